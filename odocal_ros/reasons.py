@@ -40,11 +40,14 @@ class Code(Enum):
     NO_ACCELEROMETER = CAUTION, ('Yaw and pitch need an IMU that publishes acceleration. Drive '
                                  'on level ground: unmodelled slopes bias the scale.')
     NO_ODOMETER = REJECT, 'Check the odometer topic and odometer.type, or use --odometer-topic.'
-    NO_FIX = REJECT, 'Drive under open sky and wait for a position before the start mark.'
+    NO_FIX = REJECT, ('Drive under open sky and wait for a position before the start mark. '
+                      'Without GNSS: start the localisation first, and name its topic with '
+                      '--fix-topic.')
     FIXES_UNUSABLE = REJECT, ('Wait for a valid position. If these fixes are good, relax '
                               'gnss.min_status or gnss.max_sigma.')
     BAD_ROWS_DROPPED = NOTE, ('Check the driver that sends these messages. All other messages '
                               'were used.')
+    LOCAL_FRAME = NOTE, 'No action needed: the uncertainties include the unknown Earth rate.'
     ROWS_DAMAGED = CAUTION, ('Copy the recording again from its source, or record a new one. '
                              'Messages near the damage were left out.')
     STAMPS_NOT_RISING = NOTE, ('Check the clock of the sender. Messages with increasing stamps '
@@ -132,9 +135,11 @@ class Code(Enum):
                           'warm tyres at typical speeds, and combine several legs.')
     FIXES_SMOOTHED = NOTE, ('If possible, switch off smoothing in the receiver (position filter, '
                             'static hold): accelerations then determine more.')
-    FIXES_FOLLOW_ODOMETER = CAUTION, ('Use fixes of the receiver alone: select the topic before '
-                                      'fusion, or switch off dead reckoning in the receiver. Then '
-                                      'drive again.')
+    FIXES_FOLLOW_ODOMETER = CAUTION, ('Use positions that do not contain the wheel odometry. '
+                                      'Receiver: the topic before fusion, or dead reckoning '
+                                      'switched off. SLAM, AMCL, robot_localization: a source '
+                                      'without wheels (scan matching alone, lidar or visual '
+                                      'odometry, motion capture). Then drive again.')
     # the estimate
     YAW_NOT_SEPARABLE = CAUTION, ('Provide a heading that is independent of the odometer: '
                                   'alignment.heading with alignment.heading_sigma, a '

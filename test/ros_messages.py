@@ -119,13 +119,45 @@ def twist_covariance(stamp_ns, x, y=0.0, z=0.0, variances=(0.0, 0.0, 0.0), frame
                                                                 twist=inner)
 
 
+def pose_at(position):
+    """Return a geometry_msgs/Pose that looks along x."""
+    point = kind('geometry_msgs/msg/Point')(**dict(zip('xyz', map(float, position), strict=True)))
+    return kind('geometry_msgs/msg/Pose')(position=point, orientation=quaternion())
+
+
+def pose(stamp_ns, position, frame='map'):
+    """Return a geometry_msgs/PoseStamped."""
+    return kind('geometry_msgs/msg/PoseStamped')(header=header(stamp_ns, frame),
+                                                 pose=pose_at(position))
+
+
+def pose_covariance(stamp_ns, position, covariance, frame='map'):
+    """Return a geometry_msgs/PoseWithCovarianceStamped; covariance: (6, 6)."""
+    inner = kind('geometry_msgs/msg/PoseWithCovariance')(
+        pose=pose_at(position), covariance=np.array(covariance, float).reshape(36))
+    return kind('geometry_msgs/msg/PoseWithCovarianceStamped')(header=header(stamp_ns, frame),
+                                                               pose=inner)
+
+
+def point(stamp_ns, position, frame='map'):
+    """Return a geometry_msgs/PointStamped."""
+    return kind('geometry_msgs/msg/PointStamped')(header=header(stamp_ns, frame),
+                                                  point=pose_at(position).position)
+
+
+def transform(stamp_ns, position, child='robot', frame='world'):
+    """Return a geometry_msgs/TransformStamped."""
+    inner = kind('geometry_msgs/msg/Transform')(translation=vector(*position),
+                                                rotation=quaternion())
+    return kind('geometry_msgs/msg/TransformStamped')(header=header(stamp_ns, frame),
+                                                      child_frame_id=child, transform=inner)
+
+
 def odometry(stamp_ns, x, child='base_link', frame='odom'):
     """Return a nav_msgs/Odometry with a forward speed."""
-    point = kind('geometry_msgs/msg/Point')(x=1.0, y=2.0, z=3.0)
-    pose = kind('geometry_msgs/msg/PoseWithCovariance')(
-        pose=kind('geometry_msgs/msg/Pose')(position=point, orientation=quaternion()),
-        covariance=np.arange(36.0))
+    inner = kind('geometry_msgs/msg/PoseWithCovariance')(pose=pose_at((1.0, 2.0, 3.0)),
+                                                         covariance=np.arange(36.0))
     return kind('nav_msgs/msg/Odometry')(
-        header=header(stamp_ns, frame), child_frame_id=child, pose=pose,
+        header=header(stamp_ns, frame), child_frame_id=child, pose=inner,
         twist=kind('geometry_msgs/msg/TwistWithCovariance')(twist=twist(x),
                                                             covariance=np.zeros(36)))

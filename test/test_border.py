@@ -28,9 +28,9 @@ ROS = {'rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_m
 ROOMS = {
     'outside': '', 'data': '',
     'settings': 'outside',
-    'messages': 'data settings',
-    'bagio': 'data messages outside',
     'nav': 'data',
+    'messages': 'data nav settings',
+    'bagio': 'data messages outside',
     'screening': 'data nav settings',
     'calib': 'data nav screening settings',
     'patent': 'data nav settings',

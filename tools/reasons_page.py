@@ -51,6 +51,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         '`gnss.min_status`, or a sigma above `gnss.max_sigma`.',
         Code.BAD_ROWS_DROPPED: 'Some messages have no stamp, hold NaN or an impossible value, '
         'are isolated outliers, or are fixes far from all others. They were left out.',
+        Code.LOCAL_FRAME: 'Positions are poses or points in a local frame, not GNSS fixes. The '
+        'direction of the Earth rate in this frame is not known, and external headings and GNSS '
+        'velocities do not refer to it. The estimator treats the Earth rate as gyro bias; the '
+        'uncertainties include this. `reference.latitude_deg` gives its vertical part.',
         Code.ROWS_DAMAGED: 'Several messages of a topic hold impossible values, or are outliers '
         'next to such messages: the recording itself is damaged. Other messages may be damaged '
         'without a visible sign, so messages near each group were left out too.',

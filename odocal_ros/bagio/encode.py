@@ -204,6 +204,18 @@ def fix(name: str, samples: FixSamples, frame: str = 'gnss') -> Topic:
                  layout.packer(fill, len(samples.stamp_ns)))
 
 
+def pose(name: str, samples: FixSamples, position: Floats, frame: str = 'map') -> Topic:
+    """Return geometry_msgs/PoseStamped of positions, (n, 3) m, at the times of FixSamples."""
+    layout = _Layout().header(frame).add('place', VECTOR).add('q', ('<f8', 4))
+
+    def fill(out: NDArray[Any], rows: slice) -> None:
+        _stamp(out, samples.stamp_ns[rows])
+        out['place'] = position[rows]
+        out['q'][:, 3] = 1.0
+    return Topic(name, 'geometry_msgs/msg/PoseStamped', samples.received_ns,
+                 layout.packer(fill, len(samples.stamp_ns)))
+
+
 def velocity(name: str, samples: VelocitySamples, frame: str = 'gnss') -> Topic:
     """Return geometry_msgs/TwistWithCovarianceStamped of VelocitySamples: linear ones."""
     layout = _Layout().header(frame).add('linear', VECTOR).add('angular', VECTOR).add(

@@ -31,7 +31,9 @@ LEFT_JOINT, RIGHT_JOINT = 'left_wheel_joint', 'right_wheel_joint'
 
 def drive_topics(drive: Any) -> list[Topic]:
     """Return a simulated drive's topics under the names that the node listens to."""
-    topics = [encode.imu('/imu/data', drive.imu), encode.fix('/fix', drive.fix)]
+    topics = [encode.imu('/imu/data', drive.imu),
+              encode.pose('/pose', drive.fix, drive.positions())
+              if drive.options.reference == 'pose' else encode.fix('/fix', drive.fix)]
     kind, left, right = drive.options.odometer, drive.odometer, drive.odometer_right
     two = len(right.stamp_ns) > 0
     if kind == 'angle':

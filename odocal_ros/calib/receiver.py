@@ -33,5 +33,5 @@ def odometer_reasons(share: float, sigma: float, log_time: float) -> tuple[Reaso
         return ()
     return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes contain an odometer with a scale error '
                    f'of {100 * share:+.2f} % +- {100 * sigma:.2f} % (time constant '
-                   f'{np.exp(log_time):.0f} s), as fixes fused with a wheel speed do; accounted '
-                   'for'),)
+                   f'{np.exp(log_time):.0f} s), as positions fused with a wheel speed do; '
+                   'accounted for'),)

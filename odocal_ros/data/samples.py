@@ -31,6 +31,8 @@ Stamps = Ints
 NO_STAMPS = np.empty(0, np.int64)
 FRAME_BYTES = 48     # judgement: of a frame_id that is shown
 FRAME = f'S{FRAME_BYTES}'
+# format: status of a position in a local frame; that of a NavSatFix is an int8
+LOCAL = 1000
 NONE, NONE_OF_3, NONE_OF_4 = np.empty(0), np.empty((0, 3)), np.empty((0, 4))
 
 
@@ -96,7 +98,12 @@ class OdometerForm:
 
 @dataclass(frozen=True, eq=False)
 class FixSamples:
-    """GNSS fixes."""
+    """
+    GNSS fixes, or positions in a local frame: those have the status LOCAL.
+
+    A local frame is placed on the Earth where no vehicle is (``nav/local_frame.py``): x, y
+    and z are then east, north and up, but its y axis does not point to north.
+    """
 
     stamp_ns: Stamps           # (n,)
     received_ns: Stamps        # (n,)
@@ -105,7 +112,7 @@ class FixSamples:
     height: Floats             # (n,) m, ellipsoidal
     covariance_n: Floats       # (n, 3, 3) m^2, ENU
     covariance_type: Ints      # (n,) 0 unknown .. 3 known
-    status: Ints               # (n,) NavSatStatus: -1 no fix .. 2
+    status: Ints               # (n,) NavSatStatus: -1 no fix .. 2; or LOCAL
 
     def __post_init__(self) -> None:
         freeze(self, latitude=(), longitude=(), height=(), covariance_n=(3, 3),

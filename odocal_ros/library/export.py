@@ -52,6 +52,9 @@ def csv(columns: Series) -> str:
 def kml(columns: Series) -> str:
     """Return the track of each leg as a line on the ground, for Google Earth."""
     ElementTree.register_namespace('', KML)
+    if np.isnan(columns['latitude_deg']).all():
+        raise BadUsage('export: track.kml: the positions are in a local frame, which has no place '
+                       'on a map; use trajectory.csv or trajectory.tum')
     root = ElementTree.Element(f'{{{KML}}}kml')
     document = ElementTree.SubElement(root, f'{{{KML}}}Document')
     for leg in np.unique(columns['leg']).tolist():
@@ -81,9 +84,9 @@ def mcap(result: Calibration, path: Path) -> None:
     """
     Write all series as one mcap file, for PlotJuggler and Foxglove.
 
-    /odocal/track NavSatFix; /odocal/biases IMU: the vehicle's attitude, and the biases in the
-    place of rates and forces, their variances in that of those; /odocal/residuals/SENSOR
-    JointState: each component and its sigma, units in the names.
+    /odocal/track NavSatFix, PoseStamped in a local frame; /odocal/biases IMU: the vehicle's
+    attitude, and the biases in the place of rates and forces, their variances in that of those;
+    /odocal/residuals/SENSOR JointState: each component and its sigma, units in the names.
     """
     with tempfile.TemporaryDirectory(prefix='.odocal_', dir=path.parent) as work:
         bag = write_bag(Path(work) / 'debug', _topics(result))
@@ -101,7 +104,9 @@ def _topics(result: Calibration) -> list[encode.Topic]:
                        pose['height_m'], np.zeros((n, 3, 3)), whole, whole)
     biases = ImuSamples(t, t, gyro, force, np.stack(
         [pose[q] for q in ('qx', 'qy', 'qz', 'qw')], -1), np.zeros(n))
-    return [encode.fix('/odocal/track', track, 'base_link'),
+    place_n = np.stack([pose[f'{axis}_m'] for axis in ('east', 'north', 'up')], -1)
+    return [encode.pose('/odocal/track', track, place_n, 'odocal_enu')
+            if np.isnan(track.latitude).all() else encode.fix('/odocal/track', track, 'base_link'),
             encode.imu('/odocal/biases', biases, 'base_link', gyro_sigma**2, force_sigma**2),
             *_residual_topics(result)]
 

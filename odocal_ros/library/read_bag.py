@@ -75,11 +75,15 @@ class Recording:
 
 
 def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
-               journal: JournalNotes | None) -> tuple[dict[str, str], dict[str, Reader]]:
+               journal: JournalNotes | None,
+               hearer: Listener | None = None) -> tuple[dict[str, str], dict[str, Reader]]:
     """Return slot -> topic of a bag, and topic -> reader; named ones precede a journal's."""
-    from odocal_ros.library.topics import choose_topics
+    from odocal_ros.library.topics import choose_topics, local_reference
     named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
     chosen = choose_topics(bag.topics, config, named)
+    said = local_reference(bag.topics, chosen, named)
+    if said and hearer:
+        hearer.note(said)
     return chosen, {topic: make_reader(slot, bag.topics[topic].msgtype, config)
                     for slot, topic in chosen.items()}
 
@@ -118,7 +122,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
         if journal:
             hearer.note(f'{bag.name} is a journal: settings and topics come from '
                           f'{journal.path}; options take precedence')
-        chosen, readers = readers_of(bag, topics or {}, settings, journal)
+        chosen, readers = readers_of(bag, topics or {}, settings, journal, hearer)
         digest = beside.submit(bag_sha256, bag)
         recorder = LegRecorder()
         with hearer.phase(f'reading {name}') as progress:

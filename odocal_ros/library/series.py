@@ -70,7 +70,8 @@ def _of_fits(result: Calibration,
     """Return the columns of each leg that the smoother fitted: (leg, its details) to them."""
     found = [(number, leg, columns(leg, leg.methods['smoother'].details))
              for number, leg in enumerate(result.legs, 1)
-             if leg.origin and 'key_C_nb' in getattr(leg.methods.get('smoother'), 'details', ())]
+             if leg.track_n is not None
+             and 'key_C_nb' in getattr(leg.methods.get('smoother'), 'details', ())]
     if not found:
         raise BadUsage(NONE)
     return stacked(found)
@@ -93,9 +94,11 @@ def _vehicle(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
 
 
 def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:
-    assert leg.origin is not None
     track_n = smoothed['track_n']
-    latitude, longitude, height = Origin(*leg.origin).to_geodetic(track_n).T
+    # of a local frame no place on the Earth is known
+    geodetic = Origin(*leg.origin).to_geodetic(track_n) if leg.origin else np.full(
+        track_n.shape, np.nan)
+    latitude, longitude, height = geodetic.T
     quaternion = quat_from_matrix(_vehicle(leg, smoothed))
     return {'t': smoothed['track_t'],
             **dict(zip(('east_m', 'north_m', 'up_m'), track_n.T, strict=True)),

@@ -15,6 +15,7 @@ import re
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
+from odocal_ros.messages.local_types import LOCAL_TYPES
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import FIX, IMU, VELOCITY
 from odocal_ros.settings.config import Config
@@ -24,11 +25,15 @@ OPTION = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-to
           'fix_velocity': '--fix-velocity-topic'}
 NEVER = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
 COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # asked of a vehicle, not measured
+# poses that a person sets: Nav2 and RViz
+GOALS = ('goal', 'initialpose', 'initial_pose', 'clicked')
 # estimates made of GNSS or of everything: no odometer while there is another
 FUSED = ('filtered', 'fused', 'gps', 'gnss', 'fix', 'global', 'ground_truth', 'ekf')
 GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
 
-SENSORS = {'imu': (IMU,), 'heading': (IMU,), 'fix': (FIX,), 'fix_velocity': VELOCITY}
+# an Odometry is the reference only if it is named: most are the wheel odometry itself
+REFERENCES = (FIX, *(kind for kind in LOCAL_TYPES if kind not in ODOMETERS))
+SENSORS = {'imu': (IMU,), 'heading': (IMU,), 'fix': REFERENCES, 'fix_velocity': VELOCITY}
 
 Topics = dict[str, TopicInfo]
 
@@ -54,6 +59,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
 
     """
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
+    _check_reference(chosen)
     troubles: list[str] = []
     for slot in wanted(config):
         if slot in chosen:
@@ -62,7 +68,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
         if len(found) == 1:
             chosen[slot] = found[0]
         elif not _optional(slot, config):
-            troubles.append(_trouble(topics, slot, found, config))
+            troubles.append(_trouble(topics, slot, found, config, chosen.get('fix', '')))
     if troubles:
         raise BadUsage('; '.join(troubles) + (
             '' if all('; choose one with ' in text for text in troubles) else
@@ -102,12 +108,32 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     elif slot == 'imu':
         found = _unless_all(found, ('heading',))
     elif slot == 'fix':
+        found = [name for name in found if topics[name].msgtype == FIX] or [
+            name for name in found if not _has(name, (*COMMANDS, *GOALS))]
         found = _unless_all(found, ('filtered', 'fused'))
     elif slot == 'fix_velocity':
         found = [name for name in found if _of_receiver(name)]
         named_so = [name for name in found if _last(name) == slot]
         found = named_so or found       # by the name the node listens to
     return found
+
+
+def _check_reference(chosen: dict[str, str]) -> None:
+    """Refuse one topic as both odometer and reference: its scale would be exactly 1."""
+    for slot in ('odometer', 'odometer_right'):
+        if 'fix' in chosen and chosen.get(slot) == chosen['fix']:
+            raise BadUsage(f'{chosen["fix"]} is both {OPTION[slot]} and {OPTION["fix"]}: an '
+                           'odometer cannot be calibrated against itself; name another topic for '
+                           'one of them')
+
+
+def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str, str]) -> str:
+    """Return the note that poses are the reference, if nobody named them; otherwise ''."""
+    fix = chosen.get('fix', '')
+    if not fix or 'fix' in overrides or topics[fix].msgtype == FIX:
+        return ''
+    return (f'no NavSatFix with messages in the bag; position reference: {fix} '
+            f'({topics[fix].msgtype}); another one: {OPTION["fix"]}')
 
 
 def _optional(slot: str, config: Config) -> bool:
@@ -150,11 +176,15 @@ def _may_serve(msgtype: str, slot: str) -> bool:
     """Return True if a type fits a slot; odometers can have a foreign type."""
     if slot in ('odometer', 'odometer_right'):
         return full_type(msgtype) not in (IMU, FIX)
-    return full_type(msgtype) in SENSORS[slot]
+    return full_type(msgtype) in SENSORS[slot] or slot == 'fix' and full_type(
+        msgtype) in LOCAL_TYPES
 
 
-def _trouble(topics: Topics, slot: str, found: list[str], config: Config) -> str:
+def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: str) -> str:
     """Return the explanation why a slot is open and the option that selects it."""
+    if slot == 'odometer' and fix and not found and topics[fix].msgtype in ODOMETERS:
+        return (f'no odometer in the bag besides {fix}, which is the position reference '
+                f'({OPTION["fix"]}): an odometer cannot be calibrated against itself')
     if found:
         hint = ''
         if slot == 'odometer' and {'left', 'right'} <= {
@@ -163,6 +193,9 @@ def _trouble(topics: Topics, slot: str, found: list[str], config: Config) -> str
         return (f'{len(found)} topics can be the {_label(slot)}; choose one with {OPTION[slot]}: '
                 f'{_described(topics, found)}{hint}')
     types = tuple(_types(slot, config))
+    if slot == 'fix':
+        return (f'no {_label(slot)} in the bag: a topic of {" or ".join(types)}, or a '
+                f'nav_msgs/msg/Odometry that is named with {OPTION[slot]}')
     what = ' or '.join(types) if len(types) < 3 else 'an odometer type'
     beside = ' besides the IMU' if slot == 'heading' else ''
     return f'no {_label(slot)} (a topic of {what}{beside}) in the bag'

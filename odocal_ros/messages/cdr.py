@@ -36,6 +36,11 @@ def _twist(prefix: str) -> tuple[str, ...]:
             + _each('float64', f'{prefix}.angular', 'xyz'))
 
 
+def _pose(prefix: str) -> tuple[str, ...]:
+    return (_each('float64', f'{prefix}.position', 'xyz')
+            + _each('float64', f'{prefix}.orientation', 'xyzw'))
+
+
 _HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
 FRAME_AT = 16       # format: where CDR has the text of _HEADER
 _LAYOUT = ('dim[] layout.dim', 'uint32 layout.data_offset')
@@ -59,9 +64,15 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
     'geometry_msgs/msg/TwistStamped': (*_HEADER, *_twist('twist')),
     'geometry_msgs/msg/TwistWithCovarianceStamped': (
         *_HEADER, *_twist('twist.twist'), 'float64[36] twist.covariance'),
+    'geometry_msgs/msg/PointStamped': (*_HEADER, *_each('float64', 'point', 'xyz')),
+    'geometry_msgs/msg/PoseStamped': (*_HEADER, *_pose('pose')),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': (
+        *_HEADER, *_pose('pose.pose'), 'float64[36] pose.covariance'),
+    'geometry_msgs/msg/TransformStamped': (
+        *_HEADER, 'string child_frame_id', *_each('float64', 'transform.translation', 'xyz'),
+        *_each('float64', 'transform.rotation', 'xyzw')),
     'nav_msgs/msg/Odometry': (
-        *_HEADER, 'string child_frame_id', *_each('float64', 'pose.pose.position', 'xyz'),
-        *_each('float64', 'pose.pose.orientation', 'xyzw'), 'float64[36] pose.covariance',
+        *_HEADER, 'string child_frame_id', *_pose('pose.pose'), 'float64[36] pose.covariance',
         *_twist('twist.twist'), 'float64[36] twist.covariance'),
     'std_msgs/msg/Int32MultiArray': (*_LAYOUT, 'int32[] data'),
     'std_msgs/msg/Int64MultiArray': (*_LAYOUT, 'int64[] data'),

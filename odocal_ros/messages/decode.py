@@ -219,7 +219,7 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
     msgtype = full_type(msgtype)
     if slot in ('odometer', 'odometer_right'):
         return Reader(slot, msgtype, OdometerPlan(slot, msgtype, config))
-    reader = Reader(slot, msgtype, sensor_plan(slot, msgtype))
+    reader = Reader(slot, msgtype, sensor_plan(slot, msgtype, config))
     if slot == 'imu':
         reader.frames = FrameFilter(msgtype, config.imu.frame_id)
     return reader

@@ -27,6 +27,8 @@ from odocal_ros.data.samples import (
 )
 from odocal_ros.errors import BadData
 from odocal_ros.messages.fields import array, Column, fixed, STAMP, stamp_ns, View, xyz
+from odocal_ros.messages.local_types import local_fixes, LOCAL_TYPES
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 
 IMU = 'sensor_msgs/msg/Imu'
@@ -115,10 +117,13 @@ SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
 }
 
 
-def sensor_plan(slot: str, msgtype: str) -> SensorPlan:
+def sensor_plan(slot: str, msgtype: str, config: Config) -> SensorPlan:
     """Return the fields that a slot uses of a message type; raise BadData for other types."""
+    if slot == 'fix' and msgtype in LOCAL_TYPES:
+        return SensorPlan(slot, LOCAL_TYPES[msgtype], local_fixes(config.reference.latitude_deg))
     if (slot, msgtype) not in SENSORS:
         types = [other for own, other in SENSORS if own == slot]
+        types += LOCAL_TYPES if slot == 'fix' else []
         raise BadData(f'{slot}: messages of type {msgtype} cannot be used; give a topic of type '
                       f'{" or ".join(types)}')
     return SensorPlan(slot, *SENSORS[slot, msgtype])

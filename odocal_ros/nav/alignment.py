@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
-from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.earth import gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 
 # what a leg is aligned by, recorded or planned
@@ -228,40 +229,43 @@ def off_the_earth(level: Level, latitude: float, grade: Grade) -> float:
 
 
 def complete(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bool,
-             latitude: float, grade: Grade, gyro_noise: float) -> Alignment:
+             origin: Origin, grade: Grade, gyro_noise: float) -> Alignment:
     """
     Return the Alignment of a level and a heading, rad; the gyro bias from rest where there is one.
 
     yaw is that of L's x axis where the level is taken, its sigma holds for that too.
     """
     C_nb = level.C_np @ C_nL(yaw) @ level.C_Lb
-    bias_n, sigma_n = _gyro_bias_n(level, C_nb, yaw_sigma, latitude, grade)
+    bias_n, sigma_n = _gyro_bias_n(level, C_nb, yaw_sigma, origin, grade)
     sigma_b = np.sqrt(np.einsum('ni,n->i', C_nb**2, sigma_n**2))
     return Alignment(level.t, C_nb, transpose(C_nb) @ bias_n, level.level_sigma, float(yaw_sigma),
                      sigma_b, gyro_noise, grade.gyro_bias_walk, source, shared, level.standstill,
                      grade.gyro_scale_error)
 
 
-def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, latitude: float,
+def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, origin: Origin,
                  grade: Grade) -> tuple[Floats, Floats]:
     """
     Return gyro bias and its sigma, ENU: the mean rate at rest less the Earth's.
 
     A wrong heading puts the Earth rate on wrong axes: a yaw error psi moves the east part by
-    psi, the north part by psi^2 / 2 of its level part; a tilt moves all three. Where that says
+    psi, the north part by psi^2 / 2 of its level part; a tilt moves all three. In a local frame
+    the Earth rate is not known. Where that says
     less than the grade does of the turn-on bias, or without a standstill, the bias is taken as
     zero: so the east part after a gyrocompass, which has used it up. A reading that the grade
     rules out shows that the grade is wrong (or the unit): the reading is taken.
     """
     if level.standstill is None:
         return np.zeros(3), np.full(3, grade.gyro_bias)
+    latitude = origin.latitude
     level_rate, up_rate = OMEGA * np.cos(latitude), abs(OMEGA * np.sin(latitude))
     # rms of psi^2 / 2 for a normal psi: sqrt(3) / 2 sigma^2; of an unknown one sqrt(3 / 2)
     by_yaw = level_rate * np.array(
         [min(yaw_sigma, 1.0), min(np.sqrt(3) / 2 * yaw_sigma**2, np.sqrt(1.5)), 0.0])
     by_tilt = level.level_sigma * np.array([up_rate, up_rate, level_rate])
-    sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2)
-    measured = C_nb @ level.mean_rate_b - earth_rate_n(latitude)
+    unknown = np.array(origin.local.sigma_n) if origin.local else 0.0
+    sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2 + unknown**2)
+    measured = C_nb @ level.mean_rate_b - origin.earth_rate_n
     # sigmas of noise and turn-on bias: a gyro that reads more is not of its grade
     ruled_out_sigmas = 10.0
     known = (sigma < grade.gyro_bias) | (

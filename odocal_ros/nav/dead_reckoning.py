@@ -24,18 +24,34 @@ from numpy.typing import ArrayLike, NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks
-from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
+from odocal_ros.nav.earth import (
+    C_en,
+    earth_rate_n,
+    ecef_from_geodetic,
+    geodetic_from_ecef,
+    PartlyKnownRate,
+)
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Where n is fixed: geodetic position, rad, rad, m."""
+    """
+    Where n is fixed: geodetic position, rad, rad, m.
+
+    local : the Earth rate of a local frame, whose y axis does not point to north; None: it does.
+    """
 
     latitude: float
     longitude: float
     height: float
+    local: PartlyKnownRate | None = None
+
+    @property
+    def earth_rate_n(self) -> Floats:
+        """Return the Earth's turn rate in n as far as it is known, rad/s: (3,)."""
+        return np.array(self.local.rate_n) if self.local else earth_rate_n(self.latitude)
 
     def to_n(self, geodetic: Floats) -> Floats:
         """Return positions in n, m, of (..., 3) latitude, longitude (rad), height (m)."""

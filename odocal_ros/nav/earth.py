@@ -9,6 +9,8 @@
 
 """The Earth: WGS 84 ellipsoid, gravity and rates; geodetic and Earth-fixed coordinates."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -46,6 +48,22 @@ def earth_rate_n(latitude: ArrayLike) -> Floats:
     latitude = np.asarray(latitude, dtype=float)
     zero = np.zeros_like(latitude)
     return np.stack([zero, OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)], -1)
+
+
+@dataclass(frozen=True)
+class PartlyKnownRate:
+    """The Earth's turn rate where north is not known: what is known of it, and 1 sigma, rad/s."""
+
+    rate_n: tuple[float, float, float]
+    sigma_n: tuple[float, float, float]
+
+
+def rate_without_north(latitude: float) -> PartlyKnownRate:
+    """Return the Earth's turn rate in a level frame of unknown azimuth; rad, NaN: not known."""
+    if np.isnan(latitude):
+        return PartlyKnownRate((0.0, 0.0, 0.0), (OMEGA, OMEGA, OMEGA))
+    level = float(OMEGA * np.cos(latitude) / np.sqrt(2))
+    return PartlyKnownRate((0.0, 0.0, float(OMEGA * np.sin(latitude))), (level, level, 0.0))
 
 
 def transport_rate_n(latitude: Floats, height: Floats, velocity_n: Floats) -> Floats:

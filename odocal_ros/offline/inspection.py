@@ -22,10 +22,11 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.pieces import medians
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
+from odocal_ros.library.topics import REFERENCES
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Deserialize, make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import FIX, IMU, Pairs
+from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.offline import survey
 from odocal_ros.offline.inspection_drive import closed, look
 from odocal_ros.offline.suggest import command, left_open, likely_mapping
@@ -111,7 +112,8 @@ def _taps(bag: Bag, config: Config,
     taps: dict[str, _Tap] = {}
     refused: dict[str, str] = {}
     for name, info in bag.topics.items():
-        slot = asked.get(name) or {IMU: 'imu', FIX: 'fix'}.get(info.msgtype) or (
+        slot = asked.get(name) or ('imu' if info.msgtype == IMU else '') or (
+            'fix' if info.msgtype in REFERENCES else '') or (
             'odometer' if info.msgtype in (*ODOMETERS, config.odometer.type) else '')
         if not slot or not info.count:
             continue

@@ -14,10 +14,12 @@ import math
 import textwrap
 from typing import Any
 
+from odocal_ros.data.samples import LOCAL
 from odocal_ros.output.summary import WIDTH
 from odocal_ros.outside.names import one_line
 
-STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK'}
+STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
+          str(LOCAL): 'positions in a local frame'}
 
 
 def text(found: dict[str, Any]) -> str:
@@ -45,6 +47,8 @@ def _topics(found: dict[str, Any], roles: dict[str, str]) -> list[str]:
         name, kind = one_line(topic['name']), one_line(_short(topic['type']))
         rate = f'{topic["rate_hz"]:8.2f} Hz' if topic['rate_hz'] and topic['count'] > 1 else ''
         role = f'<- {roles[topic["name"]]}' if topic['name'] in roles else ''
+        if str(LOCAL) in topic.get('fix', {}).get('status', ()):
+            role += ' (position reference)' if role else 'position reference, if GNSS is not used'
         lines.append(f'  {name:{wide}}  {kind:{kinds}} '
                      f'{topic["count"]:8d} {rate:11}  {role}'.rstrip())
     return ['topics', *lines]

@@ -86,6 +86,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--odometer', metavar='KIND', help='counts (Int64, default), speed (TwistStamped) or '
         'angle (JointState)')
     add('--two-wheels', action='store_true', default=None, help='left and right odometer')
+    add('--reference', metavar='KIND', help='fix (NavSatFix on /fix, default) or pose '
+        '(PoseStamped on /pose in a local frame, with the errors of the fixes)')
     add('--fix-noise', metavar='KIND', help='white (default), correlated or rtk')
     add('--slip', type=float, metavar='M', dest='slip_walk',
         help='random slip while moving, m per square root of a second')
@@ -135,7 +137,8 @@ def _span(text: str) -> tuple[float, float]:
 def options_of(args: argparse.Namespace) -> 'SimOptions':
     """Return the SimOptions that parsed arguments ask for."""
     from odocal_ros.sim.options import SimOptions
-    plain = ['scenario', 'seed', 'imu_grade', 'odometer', 'two_wheels', 'fix_noise', 'slip_walk',
+    plain = ['scenario', 'seed', 'imu_grade', 'odometer', 'two_wheels', 'reference',
+             'fix_noise', 'slip_walk',
              *NUMBERS]
     given = {name: getattr(args, name) for name in plain if getattr(args, name) is not None}
     for name in DEGREES:

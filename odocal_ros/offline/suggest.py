@@ -13,6 +13,7 @@
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.topics import candidates, choose_topics, named, OPTION, wanted
+from odocal_ros.messages.sensor_types import FIX
 from odocal_ros.outside.names import for_shell
 from odocal_ros.settings.config import Config, with_settings
 
@@ -81,7 +82,8 @@ def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: 
         others = {s: t for s, t in mapping.items() if s != slot}
         found = candidates(topics, slot, config, others) + [topic] * (topic not in candidates(
             topics, slot, config, others))
-        if slot in overrides or len(found) > 1:
+        local = slot == 'fix' and topics[topic].msgtype != FIX      # said, as it is unusual
+        if slot in overrides or len(found) > 1 or local:
             words += [OPTION[slot], topic]
     if 'odometer_right' in mapping and 'odometer_right' not in overrides:
         extra = ['odometer.left=topic', 'odometer.right=topic', *extra]

@@ -34,7 +34,7 @@ from odocal_ros.nav.alignment import (
 )
 from odocal_ros.nav.angles import wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin
-from odocal_ros.nav.earth import C_en, earth_rate_n
+from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
@@ -81,7 +81,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     if source == 'course':
         yaw, sigma, why = _course(inputs, level, metres_per_unit, fixes_n, origin, grade)
         reasons += why
-    return complete(level, yaw, sigma, source, shared, origin.latitude, grade, gyro_noise), reasons
+    return complete(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
 
 
 def choose_standstill(spans: Floats) -> Floats | None:
@@ -161,6 +161,8 @@ def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
     order = [asked] if asked != 'auto' else ['heading_topic', 'imu_orientation', 'gyrocompass']
     if asked == 'auto' and not np.isnan(config.alignment.heading):
         order = ['fixed']
+    elif asked == 'auto' and inputs.local:
+        order = ['course']
     refusals = []
     for source in order:
         if source == 'course':
@@ -235,6 +237,8 @@ def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, conf
 
 def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
                  config: Config) -> Found:
+    if inputs.local:
+        return None, 'the positions are in a local frame, whose y axis does not point to north'
     if level.standstill is None:
         return None, 'needs a standstill'
     yaw, sigma = gyrocompass(level, latitude, grade)
@@ -256,11 +260,11 @@ SOURCES = {'fixed': _fixed, 'imu_orientation': _imu_orientation, 'heading_topic'
 def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Floats, origin: Origin,
             grade: Grade) -> tuple[float, float, tuple[Reason, ...]]:
     """Return the yaw that turns the first 30 m of track onto the fixes, its sigma, reasons."""
-    trial = complete(level, 0.0, np.pi, 'course', True, origin.latitude, grade, 0.0)
+    trial = complete(level, 0.0, np.pi, 'course', True, origin, grade, 0.0)
     course_time = 300.0    # s within which the path for a course must be driven
     pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + course_time)
     t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - trial.gyro_bias, trial.q_nb,
-                       earth_rate_n(origin.latitude))
+                       origin.earth_rate_n)
     track = dead_reckon(t, q_nb, inputs.travel)
     near = (inputs.t_fix >= max(t[0], 0.0)) & (inputs.t_fix <= t[-1])
     if near.sum() >= 2:

@@ -89,7 +89,7 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
                                  config)
     let_go()
     gap = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
-    epochs = attitude_of(inputs, placed.origin.latitude, alignment.t, alignment.q_nb,
+    epochs = attitude_of(inputs, placed.origin, alignment.t, alignment.q_nb,
                          alignment.gyro_bias)
     track = dead_reckon(*epochs, inputs.travel)
     apart, slips = _wheels_beside(inputs, config, placed, track, reasons)

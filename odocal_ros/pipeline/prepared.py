@@ -21,8 +21,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.dead_reckoning import dead_reckon, Track
-from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.strapdown import attitude
@@ -105,7 +104,7 @@ class PreparedLeg(Placed):
 
     def _surveyed(self, name: str, t: float) -> tuple[float, ...]:
         """Return the reference point at a mark, () if the path does not start or end there."""
-        if not name:
+        if not name or self.origin.local:      # surveyed points are geodetic
             return ()
         t_mark = 0.0 if name == 'start' else self.inputs.t_stop
         span = standing_at(t_mark, self.spans)
@@ -122,10 +121,10 @@ class PreparedLeg(Placed):
     def attitude_from(self, t_begin: float, q_nb: Floats,
                       gyro_bias: Floats) -> tuple[Floats, Floats]:
         """Return the attitude from a time, s, on: t (m,) s, q_nb (m, 4); bias in b, rad/s."""
-        return attitude_of(self.inputs, self.origin.latitude, t_begin, q_nb, gyro_bias)
+        return attitude_of(self.inputs, self.origin, t_begin, q_nb, gyro_bias)
 
 
-def attitude_of(inputs: Inputs, latitude: float, t_begin: float, q_nb: Floats,
+def attitude_of(inputs: Inputs, origin: Origin, t_begin: float, q_nb: Floats,
                 gyro_bias: Floats) -> tuple[Floats, Floats]:
     """Return the attitude of inputs from a time, s, on: t (m,) s, q_nb (m, 4)."""
     rows = slice(np.searchsorted(inputs.t_imu, t_begin - 1e-9),
@@ -133,5 +132,5 @@ def attitude_of(inputs: Inputs, latitude: float, t_begin: float, q_nb: Floats,
     t = inputs.t_imu[rows]
     rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
     epoch_rate = 50.0    # Hz, least rate of attitude epochs
-    return attitude(t, inputs.w_b[rows], q_nb, earth_rate_n(latitude),
+    return attitude(t, inputs.w_b[rows], q_nb, origin.earth_rate_n,
                     max(1, int(rate / epoch_rate)), gyro_bias)

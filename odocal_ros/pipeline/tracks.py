@@ -77,7 +77,8 @@ def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reas
     more: dict[str, Any] = {
         name: start.position_n + path(t) - path(np.array(start.t))
         for name, path in (('track_before_n', before), ('track_n', after))}
-    more |= {'origin': (ready.origin.latitude, ready.origin.longitude, ready.origin.height)}
+    if not ready.origin.local:       # else no place on the Earth is known
+        more |= {'origin': (ready.origin.latitude, ready.origin.longitude, ready.origin.height)}
     pin, between, path_length, found = _checked(ready, after, start)
     more['reference_n'] = ready.fixes_n[between]
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:

@@ -23,6 +23,7 @@ from odocal_ros.nav.alignment import (
     level_in_motion,
     MOTION_LEVEL,
 )
+from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, gravity
 from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_multiply, transpose
 from odocal_ros.planning.drive import PlannedDrive
@@ -60,8 +61,9 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
         found = (Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level and gyro '
                         'bias are estimated from the drive'),)
     yaw, sigma, source, why = _heading(drive, config.alignment, fix_sigma, level, grade)
-    alignment = complete(level, yaw, sigma, source, source != 'gyrocompass', drive.latitude,
-                         grade, grade.gyro_noise)
+    alignment = complete(level, yaw, sigma, source, source != 'gyrocompass',
+                         Origin(drive.latitude, drive.longitude, drive.height), grade,
+                         grade.gyro_noise)
     return alignment, found + why
 
 

@@ -9,13 +9,14 @@
 
 """Where a leg's fixes lie, and how far a count reaches: by one rule, before any method."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
+from odocal_ros.nav.earth import rate_without_north
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
@@ -45,12 +46,15 @@ def place(inputs: 'Inputs', config: Config) -> Placed:
     """
     Return the fix positions of screened inputs and the metres per count.
 
-    inputs : Inputs.   config : Config; only the nominal scale is used.
+    inputs : Inputs.   config : Config, for the nominal scale and the latitude of a local frame.
     """
     nominal = nominal_scale(config, inputs.scale_unit)
     if not len(inputs.t_fix):
         return Placed(Origin(0.0, 0.0, 0.0), np.empty((0, 3)), np.nan, nominal, nominal)
     origin = origin_amid(inputs.t_fix, inputs.geodetic)
+    if inputs.local:
+        latitude = np.deg2rad(config.reference.latitude_deg)
+        origin = replace(origin, local=rate_without_north(float(latitude)))
     geodetic = inputs.geodetic.copy()
     lost = np.isnan(geodetic[:, 2])
     geodetic[lost, 2] = origin.height

@@ -34,6 +34,7 @@ from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.force import with_force
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
+from odocal_ros.screening.local_frame import without_north
 from odocal_ros.screening.other_imus import other_imus
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
@@ -72,6 +73,7 @@ class Inputs:
     fixes_rejected: int
     scale_unit: str
     felt: bool = True                  # False: f_b is made up, no accelerometer is there
+    local: bool = False                # True: fixes are positions in a local frame
 
     @cached_property
     def usual_f_b(self) -> Floats:
@@ -100,7 +102,8 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
 
     """
     leg, unfelt = with_force(leg, config)
-    found: list[Reason] = [*unfelt, *other_imus(leg, config.imu)]
+    leg, local = without_north(leg, config)
+    found: list[Reason] = [*unfelt, *local, *other_imus(leg, config.imu)]
     for slot in ('imu', 'odometer', 'fix'):
         if not len(getattr(leg, slot).stamp_ns):
             code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
@@ -157,7 +160,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
         t_velocity=t_velocity[some], velocity_n=velocity.velocity_n[some],
         velocity_variance=velocity.variance_n[some],
         fixes_rejected=len(leg.fix.stamp_ns) - int(use.sum()),
-        scale_unit=leg.form.scale_unit, felt=not unfelt)
+        scale_unit=leg.form.scale_unit, felt=not unfelt, local=bool(local))
     if unfelt:
         return inputs, tuple(found)
     back = reversed_starts(inputs.travel, t_imu, w_b, f_b, (0.0, t_stop))

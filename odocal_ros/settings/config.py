@@ -180,6 +180,10 @@ class ReferenceConfig:
                                        'the start mark: latitude, longitude, ellipsoidal height, '
                                        'sigma; empty: from fixes.')
     end: tuple[float, ...] = setting((), 'deg, deg, m, m', about='The same at the end mark.')
+    latitude_deg: float = setting(NAN, 'deg', -85.0, 85.0, ro=True, about=(
+        'Latitude of the site, for positions in a local frame (poses instead of GNSS fixes). It '
+        'gives gravity and the vertical Earth rate. NaN: gravity of 45 deg; the Earth rate, up to '
+        '15 deg/h, is estimated as gyro bias.'))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,6 +21,7 @@ from odocal_ros.sim.real import NONE3, Real, Vector
 SIM_GRADES = {**GRADES, 'perfect': Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 FIX_NOISES = ('white', 'correlated', 'rtk')
 ODOMETERS = ('counts', 'speed', 'angle')
+REFERENCES = ('fix', 'pose')
 BY_SCENARIO: Any = None   # filled in by ``resolved``
 
 
@@ -72,6 +73,7 @@ class SimOptions:
     start_slip_time: float = 5.0           # s from each start on
     sway: float = 0.0                      # m/s of side and up while moving, white at 10 Hz
 
+    reference: str = 'fix'                 # what the bag has: fix (NavSatFix) or pose
     fix_rate: float = 5.0                  # Hz
     fix_noise: str = 'white'               # white, correlated or rtk
     fix_sigma: float = BY_SCENARIO   # m, horizontal, each axis; up: twice
@@ -136,6 +138,7 @@ def resolved(options: SimOptions) -> SimOptions:
     _choice('--scenario', options.scenario, DEFAULTS)
     _choice('--fix-noise', options.fix_noise, FIX_NOISES)
     _choice('--odometer', options.odometer, ODOMETERS)
+    _choice('--reference', options.reference, REFERENCES)
     defaults: dict[str, Any] = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4),
                                 **DEFAULTS[options.scenario]}
     scale, nominal = SCALES[options.odometer]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import (
     FixSamples,
@@ -25,6 +26,7 @@ from odocal_ros.data.samples import (
     VelocitySamples,
 )
 from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
+from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim import body, real_wheels, sensors
 from odocal_ros.sim.housing import own_angles
@@ -89,6 +91,13 @@ class Drive:
         return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
                    odometer=self.odometer, odometer_right=self.odometer_right, fix=self.fix,
                    heading=self.heading, fix_velocity=self.velocity, form=self.form)
+
+    def positions(self) -> Floats:
+        """Return the fixes as a SLAM has them: from the start on, x forward there; (n, 3) m."""
+        start = self.options
+        position_n = Origin(start.latitude, start.longitude, start.height).to_n(
+            np.stack([self.fix.latitude, self.fix.longitude, self.fix.height], -1))
+        return position_n @ matrix_from_rpy([0.0, 0.0, float(yaw_from_heading(start.heading))])
 
 
 def motion_of(options: SimOptions) -> Motion:

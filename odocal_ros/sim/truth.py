@@ -59,7 +59,8 @@ def _topics(drive: Drive) -> dict[str, Any]:
         odometer = '/joint_states'
     elif drive.options.two_wheels:
         odometer = {'left': '/odometer/left', 'right': '/odometer/right'}
-    topics = {'imu_topic': '/imu/data', 'odometer_topic': odometer, 'fix_topic': '/fix'}
+    topics = {'imu_topic': '/imu/data', 'odometer_topic': odometer,
+              'fix_topic': f'/{drive.options.reference}'}
     return topics | ({'heading_topic': '/heading'} if len(drive.heading.stamp_ns) else {})
 
 

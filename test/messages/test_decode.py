@@ -317,6 +317,8 @@ def test_a_joint_no_message_has_gives_no_rows_but_the_reason():
 floats = st.floats(width=64, allow_nan=True)
 stamps = st.integers(-2**31 * 10**9, 2**31 * 10**9 - 1)
 frames = st.sampled_from(['', 'a', 'imu_link', 'gps/äö'])
+# near the frame's origin and anywhere
+positions = st.tuples(*[st.one_of(st.floats(-2e4, 2e4), floats)] * 3)
 joint_lists = st.sampled_from([['l', 'r'], ['r', 'l'], ['left', 'l', 'r'], ['arm'],
                                ['a', 'b', 'l']])
 
@@ -339,6 +341,12 @@ MESSAGES = {
     'fix_velocity stamped': (st.builds(make.twist_stamped, stamps, *[floats] * 3, frames), {}),
     'fix_velocity': (st.builds(make.twist_covariance, stamps, *[floats] * 3,
                                st.tuples(*[floats] * 3), frames), {}),
+    'fix pose': (st.builds(make.pose, stamps, positions, frames), {}),
+    'fix pose_covariance': (st.builds(make.pose_covariance, stamps, positions, st.lists(
+        floats, min_size=36, max_size=36), frames), {}),
+    'fix point': (st.builds(make.point, stamps, positions, frames), {}),
+    'fix transform': (st.builds(make.transform, stamps, positions, frames, frames), {}),
+    'fix odometry': (st.builds(make.odometry, stamps, floats, frames, frames), {}),
     'odometer twist': (st.builds(make.twist, *[floats] * 3), {}),
     'odometer twist_stamped': (st.builds(make.twist_stamped, stamps, floats), {}),
     'odometer odometry': (st.builds(make.odometry, stamps, floats, frames, frames), {}),

@@ -17,6 +17,7 @@ import pytest
 
 from odocal_ros.nav.alignment import complete, gyrocompass, level_at_rest, level_frame, REST_EDGE
 from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix
 from odocal_ros.settings.grades import GRADES
@@ -48,7 +49,8 @@ def levelled(sensors, grade=EXACT):
 
 
 def finished(level, yaw, sigma=1e-9, source='fixed', grade=EXACT, latitude=LATITUDE):
-    return complete(level, yaw, sigma, source, False, latitude, grade, grade.gyro_noise)
+    return complete(level, yaw, sigma, source, False, Origin(latitude, 0.0, 0.0), grade,
+                    grade.gyro_noise)
 
 
 def variance_is_one(z):

@@ -13,7 +13,7 @@ import pytest
 
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.topics import choose_topics
+from odocal_ros.library.topics import choose_topics, local_reference
 from odocal_ros.settings.config import Config, with_settings
 
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
@@ -146,3 +146,56 @@ def test_the_journal_of_a_namespaced_node_is_found():
         '/car/calibrator/status': 'diagnostic_msgs/msg/DiagnosticArray'}.items()}
     assert choose(found) == {'odometer': '/car/odometer', 'imu': '/car/imu/data',
                              'fix': '/car/fix'}
+
+
+POSE, POINT = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PointStamped'
+ODOM = 'nav_msgs/msg/Odometry'
+
+
+@pytest.mark.parametrize('kind', [
+    POSE, POINT, 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'geometry_msgs/msg/TransformStamped'])
+def test_a_pose_is_the_reference_where_there_is_no_fix(kind):
+    found = topics(fix=None, slam__pose=kind)
+    chosen = choose(found)
+    assert chosen['fix'] == '/slam/pose'
+    assert local_reference(found, chosen, {}) == (
+        f'no NavSatFix with messages in the bag; position reference: /slam/pose ({kind}); another '
+        'one: --fix-topic')
+    assert local_reference(found, chosen, {'fix': '/slam/pose'}) == ''
+    assert choose(topics(slam__pose=kind))['fix'] == '/fix'
+    assert choose(topics(slam__pose=kind), {'fix': 'slam/pose'})['fix'] == '/slam/pose'
+    unused = topics(slam__pose=kind) | {'/fix': TopicInfo('/fix', FIX, 0)}
+    assert choose(unused)['fix'] == '/slam/pose'
+
+
+def test_of_two_poses_the_user_selects():
+    found = topics(fix=None, slam__pose=POSE, prism=POINT)
+    with pytest.raises(BadUsage, match=r'^2 topics can be the fix; choose one with --fix-topic: '
+                       r'/slam/pose \(geometry_msgs/msg/PoseStamped\), /prism \(geometry_msgs'):
+        choose(found)
+    assert choose(found, {'fix': '/prism'})['fix'] == '/prism'
+    # goals and clicks are poses that a person sets
+    more = topics(fix=None, slam__pose=POSE, goal_pose=POSE, clicked_point=POINT,
+                  initialpose='geometry_msgs/msg/PoseWithCovarianceStamped')
+    assert choose(more)['fix'] == '/slam/pose'
+
+
+def test_an_odometry_is_the_reference_only_by_name():
+    found = topics(fix=None, lidar_odometry=ODOM)
+    with pytest.raises(BadUsage, match='^no fix in the bag: a topic of sensor_msgs/msg/NavSatFix '
+                       'or geometry_msgs/msg/PoseStamped .*nav_msgs/msg/Odometry that is named '
+                       'with --fix-topic; the bag has'):
+        choose(found, {'odometer': '/odometer'})
+    assert choose(found, {'fix': '/lidar_odometry'}) == {
+        'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/lidar_odometry'}
+
+
+def test_one_topic_is_not_odometer_and_reference():
+    found = topics(fix=None, odometer=None, odom=ODOM)
+    with pytest.raises(BadUsage, match='^/odom is both --odometer-topic and --fix-topic: an '
+                       'odometer cannot be calibrated against itself'):
+        choose(found, {'odometer': 'odom', 'fix': '/odom'})
+    with pytest.raises(BadUsage, match=r'^no odometer in the bag besides /odom, which is the '
+                       r'position reference \(--fix-topic\)'):
+        choose(found, {'fix': '/odom'})

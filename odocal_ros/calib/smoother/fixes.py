@@ -38,7 +38,6 @@ from odocal_ros.calib.smoother.state import (
     YAW,
 )
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.receiver_filter import odometer_error, smoothing
 from odocal_ros.nav.rotations import skew
 
@@ -61,7 +60,7 @@ class Fixes(PointRows):
         self.C = state.C_nb[k]
         dp = turn(self.C, points.dp)
         v = state.v_n[k]
-        w = earth_rate_n(leg.origin.latitude)
+        w = leg.origin.earth_rate_n
         g = gravity_n(state.p_n[k], leg.origin)
         self.arm_v = leg.antenna_arm - leg.imu_arm + state.constants[GNSS_ARM]
         arm_b = state.C_bv @ self.arm_v

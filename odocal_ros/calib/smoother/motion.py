@@ -47,7 +47,7 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.earth import C_en, earth_rate_n, gravity
+from odocal_ros.nav.earth import C_en, gravity
 from odocal_ros.nav.rotations import exp_so3, skew, transpose
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class Motion:
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
         self.f = state.scale * state.forward
         _, self.left, self.up = state.C_bv.T
-        w = earth_rate_n(leg.origin.latitude)
+        w = leg.origin.earth_rate_n
         W = skew(w)
         self.f_n, self.f_n_end = self.C @ self.f, self.C_end @ self.f
         dv, dp = turn(self.C, intervals.dv), turn(self.C, intervals.dp)

@@ -172,6 +172,8 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     # as Imus are sold, whatever the grade says of one that was calibrated: else a bias would pass
     # for an axis that points off, and the yaw of a tilted Imu with it
     gyro_bias, accel = map(max, turn_on_bias(config.imu), (grade.gyro_bias, grade.accel_bias))
+    if leg.origin.local:     # what is not known of the Earth rate is a bias too
+        gyro_bias = float(np.hypot(gyro_bias, max(leg.origin.local.sigma_n)))
     # what gravity makes of the scale is a bias too
     up = np.hypot(accel, grade.accel_scale_error * G)
     accel_bias = np.maximum([accel, accel, up], 1e-6)

@@ -1,0 +1,47 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Positions in a local metric frame as geodetic ones, for methods that know the Earth.
+
+The frame is a tangent plane of the ellipsoid (x east, y north, z up) at FRAME_LONGITUDE. Only its
+latitude has a meaning.
+"""
+
+import math
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
+
+# definition: in the Atlantic, so that the positions are not mistaken for real ones
+FRAME_LONGITUDE = math.radians(-30.0)
+# definition: here normal gravity, 9.806 m/s^2, differs least from that of other latitudes
+USUAL_LATITUDE_DEG = 45.0
+# m from the origin along an axis: there the vertical differs by 0.18 deg from the z axis.
+# Judgement: larger values are map coordinates (UTM), which are not in a tangent plane
+LARGEST_FRAME = 20_000.0
+
+
+def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, Floats]:
+    """
+    Return latitude, longitude, rad, and height, m, of (n, 3) m in a local frame: (n,) each.
+
+    NaN for positions beyond LARGEST_FRAME.   latitude_deg : NaN for USUAL_LATITUDE_DEG.
+    """
+    latitude = math.radians(USUAL_LATITUDE_DEG if math.isnan(latitude_deg) else latitude_deg)
+    with np.errstate(invalid='ignore'):      # a NaN that signals
+        near = np.all(np.abs(position) <= LARGEST_FRAME, axis=1)[:, None]
+    x, y, z = np.where(near, position, np.nan).T
+    own_e = ecef_from_geodetic(latitude, FRAME_LONGITUDE, 0.0)
+    # no matrix product: its last bits depend on the number of rows, so replay would differ
+    r_e = np.stack([own + a * x + b * y + c * z for own, (a, b, c) in zip(
+        own_e, C_en(latitude, FRAME_LONGITUDE), strict=True)])
+    return geodetic_from_ecef(r_e.T)

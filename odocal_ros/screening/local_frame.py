@@ -1,0 +1,52 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""What a leg cannot use if its positions are in a local frame, whose y axis is not north."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import LOCAL, no_heading, no_velocity
+from odocal_ros.nav.earth import OMEGA
+from odocal_ros.nav.local_frame import LARGEST_FRAME
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+
+
+def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
+    """
+    Return a leg and LOCAL_FRAME if its positions are in a local frame, otherwise nothing.
+
+    The leg is without GNSS velocities, which are east and north, and without a heading topic
+    unless the settings ask for it: that is a heading in the local frame then.
+    """
+    if not (leg.fix.status == LOCAL).any():
+        return leg, ()
+    left_out = ['GNSS velocities'] * bool(len(leg.fix_velocity.stamp_ns))
+    leg = replace(leg, fix_velocity=no_velocity())
+    if config.alignment.heading_source == 'auto' and len(leg.heading.stamp_ns):
+        left_out += ['external headings']
+        leg = replace(leg, heading=no_heading())
+    latitude = math.radians(config.reference.latitude_deg)
+    unknown = OMEGA if math.isnan(latitude) else OMEGA * math.cos(latitude)
+    text = ('positions are in a local frame, so north is unknown: up to '
+            f'{math.degrees(unknown) * 3600:.1f} deg/h of the Earth rate are estimated as gyro '
+            'bias')
+    if left_out:
+        text += f'; {" and ".join(left_out)} are not used'
+    found = Reason(Code.LOCAL_FRAME, text)
+    if not np.isnan(leg.fix.latitude).all():
+        return leg, (found,)
+    return leg, (found, Reason(
+        Code.FIXES_UNUSABLE, f'all {len(leg.fix.latitude)} positions are NaN or more than '
+        f'{LARGEST_FRAME / 1000:g} km from the origin of their frame, as map coordinates are',
+        'Publish positions in a frame with its origin near the site.'))

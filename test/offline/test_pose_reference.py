@@ -1,0 +1,101 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""A bag without GNSS: its poses are found, shown, used; comma2k19 with poses is the same."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from odocal_ros.bagio.encode import imu, pose, twist
+from odocal_ros.bagio.read import open_bag
+from odocal_ros.bagio.write import write_bag
+from odocal_ros.library.read_bag import read_bag
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.offline import cli
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """Return a bag of a car with poses, the truth beside it."""
+    out = tmp_path_factory.mktemp('posed') / 'drive'
+    assert cli.main(['simulate', '--scenario', 'town', '--duration', '200', '--imu-rate', '50',
+                     '--odometer-rate', '20', '--fix-noise', 'rtk', '--reference', 'pose',
+                     '--seed', '5', '--out', str(out), '--quiet']) == 0
+    return out
+
+
+def test_inspect_shows_the_reference_and_suggests_the_command(bag, capsys):
+    assert cli.main(['inspect', str(bag)]) == 0
+    text = capsys.readouterr().out
+    assert '/pose      geometry_msgs/PoseStamped' in text
+    assert '<- fix (position reference)' in text
+    assert '1000 positions in a local frame; no covariance' in text
+    assert f'  odocal replay {bag} --fix-topic /pose\n' in text
+    assert 'LOCAL_FRAME' in text
+
+
+def test_replay_calibrates_and_says_what_the_reference_is(bag, tmp_path, capsys):
+    assert cli.main(['replay', str(bag), '--config', str(bag.parent / 'calibrator.yaml'),
+                     '--output', str(tmp_path / 'out')]) == 0
+    said = capsys.readouterr()
+    assert said.err.count('no NavSatFix with messages in the bag; position reference: /pose '
+                          '(geometry_msgs/msg/PoseStamped); another one: --fix-topic') == 1
+    written = json.loads((tmp_path / 'out' / 'calibration.json').read_text())
+    assert written['inputs'][0]['topics']['fix'] == '/pose'
+    scale = written['result']['scale_factor']
+    assert abs(scale['value'] - 0.0213) < 3 * scale['sigma'] < 3e-4 * 0.0213
+    codes = {r['code'] for r in written['legs'][0]['reasons']}
+    assert {'LOCAL_FRAME', 'COVARIANCE_UNKNOWN'} <= codes
+
+
+@pytest.mark.parametrize('name', ['trajectory.csv', 'debug.mcap', 'track.kml'])
+def test_what_is_exported_has_no_place_on_a_map(bag, tmp_path, capsys, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    code = cli.main(['replay', str(bag), '--config', str(bag.parent / 'calibrator.yaml'),
+                     '--output', str(tmp_path / 'out'), '--export', name, '--quiet'])
+    if name == 'track.kml':
+        assert code == 2
+        assert 'the positions are in a local frame' in capsys.readouterr().err
+    elif name == 'debug.mcap':
+        with open_bag(tmp_path / 'out' / name) as written:
+            assert written.topics['/odocal/track'].msgtype == 'geometry_msgs/msg/PoseStamped'
+    else:
+        rows = np.genfromtxt(tmp_path / 'out' / name, delimiter=',', names=True)
+        assert np.isnan(rows['latitude_deg']).all()
+        assert np.ptp(rows['east_m']) > 100
+
+
+def test_a_simulated_reference_has_a_name(tmp_path, capsys):
+    assert cli.main(['simulate', '--scenario', 'town', '--reference', 'slam', '--out',
+                     str(tmp_path / 'x')]) == 2
+    assert '--reference slam: required: one of fix, pose' in capsys.readouterr().err
+
+
+def test_comma2k19_with_poses_gives_the_scale_of_its_fixes(data_dir, tmp_path):
+    """The frame looks anywhere, has no latitude and says nothing of its errors, as the fixes."""
+    from odocal_ros import calibrate_bag
+    real = data_dir / 'comma2k19_rav4' / 'bag'
+    topics = {'imu': '/imu/data_flu', 'odometer': '/vehicle/twist', 'fix': '/fix'}
+    rows = read_bag(real, topics)
+    fix = rows.samples('fix')
+    geodetic = np.stack([fix.latitude, fix.longitude, fix.height], -1)
+    position = Origin(*geodetic[0]).to_n(geodetic) @ matrix_from_rpy([0.0, 0.0, 2.1])
+    posed = write_bag(tmp_path / 'posed', [
+        imu('/imu/data_flu', rows.samples('imu')), pose('/pose', fix, position),
+        twist('/vehicle/twist', rows.samples('odometer'))])
+    by_fix = calibrate_bag(real, topics=topics)
+    by_pose = calibrate_bag(posed)
+    scale, sigma = by_fix.values['scale_factor'], by_fix.sigmas['scale_factor']
+    assert abs(by_pose.values['scale_factor'] - scale) < 0.1 * sigma
+    assert by_pose.sigmas['scale_factor'] == pytest.approx(sigma, rel=0.05)
+    assert math.isclose(scale, 1.0084, abs_tol=4 * math.hypot(sigma, 0.0006))

@@ -1,0 +1,239 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""A leg whose positions are poses in a local frame gives the values of the same leg with fixes."""
+
+from dataclasses import replace
+import math
+
+from drives import changed, drive, everything_said, settings
+import numpy as np
+import pytest
+
+from odocal_ros.calib.smoother.leg import smoother_leg
+from odocal_ros.calib.smoother.problem import _priors
+from odocal_ros.data.samples import LOCAL
+from odocal_ros.messages.local_types import local_fixes
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.earth import earth_rate_n, OMEGA, PartlyKnownRate, rate_without_north
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code
+from odocal_ros.screening import placed
+from odocal_ros.screening.placed import place
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.grades import grade_of
+from odocal_ros.sim.real import Real
+
+NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
+# method smoother, a heading that is not given
+SMOOTHER = {'heading_sigma': None, 'method': 'smoother'}
+CAR = {'scenario': 'town', 'duration': 240.0, 'imu_grade': 'consumer', 'fix_noise': 'rtk',
+       'seed': 5}
+
+
+def posed(made, latitude_deg=math.nan):
+    """Return the leg of a drive with poses in the place of its fixes."""
+    fix = made.fix
+    return replace(made.leg(), fix=local_fixes(latitude_deg)(
+        fix.stamp_ns, fix.received_ns, made.positions()))
+
+
+def without_covariance(made):
+    """Return the leg of a drive whose fixes say as little of their errors as poses do."""
+    leg = made.leg()
+    return replace(leg, fix=changed(leg.fix, covariance_type=np.zeros_like))
+
+
+def estimates(leg, config):
+    """Return the estimates of the smoother."""
+    return calibrate(leg, config).methods['smoother'].estimates
+
+
+@pytest.mark.parametrize('options', [
+    CAR, CAR | {'scenario': 'yard', 'duration': 180.0}],
+    ids=['car', 'robot at walking speed, 91 m'])
+def test_poses_give_the_values_of_fixes(options):
+    made = drive(**options)
+    config = settings(made, **SMOOTHER, leg__min_distance=20.0)
+    by_fix, by_pose = (estimates(leg, config) for leg in (without_covariance(made), posed(made)))
+    tenth = 0.1     # sigma; the pitch has the Earth rate in it, which poses do not tell
+    for name, limit in zip(NAMES, (tenth, tenth, 0.4), strict=True):
+        a, b = by_fix[name], by_pose[name]
+        assert abs(b.value - a.value) < limit * a.sigma, name
+        assert b.sigma == pytest.approx(a.sigma, rel=0.1)
+    truth = dict(zip(NAMES, (made.truth.scale, made.truth.yaw, made.truth.pitch), strict=True))
+    for name, true in truth.items():
+        assert abs(by_pose[name].value - true) < 3 * by_pose[name].sigma
+
+
+def test_with_the_earth_rate_of_the_frame_they_are_those_of_fixes(monkeypatch):
+    """So the direction of the Earth rate is all that poses lack."""
+    made = drive(**CAR | {'fix_noise': 'white'})
+    latitude, turned = made.options.latitude, math.pi / 2 - made.options.heading
+    rate = earth_rate_n(latitude) @ matrix_from_rpy([0.0, 0.0, turned])
+    monkeypatch.setattr(placed, 'rate_without_north', lambda latitude: PartlyKnownRate(
+        tuple(rate.tolist()), (0.0, 0.0, 0.0)))
+    config = settings(made, **SMOOTHER)
+    by_fix = estimates(without_covariance(made), config)
+    by_pose = estimates(posed(made, math.degrees(latitude)), config)
+    for name in NAMES:
+        assert abs(by_pose[name].value - by_fix[name].value) < 0.1 * by_fix[name].sigma
+
+
+def test_what_is_unknown_of_the_earth_rate_is_in_the_sigma():
+    """A tactical gyro sees the Earth rate: without north it loses the yaw's accuracy by it."""
+    made = drive(**CAR | {'imu_grade': 'tactical'})
+    config = settings(made, **SMOOTHER)
+    by_fix, by_pose = (estimates(leg, config) for leg in (without_covariance(made), posed(made)))
+    yaw = by_pose['yaw_mounting_angle']
+    assert 1.2 < yaw.sigma / by_fix['yaw_mounting_angle'].sigma < 3
+    assert abs(yaw.value - made.truth.yaw) < 3 * yaw.sigma
+
+
+def test_a_frame_without_north_has_the_vertical_earth_rate_at_most():
+    known = rate_without_north(math.radians(40.0))
+    _, north, up = earth_rate_n(math.radians(40.0))
+    assert known.rate_n == (0.0, 0.0, pytest.approx(up))
+    assert np.linalg.norm(known.sigma_n) == pytest.approx(north)     # in an unknown direction
+    unknown = rate_without_north(math.nan)
+    assert unknown.rate_n == (0.0, 0.0, 0.0)
+    assert unknown.sigma_n == (OMEGA, OMEGA, OMEGA)
+
+
+@pytest.mark.parametrize('latitude_deg', [math.nan, 40.0])
+def test_the_leg_is_placed_in_the_frame_as_sent(latitude_deg):
+    made = drive(**CAR)
+    config = settings(made, reference__latitude_deg=latitude_deg)
+    inputs, _ = screen(posed(made, latitude_deg), config)
+    there = place(inputs, config)
+    assert inputs.local
+    assert there.origin.local == rate_without_north(math.radians(latitude_deg))
+    sent = made.positions()[:len(there.fixes_n)]
+    off = there.fixes_n - there.fixes_n[0] - (sent - sent[0])
+    assert np.abs(off).max() < 0.2       # m: frames at places 300 m apart differ by 5e-5 rad
+    apart, as_sent = (np.linalg.norm(x - x[0], axis=1) for x in (there.fixes_n, sent))
+    np.testing.assert_allclose(apart, as_sent, atol=1e-4)
+
+
+def test_what_refers_to_north_is_not_used_and_said():
+    made = drive(**CAR, heading_sigma=0.001, velocity_sigma=0.05)
+    leg, config = posed(made), settings(made, **SMOOTHER)
+    inputs, found = screen(leg, config)
+    assert not len(inputs.t_heading)
+    assert not len(inputs.t_velocity)
+    said = {r.code: r.text for r in found}
+    assert Code.VELOCITY_UNUSABLE not in said
+    assert said[Code.LOCAL_FRAME] == (
+        'positions are in a local frame, so north is unknown: up to 15.0 deg/h of the Earth rate '
+        'are estimated as gyro bias; GNSS velocities and external headings are not used')
+    assert Code.LOCAL_FRAME not in {r.code for r in screen(made.leg(), config)[1]}
+    # who asks for a heading topic has one in the frame of the positions
+    asked = settings(made, **SMOOTHER, alignment__heading_source='heading_topic')
+    assert len(screen(leg, asked)[0].t_heading)
+    text = {r.text for r in screen(leg, settings(made, reference__latitude_deg=40.0))[1]
+            if r.code is Code.LOCAL_FRAME}
+    assert f'up to {15.041 * math.cos(math.radians(40.0)):.1f} deg/h' in text.pop()
+
+
+def test_a_gyro_is_no_compass_in_a_local_frame():
+    made = drive(scenario='straight', duration=200.0, imu_grade='navigation', fix_noise='rtk',
+                 seed=5)
+    config = settings(made, heading_sigma=None)
+    assert calibrate(made.leg(), config).methods['two_point'].estimates[
+        'yaw_mounting_angle'].value is not None
+    result = calibrate(posed(made), config)
+    assert Code.YAW_NOT_SEPARABLE in everything_said(result)
+    asked = settings(made, heading_sigma=None, alignment__heading_source='gyrocompass')
+    assert 'y axis does not point to north' in everything_said(calibrate(posed(made), asked))[
+        Code.GYROCOMPASS_REFUSED]
+
+
+def test_an_orientation_is_a_heading_in_the_frame_only_if_asked_for():
+    made = drive(**CAR, orientation_sigma=0.001)
+    reasons = [everything_said(calibrate(posed(made), settings(
+        made, heading_sigma=None, alignment__heading_source=source)))
+        for source in ('auto', 'imu_orientation')]
+    assert Code.YAW_NOT_SEPARABLE in reasons[0]
+    assert Code.YAW_NOT_SEPARABLE not in reasons[1]
+
+
+def test_surveyed_points_are_not_in_the_frame():
+    made = drive(**CAR)
+    plain, surveyed = (calibrate(posed(made), settings(made, **more)).methods['two_point']
+                       for more in ({}, {'reference__start': [40.0, 116.0, 50.0, 0.01]}))
+    assert plain.estimates['scale_factor'] == surveyed.estimates['scale_factor']
+
+
+def test_the_earth_rate_is_in_the_priors_of_the_gyro_bias():
+    made = drive(**CAR | {'imu_grade': 'tactical'})
+    config = settings(made, imu__grade='tactical', imu__gyro_bias=1e-6)
+    inputs, _ = screen(posed(made), config)
+    there = place(inputs, config)
+    leg = smoother_leg(inputs, config, there.origin, there.fixes_n, np.empty((0, 2)), there.rough)
+    grade = grade_of(config.imu)
+    np.testing.assert_allclose(_priors(config, grade, leg).gyro_bias, math.hypot(1e-6, OMEGA))
+    north = replace(leg, origin=replace(there.origin, local=None))
+    np.testing.assert_allclose(_priors(config, grade, north).gyro_bias, 1e-6)
+
+
+def test_the_bias_at_rest_has_the_sigma_of_the_earth_rate():
+    """What a gyro shows at rest is its bias and the Earth rate: in which shares is not known."""
+    made = drive(**CAR | {'imu_grade': 'tactical'})
+    config = settings(made, imu__gyro_bias=1e-3)
+    sigmas = [calibrate(leg, config).methods['two_point'].estimates['gyro_bias_z'].sigma
+              for leg in (made.leg(), posed(made))]
+    assert sigmas[1] == pytest.approx(math.hypot(sigmas[0], OMEGA), rel=0.01)
+
+
+def test_a_pose_that_contains_the_wheels_is_reported():
+    """As AMCL and most SLAM do: the remedy names what to use."""
+    made = drive(**CAR | {'scenario': 'yard', 'duration': 300.0, 'seed': 4},
+                 real=Real(receiver_odometer=-0.03))
+    config = settings(made, **SMOOTHER, leg__min_distance=20.0)
+    result = calibrate(posed(made), config).methods['smoother']
+    said, = (r for r in result.reasons if r.code is Code.FIXES_FOLLOW_ODOMETER)
+    assert 'positions fused with a wheel speed' in said.text
+    assert all(word in said.remedy for word in ('SLAM', 'AMCL', 'robot_localization', 'lidar'))
+    plain = calibrate(posed(drive(**CAR)), settings(drive(**CAR), **SMOOTHER))
+    assert Code.FIXES_FOLLOW_ODOMETER not in everything_said(plain)
+
+
+def test_a_local_frame_has_no_place_on_a_map():
+    made = drive(**CAR)
+    config = settings(made)
+    assert calibrate(made.leg(), config).origin is not None
+    result = calibrate(posed(made), config)
+    assert result.origin is None
+    assert result.track_n is not None
+
+
+def test_map_coordinates_are_refused_with_what_to_do():
+    made = drive(**CAR)
+    fix = made.fix
+    far = local_fixes(math.nan)(fix.stamp_ns, fix.received_ns,
+                                made.positions() + [691_000.0, 5_334_000.0, 0.0])
+    assert (far.status == LOCAL).all()
+    _, found = screen(replace(made.leg(), fix=far), settings(made))
+    refused = {r.text: r.remedy for r in found if r.code is Code.FIXES_UNUSABLE}
+    assert refused[f'all {len(fix.stamp_ns)} positions are NaN or more than 20 km from the origin '
+                   'of their frame, as map coordinates are'] == \
+        'Publish positions in a frame with its origin near the site.'
+
+
+def test_the_simulated_frame_starts_at_the_vehicle_and_looks_ahead():
+    made = drive(scenario='straight', duration=200.0, fix_noise='rtk', seed=5, heading=0.3)
+    position = made.positions()
+    assert np.abs(position[0]).max() < 0.2                # m: errors of 2 cm
+    forward = position[len(position) // 3]
+    assert abs(forward[1]) < 0.2 * forward[0]
+    geodetic = np.stack([made.fix.latitude, made.fix.longitude, made.fix.height], -1)
+    own = Origin(made.options.latitude, made.options.longitude, made.options.height)
+    turned = position @ matrix_from_rpy([0.0, 0.0, math.pi / 2 - made.options.heading]).T
+    np.testing.assert_allclose(turned, own.to_n(geodetic), atol=1e-9)
