@@ -26,7 +26,7 @@ ARGUMENTS = (
     ('odometer_topic', 'odometer', 'Pulse counter, joint state, speed or odometry.'),
     ('odometer_right_topic', 'odometer_right',
      "The right wheel, where odometer.right is 'topic'; as odometer_topic."),
-    ('fix_topic', 'fix', 'sensor_msgs/NavSatFix: GNSS positions.'),
+    ('fix_topic', 'fix', 'sensor_msgs/NavSatFix, or a pose without GNSS.'),
     ('fix_velocity_topic', 'fix_velocity',
      'GNSS velocity, TwistStamped or TwistWithCovarianceStamped, ENU; optional.'),
     ('heading_topic', 'heading',

@@ -12,10 +12,13 @@
 from rclpy.node import Node
 
 from odocal_ros.data.samples import OdometerForm
+from odocal_ros.errors import BadUsage
 from odocal_ros.live.topic_input import Input
+from odocal_ros.messages.local_types import LOCAL_TYPES
 from odocal_ros.settings.config import Config
 
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
+REFERENCES = (FIX, *LOCAL_TYPES)
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
 
 LOOK_AROUND_S = 1.0     # judgement: between two looks for publishers
@@ -30,9 +33,18 @@ class Inputs:
         for slot, allowed in _wanted(config).items():
             one = self.by_slot[slot] = Input(node, slot, allowed)
             one.check(config)
+        self._check_reference()
         for one in self.by_slot.values():
             if len(one.allowed) == 1:  # what is wrong with it is wrong from the start: raise
                 one.subscribe(one.allowed[0], config)
+
+    def _check_reference(self) -> None:
+        """Refuse one topic as both odometer and reference: its scale would be exactly 1."""
+        fix = self.by_slot['fix'].topic
+        for slot in ('odometer', 'odometer_right'):
+            if slot in self.by_slot and self.by_slot[slot].topic == fix:
+                raise BadUsage(f'{fix} is both {slot} and fix: an odometer cannot be calibrated '
+                               'against itself; remap one of them to another topic')
 
     def update(self, config: Config) -> None:
         """Add the topics that the configuration asks for, and look for publishers."""
@@ -81,7 +93,8 @@ class Inputs:
 def _wanted(config: Config) -> dict[str, tuple[str, ...]]:
     """Return slot -> message types allowed (empty: any) for the topics a configuration needs."""
     odometer: tuple[str, ...] = () if config.odometer.type == 'auto' else (config.odometer.type,)
-    wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer, 'fix': (FIX,)}
+    wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer,
+                                          'fix': REFERENCES}
     if config.odometer.right == 'topic':
         wanted['odometer_right'] = odometer
     if config.gnss.use_velocity:

@@ -86,6 +86,8 @@ class Input:
     def _same(self) -> list[str]:
         """Return topics that others publish with a type that would serve, the nearest first."""
         wanted, own = set(self.allowed or TYPES), {p.topic_name for p in self._node.publishers}
+        if self.slot == 'fix':      # most are the wheel odometry
+            wanted.discard('nav_msgs/msg/Odometry')
         names = [name for name, types in self._node.get_topic_names_and_types()
                  if wanted & set(types) and name not in own
                  and self._node.count_publishers(name)]

@@ -1,0 +1,102 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Poses on the topic fix, over DDS: a leg by services; its journal replays to the same bits."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+from bench import Client, NodeProcess, wait_for
+from kills import replayed
+from player import part, Player, sent_of
+import pytest
+
+from odocal_ros.bagio import encode
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 30.0
+NAMES = {'fix': '/slam/pose'}
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Simulate two minutes of town."""
+    return simulate(SimOptions(scenario='town', duration=200.0, imu_rate=50.0, odometer_rate=25.0,
+                               odometer='speed', fix_noise='rtk', reference='pose', seed=4))
+
+
+@pytest.fixture(scope='module')
+def session(drive, domain, tmp_path_factory):
+    """Drive one leg; keep what the node said and wrote."""
+    topics = {'imu': encode.imu('imu/data', drive.imu),
+              'odometer': encode.twist('odometer', drive.odometer),
+              'fix': encode.pose('pose', drive.fix, drive.positions())}
+    sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)),
+                  key=lambda one: one.stamp_ns)
+    start_s = (drive.leg().start_ns - sent[0].stamp_ns) * 1e-9
+    node = NodeProcess('-p', f'output.directory:={tmp_path_factory.mktemp("posed")}',
+                       '-p', 'leg.preroll:=20.0', '-r', 'fix:=/slam/pose')
+    client, seen = Client(), SimpleNamespace(node=node)
+    try:
+        player = Player(client.node, {s: topic.msgtype for s, topic in topics.items()}, NAMES)
+        wait_for(player.matched, 'subscriptions')
+        player.play(part(sent, start_s - 10, start_s), SPEED)
+        client.start()
+        player.play(part(sent, start_s, start_s + 150), SPEED)
+        stopping = client.ask('stop_leg')
+        client.until(state='computing')
+        player.play(part(sent, start_s + 150, start_s + 153), SPEED)
+        seen.stop = client.result(stopping)
+        seen.status = wait_for(lambda: client.status['saved'] and client.status, 'saved files')
+        seen.journal = Path(seen.status['journal'])
+        wait_for((seen.journal / 'metadata.yaml').exists, 'the joined journal')
+        seen.live = json.loads((Path(seen.status['saved']) / 'calibration.json').read_text())
+        yield seen
+    finally:
+        node.end()
+        client.close()
+
+
+def test_the_node_subscribes_with_the_type_that_is_published(session):
+    assert 'fix: geometry_msgs/msg/PoseStamped on /slam/pose, best effort' in session.node.text
+
+
+def test_a_leg_with_poses_finds_the_truth(session, drive):
+    assert session.stop.success, session.stop.message
+    scale = session.live['result']['scale_factor']
+    assert abs(scale['value'] - drive.truth.scale) < 4 * scale['sigma'] < 0.004
+    assert 'LOCAL_FRAME' in {r['code'] for r in session.live['legs'][0]['reasons']}
+
+
+def test_its_journal_replays_to_the_last_bit(session):
+    code, offline, said = replayed(session.journal)
+    assert code == 0, said
+    assert 'no NavSatFix' not in said       # the journal names its topics
+    for key in ('result', 'verdict', 'reasons', 'methods', 'check', 'config'):
+        assert session.live[key] == offline[key], key
+    for here, there in zip(session.live['legs'], offline['legs'], strict=True):
+        assert here | {'bag': session.journal.name} == there
+    assert offline['inputs'][0]['topics']['fix'] == '/slam/pose'
+
+
+def test_one_topic_is_not_odometer_and_reference(start):
+    node = start('-r', 'fix:=/odom', '-r', 'odometer:=/odom')
+    assert node.wait() != 0
+    assert ('/odom is both odometer and fix: an odometer cannot be calibrated against itself; '
+            'remap one of them to another topic') in node.text
+    assert 'Traceback' not in node.text
+
+
+def test_an_odometry_is_the_reference_where_the_name_is_remapped(start, connect):
+    from nav_msgs.msg import Odometry
+    node = start('-r', 'fix:=/lidar/odometry')
+    connect().node.create_publisher(Odometry, '/lidar/odometry', 1)
+    wait_for(lambda: 'fix: nav_msgs/msg/Odometry on /lidar/odometry' in node.text,
+             'a subscription')
