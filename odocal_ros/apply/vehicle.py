@@ -78,7 +78,8 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
             return otherwise, sigma
         return e.value, sigma if e.sigma is None else e.sigma
 
-    scale, sigma = estimate_of('scale_factor', math.nan)
+    # speeds that are multiplied as they are sent have a factor of their own
+    scale, sigma = estimate_of('scale_factor_as_sent', *estimate_of('scale_factor', math.nan))
     left, right = (estimate_of(name, math.nan)[0] for name in SIDES)
     if math.isnan(scale):
         raise BadConfig('the calibration holds no result.scale_factor: start with --params-file '

@@ -11,7 +11,7 @@
 Gyro axes against the accelerometer and against the course of the fixes.
 
 A rotation of the whole Imu (imu.mounting_rpy) turns gyro and accelerometer together. Here the gyro
-alone has an axis with the wrong sign, or two axes exchanged: no rotation corrects that.
+alone has an axis with the wrong sign, or two axes swapped: no rotation corrects that.
 """
 
 from typing import TYPE_CHECKING
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Found = list[tuple[str, str, str]]      # sent axis, true axis with its sign, sentence
 SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a sound gyro
-TURNED = np.array([1.0, -1.0, 1j, -1j])      # definition: of axes mirrored or exchanged
+TURNED = np.array([1.0, -1.0, 1j, -1j])      # definition: of axes mirrored or swapped
 # statistical: all four must hold
 LARGEST_SIGMA, FAR_SIGMAS, NEAR_TURNED, FEWEST_SEGMENTS = 0.2, 5.0, 0.4, 4.0
 
@@ -60,7 +60,7 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
 
 def gyro_axes(inputs: 'Inputs', placed: Placed) -> tuple[Reason, ...]:
     """
-    Return GYRO_AXES where an axis of the gyro is mirrored, or two are exchanged.
+    Return GYRO_AXES where an axis of the gyro is mirrored, or two are swapped.
 
     Parameters
     ----------

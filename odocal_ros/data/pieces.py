@@ -94,7 +94,7 @@ def medians(x: Floats) -> Floats:
 
 def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Floats]]:
     """
-    Return how many rows lie in each bin, and the mean of each vector there.
+    Return the number of rows in each bin, and the mean of each vector there.
 
     Parameters
     ----------

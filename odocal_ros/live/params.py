@@ -38,7 +38,8 @@ ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'r
              'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE,
              'scale_factor_right': SCALE, 'heading_error': 'rad', 'track_width': 'm'}
 # what dead reckoning takes beside
-APPLIED = ESTIMATES | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
+APPLIED = ESTIMATES | {'scale_factor_as_sent': SCALE} | {
+    f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
     f'odometer_lever_arm_{axis}': 'm' for axis in 'xyz'}
 PREFIX = 'result.'
 QOS: dict[str, tuple[str, ...]] = {
@@ -148,7 +149,7 @@ def changed(config: Config, parameters: list[Parameter]) -> Config:
 
 
 def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]) -> str:
-    """Return why parameters that the node or its start alone sets may not be changed, or ''."""
+    """Return the refusal of parameters that only the node or its start sets, or ''."""
     for p in parameters:
         now = results.get(p.name)
         if p.name in RESULTS and not (p.value == now or str(p.value) == str(now) == 'nan'):

@@ -20,7 +20,7 @@ from odocal_ros.data.samples import FRAME_BYTES, OtherImuSamples
 from odocal_ros.messages import cdr
 from odocal_ros.messages.raws import Raws
 
-SETTLED = 3     # judgement: messages that settle the frame; a damaged one does not
+SETTLED = 3     # judgement: messages that decide the frame; a damaged one does not
 TEXT_AT = cdr.FRAME_AT - 4      # format: where the length of the text stands
 
 
@@ -40,7 +40,7 @@ class FrameFilter:
 
     def sort(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Callable[[bytes], Any]) -> tuple[Bools, OtherImuSamples | None]:
-        """Return which messages to use, and what is known of the others."""
+        """Return a mask of the messages to use, and the samples of the others."""
         keep = np.ones(len(raws), bool)
         first = 0
         while not self._settled and first < len(raws):
@@ -71,7 +71,7 @@ class FrameFilter:
             self.frame, self._settled = frame, True
 
     def _alike(self, raws: Sequence[bytes]) -> Bools:
-        """Return which messages have the frame where CDR has it, without a look at each."""
+        """Return a mask of messages with the frame at its place in CDR, vectorised."""
         packed = Raws.of(raws)
         text = self.frame.encode() + b'\0'
         pattern = np.frombuffer(b'\0\1' + struct.pack('<I', len(text)) + text, np.uint8)
@@ -86,7 +86,7 @@ class FrameFilter:
         try:
             frame = cdr.frame_of(self._msgtype, raw)
             return str(deserialize(raw).header.frame_id) if frame is None else frame
-        except Exception:       # rclpy and rosbags each have their own way to fail
+        except Exception:       # rclpy and rosbags fail with exceptions of their own
             return None
 
 

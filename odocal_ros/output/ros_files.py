@@ -85,10 +85,10 @@ def _autoware(calibration: Calibration, config: Config, content: dict[str, Any])
 
 
 def _speed_factor(calibration: Calibration) -> float | None:
-    """Return the factor for reported speeds; for pulses only with a nominal K0."""
+    """Return the factor for speeds as they are sent; for pulses only with a nominal K0."""
     scale, ratio = (calibration.estimates.get(n) for n in ('scale_factor', 'scale_ratio'))
     if scale is not None and scale.unit == '1':
-        return scale.value
+        return calibration.estimates.get('scale_factor_as_sent', scale).value
     return None if ratio is None else ratio.value
 
 

@@ -18,7 +18,7 @@ force, as a complex number e1 + i e2, is
 
 Each gyro axis has a coefficient of its own, so the second term is
 ``i g int (c1 w1 + c2 w2 + c3 w3) exp(i psi) dt`` with c = (1, i, 0) for a sound gyro. A mirrored
-axis has the opposite coefficient, exchanged axes have exchanged coefficients.
+axis has the opposite coefficient, swapped axes have swapped coefficients.
 """
 
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ class Rows:
     A drive in rows of ROW_S seconds.
 
     w, f : (m, 3) rad/s and m/s^2, in e1, e2, up.   s : (m + 1,) m, travel at their edges.
-    full : (m,) whether the Imu has samples there.
+    full : (m,) whether the IMU has samples there.
     """
 
     w: Floats
@@ -77,7 +77,7 @@ def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
     Parameters
     ----------
     t, w, f : (n,), (n, 3), (n, 3) arrays
-        Times, s, turn rate, rad/s, and specific force, m/s^2, in one frame fixed to the Imu.
+        Times, s, turn rate, rad/s, and specific force, m/s^2, in one frame fixed to the IMU.
     axes : (3, 3) array
         Rows e1, e2, up in that frame: right-handed.
     travel : Travel
@@ -123,7 +123,7 @@ def _segments(rows: Rows) -> tuple[Complexes, Complexes]:
     onward = np.diff(speed) * (course[1:] + course[:-1]) / 2
     inward = np.diff(course) * (speed[1:] + speed[:-1]) / 2
     turn_rate, heading = _seconds(rows.w[:, 2]), _seconds(turned)
-    # the derivatives stand for delays, the last two for a lever arm of the Imu
+    # the derivatives stand for delays, the last two for a lever arm of the IMU
     pushes = [onward, inward, np.gradient(onward), np.gradient(inward),
               np.gradient(turn_rate) * heading, turn_rate**2 * heading]
     observables = cut(np.stack([*tilts, *pushes], -1))

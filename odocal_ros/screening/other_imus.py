@@ -19,7 +19,7 @@ MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not
 
 
 def other_imus(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
-    """Return what is said of the messages whose frame_id is not that of the IMU in use."""
+    """Return the reasons about messages whose frame_id is not that of the IMU in use."""
     other = leg.imu_other
     count, total = len(other.stamp_ns), len(other.stamp_ns) + len(leg.imu.stamp_ns)
     if not count or (imu.frame_id and len(leg.imu.stamp_ns)):

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A gyro axis that is mirrored or exchanged, against gravity and the course of the fixes."""
+"""A gyro axis that is mirrored or swapped, against gravity and the course of the fixes."""
 
 from dataclasses import replace
 from functools import cache
@@ -25,13 +25,13 @@ from odocal_ros.settings.config import with_settings
 
 SOUND = np.array([1.0, 1j, 0.0])
 AXES = {'mirrored x': np.diag([-1.0, 1.0, 1.0]), 'mirrored y': np.diag([1.0, -1.0, 1.0]),
-        'x and y exchanged': np.eye(3)[[1, 0, 2]], 'x and z exchanged': np.eye(3)[[2, 1, 0]],
-        'y and z exchanged': np.eye(3)[[0, 2, 1]]}
+        'x and y swapped': np.eye(3)[[1, 0, 2]], 'x and z swapped': np.eye(3)[[2, 1, 0]],
+        'y and z swapped': np.eye(3)[[0, 2, 1]]}
 DO = {'mirrored x': 'negate angular_velocity.x', 'mirrored y': 'negate angular_velocity.y',
-      'x and y exchanged': 'publish angular_velocity.x as angular_velocity.y, publish '
+      'x and y swapped': 'publish angular_velocity.x as angular_velocity.y, publish '
       'angular_velocity.y as angular_velocity.x',
-      'x and z exchanged': 'publish angular_velocity.x as angular_velocity.z',
-      'y and z exchanged': 'publish angular_velocity.y as angular_velocity.z'}
+      'x and z swapped': 'publish angular_velocity.x as angular_velocity.z',
+      'y and z swapped': 'publish angular_velocity.y as angular_velocity.z'}
 
 
 @cache
@@ -96,7 +96,7 @@ def test_the_fit_finds_each_coefficient_within_its_sigma():
     inputs = screened(made.leg(), settings(made)).inputs
     axes, _ = sensor_axes(inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b))
     for M, expected in ((np.eye(3), SOUND), (AXES['mirrored x'], SOUND * [-1, 1, 1]),
-                        (AXES['x and y exchanged'], SOUND[[1, 0, 2]])):
+                        (AXES['x and y swapped'], SOUND[[1, 0, 2]])):
         fit = gravity_fit(inputs.t_imu, inputs.w_b @ M.T, inputs.f_b, axes, inputs.travel,
                           made.options.nominal_scale)
         off = np.abs(fit.coefficient - expected)

@@ -69,6 +69,17 @@ def test_the_scale_of_a_speed_in_whole_kmh_is_held_by_its_sigma(how, rate, betwe
     assert Code.WHEEL_SLIP not in seen
 
 
+@pytest.mark.parametrize('how', ['floor', 'round'])
+def test_the_factor_as_sent_gives_the_path_length_of_the_sent_speeds(how):
+    drive, result = calibrated(how, 10.0)
+    exact = simulate(replace(drive.options, real=Real())).leg().odometer.value
+    ratio = exact.sum() / drive.leg().odometer.value.sum()
+    assert (ratio > 1.01) == (how == 'floor')
+    found = result.methods['smoother'].estimates['scale_factor_as_sent']
+    assert abs(found.value - drive.truth.scale * ratio) < 3 * found.sigma
+    assert found.sigma < 2e-3
+
+
 @pytest.mark.parametrize('seed', [2, 3, 31])
 def test_a_slow_yard_told_once_a_second_is_held_by_its_sigma(seed):
     # squat and turns give the way directions of its own, which tell nothing of the scale

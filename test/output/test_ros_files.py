@@ -80,6 +80,9 @@ def test_autoware_gets_the_ratio_for_pulses_and_the_factor_for_speeds(good):
                               'scale_ratio': Estimate(0.49, 5e-4, '1')}
     by_speed = texts(replace(good, estimates=speed))['vehicle_velocity_converter.param.yaml']
     assert parameters(by_speed)['speed_scale_factor'] == 0.98
+    speed['scale_factor_as_sent'] = Estimate(0.99, 1e-3, '1')
+    truncated = texts(replace(good, estimates=speed))['vehicle_velocity_converter.param.yaml']
+    assert parameters(truncated)['speed_scale_factor'] == 0.99
     unknown = good.estimates | {'scale_ratio': Estimate(None, None, '1')}
     assert 'vehicle_velocity_converter.param.yaml' not in texts(replace(good, estimates=unknown))
 

@@ -19,6 +19,7 @@ from odocal_ros.calib.evidence import KEPT_ROWS
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.mounting import FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.calib.smoother.as_sent import as_sent
 from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.chain import Neighbours
 from odocal_ros.calib.smoother.estimate import Fit
@@ -83,6 +84,8 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     found, undetermined = determined(c + configured(leg), sigma, after, leg.scale_unit,
                                      leg.nominal_scale, config, widen)
     reasons += undetermined
+    if found['scale_factor'].value is not None:
+        found |= as_sent(leg, state, covariance)
     up_b = state.C_bv[:, 2]
     drift = float(np.sqrt(up_b @ near[0][BG, BG] @ up_b) * widen)
     wheels = wheels_beside(problem, fit, covariance, drift, config.odometer.track_width)

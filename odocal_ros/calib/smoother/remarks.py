@@ -47,7 +47,7 @@ AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer
 # body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
-SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms are off alike, it is '
+SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have one error, it is '
           'imu.lever_arm. Skid steering and tracks look the same; then keep the setting.')
 
 

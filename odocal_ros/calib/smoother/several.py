@@ -22,6 +22,7 @@ from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps, ScaleStep
+from odocal_ros.calib.smoother.as_sent import as_sent_of
 from odocal_ros.calib.smoother.outcome import determined, floored, in_words, SCALES
 from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.priors import SHARED, SIZE
@@ -82,6 +83,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     nominal = next((e['scale_factor'].value / e['scale_ratio'].value for e in
                     (leg.estimates for leg in legs) if e['scale_ratio'].value), 0.0)
     estimates, why = determined(found.value[at], sigma, ratio, scale.unit, nominal, config)
+    estimates |= as_sent_of(legs, estimates['scale_factor'])
     wheels = joined(legs)
     if wheels:
         of_wheels, more = wheel_estimates(wheels, estimates['scale_factor'], config)
