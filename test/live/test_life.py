@@ -130,7 +130,7 @@ def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
                          ({'imu__gyro_noise': 2.0}, 'required: 0 to 1'),
                          ({'reference__start': [40.0]}, '1 values; required: 4'),
                          ({'imu__grade': 'golden'}, 'not one of consumer'),
-                         ({'odometer__type': 'std_msgs/msg/Int64'}, 'read-only'),
+                         ({'odometer__type': 'std_msgs/msg/Int64'}, 'fixed at start-up'),
                          ({'result__valid': True}, 'set by the node')):
         result = client.set(**value)
         assert not result.successful, value
