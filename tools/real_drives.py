@@ -67,18 +67,31 @@ def _rows(folder: Path) -> Iterator[str]:
 
 def _row(name: str, topic: str, found: dict[str, Any], unit: float, truth: dict[str, Any],
          seconds: float) -> str:
-    scale = found['result']['scale_factor']
-    value, sigma = (None if x is None else x / unit for x in (scale['value'], scale['sigma']))
     references = {key.removeprefix('scale').strip('_'): truth[key]
                   for key in truth if key.startswith('scale')}
-    off = [f'{(value - r["value"]) / math.hypot(sigma, r["sigma"]):+.1f}'
-           for r in references.values()] if value is not None and sigma is not None else ['-']
+    scales = {word: _scale(found['result'], word, unit) for word in references}
+    off = ['-' if pair is None else _off(*pair, references[word])
+           for word, pair in scales.items()]
+    stated = list(dict.fromkeys('-' if pair is None else with_sigma(*pair)
+                                for pair in scales.values()))
     said = [f'{_stated(r)} {word}'.strip().replace('_', ' ') for word, r in references.items()]
     yaw = found['result']['yaw_mounting_angle']
     angle = '-' if yaw['value'] is None else with_sigma(yaw['value'], yaw['sigma'], DEG)
-    return (f'| `{name}` | `{topic}` | {"-" if value is None else with_sigma(value, sigma)} | '
+    return (f'| `{name}` | `{topic}` | {"; ".join(stated)} | '
             f'{"; ".join(said)} | {"; ".join(off)} | {angle} | '
             f'{_stated(truth["yaw_mounting_deg"])} | {found["verdict"]} | {seconds:.0f} |\n')
+
+
+def _scale(result: dict[str, Any], word: str, unit: float) -> tuple[float, float] | None:
+    """Return scale and sigma to compare with a reference: of speeds as sent their own, if any."""
+    scale = result['scale_factor']
+    if word == 'as_sent':
+        scale = result.get('scale_factor_as_sent', scale)
+    return None if scale['value'] is None else (scale['value'] / unit, scale['sigma'] / unit)
+
+
+def _off(value: float, sigma: float, reference: dict[str, float]) -> str:
+    return f'{(value - reference["value"]) / math.hypot(sigma, reference["sigma"]):+.1f}'
 
 
 def _stated(reference: dict[str, float]) -> str:

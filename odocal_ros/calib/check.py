@@ -109,7 +109,7 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
     """
     Return MODEL_MISMATCH where a pinned track bends as neither its gyros nor the fixes would.
 
-    The ends alone tell nothing of a turn in between that was not there, or was and is not told.
+    The ends alone show neither a false nor a missing turn in between.
     Means over windows show it, across the chord; how far slow errors of the fixes may take them
     is what they do along it.
 

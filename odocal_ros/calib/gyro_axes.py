@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Found = list[tuple[str, str, str]]      # sent axis, true axis with its sign, sentence
 SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a sound gyro
 TURNED = np.array([1.0, -1.0, 1j, -1j])      # definition: of axes mirrored or swapped
-# statistical: all four must hold
+# statistical: all four must hold. False in 0 of 384 zoo drives; detection: docs/zoo.md
 LARGEST_SIGMA, FAR_SIGMAS, NEAR_TURNED, FEWEST_SEGMENTS = 0.2, 5.0, 0.4, 4.0
 
 

@@ -38,7 +38,7 @@ class Mounting:
     The nominal rotation that a drive suggests.
 
     C_bi : (3, 3) takes the IMU frame i to b (forward, left, up), quarter turns only; None where
-        it cannot be told.
+        it is not observable.
     forward_i : (3,) forward as measured, None if the drive does not show it.
     forward_sigma : rad.    assumed : forward was not measured but taken as x.
     off : rad, between what was measured and the quarter turns.

@@ -21,7 +21,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.budget import (
     budget,
@@ -59,16 +58,15 @@ class Chord:
     origin: Origin
     start: MarkFix
     end: MarkFix
-    lever_b: NDArray[np.float64]     # (3,) antenna from the odometer's point, m, in v
-    velocity_change: NDArray[np.float64]  # (3, 3) end less start: times f gives m/s in n
+    lever_b: Floats     # (3,) antenna from the odometer's point, m, in v
+    velocity_change: Floats  # (3, 3) end less start: times f gives m/s in n
     alignment: Alignment
-    # travel in doubt: where, s, and how much, scale units
-    doubt: tuple[NDArray[np.float64], NDArray[np.float64]] = (np.empty(0), np.empty(0))
+    doubt: tuple[Floats, Floats] = (np.empty(0), np.empty(0))    # of travel, at s, scale units
     # wheel slips: when, s, and how far, m
-    slips: tuple[NDArray[np.float64], NDArray[np.float64]] = (np.empty(0), np.empty(0))
+    slips: tuple[Floats, Floats] = (np.empty(0), np.empty(0))
 
     @property
-    def M(self) -> NDArray[np.float64]:
+    def M(self) -> Floats:
         """Return attitude summed over travel between the marks, (3, 3)."""
         return self.track.at(self.end.t) - self.track.at(self.start.t)
 

@@ -26,6 +26,7 @@ from odocal_ros.settings.config import Config, flat, SETTINGS
 LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'ratio to nominal',
                     'yaw_mounting_angle': 'yaw mounting angle',
                     'pitch_mounting_angle': 'pitch mounting angle',
+                    'scale_factor_as_sent': 'scale factor of the speed as sent',
                     'scale_factor_left': 'scale factor, left wheel',
                     'scale_factor_right': 'scale factor, right wheel'}
 LOST = 'not determined'

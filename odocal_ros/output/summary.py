@@ -27,6 +27,7 @@ from odocal_ros.reasons import Verdict
 WIDTH = 98    # judgement: columns
 DEG = math.degrees(1.0)    # definition
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
+AS_SENT = 'scale_factor_as_sent'
 WHEELS = {'scale_factor_left': 'left', 'scale_factor_right': 'right', 'track_width': 'track width'}
 ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
@@ -139,13 +140,16 @@ def _values(calibration: Calibration, width: int) -> list[str]:
     if ratio.value is not None:
         lines.append(_line('  ratio to nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
                            f'({beyond_one(ratio.value, ratio.sigma)})'))
+    sent = known(estimates, AS_SENT)
+    if sent.value is not None:
+        lines.append(_line('  of speed as sent', _scale_text(sent)))
     lines.append(_path_ratio(calibration, scale))
     for name, word in ANGLES.items():
         lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name), width)))
     lines += _largest_errors(calibration, width)
     for name in estimates:
         estimate = known(estimates, name)
-        if name not in ('scale_factor', 'scale_ratio', *ANGLES, *BIASES) \
+        if name not in ('scale_factor', 'scale_ratio', AS_SENT, *ANGLES, *BIASES) \
                 and name[:-2] not in ARMS and estimate.value is not None:
             text = _with_unit(estimate)
             if name == 'heading_error':

@@ -61,6 +61,9 @@ def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
     t, q_nb = _attitude(ready, method.details)
     track = dead_reckon(t, q_nb, replace(travel, t=travel.t - late['odometer']))
     lever_b, f = _lever(method.estimates, ready.config), method.details['f']
+    sent = method.estimates.get('scale_factor_as_sent')
+    if sent is not None:        # the travel here is that of the speeds as sent
+        f = f * (sent.value or 0.0) / np.linalg.norm(f)
     before = ready.path(as_configured(ready, f, method.estimates), dead_reckon(t, q_nb, travel))
     # of a speed in coarse steps the fit uses the steps alone: slip it sees by this track only
     odometer = slip_reasons(slip_check(ready, track, f, (0.0, ready.t_fit)),

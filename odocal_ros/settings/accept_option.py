@@ -12,7 +12,7 @@
 import math
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.settings.config import ACCEPTED
+from odocal_ros.settings.accept_config import ACCEPTED
 
 WANTED = ('--accept NAME=LOW:HIGH, such as --accept scale_ratio=0.995:1.005; either limit can be '
           'omitted')

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
-from odocal_ros.errors import BadConfig
+from odocal_ros.settings.accept_config import AcceptConfig
 from odocal_ros.settings.output_config import (
     FramesConfig,
     JournalConfig,
@@ -34,8 +34,6 @@ from odocal_ros.settings.setting import (
 
 GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
-# results that limits may be set for
-ACCEPTED = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')
 NAN = math.nan
 
 
@@ -223,41 +221,6 @@ class VerdictConfig:
     scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='Random walk of '
                                          'the scale factor between legs, relative, 1 sigma '
                                          '(tyres).')
-
-
-@dataclass(frozen=True, kw_only=True)
-class AcceptConfig:
-    scale_factor_min: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
-        'Lower acceptance limit of the scale factor: value minus 2 sigma must not be below. NaN: '
-        'no limit.'))
-    scale_factor_max: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
-        'Upper acceptance limit: value plus 2 sigma must not be above.'))
-    scale_ratio_min: float = setting(NAN, '1', about='The same for the scale factor relative to '
-                                     'its nominal value.')
-    scale_ratio_max: float = setting(NAN, '1', about='The same.')
-    yaw_mounting_angle_min: float = setting(NAN, 'rad', about='The same for the yaw mounting '
-                                            'angle.')
-    yaw_mounting_angle_max: float = setting(NAN, 'rad', about='The same.')
-    pitch_mounting_angle_min: float = setting(NAN, 'rad', about='The same for the pitch mounting '
-                                              'angle.')
-    pitch_mounting_angle_max: float = setting(NAN, 'rad', about='The same.')
-    strict: bool = setting(False, about='A result with a caution does not pass; it is undecided.')
-
-    def __post_init__(self) -> None:
-        for name, (low, high) in self.limits.items():
-            if not low < high:
-                raise BadConfig(f'accept.{name}_min = {low:g} is not below accept.{name}_max = '
-                                f'{high:g}')
-
-    @property
-    def limits(self) -> dict[str, tuple[float, float]]:
-        """Return lower and upper limit by result, of those that have one; the other is inf."""
-        pairs = {name: (getattr(self, f'{name}_min'), getattr(self, f'{name}_max'))
-                 for name in ACCEPTED}
-        return {name: (-math.inf if math.isnan(low) else low,
-                       math.inf if math.isnan(high) else high)
-                for name, (low, high) in pairs.items()
-                if not (math.isnan(low) and math.isnan(high))}
 
 
 @dataclass(frozen=True, kw_only=True)

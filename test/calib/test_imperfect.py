@@ -171,10 +171,19 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     assert abs(slope['slope'] - true) < 3.0 * slope['sigma']
     e = found.estimates['scale_factor']
     assert abs(e.value - drive.truth.scale) < 3.0 * e.sigma
+    assert 'warm tyres' in next(r for r in found.reasons if r.code is Code.SCALE_VARIES).remedy
     # and of a vehicle that has none of it nothing
     clean = {r.code for r in smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config).reasons}
     assert not clean & {Code.FIXES_SMOOTHED, Code.FIXES_NOISIER_THAN_SAID, Code.LEVER_ARM_OFF,
                         Code.SCALE_VARIES, Code.IMU_AXES_SKEW}
+
+
+def test_a_scale_that_falls_with_speed_is_not_blamed_on_tyres():
+    _, config, leg = made(scenario='town', duration=300.0, imu_grade='industrial', seed=4,
+                          fix_noise='rtk', real=Real(speed_law=-0.006))
+    falls = next(r for r in smooth(leg, config).reasons if r.code is Code.SCALE_VARIES)
+    assert re.search('changes by -.* from low to high speed', falls.text)
+    assert falls.remedy.startswith('Possible causes: truncated speed values')
 
 
 def scale_off(drive, config, leg):

@@ -350,10 +350,10 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     session.start(1, Config())
     known = {'distance_m': 300.0, 'max_speed': 10.0}
     far = of_sigmas(looks[-1], scale=2e-3, yaw=0.02)
-    told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
+    said = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
     # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
-    assert ' m/pulse +- 2000 ppm so far; drive 750 m more for the limit of 1000 ppm; yaw ' in told
-    assert told.endswith('; for the yaw: stop and start 12 times, or make as many turns')
+    assert ' m/pulse +- 2000 ppm so far; drive 750 m more for the limit of 1000 ppm; yaw ' in said
+    assert said.endswith('; for the yaw: stop and start 12 times, or make as many turns')
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=40.0, **known))
     assert '; estimate is 40 s old; ' in told
     good = hint(SessionView(session, Config(), forecast=of_sigmas(looks[-1]), **known))

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Several IMUs on one topic, told apart by their frame_id."""
+"""Several IMUs on one topic, distinguished by their frame_id."""
 
 from dataclasses import replace
 import re

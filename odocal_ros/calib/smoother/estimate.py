@@ -187,7 +187,7 @@ def damped(solved: Solved, taken: Floats) -> Solved:
     Return a step shortened where it turns back on the one before, docs/method.md (S27a).
 
     Residuals times the second derivatives, which Gauss and Newton leave out, may be as much as
-    what the data know of a constant: full steps then go to and fro.
+    what the data know of a constant: full steps then oscillate.
     """
     before = float(taken @ solved.reduced @ taken)
     along = float(taken @ solved.reduced @ solved.step_border)
@@ -214,7 +214,7 @@ def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats, levels: Le
     z2 = noise**2 / np.maximum(found, 1e-12) / grown
     z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
     wanted = np.clip(spread * z2 / TAIL_SIGMAS**2, 1.0, 1e6)
-    # half way in the logarithm: neighbours share a slip, and would hand it to and fro
+    # half way in the logarithm: adjacent intervals share a slip, and would oscillate
     wanted[:, :JUMP] = np.sqrt(spread * wanted)[:, :JUMP]
     out: Floats = wanted
     return out

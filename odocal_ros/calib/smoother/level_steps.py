@@ -26,7 +26,7 @@ from odocal_ros.calib.smoother.problem import Problem
 class OverRelaxation:
     """Powers on the steps of a level: the fixed point is slow where a noise is small."""
 
-    first: float = 1.6          # from 2 on a level by itself goes to and fro: its steps overshoot
+    first: float = 1.6          # from 2 on a single level oscillates: its steps overshoot
     faster: float = 1.25        # times, with each step the same way
     slower: float = 0.5         # times, with each that turns back
     most: float = 3.0

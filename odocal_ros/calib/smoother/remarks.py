@@ -46,8 +46,11 @@ AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer
 # 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
 # body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
+FALLS_WITH_SPEED = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
+                    'wheel at high speed. Tyres grow with speed, which is the opposite. Use wheel '
+                    'pulses, or a wheel that is not driven.')
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
-SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have one error, it is '
+SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have the same error, it is '
           'imu.lever_arm. Skid steering and tracks look the same; then keep the setting.')
 
 
@@ -146,8 +149,9 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
             said.append(f'{100 * change:+.2f} % {what}')
     if not said:
         return []
+    less = said[0].startswith('-') and 'speed' in said[0]
     return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(said)}; the stated '
-                   'value is the mean over this leg')]
+                   'value is the mean over this leg', FALLS_WITH_SPEED if less else '')]
 
 
 def _arms(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
