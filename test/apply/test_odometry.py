@@ -232,3 +232,12 @@ def test_the_last_of_the_braking_is_no_tilt():
     pitch = np.array([np.arcsin(-matrix_from_quat(p.q)[2, 0]) for p in poses])
     # 0.1 s by which a speed is late, of 6 m/s^2, is a tilt of 0.06 rad where it is believed
     assert np.abs(pitch).max() < 0.03
+
+
+def test_speeds_that_are_multiplied_as_sent_have_their_own_factor():
+    exact = {'scale_factor': Estimate(0.987, 3e-4, '1')}
+    assert vehicle_of(exact, ApplyConfig()).scale == 0.987
+    sent = exact | {'scale_factor_as_sent': Estimate(0.995, 4e-4, '1')}
+    vehicle = vehicle_of(sent, ApplyConfig())
+    assert vehicle.scale == 0.995
+    assert vehicle.scale_sigma == pytest.approx(4e-4 / 0.995)
