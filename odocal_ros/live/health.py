@@ -39,6 +39,7 @@ class Health:
         self.lost = 0          # by the middleware's sequence numbers
         self.gaps = 0
         self.newest_ns = 0
+        self.stampless = False    # no stamp in the last messages
         self.received_ns = 0
         self.delay_s = 0.0     # arrival minus stamp of the newest row
         self.jumped_back = False
@@ -71,6 +72,7 @@ class Health:
         self.count += len(block.stamp_ns)
         if isinstance(block, FixSamples) and len(block.status):
             self.fix_status = int(block.status[-1])
+        self.stampless = len(block.stamp_ns) > 0 and not (block.stamp_ns > 0).any()
         sound = self._not_ahead(block.stamp_ns)
         if not sound.any():
             return sound

@@ -195,7 +195,7 @@ class Input:
             return ''
         if self.trouble:
             return self.trouble
-        if self.health.received_ns and not self.health.newest_ns:
+        if self.health.stampless:
             return f'{self.topic}: all header stamps are zero; check the driver'
         if not self.publishers:
             return (f'no {LABELS[self.slot]} on {self.topic}: 0 publishers found'

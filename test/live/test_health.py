@@ -162,6 +162,16 @@ def test_zero_stamps_do_not_count_as_flowing():
     assert not health.flowing(SECOND)
 
 
+def test_after_a_jump_of_time_no_stamp_is_called_zero():
+    health = Health()
+    assert not health.stampless
+    health.decoded(rows([0.0, 0.0]))
+    assert health.stampless
+    health.decoded(rows([5.0, 5.1]))
+    health.forget()
+    assert (health.newest_ns, health.stampless) == (0, False)
+
+
 def test_distance_survives_a_rollover_however_blocks_are_cut():
     counts = np.array([65000, 65300, 64, 364, 664]) # 300 counts each, over 65536
     for cut in range(1, 5):

@@ -275,6 +275,7 @@ def test_sim_time_and_its_jump_back(start, connect, sent):
     status = client.until(leg_event='cancelled')
     assert status['leg_id'] == '1'
     wait_for(lambda: 'time jumped: leg 1 is cancelled' in node.text, 'the warning')
+    play(4, 6)
     client.until(state='idle')         # and it goes on with what comes after the jump
     assert client.call('start_leg').success
 
