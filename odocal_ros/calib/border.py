@@ -59,9 +59,23 @@ class Border:
         A = np.eye(len(D))[:, at] * size
         DA = D @ A
         taken = DA @ np.linalg.pinv(np.diag(known * 1.0) + A.T @ DA)
-        information = D - taken @ DA.T
-        return replace(self, information=(information + information.T) / 2,
-                       pull=self.pull - taken @ (A.T @ self.pull))
+        return self._less(taken @ DA.T, taken @ (A.T @ self.pull))
+
+    def doubted(self, effects: Floats) -> 'Border':
+        """
+        Return the border by which, with the priors used, x is as it is and its covariance larger.
+
+        effects : (m, L), whose squares are what the covariance grows by, docs/method.md (S33a).
+        """
+        weight = 1 / self.used**2
+        G = (self.information + np.diag(weight)) @ effects
+        taken = G @ np.linalg.inv(np.eye(G.shape[1]) + effects.T @ G)
+        off = np.where(weight > 0, self.centre - self.value, 0.0)
+        return self._less(taken @ G.T, taken @ (effects.T @ (self.pull + weight * off)))
+
+    def _less(self, information: Floats, pull: Floats) -> 'Border':
+        left = self.information - information
+        return replace(self, information=(left + left.T) / 2, pull=self.pull - pull)
 
     def only(self, names: Sequence[str]) -> 'Border':
         """Return the information on some constants, the others taken out with their priors."""

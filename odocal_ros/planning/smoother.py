@@ -23,6 +23,7 @@ from odocal_ros.calib.smoother.problem import Problem, SPACING
 from odocal_ros.calib.smoother.refusal import refused
 from odocal_ros.calib.smoother.slow_error import WHITE_SHARE
 from odocal_ros.calib.smoother.smoother import too_little
+from odocal_ros.calib.smoother.state import M
 from odocal_ros.planning.drive import PlannedDrive
 from odocal_ros.planning.predict import Sigmas
 from odocal_ros.planning.samples import Ideal, ideal
@@ -105,4 +106,4 @@ def _fit(problem: Problem, made: Ideal, levels: Levels) -> Fit:
     state, priors = made.state, problem.priors
     weighted = Equations(problem, state, priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), True, False, 0,
-               np.nan, weighted, solve(weighted.normal()))
+               np.nan, weighted, solve(weighted.normal()), np.zeros((M, 0)))     # none estimated

@@ -283,7 +283,9 @@ def test_a_leg_of_the_smoother_is_what_its_border_and_its_beliefs_say(legs):
         for i, name in enumerate((SCALE, YAW, 'pitch_mounting_angle')):
             e = one.estimates[name]
             value, size = (np.log(e.value), e.value) if i == 0 else (e.value, 1.0)
-            sigma = np.hypot(np.sqrt(found.covariance[i, i]), MODEL_FLOOR[i])
+            # sizes are of the vehicle's priors, of which a border has none
+            of_sizes, = (s.effects[i] for s in one.sources if s.name == 'imperfection_sizes')
+            sigma = np.sqrt(found.covariance[i, i] + MODEL_FLOOR[i]**2 + of_sizes @ of_sizes)
             assert sigma == pytest.approx(e.sigma / size, rel=1e-6)
             assert abs(found.value[i] - value) < 1e-3 * sigma
 

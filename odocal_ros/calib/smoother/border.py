@@ -13,7 +13,7 @@ import numpy as np
 
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.smoother.estimate import Fit
-from odocal_ros.calib.smoother.priors import PriorRows
+from odocal_ros.calib.smoother.priors import PriorRows, SIZES
 from odocal_ros.calib.smoother.problem import NO_ERROR
 from odocal_ros.calib.smoother.state import CONSTANTS
 from odocal_ros.data.arrays import Floats
@@ -35,4 +35,5 @@ def border_of(fit: Fit, configured: Floats) -> Border:
         CONSTANTS, at + configured,
         (fit.solved.reduced - np.diag(weight)) * np.outer(free, free),
         (fit.solved.g_reduced + weight * (at - priors.centre)) * free, priors.centre + configured,
-        fit.first.constants, priors.constants)
+        fit.first.constants, priors.constants).doubted(
+            fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data

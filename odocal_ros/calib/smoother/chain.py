@@ -107,6 +107,30 @@ class Solved:
             across[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
         return Neighbours(own, across, self.covariance)
 
+    def products(self, chain: Floats, border: Floats) -> tuple[Floats, Floats]:
+        """
+        Return g' H^-1 g of right-hand sides g, (r, r), and H^-1 g of the border, (m, r).
+
+        chain : (N, n, r), border : (m, r).   By the forward elimination alone; before
+        ``neighbours``.
+        """
+        assert self._chain is not None, 'the chain was used up'
+        wide, own = self._chain
+        N, n = self.step.shape
+        m = len(self.step_border)
+        square = np.zeros((chain.shape[2],) * 2)
+        rest = border * self._scale_border[:, None]
+        y = np.zeros((n, chain.shape[2]))
+        for k in stepping(range(N)):
+            y = chain[k] * self._scale[k][:, None] - y
+            square += y.T @ own[k] @ y
+            eliminated = wide[k][:, :n + m].T @ y
+            rest -= eliminated[n:]
+            y = eliminated[:n]
+        rest /= self._scale_border[:, None]
+        moved = self.covariance @ rest
+        return square + rest.T @ moved, moved
+
     def forget(self) -> None:
         """Let go of what the covariances are made from."""
         self._chain = None

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, TypeVar
 from odocal_ros.calib.smoother.chain import Neighbours, Normal, Solved
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.heading import HeadingRows
+from odocal_ros.calib.smoother.level_information import LevelInformation, LevelSides
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.part import Here, Part
-from odocal_ros.calib.smoother.priors import PriorRows
+from odocal_ros.calib.smoother.priors import PriorRows, SIZES
 from odocal_ros.calib.smoother.rests import Rests
 from odocal_ros.calib.smoother.slow_error import SlowError
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
@@ -84,6 +85,15 @@ class Weighted:
         for part in self.parts.values():
             part.after(step, constants, reached)
         return self
+
+    def information(self, solved: Solved) -> LevelInformation:
+        """Return what the data know of the levels, sizes last; before ``solved.neighbours``."""
+        names = sorted(self.levels.values, key=SIZES.__contains__)
+        sides = LevelSides(len(self.state.t), self.n, M, names)
+        for part in self.parts.values():
+            part.add_levels(sides)
+        taken, moves = solved.products(sides.chain, sides.border)
+        return LevelInformation(sides.names, (sides.square - taken) / 2, moves)
 
     def forget(self) -> None:
         """Let go of what can be made again."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from odocal_ros.calib.smoother.chain import Neighbours, solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
-from odocal_ros.calib.smoother.level_steps import update
+from odocal_ros.calib.smoother.level_steps import prior_information, update
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels, ROAD
 from odocal_ros.calib.smoother.part import JUMP, SPREAD, WANTED
@@ -93,10 +93,16 @@ class Fit(Outline):
 
     weighted: Weighted
     solved: Solved
+    by_levels: Floats        # (M, L) what unit errors of levels do to the constants, sizes last
 
     def __post_init__(self) -> None:
         self.weighted.forget()
         self.solved.forget()
+
+    @property
+    def covariance(self) -> Floats:
+        """Return that of the constants with the uncertainty of the levels, (S27b): (M, M)."""
+        return self.solved.covariance + self.by_levels @ self.by_levels.T
 
     def outline(self) -> Outline:
         """Return all but the equations, which can go where nobody else holds them."""
@@ -178,8 +184,9 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
         del weighted, solved      # the most that a long leg takes
     creeping = not settled and bool(max(still, change) < SETTLING.creeping)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
+    by_levels = weighted.information(solved).effects(prior_information(levels))
     return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
-               likelihood, weighted, solved)
+               likelihood, weighted, solved, by_levels)
 
 
 def damped(solved: Solved, taken: Floats) -> Solved:

@@ -133,7 +133,7 @@ class GrowingFit:
         self._judged = duration
         if anew.settled:
             problem.per_effective = other.per_effective
-            sigma = np.sqrt(np.diag(anew.solved.covariance))
+            sigma = np.sqrt(np.diag(anew.covariance))
             apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
             if apart.max() > CONFIRM_SIGMAS:
                 best = best_fit(problem, config, trace)
@@ -143,7 +143,7 @@ class GrowingFit:
 
 def _so_far(view: SmootherLeg, problem: Problem, best: Fit, config: Config) -> SoFar:
     method = outcome(view, problem, best, config)
-    covariance = floored(best.solved.covariance * method.details['widened']**2)
+    covariance = floored(best.covariance * method.details['widened']**2)
     sigmas: Floats = np.sqrt(np.diag(covariance))[[LN_K, YAW, PITCH]]
     # an angle that is as set is none that the drive knows
     sigmas[best.first.constants[[LN_K, YAW, PITCH]] <= NO_ERROR] = np.inf

@@ -69,12 +69,17 @@ def shaken(leg: SmootherLeg) -> dict[str, float]:
     What a vehicle shakes is in them, and much of it does not add up over a second: levels to come
     down from.
     """
+    rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
+    return {name: sigma**2 for name, sigma in of_samples(leg, rows).items()}
+
+
+def of_samples(leg: SmootherLeg, rows: slice | Bools) -> dict[str, float]:
+    """Return the noise that neighbouring samples differ by, as white, SI per sqrt(Hz)."""
     def jumps(x: Floats) -> Floats:
         out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)
         return out
 
-    rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
     usual = float(np.median(np.diff(leg.t_imu[rows]), overwrite_input=True))
-    return {name: float(np.median(by_step(jumps, x[rows]), overwrite_input=True)
-                        / 2.366 / 2 * usual)      # 2.366: of chi2 with 3
+    return {name: float(np.sqrt(np.median(by_step(jumps, x[rows]), overwrite_input=True)
+                                / 2.366 / 2 * usual))      # 2.366: of chi2 with 3
             for name, x in (('gyro', leg.w_b), ('accel', leg.f_b))}

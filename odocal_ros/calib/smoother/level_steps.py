@@ -20,6 +20,7 @@ from odocal_ros.calib.smoother.long_run import long_run
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.priors import SIZE, SIZE_SPREADS, SIZES
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.slow_error import TIME_SPREAD
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,13 @@ RELAXATION = OverRelaxation()
 PRIOR_ROWS = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
 # levels of rows that slips and jumps are factors on
 SLIPPING = ('along', 'along_hard', 'side', 'side_turn', 'up')
+
+
+def prior_information(levels: Levels) -> dict[str, float]:
+    """Return the information of its prior on the logarithm of each level."""
+    return {name: SIZE_SPREADS[name]**-2 if name in SIZES
+            else TIME_SPREAD**-2 if name == 'correlation_time'
+            else PRIOR_ROWS.get(name, 1.0) / 2 for name in levels.values}
 
 
 def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: Problem,

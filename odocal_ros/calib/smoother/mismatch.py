@@ -14,10 +14,10 @@ import numpy as np
 from odocal_ros.calib.smoother.estimate import Fit, SETTLING
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
+from odocal_ros.calib.smoother.noise_cause import noise_remedy
 from odocal_ros.calib.smoother.outside import Heading
 from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.quantised import explained
 from odocal_ros.calib.smoother.slip import SLIP_VARIANCE
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.reasons import Code, Reason
@@ -26,11 +26,6 @@ from odocal_ros.settings.grades import grade_of, turn_on_bias
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: judgement
-BY_SHAKING = 'IMU errors exceed its grade and are not white noise'
-SHAKEN = ('Vibration is not white noise; uncertainties were increased. Mount the IMU firmly and '
-          'away from the engine.')
-OF_FORCE = ('Mount the IMU firmly. If this is its normal noise, set imu.grade, or '
-            'imu.accel_noise and the other noise settings.')
 
 
 def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
@@ -41,10 +36,9 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     level = fit.levels.roots()
     # of an accelerometer that is not there nothing is said
     sensors = {'gyro': 'gyro', 'accel': 'accelerometer'} if problem.leg.felt else {'gyro': 'gyro'}
-    coarse = _coarse(explained(problem.leg, level), {
-        name: what for name, what in sensors.items()
-        if level[name] > WORSE_THAN_GRADE * min(own[name], stated[name])})
-    shaken = max(level[name] / own[name] for name in sensors)
+    remedy = noise_remedy(problem, level, [
+        name for name in sensors if level[name] > WORSE_THAN_GRADE * min(own[name], stated[name])])
+    over_grade = max(level[name] / own[name] for name in sensors)
     worse = [f'{what} noise is {level[name] / stated[name]:.1f} times'
              for name, what in sensors.items() if level[name] > WORSE_THAN_GRADE * stated[name]]
     worse += [f'{what} bias is {np.max(np.abs(now[0]) / sigma):.1f} times' for (
@@ -56,7 +50,7 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     if worse:
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
                               f'{config.imu.grade} grade; the estimate from this drive is used',
-                              coarse or ('' if any('gyro' in x for x in worse) else OF_FORCE)))
+                              remedy))
     odd, move = [], 0.0
     if fit.creeping or not fit.settled:
         move = moving(fit)
@@ -64,8 +58,11 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
             f'the estimates still changed by {move:.2g} sigma'
             if move > SETTLING.nearly else 'the noise levels still changed'))
     odd_share = 0.15        # of fixes far off, of intervals with a slip: judgement
-    if shaken > WORSE_THAN_GRADE:      # what shakes a vehicle is not white, of no known colour
-        odd.append(BY_SHAKING)
+    noisy = []
+    if over_grade > WORSE_THAN_GRADE:      # vibration is not white, and of no known spectrum
+        noisy = [f'IMU noise is {over_grade:.1f} times that of its grade and may not be white; '
+                 'uncertainties were increased']
+    odd += noisy
     share = float((fit.weighted[Fixes].weight[:, 0] < 0.5).mean())
     if share > odd_share:
         odd.append(f'{100 * share:.0f} % of the fixes are outliers')
@@ -78,7 +75,7 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd),
-                              (coarse or SHAKEN) if odd == [BY_SHAKING] else ''))
+                              ('See IMU_WORSE_THAN_GRADE.' if worse else remedy) if odd == noisy else ''))
     # judgement: nothing tells by how much a model is off; a fit that has not settled may be off by
     # what it still moves, several times
     return max(1.0, 2.0 * bool(odd), 4.0 * move), reasons
@@ -88,17 +85,6 @@ def moving(fit: Fit) -> float:
     """Return by how much of their sigmas scale, yaw and pitch moved in the last pass, at most."""
     step = fit.solved.step_border / np.sqrt(np.diag(fit.solved.covariance))
     return float(np.abs(step[:WANTED]).max())
-
-
-def _coarse(steps: dict[str, float], sensors: dict[str, str]) -> str:
-    """Return the remedy for sensors whose noise is the quantisation of their output."""
-    said = [f'the {sensors[name]} has steps of ' + (
-        f'{np.rad2deg(step):.3g} deg/s' if name == 'gyro' else f'{step:.3g} m/s^2')
-        for name, step in steps.items() if name in sensors]
-    if not said:
-        return ''
-    return (f'The cause is quantisation: {" and ".join(said)}. Set a finer resolution or a '
-            'smaller range in the IMU or its driver, if there is one.')
 
 
 def _heading(heading: Heading, error: float) -> list[Reason]:

@@ -19,6 +19,7 @@ import numpy as np
 from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal
 from odocal_ros.calib.smoother.imu_noise import at_rest, sensor_noise
 from odocal_ros.calib.smoother.least import LEAST
+from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise, Levels
 from odocal_ros.calib.smoother.part import Here, Part, Total
@@ -161,6 +162,23 @@ class MotionRows(Part):
         quadratic, expected = np.einsum('kc,kc->c', estimates, estimates), seen.sum(axis=0)
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
                 for name in INTERVAL}
+
+    def add_levels(self, out: LevelSides) -> None:
+        """Add the right-hand sides of its levels."""
+        n, columns = self.n, out.at(INTERVAL)
+        of = np.eye(len(INTERVAL))[self.noise.component]
+        square, border = Total(), Total()
+        for rows in blocks(len(self.r)):
+            ends = slice(rows.start + 1, rows.stop + 1)
+            A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
+            q = (A * np.einsum('kic,ki->kc', A, self.r[rows])[:, None]) @ of
+            g = np.swapaxes(self.J[rows], 1, 2) @ q
+            out.chain[rows, :, columns] += g[:, :n]
+            out.chain[ends, :, columns] += g[:, n:2 * n]
+            border.add(g[:, 2 * n:])
+            square.add(np.swapaxes(q, 1, 2) @ q)
+        out.border[:, columns] += border.sum
+        out.square[np.ix_(columns, columns)] += square.sum
 
     def _noises(self, near: Neighbours) -> tuple[Floats, Floats]:
         """

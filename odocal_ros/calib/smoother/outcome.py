@@ -76,10 +76,10 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     slips, along_reasons = _odometer(leg, fit, near, count)
     reasons += along_reasons
     state, c = fit.state, fit.state.constants
-    covariance = floored(fit.solved.covariance * widen**2)
+    covariance = floored(fit.covariance * widen**2)
     sigma = np.sqrt(np.diag(covariance))
     reasons += remarks(problem, fit, sigma, config)
-    after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
+    after = np.sqrt(np.diag(fit.covariance)) / fit.first.constants
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
     found, undetermined = determined(c + configured(leg), sigma, after, leg.scale_unit,
                                      leg.nominal_scale, config, widen)
@@ -242,7 +242,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
                     * motion.T[:, 0]).sum()
     return {
         'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
-        'correlation': correlations(fit.solved.covariance[:3, :3], PARAMETERS),
+        'correlation': correlations(fit.covariance[:3, :3], PARAMETERS),
         'f': K * state.forward,
         'noise': fit.levels.roots(),
         'iterations': fit.iterations, 'widened': float(widen),

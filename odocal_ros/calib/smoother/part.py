@@ -24,6 +24,7 @@ import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal
+from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import Intervals, Points
 from odocal_ros.calib.smoother.state import BARE, Priors, State, WITH_SLOW
@@ -118,6 +119,9 @@ class Part:
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
         """Return of each level its quadratic sum and the redundancy of its rows, (S26)."""
         return {}
+
+    def add_levels(self, out: LevelSides) -> None:
+        """Add the right-hand sides of its levels: docs/method.md (S27b)."""
 
     def effects(self, near: Neighbours) -> Iterable[tuple[str, Floats]]:
         """Yield names of sources, and what their unit errors do to the constants: (..., 3, k)."""

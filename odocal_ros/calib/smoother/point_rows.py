@@ -21,6 +21,7 @@ from typing import ClassVar, TYPE_CHECKING
 import numpy as np
 
 from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal
+from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.part import Part, Total
 from odocal_ros.calib.smoother.state import M, SLOW, State, WITH_SLOW
@@ -195,6 +196,26 @@ class PointRows(Part):
         return {level: (float(r2[:, columns].sum()),
                         float(known[:, columns].sum() - taken[:, :, columns].sum()))
                 for level, columns in self.levels_of.items()}
+
+    def add_levels(self, out: LevelSides) -> None:
+        """Add the right-hand sides of its levels."""
+        if len(self.k) < FEWEST_JUDGED:
+            return
+        columns = out.at(self.levels_of)
+        q = np.zeros((*self.r.shape, len(columns)))
+        for i, own in enumerate(self.levels_of.values()):
+            q[:, own, i] = self.r[:, own]
+        border = Total()
+        for present, gather in self._intervals():
+            some = gather(q)
+            g = np.swapaxes(gather(self.J), 1, 2) @ some
+            out.chain[present[:, None], :, columns] += np.moveaxis(g[:, :self.n], 2, 1)
+            border.add(g[:, self.n:])
+            if self.J_end is not None:
+                end = np.swapaxes(gather(self.J_end), 1, 2) @ some
+                out.chain[present[:, None] + 1, SLOW, columns] += np.moveaxis(end, 2, 1)
+        out.border[:, columns] += border.sum
+        out.square[columns, columns] += np.einsum('kdi,kdi->i', q, q)
 
     def _taken(self, block: Floats, gather: Gather) -> Floats:
         """Return what the unknowns take up of the rows of some intervals: (k, most, d)."""

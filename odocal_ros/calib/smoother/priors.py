@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from odocal_ros.calib.smoother.chain import Neighbours, Normal
+from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.part import Here, hold, Part, WANTED
 from odocal_ros.calib.smoother.state import (
@@ -112,6 +113,14 @@ class PriorRows(Part):
         off = self._constants_off()[IMPERFECT]
         q, e = (np.bincount(KIND_OF, known * x) for x in (weight * off**2, 1 - weight * variance))
         return {name: (float(a), float(b)) for name, a, b in zip(SIZES, q, e, strict=True)}
+
+    def add_levels(self, out: LevelSides) -> None:
+        """Add the right-hand sides of the sizes."""
+        columns = out.at(SIZES)
+        off, sigma = self._constants_off()[IMPERFECT], self.priors.constants[IMPERFECT]
+        of = np.eye(len(SIZES))[KIND_OF]
+        out.border[IMPERFECT, columns] += of * (off / sigma**2)[:, None]
+        out.square[columns, columns] += of.T @ (off / sigma)**2
 
     def _biases(self) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield columns, value and sigma of the biases at the first keyframe."""

@@ -15,7 +15,7 @@ from odocal_ros.calib.result import Source
 from odocal_ros.calib.smoother.chain import Neighbours
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.part import WANTED
-from odocal_ros.calib.smoother.priors import PriorRows
+from odocal_ros.calib.smoother.priors import PriorRows, SIZES
 from odocal_ros.data.arrays import Floats
 
 
@@ -37,6 +37,10 @@ def shares(fit: Fit, neighbours: Neighbours) -> tuple[Source, ...]:
               for name, effects in fit.weighted[PriorRows].shared_effects(solved)]
     rest = solved[:WANTED, :WANTED] - sum(covariance.values()) - sum(
         s.effects @ s.effects.T for s in shared)
+    by_levels = fit.by_levels[:WANTED]
+    for name, effects in (('noise_levels', by_levels[:, :-len(SIZES)]),
+                          ('imperfection_sizes', by_levels[:, -len(SIZES):])):
+        covariance[name] = effects @ effects.T
     own = [Source(name, _root(value)) for name, value in covariance.items()]
     return (*own, *shared, Source('standstill', _root(rest)))
 

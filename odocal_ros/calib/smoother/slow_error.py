@@ -13,9 +13,11 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import solveh_banded
 
 from odocal_ros.calib.smoother.chain import Neighbours, Normal
 from odocal_ros.calib.smoother.least import LEAST
+from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.part import Here, hold, JUMP, link, Part
 from odocal_ros.calib.smoother.state import SLOW
@@ -140,6 +142,54 @@ class SlowError(Part):
                       - np.log(tau / USUAL_TIME) / TIME_SPREAD**2)
         information = 3 * float((da**2 / (1 - a**2) + dq**2 / 2).sum() + 0.5) + TIME_SPREAD**-2
         return information + score, information
+
+    def add_levels(self, out: LevelSides) -> None:
+        """Add the right-hand sides of its levels: of a power q is the error itself."""
+        s = self.state.slow_n
+        axes = {'slow': np.array([1.0, 1.0, 0.0]), 'slow_up': np.array([0.0, 0.0, 1.0])}
+        g, q = ([x * one for one in axes.values()] for x in (self._precision(s), s))
+        names = list(axes)
+        if not self.time_given:
+            by_time = self._by_time(s)
+            g.append(by_time)
+            q.append(self._process(by_time))
+            names.append('correlation_time')
+        columns = out.at(names)
+        for i, own in zip(columns, g, strict=True):
+            out.chain[:, SLOW, i] += own
+        out.square[np.ix_(columns, columns)] += [[(a * b).sum() for b in g] for a in q]
+
+    def _precision(self, s: Floats) -> Floats:
+        """Return the inverse covariance of the process times values of it: (N, 3)."""
+        push = (s[1:] - self.decay * s[:-1]) / self.drive
+        out = np.zeros_like(s)
+        out[0] = s[0] / self.power
+        out[1:] += push
+        out[:-1] -= self.decay * push
+        return out
+
+    def _by_time(self, s: Floats) -> Floats:
+        """Return minus the derivative of that by the logarithm of the correlation time: (N, 3)."""
+        a, r = self.decay, s[1:] - self.decay * s[:-1]
+        da = a * self.T[:, None] / self.levels.correlation_time
+        dq = 1 - 2 * a * da / (1 - a**2)
+        push = (da * s[:-1] + r * dq) / self.drive
+        out = np.zeros_like(s)
+        out[0] = s[0] / self.power
+        out[1:] += push
+        out[:-1] += da * r / self.drive - a * push
+        return out
+
+    def _process(self, g: Floats) -> Floats:
+        """Return the covariance of the process times (N, 3): it solves ``_precision``."""
+        N, out = len(g), np.empty_like(g)
+        for axis in range(3):
+            a, q = self.decay[:, 0], np.append(self.power[axis], self.drive[:, axis])
+            bands = np.zeros((2, N))
+            bands[1] = 1 / q + np.append(a**2 / q[1:], 0.0)
+            bands[0, 1:] = -a / q[1:]
+            out[:, axis] = solveh_banded(bands, g[:, axis])
+        return out
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what unit errors of what drives it, and of its first value, do."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from odocal_ros.calib.smoother.chain import Neighbours, Normal
 from odocal_ros.calib.smoother.least import LEAST
+from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.part import Here, hold, Part
 from odocal_ros.calib.smoother.state import E
@@ -65,6 +66,13 @@ class TravelError(Part):
         spread = np.append(near.entries([E], [E])[:, 0], last)
         x = self.state.travel_error[moving]
         return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
+
+    def add_levels(self, out: LevelSides) -> None:
+        """Add the right-hand side of its level."""
+        i, = out.at((self.name,))
+        g = self.weight * self.state.travel_error / self.variance
+        out.chain[:, E, i] += g
+        out.square[i, i] += g @ self.state.travel_error
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what a unit error of each reading does."""

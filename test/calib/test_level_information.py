@@ -1,0 +1,122 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The information on noise levels against differences of costs and of solutions."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from smoother_legs import made
+
+from odocal_ros.calib.border import Border
+from odocal_ros.calib.smoother import point_rows
+from odocal_ros.calib.smoother.chain import solve
+from odocal_ros.calib.smoother.equations import Equations
+from odocal_ros.calib.smoother.level_steps import prior_information
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.smoother import best_fit
+
+STEP = 0.02                 # of logarithms of levels
+# relative: third derivatives of logarithms are as large as the second: STEP**2 / 6
+ROUGH = 1e-3
+# one level of each part at least; a travel error is at its least and cannot be less
+NAMES = ('size_squat', 'gyro', 'along', 'side', 'fix', 'slow', 'size_gyro_axis')
+
+
+@pytest.fixture(scope='module')
+def weighed():
+    """Return (function from changed levels to equations and solution, levels), no row a tail."""
+    _, config, leg = made(imu_grade='industrial', duration=135.0, fix_sigma=0.5)
+    problem = Problem.of(leg, config)
+    fit = best_fit(problem, config)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(point_rows, 'TAIL_SIGMAS', 1e3)   # weights would change with the levels
+        equations = Equations(problem, fit.state, fit.priors, fit.spread, True)
+
+        def at(**by):
+            levels = fit.levels.but(**{n: fit.levels[n] * np.exp(x) for n, x in by.items()})
+            weighted = equations.at(levels)
+            solved = solve(weighted.normal())
+            return weighted.after(solved), solved
+
+        yield at, fit.levels
+
+
+def test_moves_are_the_differences_of_solutions(weighed):
+    at, levels = weighed
+    both, solved = at()
+    information = both.information(solved)
+    sigma = np.sqrt(np.diag(solved.covariance))
+    for name in (*NAMES, 'correlation_time'):
+        up, down = (at(**{name: x})[1].step_border for x in (STEP, -STEP))
+        moves = information.moves[:, information.names.index(name)]
+        np.testing.assert_allclose(moves / sigma, (up - down) / (2 * STEP) / sigma,
+                                   rtol=ROUGH, atol=ROUGH * np.abs(moves / sigma).max() + 1e-9)
+
+
+def test_average_information_is_the_curvature_of_the_cost(weighed):
+    """Of a variance s V the least cost C has d2C/d(ln s)2 = 4 A + dC/d(ln s), and 4 A across."""
+    at, levels = weighed
+    both, solved = at()
+    information = both.information(solved)
+
+    def cost(**by):
+        return at(**by)[0].cost()
+
+    middle = cost()
+    for name, other in pairwise(NAMES):
+        j = information.names.index(name)
+        up, down = cost(**{name: STEP}), cost(**{name: -STEP})
+        curvature, slope = (up - 2 * middle + down) / STEP**2, (up - down) / (2 * STEP)
+        rounding = 1e-12 * middle / STEP**2
+        assert information.average[j, j] == pytest.approx(
+            (curvature - slope) / 4, rel=ROUGH, abs=ROUGH * abs(slope) + rounding), name
+        across = sum(a * b * cost(**{name: a * STEP, other: b * STEP})
+                     for a in (1, -1) for b in (1, -1)) / (4 * STEP**2)
+        assert information.average[j, information.names.index(other)] == pytest.approx(
+            across / 4, rel=ROUGH, abs=ROUGH * abs(slope) + rounding), (name, other)
+
+
+def test_information_is_symmetric_and_not_negative(weighed):
+    at, _ = weighed
+    both, solved = at()
+    A = both.information(solved).average
+    np.testing.assert_allclose(A, A.T, atol=1e-9 * A.max())
+    assert np.linalg.eigvalsh(A).min() > -1e-9 * A.max()
+
+
+def test_levels_that_are_known_add_nothing_unknown_ones_their_prior(weighed):
+    at, levels = weighed
+    both, solved = at()
+    information = both.information(solved)
+    own = prior_information(levels)
+    sure = information.effects(dict.fromkeys(own, 1e12))
+    assert (np.sqrt((sure**2).sum(axis=1)) < 1e-5 * np.sqrt(np.diag(solved.covariance))).all()
+    effects = information.effects(own)
+    most = sum(information.moves[:, i]**2 / own[n] for i, n in enumerate(information.names))
+    # errors of levels in common may double what each does alone, not more than their number
+    assert ((effects**2).sum(axis=1) <= most * len(own) + 1e-30).all()
+
+
+def test_a_border_with_errors_of_levels_has_the_sum_of_both_covariances():
+    rng = np.random.default_rng(1)
+    A, effects = rng.standard_normal((9, 4)), 0.1 * rng.standard_normal((4, 2))
+    D, sigma, centre = A.T @ A, np.array([1.0, 2.0, 3.0, np.inf]), rng.standard_normal(4)
+    border = Border(tuple('abcd'), np.zeros(4), D, A.T @ rng.standard_normal(9), centre, sigma,
+                    sigma)
+    wider, weight = border.doubted(effects), 1 / sigma**2
+
+    def posterior(one):
+        P = np.linalg.inv(one.information + np.diag(weight))
+        return P, P @ (one.pull + weight * centre)
+
+    (P, x), (wide, same) = posterior(border), posterior(wider)
+    np.testing.assert_allclose(wide, P + effects @ effects.T, rtol=1e-9)
+    np.testing.assert_allclose(same, x, rtol=1e-9)
