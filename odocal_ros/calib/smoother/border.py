@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The information of a leg on its constants, states and priors taken out: docs/method.md (S33)."""
+"""The marginal information of a leg on its constants, without priors: docs/method.md (S33)."""
 
 import numpy as np
 
@@ -21,10 +21,10 @@ from odocal_ros.data.arrays import Floats
 
 def border_of(fit: Fit, configured: Floats) -> Border:
     """
-    Return the border of a fit, at its last linearisation.
+    Return the marginal information of a fit at its last linearisation point.
 
-    The Schur complement of the constants less their priors, which the elimination leaves as they
-    are. Of a constant that the leg holds where it is, it tells nothing to another leg.
+    The Schur complement of the constants less their priors. Constants that are fixed in the leg
+    have no information for other legs.
 
     configured : (M,) values of the settings that constants are corrections to.
     """

@@ -10,14 +10,13 @@
 """
 Least squares on a chain with a border, and its Schur complement: docs/method.md (S22) to (S24).
 
-Blocks touch their neighbours, the border of constants touches all.
+The normal matrix is block tridiagonal with a border of constants (an arrowhead). Blocks are
+eliminated in order by Cholesky; back substitution gives the step and the joint covariance of each
+pair of adjacent blocks and the border. Unknowns are scaled to a unit diagonal first: their sizes
+differ by 1e20.
 
-The normal matrix is block tridiagonal with a border of constants. Blocks are eliminated one after
-the other by Cholesky; the way back gives the step, and the covariance of each pair of neighbours
-with the border. Unknowns are scaled to a unit diagonal first: they differ by 1e20 in size.
-
-An hour has thousands of blocks: the equations, their elimination and the covariances stand one
-after the other in the same memory, which lies in files for hours.
+An hour has thousands of blocks. The equations, their elimination and the covariances use the same
+memory in turn, which is in mapped files for long legs.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,17 +32,17 @@ from odocal_ros.data.mapped import let_go, room
 from odocal_ros.errors import OdocalError
 
 Floats = NDArray[np.float64]
-LET_GO_AFTER = 512          # judgement: intervals until what lies in a file is let go
-SHORT_LEG = 1200            # judgement: intervals of a leg of which all that is made is kept
+LET_GO_AFTER = 512          # judgement: intervals between releases of mapped memory
+SHORT_LEG = 1200            # judgement: intervals up to which all joint marginals are stored
 
 
 class NotPositive(OdocalError):
-    """The normal matrix is not positive definite: nothing holds some unknown."""
+    """The normal matrix is not positive definite: an unknown is not constrained."""
 
 
 class Normal:
     """
-    Normal equations H x = g of N blocks of n unknowns and a border of m, at first all zero.
+    Normal equations H x = g of N blocks of n unknowns and a border of m, initially zero.
 
     diagonal : (N, n, n).   beside : (N - 1, n, n), row k, column k + 1.   border : (N, n, m).
     corner : (m, m).   g, g_border : (N, n), (m,).
@@ -51,7 +50,7 @@ class Normal:
 
     def __init__(self, N: int, n: int, m: int) -> None:
         self.diagonal = room(N, n, n)
-        self.wide = room(N, n, n + m + 1)           # what elimination carries, side by side
+        self.wide = room(N, n, n + m + 1)           # right-hand sides of the elimination
         self.beside = self.wide[:-1, :, :n]
         self.border = self.wide[:, :, n:n + m]
         self.g = self.wide[:, :, n + m]
@@ -60,20 +59,20 @@ class Normal:
 
 @dataclass(eq=False)
 class Solved:
-    """Step, and what the covariances are made from."""
+    """The step, and the factorisation from which the covariances are computed."""
 
     step: Floats              # (N, n)
     step_border: Floats       # (m,)
     covariance: Floats        # (m, m) of the border
     log_determinant: float    # of H
-    reduced: Floats           # (m, m) of the border, all blocks eliminated
+    reduced: Floats           # (m, m) Schur complement of the border
     g_reduced: Floats         # (m,)
     _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n), until neighbours
     _scale: Floats            # (N, n)
     _scale_border: Floats     # (m,)
 
     def neighbours(self) -> 'Neighbours':
-        """Return the covariances of neighbours; once, for they take the place of the chain."""
+        """Return the joint marginals of adjacent blocks; once, since they reuse the memory."""
         assert self._chain is not None, 'the chain was used up'
         (wide, own), self._chain = self._chain, None
         N, n = self.step.shape
@@ -97,7 +96,7 @@ class Solved:
         return self._unscaled(own, wide[:, :, :n + m])
 
     def _unscaled(self, own: Floats, across: Floats) -> 'Neighbours':
-        """Return covariances in the units of the unknowns; takes the place of the scaled ones."""
+        """Return covariances in the units of the unknowns, computed in place."""
         n, s, s_c = own.shape[1], self._scale, self._scale_border
         for rows in blocks(len(own)):
             own[rows] *= s[rows, :, None] * s[rows, None, :]
@@ -132,16 +131,16 @@ class Solved:
         return square + rest.T @ moved, moved
 
     def forget(self) -> None:
-        """Let go of what the covariances are made from."""
+        """Release the factorisation."""
         self._chain = None
 
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
     """
-    The covariance of block k, block k + 1 and the border, for each of N - 1 intervals.
+    Joint marginals: the covariance of block k, block k + 1 and the border, for N - 1 intervals.
 
-    In full it is (N - 1, 2n + m, 2n + m), which is made some intervals at a time.
+    In full (N - 1, 2n + m, 2n + m); computed for some intervals at a time.
     """
 
     _own: Floats              # (N, n, n) covariance of each block
@@ -181,7 +180,7 @@ class Neighbours:
         return np.concatenate(own)
 
     def blocks(self) -> Iterator[tuple[slice, Floats]]:
-        """Yield all of them, some intervals at a time."""
+        """Yield slices of intervals and their covariances."""
         for rows in blocks(len(self)):
             at = np.arange(rows.start, rows.stop)
             yield rows, self._made(at) if len(self) > SHORT_LEG else self._whole[rows]
@@ -196,11 +195,10 @@ class Neighbours:
 
 def blocks(n: int) -> Iterator[slice]:
     """
-    Yield slices of n rows, as even as can be.
+    Yield slices of n rows of nearly equal length.
 
-    None of one row, where there are more: numpy multiplies a single matrix by another way than
-    those of a stack, and results are to be the same whatever the chunks. What lies in files is let
-    go now and then.
+    A slice has more than one row if n has: numpy multiplies a single matrix differently from a
+    stack, and results must not depend on the chunks. Mapped memory is released periodically.
     """
     at_a_time = 64      # their matrices stay in the cache
     edges = np.linspace(0, n, max(1, -(-n // at_a_time)) + 1).astype(int)
@@ -211,7 +209,7 @@ def blocks(n: int) -> Iterator[slice]:
 
 
 def stepping(numbers: range) -> Iterator[int]:
-    """Yield numbers; what lies in files is let go now and then."""
+    """Yield numbers; mapped memory is released periodically."""
     for k in numbers:
         yield k
         if k % LET_GO_AFTER == 0:
@@ -220,19 +218,19 @@ def stepping(numbers: range) -> Iterator[int]:
 
 def solve(normal: Normal) -> Solved:
     """
-    Solve the normal equations, which are used up by it.
+    Solve the normal equations in place.
 
     Raises
     ------
     NotPositive
-        The equations leave something undetermined beyond rounding.
+        An unknown is not constrained, within rounding.
 
     """
     from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
     diagonal, wide = normal.diagonal, normal.wide
     N, n = normal.g.shape
     m = len(normal.g_border)
-    s = np.ones((N + 1, n))     # and what the last one's missing neighbour is scaled by
+    s = np.ones((N + 1, n))     # and of a missing block after the last
     for rows in blocks(N):
         s[rows] = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', diagonal[rows]), 1e-300))
     s_c = 1 / np.sqrt(np.maximum(np.diag(normal.corner), 1e-300))

@@ -8,9 +8,9 @@
 # the License.
 
 """
-The least squares of a leg at one state: the parts, their normal equations, cost and components.
+The least-squares problem of a leg at one state: factors, normal equations, cost, components.
 
-A sensor, or a prior, that is to be heard is one more class here (``part.Part``).
+An additional sensor or prior is one more class in ``PARTS`` (``part.Part``).
 """
 
 from typing import TYPE_CHECKING, TypeVar
@@ -40,7 +40,7 @@ PARTS: tuple[type[Part], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, S
 
 
 class Equations:
-    """The parts at one linearisation, for any levels."""
+    """The factors at one linearisation point, without weights."""
 
     def __init__(self, problem: 'Problem', state: State,
                  priors: Priors | None = None, spread: Floats | None = None,
@@ -50,16 +50,16 @@ class Equations:
         self.parts = {kind.name: kind(problem, here) for kind in PARTS if kind.there(problem)}
 
     def at(self, levels: Levels) -> 'Weighted':
-        """Return the equations with these levels."""
+        """Return the equations weighted by levels."""
         return Weighted(self, levels)
 
 
 class Weighted:
     """
-    Equations at given levels.
+    The factors at given levels.
 
-    After a step has been taken in, cost and components are those where it leads. ``neighbours``
-    are those of ``Solved``.
+    ``after`` applies a step; cost and components then refer to the new state. ``neighbours`` are
+    those of ``Solved``.
     """
 
     def __init__(self, equations: Equations, levels: Levels) -> None:
@@ -79,7 +79,7 @@ class Weighted:
         return out
 
     def after(self, solved: Solved) -> 'Weighted':
-        """Bring the residuals to where the step leads, were all linear; returns itself."""
+        """Apply the step to the residuals, to first order; return self."""
         step, constants = solved.step, solved.step_border
         reached = self.state.moved(step, constants)
         for part in self.parts.values():
@@ -87,7 +87,7 @@ class Weighted:
         return self
 
     def information(self, solved: Solved) -> LevelInformation:
-        """Return what the data know of the levels, sizes last; before ``solved.neighbours``."""
+        """Return the information on the levels, sizes last; call before ``solved.neighbours``."""
         names = sorted(self.levels.values, key=SIZES.__contains__)
         sides = LevelSides(len(self.state.t), self.n, M, names)
         for part in self.parts.values():
@@ -96,12 +96,12 @@ class Weighted:
         return LevelInformation(sides.names, (sides.square - taken) / 2, moves)
 
     def forget(self) -> None:
-        """Let go of what can be made again."""
+        """Release memory that can be recomputed."""
         for part in self.parts.values():
             part.forget()
 
     def cost(self) -> float:
-        """Return the weighted sum of squares of all rows, robust in those of an instant."""
+        """Return the weighted sum of squares of all rows; point rows with their robust loss."""
         return float(sum(part.cost() for part in self.parts.values()))
 
     def log_R_total(self) -> float:
@@ -110,7 +110,7 @@ class Weighted:
 
     def components(self, neighbours: Neighbours) -> dict[str, tuple[float, float]]:
         """
-        Return for each variance component its quadratic sum and its expectation: (S26).
+        Return the quadratic sum and its expectation for each variance component: (S26).
 
         The restricted likelihood has its maximum where, for every component of level s with
         covariance s V, r' R^-1 s V R^-1 r equals the trace of R^-1 s V less that of the part the

@@ -8,12 +8,12 @@
 # the License.
 
 """
-Iterate: linearise, solve, estimate the noise, until nothing moves.
+The iteration of a fit: linearise, solve, update the noise levels, until convergence.
 
-The variance components go to the maximum of the restricted likelihood, by their quadratic sums
-over what is expected of them, with over-relaxation: docs/method.md (S26), (S27). What lies far
-outside its distribution is taken to have a heavy tail: fixes, slips of an interval, and priors (a
-lever arm, a delay, a turn-on bias) that the data gainsay.
+The variance components converge to the maximum of the restricted likelihood by the ratio of their
+quadratic sums to the expectation, with over-relaxation: docs/method.md (S26), (S27). Outliers have
+heavy tails: fixes, slips of an interval, and priors (of a lever arm, a delay, a turn-on bias) that
+the data contradict.
 """
 
 from collections.abc import Callable
@@ -34,16 +34,16 @@ from odocal_ros.calib.smoother.slow_error import SlowError
 from odocal_ros.calib.smoother.state import M, PITCH, Priors, State, YAW
 from odocal_ros.data.arrays import Floats
 
-# called with each pass, last with its largest move of a constant, in sigmas
+# called after each pass; the last argument is the largest step of a constant, in sigmas
 Trace = Callable[[int, State, Levels, Weighted, Solved, float], None]
 
 
 @dataclass(frozen=True)
 class Settling:
     """
-    When a fit has settled: by how much of its sigma a constant may still move.
+    Convergence limits: steps of the constants in the last pass, in sigmas.
 
-    Judgement: what is left of a step is then far below what is stated.
+    Judgement: the remaining change is then far below the stated sigma.
     """
 
     # residuals are noise from the first on, and no more from the second; the first step with
@@ -68,28 +68,28 @@ AGAIN_PASSES = 6    # judgement: of a fit that sets out from one that settled, b
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """What a fit can set out from."""
+    """Initial values of a fit."""
 
     state: State
     levels: Levels
-    priors: Priors           # as the data left them
-    first: Priors            # as they were before any gave way
+    priors: Priors           # as relaxed by the data
+    first: Priors            # before any was relaxed
     spread: Floats           # (K, SPREAD) factors on variances: slips, jumps of slow fix errors
 
 
 @dataclass(frozen=True, eq=False)
 class Outline(WarmStart):
-    """Where the iteration ended, without the equations: they are large."""
+    """The result of the iteration without the equations, which are large."""
 
     settled: bool
-    creeping: bool           # near enough, but its noise levels still move
+    creeping: bool           # converged, but the noise levels still change
     iterations: int
     likelihood: float        # restricted, its logarithm but for a constant; NaN: not iterated
 
 
 @dataclass(frozen=True, eq=False)
 class Fit(Outline):
-    """Where the iteration ended."""
+    """The result of the iteration."""
 
     weighted: Weighted
     solved: Solved
@@ -101,16 +101,16 @@ class Fit(Outline):
 
     @property
     def covariance(self) -> Floats:
-        """Return that of the constants with the uncertainty of the levels, (S27b): (M, M)."""
+        """Return the covariance of the constants including that by the levels, (S27b): (M, M)."""
         return self.solved.covariance + self.by_levels @ self.by_levels.T
 
     def outline(self) -> Outline:
-        """Return all but the equations, which can go where nobody else holds them."""
+        """Return everything but the equations, so that their memory can be released."""
         return Outline(self.state, self.levels, self.priors, self.first, self.spread,
                        self.settled, self.creeping, self.iterations, self.likelihood)
 
     def neighbours(self) -> Neighbours:
-        """Return the covariances of neighbours; not kept, for they are large."""
+        """Return the joint marginals of adjacent keyframes; not stored, since they are large."""
         return solve(self.weighted.normal()).neighbours()
 
 
@@ -122,25 +122,25 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     Parameters
     ----------
     problem, state, levels : Problem, State, Levels
-        The leg, where to start.
+        The leg and the initial values.
     most : int
         Iterations.
     frozen : bool
-        Leave the noise levels alone.
+        Keep the noise levels constant.
     about : WarmStart, optional
-        Of an earlier fit, whose slips and priors are taken over.
+        From an earlier fit, whose slips and priors are used.
     trace : callable, optional
-        Called with each pass, for benchmarks.
+        Called after each pass, for progress and benchmarks.
 
     """
     before, still, settled, fitted = np.ones(3), 0.0, False, about is not None
     was_fitted = fitted
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
     spread = about.spread if about else np.ones((len(state.t) - 1, SPREAD))
-    # passes in which heavy tails are looked for: before, residuals are none, and in the end they
-    # rest
+    # passes in which heavy tails are updated: earlier, the residuals contain the start; later,
+    # the tails are constant
     tails, last_tails = 1 if about else 3, 15
-    # pass that counts errors in a row; the better of two starts is counted when it goes on
+    # pass that estimates the effective sample size; of two starts only that of the better one
     judged = 3 if about is None else 0 if problem.per_effective else 1
     of_all = np.where(np.arange(M) < WANTED, 1.0, SETTLING.others)
     flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), SETTLING.flat_angle, np.inf)
@@ -175,13 +175,13 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
             near = solved.neighbours()
             tail, before_levels = tails <= count <= last_tails, levels
             levels = update(weighted, near, levels, problem, pace, fitted)
-            # slips and the levels of what slips are factors on the same rows: judged at the new
+            # slips and levels are factors on the same rows: slips are evaluated at the new levels
             if tail:
                 spread = slips(weighted, near, spread, before_levels, levels)
             if tail:
                 priors = relaxed(first, priors, state, solved, near)
             del near
-        del weighted, solved      # the most that a long leg takes
+        del weighted, solved      # the largest memory of a long leg
     creeping = not settled and bool(max(still, change) < SETTLING.creeping)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     by_levels = weighted.information(solved).effects(prior_information(levels))
@@ -191,10 +191,10 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
 
 def damped(solved: Solved, taken: Floats) -> Solved:
     """
-    Return a step shortened where it turns back on the one before, docs/method.md (S27a).
+    Return the step, shortened if it reverses the previous step, docs/method.md (S27a).
 
-    Residuals times the second derivatives, which Gauss and Newton leave out, may be as much as
-    what the data know of a constant: full steps then oscillate.
+    Gauss-Newton omits residuals times second derivatives. They can be as large as the information
+    on a constant; full steps then oscillate.
     """
     before = float(taken @ solved.reduced @ taken)
     along = float(taken @ solved.reduced @ solved.step_border)
@@ -206,9 +206,9 @@ def damped(solved: Solved, taken: Floats) -> Solved:
 def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats, levels: Levels,
           onward: Levels) -> Floats:
     """
-    Return factors on variances where an interval lies far out: (K, SPREAD).
+    Return the variance factors of outlier intervals: (K, SPREAD).
 
-    levels, onward : of this pass and of the next, by which they are judged.
+    levels, onward : of this pass and of the next; outliers are evaluated at the next.
     """
     noise, found = weighted[MotionRows].road_noise(neighbours)
     jumps = np.zeros((2, len(noise), 1))
@@ -219,9 +219,9 @@ def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats, levels: Le
     jumped = onward['slow'] / levels['slow'] if 'slow' in weighted.parts else 1.0
     grown = np.concatenate([grown, np.full((len(grown), 1), jumped)], axis=1)
     z2 = noise**2 / np.maximum(found, 1e-12) / grown
-    z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
+    z2[found < 0.02] = 0.0          # not observable in this interval
     wanted = np.clip(spread * z2 / TAIL_SIGMAS**2, 1.0, 1e6)
-    # half way in the logarithm: adjacent intervals share a slip, and would oscillate
+    # half the change in the logarithm: adjacent intervals share a slip and would oscillate
     wanted[:, :JUMP] = np.sqrt(spread * wanted)[:, :JUMP]
     out: Floats = wanted
     return out

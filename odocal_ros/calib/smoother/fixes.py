@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Fixes as rows, docs/method.md (S15), (S16): where the antenna is, from the keyframe before."""
+"""The factor of fixes, docs/method.md (S15), (S16): antenna position after a keyframe."""
 
 from typing import TYPE_CHECKING
 
@@ -84,7 +84,7 @@ class Fixes(PointRows):
         self.raw = np.nan_to_num(raw) - smoothed - added
 
     def errors(self) -> Floats:
-        """Return what the fixes err by, white and slow, where they are linearised: (m, 3) m."""
+        """Return the fix errors, white and correlated, at the linearisation point: (m, 3) m."""
         s, share = self.state.slow_n, self.share[:, None]
         return self.raw + s[self.k] * (1 - share) + s[self.k + 1] * share
 
@@ -92,7 +92,7 @@ class Fixes(PointRows):
         """
         Return derivatives of the residual: (m, 3, n) by the keyframe before, (m, 3, M).
 
-        Those by the slow errors are left to ``share``: -(1 - share) before, -share after.
+        Those by the correlated errors are -(1 - share) before, -share after.
         """
         tau = self.points.tau[:, None, None]
         m = len(tau)
@@ -116,22 +116,22 @@ class Fixes(PointRows):
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
-        """Return first levels, factors on the stated variance, and their least."""
+        """Return initial and minimum levels, factors on the stated variances."""
         least = (LEAST.fix / problem.fix_sigma)**2
         return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
 
     @classmethod
     def times(cls, problem: 'Problem', constants: Floats) -> Floats:
-        """Return when the fixes that are used were true, s."""
+        """Return the times of validity of the used fixes, s."""
         out: Floats = problem.leg.t_fix[problem.use] - constants[GNSS_DELAY]
         return out
 
     def stated(self, rows: Floats) -> Floats:
-        """Return rows in the sigmas that the receiver states."""
+        """Return rows divided by the sigmas that the receiver states."""
         return self.root @ rows
 
     def known(self) -> Bools:
-        """Tell which components there are: (m, 3), fixes without height are level ones."""
+        """Return which components exist: (m, 3); fixes without height have two."""
         known = np.ones((len(self.k), 3), bool)
         known[:, 2] = self.root[:, 2, 2] > 1e-5
         return known
@@ -145,7 +145,7 @@ def antenna(state: State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Flo
 
 
 def whitener(covariance_n: Floats, no_height: Bools) -> Floats:
-    """Return inverse roots of covariances, lower triangular: level rows know no height."""
+    """Return inverse Cholesky factors of covariances; without a height only horizontal rows."""
     C = covariance_n.copy()
     C[no_height, 2, :] = C[no_height, :, 2] = 0.0
     C[no_height, 2, 2] = 1e6**2     # m^2, of a height that is not there

@@ -47,7 +47,7 @@ CONFIRM_SIGMAS = 3.0  # statistical: of three values chance reaches it once in 1
 @dataclass(frozen=True, eq=False)
 class SoFar:
     """
-    What a fit tells of a leg as if it ended here.
+    The result of a fit of the leg so far.
 
     method : as the leg would come out.   sigmas : (3,) of ln scale, yaw, pitch, rad, of what is
     not determined too.   state : at the keyframes.
@@ -74,12 +74,12 @@ class GrowingFit:
         self._judged = 0.0       # s of the leg when it was last fit from nothing
 
     def forget(self) -> None:
-        """Start the next one from nothing."""
+        """Make the next fit a cold start."""
         self._last, self.once_s = None, 0.0
 
     def fit(self, view: SmootherLeg, config: Config, trace: Trace) -> SoFar:
         """
-        Return what the leg so far tells.
+        Return the result of the leg so far.
 
         view : the leg, what came before in the same frame and more.   trace : called between
         passes; what it raises goes through.   BadData is raised where no fit is found; the next
@@ -124,7 +124,7 @@ class GrowingFit:
         return best, problem
 
     def _confirmed(self, best: Fit, problem: Problem, config: Config, trace: Trace) -> Fit:
-        """Return the fit if a coarse one from a cold start agrees with it, else a new one."""
+        """Return the fit if a coarse cold start confirms it, else a new fit."""
         begin = self._cpu_s()
         view = problem.leg
         duration = view.t_stop - view.t_begin

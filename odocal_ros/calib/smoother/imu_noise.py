@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""White noise and walks of an IMU: as its grade, its standstills and its samples have them."""
+"""White noise and random walks of an IMU by its grade, its standstills and its samples."""
 
 from dataclasses import replace
 
@@ -21,26 +21,26 @@ from odocal_ros.data.pieces import by_step
 from odocal_ros.screening.force import TILT_SIGMA
 from odocal_ros.settings.grades import G, Grade
 
-# m/s^2/sqrt(Hz) at least, and m/s^2/sqrt(s): what moves the vehicle, 1.5 m/s^2 for some seconds at
-# a time, and slopes of a few per cent over a minute. Judgement
+# m/s^2/sqrt(Hz) minimum, and m/s^2/sqrt(s): accelerations of the vehicle, 1.5 m/s^2 for some
+# seconds, and slopes of a few per cent over a minute. Judgement
 UNFELT_NOISE, UNFELT_WALK = 5.0, 0.01
 
 
 def sensor_noise(grade: Grade) -> dict[str, float]:
-    """Return the roots of the IMU's noise levels by its grade, SI: white ones and walks."""
+    """Return sigmas of white noise and random walks by the grade of the IMU, SI."""
     stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
               'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
     return {name: max(sigma, LEAST.imu[name]) for name, sigma in stated.items()}
 
 
 def unfelt(grade: Grade) -> Grade:
-    """Return the grade of an IMU without an accelerometer: its forces are gravity, made up."""
+    """Return the grade of an IMU without an accelerometer: its specific force is gravity."""
     return replace(grade, accel_noise=UNFELT_NOISE, accel_bias=TILT_SIGMA * G,
                    accel_bias_walk=UNFELT_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
 
 
 def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
-    """Return white noise levels of gyro and accelerometer as standstills show them."""
+    """Return white noise levels of gyro and accelerometer from standstills."""
     turn, force = np.split(imu.over_intervals(imu.signals), 2, axis=1)
     T = np.diff(imu.t[imu.key])[:, None]
     inside = still[:-1] & still[1:]
@@ -50,7 +50,7 @@ def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     for run in runs:
         if len(run) < 3:
             continue
-        # the second difference knows no bias, no drift; its variance is six times that of one
+        # second differences contain no bias and no drift; their variance is six times as large
         for i, x in enumerate((turn, force)):
             d = np.diff((x / T)[run], n=2, axis=0) * np.sqrt(T[run][1:-1] / 6)
             sums[i] += (d**2).sum() / 3
@@ -64,17 +64,16 @@ def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
 
 def shaken(leg: SmootherLeg) -> dict[str, float]:
     """
-    Return white noise levels of gyro and accelerometer as neighbouring samples show them.
+    Return white noise levels of gyro and accelerometer from adjacent samples.
 
-    What a vehicle shakes is in them, and much of it does not add up over a second: levels to come
-    down from.
+    They include vibration, most of which cancels within a second: initial levels that decrease.
     """
     rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
     return {name: sigma**2 for name, sigma in of_samples(leg, rows).items()}
 
 
 def of_samples(leg: SmootherLeg, rows: slice | Bools) -> dict[str, float]:
-    """Return the noise that neighbouring samples differ by, as white, SI per sqrt(Hz)."""
+    """Return the noise of differences of adjacent samples, as white noise, SI per sqrt(Hz)."""
     def jumps(x: Floats) -> Floats:
         out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)
         return out

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Bounds of variance components from below: data may seem to have less, settings may say 0."""
+"""Lower limits of variance components: estimates can be smaller, settings can be 0."""
 
 from dataclasses import dataclass, field
 
@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 @dataclass(frozen=True)
 class LeastNoise:
     """
-    1 sigma, below which a variance component does not go.
+    Minimum sigma of each variance component.
 
-    Physical: of receivers what the best of today have; of an IMU a tenth of navigation grade,
-    since one with a dead band is silent at rest.
+    Physical: the best receivers of today; for an IMU a tenth of navigation grade, since one with a
+    dead band has no noise at rest.
     """
 
     fix: float = 0.005          # m, east or north or up, of white and of slow errors each

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""One step of the noise levels and sizes to the maximum of the restricted likelihood."""
+"""A step of the noise levels and sizes towards the maximum of the restricted likelihood."""
 
 from dataclasses import dataclass
 
@@ -25,24 +25,23 @@ from odocal_ros.calib.smoother.slow_error import TIME_SPREAD
 
 @dataclass(frozen=True)
 class OverRelaxation:
-    """Powers on the steps of a level: the fixed point is slow where a noise is small."""
+    """Exponents on the steps of a level: the fixed-point iteration is slow for small noises."""
 
-    first: float = 1.6          # from 2 on a single level oscillates: its steps overshoot
-    faster: float = 1.25        # times, with each step the same way
-    slower: float = 0.5         # times, with each that turns back
+    first: float = 1.6          # from 2 on a single level oscillates
+    faster: float = 1.25        # factor after a step in the same direction
+    slower: float = 0.5         # factor after a step that reverses
     most: float = 3.0
 
 
 RELAXATION = OverRelaxation()
-# pseudo-observations that a level of the IMU is as its prior has it. Judgement: a few seconds'
-# worth
+# pseudo-observations of the prior of an IMU level. Judgement: equivalent to a few seconds
 PRIOR_ROWS = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
-# levels of rows that slips and jumps are factors on
+# levels of rows with slips
 SLIPPING = ('along', 'along_hard', 'side', 'side_turn', 'up')
 
 
 def prior_information(levels: Levels) -> dict[str, float]:
-    """Return the information of its prior on the logarithm of each level."""
+    """Return the prior information on the logarithm of each level."""
     return {name: SIZE_SPREADS[name]**-2 if name in SIZES
             else TIME_SPREAD**-2 if name == 'correlation_time'
             else PRIOR_ROWS.get(name, 1.0) / 2 for name in levels.values}
@@ -51,9 +50,9 @@ def prior_information(levels: Levels) -> dict[str, float]:
 def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: Problem,
            pace: dict[str, tuple[float, float]], fitted: bool = True) -> Levels:
     """
-    Return levels one step on to the maximum of the restricted likelihood: docs/method.md (S27).
+    Return the levels after one step of (S27), docs/method.md.
 
-    pace : power and last step of each level, kept up to date.
+    pace : exponent and last step of each level, updated in place.
     """
     new, found = {}, weighted.components(neighbours)
     if 'slow' in found and 'fix' in found:
@@ -62,12 +61,12 @@ def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: 
     for name, (quadratic, expected) in found.items():
         level = levels[name]
         if name in SIZES:
-            if not fitted:      # what multiplies noise waits until residuals are noise
+            if not fitted:      # sizes are constant while residuals contain the start
                 continue
             step = _size_step(level, quadratic, expected, SIZE_SPREADS[name])
             new[name] = max(level * step, problem.least[name])
             continue
-        # the others have one that a level is as it is: more end the way to a small noise too early
+        # the others have one, at their current value: more would stop at too large a noise
         pseudo = PRIOR_ROWS.get(name, 1.0)
         pull = pseudo * (problem.first_levels[name] / level if name in PRIOR_ROWS else 1.0)
         step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
@@ -82,7 +81,7 @@ def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: 
 
 
 def _size_step(level: float, quadratic: float, expected: float, spread: float) -> float:
-    """Return the factor on a size, log-normal about the usual one: a safeguarded Newton step."""
+    """Return the factor on a size with a log-normal prior: a safeguarded Newton step."""
     gradient = (quadratic - expected) / 2 - np.log(level / SIZE) / spread**2
     ratio = gradient / (max(expected, quadratic) / 2 + spread**-2)
     step = np.log1p(max(ratio, -0.9)) if ratio < 0 else ratio

@@ -10,8 +10,8 @@
 """
 The growth of fix errors with time, against that of the model: docs/method.md (S17a).
 
-A receiver that filters has errors whose rate lasts. They grow with time, those of a Gauss-Markov
-process with its root: steps from one fix to the next then say too little of what becomes of them.
+The errors of a receiver that filters have a correlated rate. They grow with time, those of a
+Gauss-Markov process with its root: differences of adjacent fixes then underestimate them.
 """
 
 import numpy as np
@@ -22,8 +22,7 @@ from odocal_ros.calib.smoother.point_rows import TAIL_SIGMAS
 from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import NORMAL_MEDIAN, REMARK_SIGMAS
 
-# spans that the fixes must hold to be compared: statistical, their variance is then good to 35 %,
-# with two axes
+# minimum number of spans in a leg: statistical, their variance is then good to 35 %, with two axes
 FEWEST_SPANS = 8
 COLUMNS = {'slow': slice(0, 2), 'slow_up': slice(2, 3)}     # of ENU
 
@@ -31,19 +30,19 @@ COLUMNS = {'slow': slice(0, 2), 'slow_up': slice(2, 3)}     # of ENU
 def long_run(fixes: Fixes, levels: Levels,
              found: dict[str, tuple[float, float]]) -> dict[str, float]:
     """
-    Return the factors, 1 or more, by which slow errors exceed what their steps say.
+    Return the factors, 1 or more, by which correlated errors exceed the model of their steps.
 
-    Of spans of 1, 2, 4, ... s the largest ratio of the mean square of what errors change by to
-    what is expected, less REMARK_SIGMAS of its standard deviations.
+    The largest ratio, for spans of 1, 2, 4, ... s, of the mean square of the error differences to
+    its expectation, less REMARK_SIGMAS of its standard deviations.
 
     Parameters
     ----------
     fixes : Fixes
-        Whose errors are looked at, white and slow together.
+        With white and correlated errors.
     levels : Levels
         Of the pass.
     found : dict
-        Quadratic sum and expectation of each level: what rows and steps say.
+        Quadratic sum and expectation of each level.
 
     """
     t, error = fixes.state.t[fixes.k] + fixes.points.tau, fixes.errors()

@@ -74,21 +74,21 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
                    'm/√s')
     reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
-        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd),
-                              ('See IMU_WORSE_THAN_GRADE.' if worse else remedy) if odd == noisy else ''))
+        known = 'See IMU_WORSE_THAN_GRADE.' if worse else remedy
+        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd), known if odd == noisy else ''))
     # judgement: nothing tells by how much a model is off; a fit that has not settled may be off by
     # what it still moves, several times
     return max(1.0, 2.0 * bool(odd), 4.0 * move), reasons
 
 
 def moving(fit: Fit) -> float:
-    """Return by how much of their sigmas scale, yaw and pitch moved in the last pass, at most."""
+    """Return the largest step of scale, yaw and pitch in the last pass, in sigmas."""
     step = fit.solved.step_border / np.sqrt(np.diag(fit.solved.covariance))
     return float(np.abs(step[:WANTED]).max())
 
 
 def _heading(heading: Heading, error: float) -> list[Reason]:
-    """Say where the outside heading is farther from that of the drive than its sigma allows."""
+    """Report an external heading that differs from that of the drive by more than its sigma."""
     if not len(heading.t) or abs(error) < REMARK_SIGMAS * heading.sigma:
         return []
     return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source}) differs by '

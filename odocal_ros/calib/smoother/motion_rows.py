@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The motion of the intervals as a part: IMU and odometer from each keyframe to the next."""
+"""The motion factor: IMU and odometer between adjacent keyframes."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -44,10 +44,12 @@ ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up',))
 
 class MotionRows(Part):
     """
-    Rows of ``Motion`` in the noise of ``IntervalNoise``; weighed: r (K, 18), whiten (K, 18, 18).
+    Rows of ``Motion`` with the noise of ``IntervalNoise``.
 
-    Unit noises are made again whenever they are wanted, some intervals at a time: they would take
-    more memory than all else.
+    Weighted are r (K, 18) and whiten (K, 18, 18).
+
+    Unit noises are recomputed when needed, some intervals at a time: stored, they would be the
+    largest memory.
     """
 
     name = 'motion'
@@ -61,17 +63,17 @@ class MotionRows(Part):
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
-        """Return first levels and their least: of the IMU as it rests, of the road."""
+        """Return initial and minimum levels, of the IMU by its standstills, and of the road."""
         imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
         imu |= at_rest(problem.imu, problem.leg, problem.still)
-        slide, road = least_slide(problem.turned)**2, 0.01**2      # m^2/s, where they set out
+        slide, road = least_slide(problem.turned)**2, 0.01**2      # m^2/s, initial
         return (imu | dict.fromkeys(ALONG, road)
                 | dict.fromkeys(SIDEWAYS, max(road, slide)),
                 imu | dict.fromkeys(ALONG, LEAST.road**2) | dict.fromkeys(SIDEWAYS, slide)
                 | {'up': max(slide, HEAVE**2)})
 
     def weigh(self, levels: Levels) -> None:
-        """Whiten the rows by the Cholesky root of their covariance."""
+        """Whiten the rows by the Cholesky factor of their covariance."""
         self._found: tuple[ref[Neighbours], Floats, Floats] | None = None
         self.whiten = room(len(self.raw), ROWS, ROWS)
         self.r, logs = np.empty((2, len(self.raw), ROWS))
@@ -85,7 +87,7 @@ class MotionRows(Part):
         self.log_R = -2 * logs.sum()
 
     def after(self, step: Floats, constants: Floats, reached: State) -> None:
-        """Bring the residuals to where the step leads."""
+        """Apply the step to the residuals."""
         r, n = self.r.copy(), self.n
         for rows in blocks(len(r)):
             J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
@@ -102,7 +104,7 @@ class MotionRows(Part):
         return J
 
     def derivatives(self, rows: slice) -> tuple[Floats, Floats, Floats]:
-        """Return those of some intervals as in ``Motion.jacobians``, once fitted by signals."""
+        """Return derivatives of some intervals as ``Motion.jacobians``, by fitted signals."""
         begin, end, constants = self.motion.take(rows).jacobians(self.n)
         if self.signals is not None:
             gyro = (self.noise.columns(rows) * self.roots())[:, :, self.of('gyro')]
@@ -113,7 +115,7 @@ class MotionRows(Part):
         return begin, end, constants
 
     def forget(self) -> None:
-        """Let go of the derivatives, and of what was found with them."""
+        """Release the derivatives and the results computed from them."""
         self.__dict__.pop('J', None)
         self._found = None
 
@@ -144,7 +146,7 @@ class MotionRows(Part):
         return out
 
     def _units(self, rows: slice) -> tuple[Floats, Floats]:
-        """Return the whitened unit noises of some intervals, (k, 18, c), and J' of them."""
+        """Return the whitened unit noises A of some intervals, (k, 18, c), and J' A."""
         A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
         return A, np.swapaxes(self.J[rows], 1, 2) @ A
 
@@ -153,11 +155,11 @@ class MotionRows(Part):
         return np.sqrt([self.levels[INTERVAL[i]] for i in self.noise.component])
 
     def of(self, *names: str) -> Bools:
-        """Tell which unit noises are of these levels: (c,) bool."""
+        """Return which unit noises belong to these levels: (c,) bool."""
         return np.isin(self.noise.component, [INTERVAL.index(name) for name in names])
 
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
-        """Return for each level its quadratic sum and what is expected of it."""
+        """Return the quadratic sum and its expectation for each level."""
         estimates, seen = self._noises(near)
         quadratic, expected = np.einsum('kc,kc->c', estimates, estimates), seen.sum(axis=0)
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
@@ -182,9 +184,9 @@ class MotionRows(Part):
 
     def _noises(self, near: Neighbours) -> tuple[Floats, Floats]:
         """
-        Return the best estimates of the unit noises, and the variances these should have.
+        Return the estimates of the unit noises and their expected variances.
 
-        (K, c) each; made once for one ``near``, since levels and slips both ask for them.
+        (K, c) each; computed once for one ``near``, since levels and slips both use them.
         """
         if self._found is None or self._found[0]() is not near:
             estimates, variances = np.empty((2, len(self.r), len(self.noise.component)))
@@ -196,7 +198,7 @@ class MotionRows(Part):
         return self._found[1:]
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
-        """Yield what the unit noises of each level do."""
+        """Yield the effects of the unit noises of each level."""
         units, given = [], []
         for rows, block in near.blocks():
             cross = self.with_wanted(block)
@@ -211,10 +213,10 @@ class MotionRows(Part):
 
     def road_noise(self, near: Neighbours) -> tuple[Floats, Floats]:
         """
-        Return the odometer's noise of each interval, along, side, up: (K, 3) each.
+        Return the odometer's noise in each interval, forward, sideways, up: (K, 3) each.
 
-        First the best estimate in its own sigmas, second the variance that it should have: of 1,
-        what the data can see.
+        First the estimate in its own sigmas, second its expected variance: the observable part
+        of 1.
         """
         estimate, seen = self._noises(near)
         columns = [self.of(*names) for names in ODOMETER_AXES]
@@ -222,7 +224,7 @@ class MotionRows(Part):
                 np.stack([seen[:, c].sum(axis=1) for c in columns], -1))
 
     def along_size(self) -> Floats:
-        """Return how far a unit of the noise along moves the end of each interval, m: (K,)."""
+        """Return the displacement by a unit of the noise along the path, m: (K,)."""
         pick = self.of(*ALONG)
         return np.concatenate([
             np.linalg.norm(self.noise.columns(rows)[:, D, pick] * self.roots()[pick], axis=1)

@@ -8,11 +8,11 @@
 # the License.
 
 """
-Variance components, and what a unit of each does to the rows of an interval: docs/method.md (S13).
+Variance components, and the effect of a unit of each on the rows of an interval, (S13).
 
-White noise that enters at a time within the interval acts on all that follows; the integral over
-that time is a three-point Gauss rule, exact for the polynomials that constant force and speed
-make. Columns of one component times the root of its level are independent unit noises.
+White noise at a time within the interval affects the rest of the interval. The integral over that
+time is a three-point Gauss rule, exact for the polynomials of constant force and speed. Columns of
+one component times the root of its level are independent unit noises (docs/method.md).
 """
 
 from dataclasses import dataclass
@@ -38,9 +38,9 @@ GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
 # rad/s: above it, a vehicle may slide sideways. Judgement: 0.5 m/s^2 at 10 m/s
 TURNING_RATE = 0.05
-# m that an odometer at rest may err by in a second, at least: physical, play of a drive train
+# m in a second, minimum error of an odometer at rest: physical, play of a drive train
 REST_NOISE = 5e-4
-ABSENT_VARIANCE = 1e4   # m^2, of a way that no odometer says: nothing is known of it
+ABSENT_VARIANCE = 1e4   # m^2, of travel without odometer samples
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Levels:
     """
     Variance of each component: per s of INTERVAL and slow errors, factors on the stated ones.
 
-    ``correlation_time`` is one of them: that of the slow fix error, s, where there is one.
+    ``correlation_time`` is one of them: of the correlated fix error, s, if it is estimated.
     """
 
     values: dict[str, float]
@@ -58,22 +58,22 @@ class Levels:
 
     @property
     def correlation_time(self) -> float:
-        """Return the correlation time of the slow fix error, s, 0: there is none."""
+        """Return the correlation time of the correlated fix error, s, 0: none."""
         return self.values.get('correlation_time', 0.0)
 
     def but(self, **values: float) -> 'Levels':
-        """Return levels with some replaced."""
+        """Return levels with some values replaced."""
         return Levels(self.values | values)
 
     def roots(self) -> dict[str, float]:
-        """Return standard deviations, of slow errors those in the long run, and the time."""
+        """Return standard deviations, stationary ones of correlated errors, and the time."""
         time = self.correlation_time
         return {k: float(np.sqrt(v * (time / 2 if k in SLOW_LEVELS else 1.0)))
                 for k, v in self.values.items()} | {'correlation_time': time}
 
     @classmethod
     def of_roots(cls, roots: dict[str, float]) -> 'Levels':
-        """Return the levels of such standard deviations."""
+        """Return the levels with these standard deviations."""
         time = roots['correlation_time']
         return cls({k: v**2 / (time / 2 if time and k in SLOW_LEVELS else 1.0)
                     for k, v in roots.items()} | {'correlation_time': time})
@@ -82,14 +82,14 @@ class Levels:
 @dataclass(eq=False)
 class IntervalNoise:
     """
-    The noises of K intervals; of a unit of each what it does to the rows, (K, 18, c), by parts.
+    The noises of K intervals; the effect of a unit of each on the rows, (K, 18, c), in chunks.
 
     component : (c,) index in INTERVAL of each column.
     """
 
     motion: Motion
     axes: Floats                       # (K, 3, 3) rows: forward, left, up
-    road: Floats                       # (K, 5) what the wheels' unit noises do along their axes
+    road: Floats                       # (K, 5) effects of the wheels' unit noises along their axes
     extra: Floats                      # (K, 18) variances that are given, not estimated
     given: Floats                      # (K, 18, g) columns of unit noises, the same
     component: ClassVar[NDArray[np.int64]] = np.array(
@@ -97,7 +97,7 @@ class IntervalNoise:
         + [INTERVAL.index(name) for name in ROAD])
 
     def columns(self, rows: slice) -> Floats:
-        """Return what unit noises do in the intervals of a slice: (k, 18, c)."""
+        """Return the effects of unit noises in the intervals of a slice: (k, 18, c)."""
         motion = self.motion.take(rows)
         T, C = motion.T[:, 0], motion.C
         force, way = skew(motion.dv / motion.T), skew(motion.way / motion.T)
@@ -122,7 +122,7 @@ class IntervalNoise:
         return out
 
     def grown(self, by: dict[str, float]) -> Floats:
-        """Return by how much the road's variances along, left and up grow with levels: (K, 3)."""
+        """Return the factors of the road's variances forward, left, up by new levels: (K, 3)."""
         out = np.ones((len(self.road), 3))
         for column, (name, axis) in enumerate(ROAD.items()):
             out[:, axis] = np.where(self.road[:, column] > 0, by[name], out[:, axis])
@@ -145,9 +145,9 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     """
     Return the noises of a motion.
 
-    rest : (K,) bool, intervals that stand: their odometer has a small noise that is given, for
-        what stands says nothing of what moves.
-    spread : (K, 3 or more) factors on the odometer's variances along, to the side and up first.
+    rest : (K,) bool, intervals at standstill: their odometer noise is given, since it does not
+        depend on the noise in motion.
+    spread : (K, 3 or more) factors on the odometer's variances, forward, sideways and up first.
     """
     K, T = len(motion.T), motion.T[:, 0]
     axes = np.swapaxes(motion.C_end @ motion.state.C_bv, 1, 2)      # rows: forward, left, up
@@ -170,11 +170,11 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
 
 def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Floats:
     """
-    Return noises of a way that is measured by speeds in steps: (K, 18, g).
+    Return noises of travel from quantised speeds: (K, 18, g).
 
-    Fine steps round. Along the way itself coarse ones say nothing: what they tell is in
-    speed_steps.py. In a turn an error that goes from one end of its cell to the other amid the
-    interval moves the end sideways.
+    Fine steps are rounding noise. Coarse steps are not used along the path; speed_steps.py uses
+    their transitions. In a turn, a quantisation error that changes within the interval displaces
+    the end sideways.
     """
     coarse = leg.travel.coarse
     if coarse is None:
@@ -196,16 +196,16 @@ def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Float
 
 
 def rest_noise(speed: Floats, rest: Bools) -> float:
-    """Return the variance of a second's way at rest, m^2: what a noisy speed adds up to."""
+    """Return the variance of the travel in a second at rest, m^2."""
     measured = float((speed[rest]**2).mean()) if rest.sum() >= 5 else 0.0      # s to know it by
     return max(measured, REST_NOISE**2)
 
 
 def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
     """
-    Tell where the vehicle speeds up or brakes, and where it turns: (K,) bool each.
+    Return where the vehicle accelerates or brakes, and where it turns: (K,) bool each.
 
-    By more than 0.5 m/s^2 along, where a wheel may slip, and TURNING_RATE, where it may slide.
+    Above 0.5 m/s^2, where a wheel may slip, and TURNING_RATE, where it may slide.
     """
     T = motion.T[:, 0]
     speed = np.einsum('ki,ki->k', motion.way, (motion.f_n + motion.f_n_end) / 2) \
@@ -217,7 +217,7 @@ def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
 
 
 def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
-    """Return variances of what gaps hide: (K, 18)."""
+    """Return variances of the motion within gaps: (K, 18)."""
     sums, T = motion.sums, motion.T[:, 0]
     extra = np.zeros((len(T), ROWS))
     # s: a longer step of the Imu hides motion

@@ -8,11 +8,12 @@
 # the License.
 
 """
-A part of the equations: what one sensor, or one prior, says of the unknowns.
+A factor of the likelihood: the residuals of one sensor or one prior.
 
-Each part is a file: residuals and derivatives at one state, first and least noise levels, and what
-its rows give to normal equations, cost, variance components and the budget of errors. It is made
-unweighted; ``weighed`` returns a copy of it at given levels, whose ``after`` takes a step in.
+Each factor is a file. It holds residuals and derivatives at one state, initial and minimum noise
+levels, and its terms of the normal equations, the cost, the variance components and the error
+budget. It is created without weights; ``weighed`` returns a copy at given levels, whose ``after``
+applies a step to the residuals.
 """
 
 from collections.abc import Iterable
@@ -33,20 +34,20 @@ from odocal_ros.data.arrays import Floats
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
-# factors on variances of an interval: the odometer's along, to the side and up (slips), and that
-# of what drives the slow fix error (a receiver that jumps)
+# variance factors of an interval: of the odometer forward, sideways and up (slips), and of the
+# driving noise of the correlated fix error (jumps of the receiver)
 FACTORS = ('along', 'side', 'up', 'jump')
 SPREAD, JUMP = len(FACTORS), FACTORS.index('jump')
-WANTED = len(PARAMETERS)    # constants that the budget is of: ln K, yaw, pitch
+WANTED = len(PARAMETERS)    # constants in the error budget: ln K, yaw, pitch
 
 
 @dataclass(frozen=True, eq=False)
 class Here:
     """
-    Where the equations are linearised: a state, and sums over samples at it.
+    The linearisation point of the equations: a state, and the preintegrated samples at it.
 
-    points : sums to the times of the rows, by the name of their part.
-    spread : (K, SPREAD) factors on the variances of intervals that lie far out.
+    points : sums up to the times of the rows, by the name of their factor.
+    spread : (K, SPREAD) factors on the variances of outlier intervals.
     fitted : as for ``Motion``.
     """
 
@@ -60,12 +61,12 @@ class Here:
 
 class Part:
     """
-    One part, here one that says nothing; those of today are listed in ``equations``.
+    Base class of the factors, without any rows. ``equations`` lists the factors.
 
-    A sensor's own class has ``__init__(problem, here)`` and what differs from this; one with rows
-    of its own also raw, its residuals, and ``jacobians(n)``, their derivatives by the keyframes
-    and by the constants. ``near`` is what ``Solved.neighbours`` returns, or a block of it,
-    (k, 2n + M, 2n + M), where that is said.
+    A subclass implements ``__init__(problem, here)`` and overrides what differs. With rows of its
+    own it also has raw, the residuals, and ``jacobians(n)``, their derivatives by keyframes and
+    constants. ``near`` is the result of ``Solved.neighbours``, or where stated a block of it,
+    (k, 2n + M, 2n + M).
     """
 
     name: ClassVar[str]
@@ -79,20 +80,20 @@ class Part:
 
     @classmethod
     def there(cls, problem: 'Problem') -> bool:
-        """Tell whether a leg has such rows."""
+        """Return True if a leg has such rows."""
         return True
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
-        """Return the variances to start from, by the names of its levels, and the least."""
+        """Return the initial and the minimum variances, by the names of its levels."""
         return {}, {}
 
     def in_use(self, levels: Levels) -> bool:
-        """Tell whether the rows are there with these levels."""
+        """Return True if the rows exist at these levels."""
         return True
 
     def weighed(self, levels: Levels) -> 'Part':
-        """Return the part with its rows weighed."""
+        """Return a copy with weighted rows."""
         new = copy(self)
         new.levels = levels
         new.n = WITH_SLOW if levels.correlation_time else BARE
@@ -100,55 +101,55 @@ class Part:
         return new
 
     def weigh(self, levels: Levels) -> None:
-        """Set what depends on the levels."""
+        """Compute everything that depends on the levels."""
 
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
 
     def after(self, step: Floats, constants: Floats, reached: State) -> None:
-        """Bring the residuals to where a step (N, n), (M,) leads, were all linear."""
+        """Apply a step (N, n), (M,) to the residuals, to first order."""
         self.state = reached
 
     def forget(self) -> None:
-        """Let go of what can be made again."""
+        """Release memory that can be recomputed."""
 
     def cost(self) -> float:
         """Return the weighted sum of squares of the residuals."""
         return 0.0
 
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
-        """Return of each level its quadratic sum and the redundancy of its rows, (S26)."""
+        """Return the quadratic sum and the redundancy of each level, (S26)."""
         return {}
 
     def add_levels(self, out: LevelSides) -> None:
         """Add the right-hand sides of its levels: docs/method.md (S27b)."""
 
     def effects(self, near: Neighbours) -> Iterable[tuple[str, Floats]]:
-        """Yield names of sources, and what their unit errors do to the constants: (..., 3, k)."""
+        """Yield the names of error sources and the effects of their unit errors: (..., 3, k)."""
         return ()
 
     def with_wanted(self, block: Floats) -> Floats:
-        """Return the covariance of scale, yaw and pitch with the unknowns: (k, 3, 2n + M)."""
+        """Return the cross-covariance of scale, yaw, pitch and the unknowns: (k, 3, 2n + M)."""
         return block[:, 2 * self.n:2 * self.n + WANTED, :]
 
     def all_with_wanted(self, near: Neighbours) -> Floats:
-        """Return that of all intervals: (K, 3, 2n + M)."""
-        # copies: a view of a few rows would hold the whole block
+        """Return the cross-covariance for all intervals: (K, 3, 2n + M)."""
+        # copies: a view of a few rows would keep the whole block in memory
         return np.concatenate([self.with_wanted(block).copy() for _, block in near.blocks()])
 
 
 class Total:
-    """A sum of rows that come by parts, to the last bit as if all were there at once."""
+    """A sum of rows that arrive in chunks; equal to the sum of all rows to the last bit."""
 
     _sum: np.ndarray | None = None
 
     @property
     def sum(self) -> np.ndarray:
-        """Return the sum of the rows so far; before the first it has no shape."""
+        """Return the sum of the rows so far; a scalar zero before the first."""
         return np.zeros(()) if self._sum is None else self._sum
 
     def add(self, rows: Floats) -> None:
-        """Add rows: numpy adds them one after the other."""
+        """Add rows one after the other."""
         if self._sum is not None:
             rows = np.concatenate([self._sum[None], rows])
         self._sum = rows.sum(axis=0)
@@ -156,7 +157,7 @@ class Total:
 
 def hold(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
          residual: Floats | float, weight: Floats | float = 1.0) -> None:
-    """Add rows that are an unknown each: those of columns at keyframes k, a slice or one."""
+    """Add priors of single unknowns: columns at keyframes k, a slice or one."""
     i = np.arange(out.g.shape[1])[columns]
     keys = np.atleast_1d(np.arange(len(out.g))[k])
     weight, pull = (np.broadcast_to(x, (len(keys), len(i)))
@@ -169,7 +170,7 @@ def hold(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
 
 def link(out: Normal, columns: slice, decay: Floats | float, weight: Floats,
          residual: Floats) -> None:
-    """Add rows of all intervals, (K, c): an unknown at the end less its decayed one before."""
+    """Add a first-order process over all intervals, (K, c): x at the end less decay times x."""
     i = np.arange(out.g.shape[1])[columns]
     all_of = np.broadcast_shapes(np.shape(residual), (len(out.beside), len(i)))
     terms = (decay**2 * weight, weight, decay * weight, decay * weight * residual,

@@ -8,10 +8,10 @@
 # the License.
 
 """
-Rows at times between keyframes, for sensors that say something of an instant.
+Rows at times between keyframes, for sensors that measure at an instant.
 
-Each hangs on the keyframe before it, on the constants, and, where slow fix errors are estimated,
-on those of the keyframe after it. What lies far out loses weight: docs/method.md (S25).
+Each depends on the keyframe before it, on the constants and, if correlated fix errors are
+estimated, on those of the keyframe after it. Outliers are down-weighted: docs/method.md (S25).
 """
 
 from collections.abc import Callable, Iterator
@@ -32,8 +32,8 @@ from odocal_ros.settings.levels import NORMAL_MEDIAN
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
-# sigmas beyond which a row, or a slip of an interval, has a heavy tail. Statistical: one sound row
-# in 370 loses some of its weight
+# sigmas beyond which a row, or the slip of an interval, has a heavy tail. Statistical: one normal
+# row in 370 is down-weighted
 TAIL_SIGMAS = 3.0
 FEWEST_JUDGED = 5    # rows, of which one may be an outlier: judgement
 
@@ -45,14 +45,13 @@ class PointRows(Part):
     """
     Rows of d components each.
 
-    A sensor's own class sets k (m,), the keyframes before; raw (m, d), residuals; per_effective,
-    of how many neighbours the errors are one: each row counts by so much less; share (m,), of the
-    slow fix error of the keyframe after, that is in a row of three components: None in what knows
-    no such. It has ``jacobians`` and ``stated``. Weighed are r (m, d), J (m, d, n + M), and J_end
-    (m, 3, 3) by that slow error, or None.
+    A subclass sets k (m,), the keyframes before; raw (m, d), the residuals; per_effective, rows
+    per independent row; share (m,), the weight of the correlated fix error of the keyframe after,
+    in rows of three components, or None. It implements ``jacobians`` and ``stated``. Weighted are
+    r (m, d), J (m, d, n + M), and J_end (m, 3, 3) by that correlated error, or None.
     """
 
-    levels_of: ClassVar[dict[str, slice]]     # columns that a level, factor on variances, is of
+    levels_of: ClassVar[dict[str, slice]]     # columns of each level, a factor on variances
     source: ClassVar[str]                     # name in the budget
     k: Ints
     raw: Floats
@@ -61,7 +60,7 @@ class PointRows(Part):
 
     @classmethod
     def times(cls, problem: 'Problem', constants: Floats) -> Floats:
-        """Return when what was sent was true, s: (m,); sums to these times are in ``here``."""
+        """Return the times of validity, s: (m,); ``here`` holds the sums up to these times."""
         raise NotImplementedError
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
@@ -69,15 +68,15 @@ class PointRows(Part):
         raise NotImplementedError
 
     def stated(self, rows: Floats) -> Floats:
-        """Return rows (m, d, c) in the sigmas that the sensor states."""
+        """Return rows (m, d, c) divided by the sigmas that the sensor states."""
         raise NotImplementedError
 
     def known(self) -> Bools | bool:
-        """Tell which components are there at all: (m, d) bool or one for all."""
+        """Return which components exist: (m, d) bool or one for all."""
         return True
 
     def weigh(self, levels: Levels) -> None:
-        """Set r, J and J_end, weighed for heavy tails as well."""
+        """Compute r and J_end with the weights of heavy tails."""
         white = self.stated(self.raw[:, :, None])[:, :, 0]
         factor = np.ones(white.shape[1])
         for level, columns in self.levels_of.items():
@@ -105,7 +104,7 @@ class PointRows(Part):
         return out
 
     def forget(self) -> None:
-        """Let go of the derivatives: they are made again if they are wanted again."""
+        """Release the derivatives; they are recomputed when needed."""
         self.__dict__.pop('J', None)
 
     def _sizes(self, white: Floats) -> Iterator[tuple[slice, Floats]]:
@@ -113,7 +112,7 @@ class PointRows(Part):
             yield columns, np.abs(np.hypot.reduce(white[:, columns], axis=1))
 
     def _weights(self, white: Floats) -> Floats:
-        """Return weights of whitened residuals, (m, d), those of one level together."""
+        """Return weights of whitened residuals, (m, d), equal for the columns of one level."""
         w = np.ones_like(white)
         if len(white) >= FEWEST_JUDGED:
             for columns, size in self._sizes(white):
@@ -121,7 +120,7 @@ class PointRows(Part):
         return w
 
     def cost(self) -> float:
-        """Return the losses that the weights belong to: squares, logarithms beyond TAIL_SIGMAS."""
+        """Return the robust loss of the weights: squares, logarithms beyond TAIL_SIGMAS."""
         total = 0.0
         for _, size in self._sizes(self.r / np.sqrt(self.weight / self.per_effective)):
             far = np.maximum(size / TAIL_SIGMAS, 1.0)
@@ -130,7 +129,7 @@ class PointRows(Part):
         return total / self.per_effective
 
     def after(self, step: Floats, constants: Floats, reached: State) -> None:
-        """Bring the residuals to where the step leads."""
+        """Apply the step to the residuals."""
         own = np.concatenate([step[self.k], np.broadcast_to(constants, (len(self.k), M))], axis=1)
         self.r = self.r + np.einsum('kij,kj->ki', self.J, own)
         if self.J_end is not None:
@@ -161,9 +160,9 @@ class PointRows(Part):
 
     def _intervals(self) -> Iterator[tuple[Ints, Gather]]:
         """
-        Yield the intervals that have rows, some at a time, and what gathers rows by them.
+        Yield the intervals that have rows, some at a time, and a function that groups rows.
 
-        That takes rows (m, d, c) to (intervals, d most, c), padded.
+        The function pads rows (m, d, c) to (intervals, d most, c).
         """
         present, first, count = np.unique(self.k, return_index=True, return_counts=True)
         for some in blocks(len(present)):
@@ -181,12 +180,12 @@ class PointRows(Part):
             yield present[some], gather
 
     def _columns(self) -> tuple[Ints, Ints]:
-        """Return the columns of J and of J_end among those of neighbours."""
+        """Return the columns of J and of J_end in the joint marginals."""
         n = self.n
         return np.r_[0:n, 2 * n:2 * n + M], np.arange(n + SLOW.start, n + SLOW.stop)
 
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
-        """Return for each level its quadratic sum and what is expected of it."""
+        """Return the quadratic sum and its expectation for each level."""
         if len(self.k) < FEWEST_JUDGED:
             return {}
         taken = np.concatenate([self._taken(near.of(present), gather)
@@ -218,7 +217,7 @@ class PointRows(Part):
         out.square[columns, columns] += np.einsum('kdi,kdi->i', q, q)
 
     def _taken(self, block: Floats, gather: Gather) -> Floats:
-        """Return what the unknowns take up of the rows of some intervals: (k, most, d)."""
+        """Return the part of the row variances that the unknowns fit: (k, most, d)."""
         (own, end), J = self._columns(), gather(self.J)
         taken = ((J @ block[:, own[:, None], own]) * J).sum(axis=2)
         if self.J_end is not None:
@@ -229,7 +228,7 @@ class PointRows(Part):
         return out
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
-        """Yield what a unit error of each row does."""
+        """Yield the effect of a unit error of each row."""
         own, end = self._columns()
         parts = []
         for present, gather in self._intervals():
@@ -242,7 +241,7 @@ class PointRows(Part):
 
 
 def alike(rows: PointRows) -> float:
-    """Return rows per effective one (1: independent), by the spread of means of neighbours."""
+    """Return rows per independent row, by the scatter of means of adjacent rows."""
     r = rows.r / np.sqrt(rows.weight)
     r = (r - np.median(r, axis=0))[:, :2]       # the level ones tell scale and yaw
     scale = np.median(np.abs(r), axis=0) / NORMAL_MEDIAN

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Priors as a part, docs/method.md (S21): of biases, constants, and where a leg begins."""
+"""The prior factor, docs/method.md (S21): biases, constants, and the first keyframe."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -48,13 +48,13 @@ SIZES, SIZE = tuple(f'size_{kind}' for kind in KIND_SIZES), 0.5
 # the logarithm apart: at 1 the sigma of the scale is up to 2.8 times as large in drives without
 # one, at 3 1.7 times (docs/decisions/0019)
 SIZE_SPREADS = dict.fromkeys(SIZES, 1.0) | {'size_fix_error_by_motion': 3.0}
-# where a leg begins, which nothing has to hold but the data: m, m/s, rad about east, north, up.
-# Judgement, far wider than any data
+# priors of the first keyframe: m, m/s, rad about east, north, up. Judgement: far wider than any
+# data
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
     'position': (P, 1e4), 'velocity': (V, 100.0), 'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
-# m: on ground taken as level no height is observed; 1e4 m would be lost in rounding. Definition
+# m: without heights; 1e4 m would be lost in rounding. Definition
 UP, LEVEL_START = slice(P.stop - 1, P.stop), 1.0
-# priors of the vehicle, so the same in every leg
+# priors of the vehicle, shared by all legs
 SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'odometer_delay': constants_from('odometer_delay'),
           'fix_latency': constants_from('gnss_delay'),
@@ -73,7 +73,7 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
 
 
 class PriorRows(Part):
-    """Rows of the unknowns themselves, each with its prior, beside no row of a sensor."""
+    """Rows of the unknowns with their priors."""
 
     name = 'priors'
 
@@ -87,11 +87,11 @@ class PriorRows(Part):
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
-        """Return first sizes of imperfections, by the square of the usual one, and the least."""
+        """Return initial and minimum sizes of imperfections, in squares of the usual one."""
         return dict.fromkeys(SIZES, SIZE), dict.fromkeys(SIZES, 1e-6)
 
     def weigh(self, levels: Levels) -> None:
-        """Set the priors by the sizes of imperfections: docs/method.md (S28)."""
+        """Compute the priors from the sizes of imperfections: docs/method.md (S28)."""
         size = np.array([levels[name] for name in SIZES])[KIND_OF]
         constants = self.base.constants.copy()
         constants[IMPERFECT] *= np.sqrt(size)
@@ -100,10 +100,10 @@ class PriorRows(Part):
 
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
         """
-        Return of each size its quadratic sum and what is expected of it: docs/method.md (S29).
+        Return the quadratic sum and its expectation for each size: docs/method.md (S29).
 
-        An imperfection has a say as far as the drive knows it beside its usual size: what a drive
-        hardly sees a misfit elsewhere would drive far off.
+        An imperfection is weighted by the share of the drive in its information: a model error
+        elsewhere would move the size of one that is hardly observable.
         """
         at = 2 * self.n + np.arange(IMPERFECT.start, IMPERFECT.stop)
         variance = near[0][at, at]
@@ -132,7 +132,7 @@ class PriorRows(Part):
         return self.state.constants - self.priors.centre
 
     def add(self, out: Normal) -> None:
-        """Add the rows to normal equations; the start is held but loosely, where it is."""
+        """Add the rows to normal equations; the first keyframe has a wide prior at its value."""
         for columns, sigma in START_SIGMAS.values():
             hold(out, 0, columns, sigma**2, 0.0)
         if self.level:
@@ -150,12 +150,12 @@ class PriorRows(Part):
         return out
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
-        """Yield what the turn-on biases do."""
+        """Yield the effects of the turn-on biases."""
         first = self.with_wanted(near[0][None])[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
 
     def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
-        """Yield what errors do that are the same in every leg: names, (3, k)."""
+        """Yield names and effects, (3, k), of errors that all legs share."""
         for name, where in self.shared.items():
             yield name, covariance[:WANTED, where] / self.priors.constants[where]

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A leg made ready for the smoother: keyframes, priors, first noise levels, sums over samples."""
+"""The estimation problem of a leg: keyframes, priors, initial levels, preintegrated samples."""
 
 from dataclasses import dataclass, field, replace
 
@@ -74,7 +74,7 @@ class Problem:
     rate_b: np.ndarray       # (N, 3) rad/s, measured at the keyframes
     first_levels: Levels = field(default_factory=lambda: Levels({}))
     least: dict[str, float] = field(default_factory=dict)     # levels
-    shaken: dict[str, float] = field(default_factory=dict)    # levels of the Imu to come down from
+    shaken: dict[str, float] = field(default_factory=dict)    # initial levels of the IMU
     # velocity, heading, steps of speed: errors that are one
     per_effective: dict[str, float] = field(default_factory=dict)
 

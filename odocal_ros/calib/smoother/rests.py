@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Standstills as a part, docs/method.md (S20): no velocity at keyframes, no turn between them."""
+"""The standstill factor, docs/method.md (S20): no velocity at keyframes, no turn between."""
 
 from typing import TYPE_CHECKING
 

@@ -21,11 +21,10 @@ from odocal_ros.data.arrays import Floats
 
 def shares(fit: Fit, neighbours: Neighbours) -> tuple[Source, ...]:
     """
-    Return the sources of error of (ln K, yaw, pitch); their covariances add up to the whole.
+    Return the error sources of (ln K, yaw, pitch); their covariances add up to the total.
 
-    An error of unit size in a row moves the estimate by the covariance of the estimate with the
-    unknowns of that row, times the row's whitened derivative. What no part claims is left to the
-    standstills.
+    A unit error in a row moves the estimate by the covariance of the estimate and the unknowns of
+    that row, times the row's whitened derivative. The remainder belongs to the standstills.
     """
     parts, solved = fit.weighted.parts, fit.solved.covariance
     covariance: dict[str, np.ndarray] = {}

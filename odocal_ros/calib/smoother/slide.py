@@ -8,11 +8,11 @@
 # the License.
 
 """
-Bounds from below of how much wheels slide sideways and heave: as the leg has tested it.
+Lower limits of sideslip and vertical motion, by the turns of the leg.
 
-Wheels slide in turns. A leg with turns shows how much, and its own figure stands. On a leg that
-goes straight on nothing tells a vehicle that goes a little askew from an IMU that is mounted so:
-there an ordinary road's noise is taken, whatever the residuals of the single seconds say.
+Sideslip is observable in turns: a leg with turns uses its own estimate. On a straight leg a
+constant sideslip cannot be separated from the mounting yaw: the noise of an ordinary road is the
+lower limit, whatever the residuals of single seconds.
 """
 
 from typing import TYPE_CHECKING
@@ -43,7 +43,7 @@ SIDEWAYS = ('side', 'side_turn', 'up')
 
 
 def turned(leg: SmootherLeg, imu: ImuSteps) -> float:
-    """Return the angle driven in turns, all counted positive, rad."""
+    """Return the total angle of the turns, without sign, rad."""
     t = imu.t[imu.key]
     T = np.diff(t)
     turn = imu.over_intervals(imu.turn) - rest_bias(leg, imu)[0] * T[:, None]
@@ -54,13 +54,13 @@ def turned(leg: SmootherLeg, imu: ImuSteps) -> float:
 
 
 def least_slide(angle: float) -> float:
-    """Return the least sideways and vertical noise, m/sqrt(s), by the angle turned in all, rad."""
+    """Return the minimum sideways and vertical noise, m/sqrt(s), by the total turn angle, rad."""
     tested = np.clip((angle - NO_TURN) / NO_TURN, 0.0, 1.0)
     return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**tested)
 
 
 def assumed(problem: 'Problem', levels: Levels) -> list[Reason]:
-    """Say where a road's noise was assumed and not seen, and decides: reasons."""
+    """Return the reason that names an assumed road noise, if it matters."""
     least = problem.least['side']
     if least < 2e-3**2 or all(      # m^2/s, worth a word
             levels[name] > 1.01 * least for name in SIDEWAYS):

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Slow errors of fixes as a part, docs/method.md (S17): a Gauss-Markov process."""
+"""The factor of time-correlated fix errors, docs/method.md (S17): a Gauss-Markov process."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -34,11 +34,11 @@ WHITE_SHARE = 0.2       # of the variance, beside a slow part of 0.9, to start f
 
 class SlowError(Part):
     """
-    Rows of what the slow fix error does beyond its decay, and of its first value.
+    Rows of the driving noise of the correlated fix error, and of its first value.
 
-    Levels slow, slow_up: the variance it gains in a second before it decays, m^2/s, so that its
-    own is that times half the correlation time; and that time, s, where the operator does not say
-    it. The fixes tie it to the track (fixes.py).
+    Levels slow, slow_up: the spectral density of the driving noise, m^2/s; the stationary variance
+    is the density times half the correlation time. The time, s, is a level unless configured.
+    The rows of the fixes contain the error (fixes.py).
     """
 
     name = 'slow'
@@ -47,24 +47,24 @@ class SlowError(Part):
         self.state, self.T = here.state, here.intervals.T
         self.jump = 1.0 if here.spread is None else here.spread[:, JUMP:]
         self.time_given = not np.isnan(problem.fix_time)
-        # where runs of intervals begin through which the error goes unseen: a fix ends one
+        # where runs of intervals without fixes begin: a fix ends a run
         ends = np.bincount(here.points['fixes'].interval, minlength=len(self.T)) > 0
         self.runs = np.flatnonzero(np.append(True, ends[:-1] | ends[1:]))
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
-        """Return first levels by what the fixes state, and their least."""
+        """Return initial levels by the stated sigmas of the fixes, and minimum levels."""
         gain = 2 * problem.fix_sigma**2 / USUAL_TIME
         return {'slow': gain, 'slow_up': 4 * gain}, {
             **dict.fromkeys(('slow', 'slow_up'), 2 * LEAST.fix**2 / USUAL_TIME),
             'correlation_time': 5.0}      # s: less is not separable from white
 
     def in_use(self, levels: Levels) -> bool:
-        """Tell whether slow errors are estimated."""
+        """Return True if correlated errors are estimated."""
         return levels.correlation_time > 0
 
     def weigh(self, levels: Levels) -> None:
-        """Set decay (K, 1), variances of what drives it (K, 3) and of its values (3,), m^2."""
+        """Compute decay (K, 1), variances of driving noise (K, 3) and error (3,), m^2."""
         decay = np.exp(-self.T / levels.correlation_time)
         gain = np.array([levels['slow'], levels['slow'], levels['slow_up']])
         self.power = gain * levels.correlation_time / 2
@@ -73,7 +73,7 @@ class SlowError(Part):
         self.log_R = np.log(self.drive).sum() + np.log(self.power).sum()
 
     def residual(self) -> Floats:
-        """Return what it does beyond its decay: (K, 3) m."""
+        """Return the driving noise of each interval: (K, 3) m."""
         s = self.state.slow_n
         return s[1:] - self.decay * s[:-1]
 
@@ -89,7 +89,7 @@ class SlowError(Part):
         return out
 
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
-        """Return of each level its quadratic sum and what is expected of it."""
+        """Return the quadratic sum and its expectation for each level."""
         i, s = np.arange(SLOW.start, SLOW.stop), self.state.slow_n
         a, q, r = self.decay, self.drive, self.residual()
         before, both, var = self._variances(near)
@@ -105,7 +105,7 @@ class SlowError(Part):
         return found
 
     def _variances(self, near: Neighbours) -> tuple[Floats, Floats, Floats]:
-        """Return variances left: of the value before, with that after, of the drive: (K, 3)."""
+        """Return covariances: of the value before, with that after, of driving noise: (K, 3)."""
         i, n, a = np.arange(SLOW.start, SLOW.stop), self.n, self.decay
         before, both, after = np.split(near.entries(np.r_[i, i, n + i], np.r_[i, n + i, n + i]), 3,
                                        axis=1)
@@ -113,10 +113,10 @@ class SlowError(Part):
 
     def jumps(self, near: Neighbours) -> Floats:
         """
-        Return what drives the error in each interval, on the axis that it moves most: (2, K, 1).
+        Return the driving noise of each interval, on the axis with the largest: (2, K, 1).
 
-        As of the road: the best estimate in its own sigmas, and the variance that it should have.
-        Intervals without fixes between them tell their sum alone: it is judged, for all of them.
+        The estimate in its own sigmas and its expected variance. Intervals without fixes between
+        them determine only their sum, which is used for all of them.
         """
         seen = 1 - self._variances(near)[2] / self.drive
         seen, push, drive = (np.add.reduceat(x, self.runs) for x in (
@@ -131,9 +131,9 @@ class SlowError(Part):
         """
         Return the score of the logarithm of the correlation time and its information, as a level.
 
-        By Fisher's identity it is what is expected of the complete data's. product : (K, 3) m^2,
-        the drive times the value before it; excess : (K, 3) the square of the drive and begin :
-        (3,) that of the first value, of their variances, less 1: all as expected.
+        By Fisher's identity the score is the expected score of the complete data. product :
+        (K, 3) m^2, driving noise times the value before; excess : (K, 3) and begin : (3,) squares
+        of the driving noise and of the first value over their variances, less 1: expected values.
         """
         a, tau = self.decay, self.levels.correlation_time
         da = a * self.T[:, None] / tau                       # by ln tau
@@ -144,7 +144,7 @@ class SlowError(Part):
         return information + score, information
 
     def add_levels(self, out: LevelSides) -> None:
-        """Add the right-hand sides of its levels: of a power q is the error itself."""
+        """Add the right-hand sides of its levels; for a power, q is the error itself."""
         s = self.state.slow_n
         axes = {'slow': np.array([1.0, 1.0, 0.0]), 'slow_up': np.array([0.0, 0.0, 1.0])}
         g, q = ([x * one for one in axes.values()] for x in (self._precision(s), s))
@@ -192,7 +192,7 @@ class SlowError(Part):
         return out
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
-        """Yield what unit errors of what drives it, and of its first value, do."""
+        """Yield the effects of unit driving noise and of the first value."""
         cross, n = self.all_with_wanted(near), self.n
         end = slice(n + SLOW.start, n + SLOW.stop)
         push = cross[:, :, end] - self.decay[:, :, None] * cross[:, :, SLOW]

@@ -31,8 +31,8 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
-# rad, passes, judgement: a heading by accelerations that is known worse is one of two, and both
-# are tried for so long
+# rad, passes, judgement: a heading from accelerations with a larger sigma may be one of two; both
+# are tried for this number of passes
 TWO_HEADINGS, START_PASSES = 0.1, 3
 
 
@@ -73,10 +73,10 @@ def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fi
     """
     Return the fit of a leg.
 
-    From one start, or from two where accelerations do not tell the heading: then the likelier
-    after a few passes goes on. A coarse speed's offset is then tried for its two usual values.
+    From one start, or from two if accelerations do not determine the heading: the likelier after
+    a few passes continues. The offset of a quantised speed is then tested for two usual values.
     """
-    # no name for what is passed on: the equations of one fit at a time
+    # not stored in a variable: one fit in memory at a time
     return judge_offset(problem, _fit(problem, config, trace), trace)
 
 
@@ -95,7 +95,7 @@ def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
 
 def _likelier(problem: Problem, config: Config, starts: tuple[Start, Start],
               trace: Trace | None) -> Fit:
-    """Return the fit from the start that is likelier after some passes."""
+    """Return the fit from the start that is likelier after START_PASSES."""
     about = max((fit(problem, one.state, _first_levels(problem, one), START_PASSES, trace=trace)
                  for one in starts), key=lambda f: f.likelihood).outline()
     last = fit(problem, about.state, about.levels, config.leg.compute_limit, about=about,
@@ -104,7 +104,7 @@ def _likelier(problem: Problem, config: Config, starts: tuple[Start, Start],
 
 
 def _first_levels(problem: Problem, start: Start) -> Levels:
-    """Return levels to start from: fixes no better than the track by the odometer fits them."""
+    """Return initial levels: fixes no better than their fit to the odometer track."""
     wide = max(1.0, (start.fix_spread / problem.fix_sigma)**2)
     time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
     return problem.first_levels.but(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE * wide,

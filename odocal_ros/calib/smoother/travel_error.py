@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The odometer's reading error as a part, docs/method.md (S10): rounding at each keyframe."""
+"""The factor of the odometer's reading error, docs/method.md (S10): rounding at each keyframe."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class TravelError(Part):
-    """Rows of the travel error at each keyframe, of one level: scale units."""
+    """Rows of the travel error at each keyframe, with one level: scale units."""
 
     name = 'travel'
 
@@ -38,14 +38,14 @@ class TravelError(Part):
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
-        """Return the level of rounding to a count, which is the least too."""
+        """Return the level of rounding to a count, initial and minimum."""
         leg = problem.leg
         least = LEAST.travel / leg.rough_scale
         level = {'travel': max(leg.travel.quantum**2 / 12, least**2)}
         return level, level
 
     def weigh(self, levels: Levels) -> None:
-        """Set the variance, scale units squared."""
+        """Compute the variance, scale units squared."""
         self.variance = max(self.least, levels['travel'])
         self.log_R = self.weight.sum() * np.log(self.variance)
 
@@ -60,7 +60,7 @@ class TravelError(Part):
         return out
 
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
-        """Return of the level its quadratic sum and what is expected of it, in motion."""
+        """Return the quadratic sum and its expectation for the level, in motion."""
         e, moving = self.variance, ~self.still
         last = near[-1][self.n + E, self.n + E]
         spread = np.append(near.entries([E], [E])[:, 0], last)
@@ -75,7 +75,7 @@ class TravelError(Part):
         out.square[i, i] += g @ self.state.travel_error
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
-        """Yield what a unit error of each reading does."""
+        """Yield the effect of a unit error of each reading."""
         cross = self.all_with_wanted(near)
         root = np.sqrt(self.weight / self.variance)
         travel = np.concatenate([cross[:, :, E], cross[-1:, :, self.n + E]]) * root[:, None]
@@ -84,9 +84,9 @@ class TravelError(Part):
 
 def once_a_rest(still: Bools) -> Floats:
     """
-    Return the weight of the rounding's prior at each keyframe, (N,).
+    Return the weight of the prior of the rounding error at each keyframe, (N,).
 
-    A counter that stands errs by the same all the time: its keyframes together count as one.
+    The error is constant while the counter stands: the keyframes of a standstill count as one.
     """
     starts = np.flatnonzero(np.diff(still, prepend=False) & still)
     stops = np.flatnonzero(np.diff(still, append=False) & still) + 1
