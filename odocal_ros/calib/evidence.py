@@ -24,6 +24,7 @@ from odocal_ros.data.pieces import by_row, chunks
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.gaps import gaps_in_rhythm, gaps_longer
 from odocal_ros.nav.rotations import yaw_from_quat
+from odocal_ros.screening.fix_screen import sigma_limit
 from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 
@@ -154,10 +155,11 @@ def _sent(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
     near[rows] = False
     usable = np.isin(t, inputs.t_fix)
     sigma = np.sqrt(fix.covariance_n[:, :2, :2].diagonal(axis1=1, axis2=2).max(axis=1, initial=0))
+    limit = sigma_limit(sigma[fix.status >= gnss.min_status], gnss.max_sigma)
     out = np.flatnonzero(near)
     because = [
         f'status below {gnss.min_status}' if fix.status[i] < gnss.min_status else
-        f'sigma above {gnss.max_sigma:g} m' if 0 < gnss.max_sigma < sigma[i] else
+        f'sigma above {limit:.3g} m' if limit < sigma[i] else
         'far off the track' if usable[i] and row[t[i]] == i else
         'implausible stamp or position' for i in out]
     status: Ints = fix.status[rows]

@@ -123,8 +123,9 @@ class GnssConfig:
     time_sigma: float = setting(0.05, 's', 0.0, 1.0, about='Unknown latency of fixes, 1 sigma; '
                                 'matters at marks set in motion.')
     min_status: int = setting(0, '', -1, 2, about='Minimum NavSatStatus of a used fix.')
-    max_sigma: float = setting(3.0, 'm', 0.0, 1e4, about='Limit of the horizontal 1 sigma of a '
-                               'used fix; 0: off.')
+    max_sigma: float = setting(NAN, 'm', 0.0, 1e4, about='Limit of the horizontal 1 sigma of a '
+                               'used fix; NaN: 3 m, or twice the median of the leg if that is '
+                               'larger; 0: off.')
     default_sigma: float = setting(2.5, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of fixes '
                                    'without a covariance.')
     correlation_time: float = setting(NAN, 's', 0.0, 1e4, about='Correlation time of fix errors; '

@@ -240,6 +240,15 @@ def test_a_height_without_a_variance_leaves_the_level_part_standing(leg):
     np.testing.assert_allclose(inputs.covariance_n[:, 2, 2], 4 * leg.fix.covariance_n[:, 0, 0])
 
 
+def test_the_limit_of_poor_fixes_rises_with_the_median_of_the_leg(leg):
+    usual = changed(leg.fix, covariance_n=lambda a: a * 0 + np.eye(3) * 16.0)
+    poor = changed(usual, covariance_n=lambda a: a.__setitem__(slice(20, 26), np.eye(3) * 81.0))
+    _, codes, _ = said(replace(leg, fix=poor))
+    assert codes[Code.BAD_ROWS_DROPPED].endswith('6 with sigma above 8 m')
+    _, codes, _ = said(replace(leg, fix=poor), with_settings(Config(), {'gnss.max_sigma': 3.0}))
+    assert codes[Code.FIXES_UNUSABLE].endswith('with sigma above 3 m')
+
+
 def test_poor_fixes_are_left_out_by_the_limit_and_zero_takes_it_off(leg):
     bad = changed(leg.fix, covariance_n=lambda a: a.__setitem__(slice(20, 26), np.eye(3) * 25.0))
     inputs, codes, _ = said(replace(leg, fix=bad))
