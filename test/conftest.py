@@ -45,29 +45,10 @@ os.environ.pop('ROS_LOCALHOST_ONLY', None)      # deprecated, and it would win
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')      # as the commands have it: the same digits
 
 
-# files that take longer than all the others together
-SLOW = ('test_ament_lint', 'test_calibrate', 'test_cli', 'test_damage', 'test_damaged_rows',
-        'test_delay_note', 'test_docs', 'test_draw', 'test_examples', 'test_fleet', 'test_folder',
-        'test_foresight', 'test_fuzz', 'test_imperfect', 'test_inspect', 'test_journal',
-        'test_kills', 'test_kpi', 'test_late_counter', 'test_late_rows', 'test_left_over',
-        'test_leg_text', 'test_legs_on_border', 'test_library', 'test_motion', 'test_odd_text',
-        'test_odometry', 'test_one_bad_row', 'test_package', 'test_paper', 'test_parts',
-        'test_plan', 'test_predict', 'test_predict_smoother', 'test_readers_agree',
-        'test_real_drives', 'test_replay', 'test_replay_force', 'test_report',
-        'test_result_folders', 'test_reversing', 'test_scale_change', 'test_several_bags',
-        'test_shutdown', 'test_site', 'test_slow_slip', 'test_smoother_memory',
-        'test_smoother_noise', 'test_smoother_outside', 'test_smoother_parts',
-        'test_smoother_result', 'test_smoother_run', 'test_smoother_slip', 'test_smoother_so_far',
-        'test_speed_steps', 'test_stream_faults', 'test_try', 'test_wheel_faults',
-        'test_wheel_survey', 'test_wheel_unseen', 'test_wheels_fit', 'test_wheels_run',
-        'test_wire', 'test_without_rosbags', 'test_write')
-
-
 def pytest_collection_modifyitems(items):
-    """Mark what takes long (slow), runs a node (live), needs the recordings (data); long first."""
+    """Mark what is in live/ (live) and what needs the recordings (data); put slow tests first."""
     for item in items:
-        marks = {'slow': item.path.stem in SLOW, 'live': item.path.parent.name == 'live',
-                 'data': 'data_dir' in item.fixturenames}
+        marks = {'live': item.path.parent.name == 'live', 'data': 'data_dir' in item.fixturenames}
         for mark in (name for name, there in marks.items() if there):
             item.add_marker(mark)
     # else a worker ends with a long file while another has nothing left to do

@@ -15,6 +15,7 @@ import shutil
 
 import pytest
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
 CODE = [str(ROOT / name) for name in ('odocal_ros', 'examples', 'launch', 'tools', 'setup.py')]
 

@@ -20,6 +20,8 @@ from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.glitches import about_clumps
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def made():

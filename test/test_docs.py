@@ -26,6 +26,8 @@ from odocal_ros.output.budget_table import source_label
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config_file import read_config_file
 
+pytestmark = pytest.mark.slow
+
 # what begins otherwise than with odocal or ros2, and what runs it instead of this file
 ELSEWHERE = {
     './tools/try-it': 'installs for a minute: run by hand and by the README of a release',

@@ -20,6 +20,8 @@ from odocal_ros.pipeline import methods as leg_methods
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def made():

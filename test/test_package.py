@@ -25,6 +25,7 @@ import yaml
 
 import odocal_ros
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
 PARTS = ('package.xml', 'setup.py', 'setup.cfg', 'pyproject.toml', 'README.md', 'LICENSE',
          'resource', 'config', 'launch', 'odocal_ros')

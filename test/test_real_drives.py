@@ -19,6 +19,8 @@ from odocal_ros.bagio.encode import counter, fix, imu, twist
 from odocal_ros.bagio.write import write_bag
 from tools import real_drives
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def data(tmp_path, monkeypatch):

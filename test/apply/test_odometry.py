@@ -27,6 +27,7 @@ from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0, 'duration': 120.0}   # replay keeps each epoch
 KINDS = {'counts': {}, 'speed': {'odometer': 'speed'}, 'angle': {'odometer': 'angle'}}
 

@@ -19,6 +19,7 @@ from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import with_settings
 
+pytestmark = pytest.mark.slow
 STREAMS = 6       # of any number: benchmarks/stream_faults.py
 SECOND = 10**9
 

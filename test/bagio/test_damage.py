@@ -26,6 +26,7 @@ from odocal_ros.messages.decode import make_reader
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 
+pytestmark = pytest.mark.slow
 SLOTS = {'/imu/data': 'imu', '/odometer': 'odometer', '/fix': 'fix'}
 
 

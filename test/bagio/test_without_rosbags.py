@@ -18,6 +18,7 @@ import pytest
 from odocal_ros.bagio.encode import counter, fix, imu
 from odocal_ros.bagio.write import write_bag
 
+pytestmark = pytest.mark.slow
 PROGRAM = ("import sys; sys.modules['rosbags'] = None\n"
            'from odocal_ros.offline.cli import main\n'
            'sys.exit(main(sys.argv[1:]))')

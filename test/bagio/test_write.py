@@ -20,6 +20,7 @@ from odocal_ros.data.samples import HeadingSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 SHORT = {'scenario': 'town', 'duration': 140.0, 'imu_rate': 50.0}
 
 

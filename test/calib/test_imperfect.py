@@ -26,6 +26,7 @@ from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
 from odocal_ros.sim.truth import settings
 
+pytestmark = pytest.mark.slow
 GRADE = 3e-3
 TOWN = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'sway': 0.05}
 

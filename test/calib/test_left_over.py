@@ -25,6 +25,7 @@ from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.smoother import best_fit
 
+pytestmark = pytest.mark.slow
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
 

@@ -28,6 +28,7 @@ from odocal_ros.pipeline.slow_slip import held
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import with_settings
 
+pytestmark = pytest.mark.slow
 NAMES = ('k', 'z0', 'z1', 'z2', 'z3')
 LEGS, STATES, ROWS = 5, 80, 130
 TRUTH = np.array([0.1, 0.3, -0.2, 0.05, 0.4])

@@ -35,6 +35,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import GRADES
 
+pytestmark = pytest.mark.slow
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # what a drive is planned with
 WHITE = {'gnss.correlation_time': 0.0}

@@ -31,6 +31,7 @@ from odocal_ros.settings.config import with_settings
 from odocal_ros.settings.levels import REMARK_SIGMAS
 from odocal_ros.sim.real import Real
 
+pytestmark = pytest.mark.slow
 STEPS = np.array([0.02, 0.0, 0.05, 0.01])
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
 ACCEL = (3e-3, 0.0, 0.0, 0.0, -2e-3, 0.0, 0.0, 0.0, 0.0)      # scale errors of x and y

@@ -17,6 +17,7 @@ from odocal_ros.calib.smoother import smooth
 from odocal_ros.calib.smoother.noise import REST_NOISE, rest_noise
 from odocal_ros.calib.smoother.travel_error import once_a_rest
 
+pytestmark = pytest.mark.slow
 SWAY = {'sway': 0.05, 'odometer': 'speed', 'odometer_rate': 10.0, 'speed_noise': 0.05}
 
 

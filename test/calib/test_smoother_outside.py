@@ -28,6 +28,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import with_settings
 
+pytestmark = pytest.mark.slow
 ARMS = {'antenna_lever_arm': (0.5, -0.3, 1.2)}
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'} | ARMS
 STRAIGHT = {'scenario': 'straight', 'duration': 300.0, 'imu_grade': 'industrial'}

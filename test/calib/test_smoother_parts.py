@@ -52,6 +52,7 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.odometer import Travel
 
+pytestmark = pytest.mark.slow
 N = WITH_SLOW
 # relative errors that are left out of derivatives. Motion: Earth rate times a second, 7e-5 rad,
 # and half the attitude residual, 2e-4. Instants: what a turn of 1e-3 rad leaves of second order

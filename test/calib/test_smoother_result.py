@@ -32,6 +32,7 @@ from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
 from odocal_ros.settings.grades import GRADES, turn_on_bias
 
+pytestmark = pytest.mark.slow
 smoother = import_module('odocal_ros.calib.smoother.smoother')
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 

@@ -24,6 +24,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.sim import routes
 from odocal_ros.sim.profile import hold, ramp
 
+pytestmark = pytest.mark.slow
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
 

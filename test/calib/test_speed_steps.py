@@ -22,6 +22,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 KMH = 1 / 3.6
 SEED = 31
 

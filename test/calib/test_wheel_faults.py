@@ -29,6 +29,7 @@ from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.screen import screen
 from odocal_ros.screening.wheel_faults import broken_wheels
 
+pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
 COUNT = 0.0213      # m
 

@@ -37,6 +37,8 @@ from odocal_ros.fleet.jobs import computed_rows
 from odocal_ros.fleet.rows import DONE, FAILED, rows_of
 from odocal_ros.offline.cli import main
 
+pytestmark = pytest.mark.slow
+
 
 def stored(output):
     """Return all rows in an output folder, by bag, but for how long each took."""

@@ -20,6 +20,7 @@ from odocal_ros.fleet.kpi import FEWEST, kpi
 from odocal_ros.fleet.tables import VALUES
 from odocal_ros.offline.cli import main
 
+pytestmark = pytest.mark.slow
 LIMITS = {'scale_ratio': (0.99, 1.01)}
 NONE = {f'{name}{part}': None for name in VALUES for part in ('', '_sigma')}
 

@@ -37,6 +37,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 SECOND = 1_000_000_000
 HEADING = 0.003         # rad
 

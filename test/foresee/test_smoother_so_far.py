@@ -37,6 +37,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 SECOND = 1_000_000_000
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 LOOKS = (30.0, 47.0, 60.0, 95.0, 108.0, 165.0, 172.0, 240.0)    # s after the start mark

@@ -29,6 +29,7 @@ from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.sqlite_file import SqliteFile
 from odocal_ros.errors import OdocalError
 
+pytestmark = pytest.mark.slow
 MUTATED = 60       # bags in each run
 
 

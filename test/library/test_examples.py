@@ -26,6 +26,7 @@ from rosbags.typesys import get_typestore, Stores
 from odocal_ros.bagio import encode
 from odocal_ros.bagio.write import write_bag
 
+pytestmark = pytest.mark.slow
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 NUMBER = r'([\d.]+)'
 

@@ -31,6 +31,8 @@ from odocal_ros.offline.cli import main
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.motion import attitude
 
+pytestmark = pytest.mark.slow
+
 
 def without_time(content):
     return {key: value for key, value in content.items() if key != 'created'}

@@ -25,6 +25,7 @@ from odocal_ros.bagio import encode
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 SPEED = 30.0
 NAMES = {'imu': '/front/imu', 'fix': '/gps/fix'}
 

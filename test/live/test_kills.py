@@ -13,6 +13,8 @@ from kills import drive, killed_at_files, wrong
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def driven(domain):

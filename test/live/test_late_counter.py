@@ -23,6 +23,7 @@ import pytest
 from odocal_ros.bagio import encode
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 FIRST_S, START_S, SLIP_S, LAST_S = 12.0, 18.0, 36.0, 54.0     # of the drive, in real time
 SLIP_M, SLIP_LASTS_S = 0.5, 0.5
 HELD_EVERY_S, HELD_S = 7.0, 0.12

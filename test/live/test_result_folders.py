@@ -17,6 +17,7 @@ from kills import drive, LAST_S, START_S, whole_content
 from player import part, Player
 import pytest
 
+pytestmark = pytest.mark.slow
 SCALE, SPEED = 1.02, 30.0
 QUICK = ('-p', 'method:=two_point')     # the files are the same
 OBEY = (f'import sys; sys.path.insert(0, {str(Path(__file__).resolve().parents[1])!r})\n'

@@ -19,6 +19,8 @@ import pytest
 
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
+
 # a report that takes as long as that of a long leg on a busy machine
 SLOW = ('import odocal_ros.output.files as f\n'
         'draw = f.report_or_why\n'

@@ -13,6 +13,7 @@ from kills import drive
 import pytest
 from wire import Wire
 
+pytestmark = pytest.mark.slow
 CLEAN, FEW, HALF = 2, 3, 5      # seeds: how much of a round is hostile
 
 

@@ -26,6 +26,7 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.cli import main
 
+pytestmark = pytest.mark.slow
 K = 0.02                   # m per pulse
 RATE = 25                  # Hz, IMU
 G = 9.81

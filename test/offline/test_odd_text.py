@@ -22,6 +22,7 @@ from odocal_ros.library.legs import parse_leg
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config_file import parse_set
 
+pytestmark = pytest.mark.slow
 ODD = [None, True, -1, 0, 10**400, 2**63, float('inf'), float('nan'), '', 'text', '\0', [], [[]],
        {}, {'a': 1}, [None], -1e308, '1' * 5000, {'nanoseconds': []}, b'\xff']
 HEAD = '/**:\n  ros__parameters:\n    '

@@ -20,6 +20,8 @@ from odocal_ros.paper.drive import errors_of, PaperDrive, SOURCES
 from odocal_ros.paper.tables import compute
 from odocal_ros.settings.config import with_settings
 
+pytestmark = pytest.mark.slow
+
 # method.md 1.4: table 1 by the corrected equations, rounded or cut
 FIGURES_1 = {
     ('dL', 'phi_U'): (-2.195e-6, 1e-9), ('dlam', 'phi_U'): (2.865e-6, 1e-9),

@@ -28,6 +28,7 @@ from odocal_ros.planning.smoother import predict_smoother
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
 
+pytestmark = pytest.mark.slow
 PAPER = ['plan', '--scenario', 'paper', '--imu-grade', 'navigation']
 TWO_POINT = ['--set', 'method=two_point']
 STRAIGHT = ['--distance', '1000', '--speed', '15', '--imu-grade', 'industrial']

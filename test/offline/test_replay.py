@@ -32,6 +32,7 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.config_file import parse_set
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 LOW = {'imu_rate': 50.0, 'odometer_rate': 20.0}
 QUICK = ('--method', 'two_point')      # where the door is looked at, not what is found
 

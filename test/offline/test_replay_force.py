@@ -23,6 +23,8 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):

@@ -19,6 +19,7 @@ from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.offline.cli import main
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 DAY_NS = 86_400 * 10**9
 SHORT = {'scenario': 'straight', 'duration': 220.0, 'imu_rate': 50.0, 'odometer_rate': 20.0}
 

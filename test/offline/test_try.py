@@ -24,6 +24,8 @@ from odocal_ros.bagio.write import write_bag
 from odocal_ros.offline import replay, try_bag
 from odocal_ros.offline.cli import main
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def bag(tmp_path, monkeypatch):

@@ -12,12 +12,14 @@
 import json
 
 import numpy as np
+import pytest
 import ros_bags
 from ros_bags import T0
 import ros_messages as make
 
 from odocal_ros.offline.cli import main
 
+pytestmark = pytest.mark.slow
 RATE, WIDTH = 20, 1.6
 
 

@@ -33,6 +33,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 
 

@@ -21,6 +21,7 @@ from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.pipeline.parts import calibrate_parts, parts_of
 from odocal_ros.reasons import Code, Verdict
 
+pytestmark = pytest.mark.slow
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 GAP = (200.0, 203.0)
 

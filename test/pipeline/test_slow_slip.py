@@ -19,6 +19,7 @@ from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 
+pytestmark = pytest.mark.slow
 ROUTE = {'scenario': 'straight', 'duration': 400.0, 'two_wheels': True, 'seed': 3}
 SLIP_M = 20.0
 WHEELS = ('scale_factor_left', 'scale_factor_right')

@@ -21,6 +21,7 @@ from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.pipeline.smoother_run import _late_path
 from odocal_ros.reasons import Code, Verdict
 
+pytestmark = pytest.mark.slow
 SIGMAS = 4.0     # 1 in 16 000 of a normal error; the seed is fixed
 ASKED = {'method': 'smoother', 'heading_sigma': None}      # no heading from outside
 

@@ -25,6 +25,7 @@ from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim.sensors import wheel_scales
 
+pytestmark = pytest.mark.slow
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'imu_grade': 'industrial'}
 SIGMAS = 4.0     # 1 in 16 000 of a normal error; seeds are fixed
 WHEELS = ('scale_factor', 'scale_factor_left', 'scale_factor_right')

@@ -30,6 +30,7 @@ from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions, simulate
 from odocal_ros.sim.truth import settings
 
+pytestmark = pytest.mark.slow
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 HEADING = math.radians(0.06)
 DEG = math.degrees(1.0)

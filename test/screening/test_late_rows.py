@@ -22,6 +22,7 @@ from odocal_ros.screening import late_rows
 from odocal_ros.screening.late_rows import LEAST_JITTER, ROUNDING_COUNTS
 from odocal_ros.screening.screen import screen
 
+pytestmark = pytest.mark.slow
 SLIP_M, SLIP_S = 0.5, 200.0
 
 

@@ -22,6 +22,8 @@ from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.reversing import doubled, reversed_starts
 from odocal_ros.screening.screen import screen
 
+pytestmark = pytest.mark.slow
+
 # m/s and s at that speed: 3 m, 10 m and 72 m backwards
 ROUTES = {'3 m': there_and_back(0.8, 0.0), '10 m': there_and_back(1.5, 3.0),
           '72 m': there_and_back(3.0, 20.0), 'three point turn': three_point_turn}

@@ -20,6 +20,8 @@ from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
 from odocal_ros.sim.truth import settings
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_clean_vehicle_has_nothing_real_and_an_operator_who_knows_it():
     options, there = drawn(7, 'town', 'industrial', ())
