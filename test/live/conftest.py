@@ -7,14 +7,11 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Fixtures of the node's tests: a ROS domain of their own, nodes and clients that end."""
+"""Fixtures of the node's tests: nodes and clients that end."""
 
 from importlib.util import find_spec
-import os
 from pathlib import Path
-import random
 import re
-import socket
 
 from bench import Client, NodeProcess
 import pytest
@@ -33,26 +30,8 @@ def pytest_report_header():
                                   'install odocal_ros[ros]')
 
 
-@pytest.fixture(scope='session')
-def domain():
-    """Take a ROS domain that no other test run on this machine has, for the whole session."""
-    for _ in range(200):
-        number = random.randint(1, 100)
-        lock = socket.socket()
-        try:
-            lock.bind(('127.0.0.1', 21000 + number))
-        except OSError:
-            lock.close()
-            continue
-        break
-    os.environ['ROS_DOMAIN_ID'] = str(number)
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    yield number
-    lock.close()
-
-
 @pytest.fixture
-def start(domain, tmp_path):
+def start(tmp_path):
     """Return a function that starts the node as a process; all end with the test."""
     started = []
 
@@ -66,7 +45,7 @@ def start(domain, tmp_path):
 
 
 @pytest.fixture
-def connect(domain):
+def connect():
     """Return a function that connects a client; all end with the test."""
     connected = []
 

@@ -53,7 +53,7 @@ def drive():
 
 
 @pytest.fixture(scope='module')
-def seen(drive, tmp_path_factory, domain):
+def seen(drive, tmp_path_factory):
     """Run the node twice, and keep what it said."""
     found = SimpleNamespace(folder=tmp_path_factory.mktemp('results'))
     for run in (_first, _a_day_later):

@@ -28,7 +28,7 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 
 
 @pytest.fixture
-def embedded(domain, tmp_path):
+def embedded(tmp_path):
     """Spin the node and a stranger in one executor of a context of our own."""
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor

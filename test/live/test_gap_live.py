@@ -26,7 +26,7 @@ GAP = (100.0, 103.0)       # s of the drive
 
 
 @pytest.fixture(scope='module')
-def seen(tmp_path_factory, domain):
+def seen(tmp_path_factory):
     """Drive a leg with such a gap through a node, and keep what it said."""
     drive = simulate(SimOptions(
         scenario='town', duration=240.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',

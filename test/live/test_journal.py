@@ -39,7 +39,7 @@ def same(live, offline, journal):
 
 
 @pytest.fixture(scope='module')
-def session(domain, tmp_path_factory):
+def session(tmp_path_factory):
     """Drive three legs through one node: kept, cancelled, undone."""
     simulated = simulate(SimOptions(
         scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
@@ -137,7 +137,7 @@ def test_dropped_legs_are_not_replayed(session):
 
 
 @pytest.mark.parametrize('moment_s', [0.3, 1.3, 2.6])
-def test_a_killed_leg_is_replayed_from_its_mark(domain, tmp_path, moment_s):
+def test_a_killed_leg_is_replayed_from_its_mark(tmp_path, moment_s):
     left = killed(drive(), moment_s, tmp_path)
     assert left.marks == [(left.start_ns, 0)]
     # a second by design, of what the node had heard: how late that was is the machine's load

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope='module')
-def driven(domain):
+def driven():
     return drive()
 
 

@@ -82,7 +82,7 @@ def play(player, sent, begin_ns, first_s, last_s):
             player.publishers[one.slot].publish(one.raw)
 
 
-def test_lateness_is_no_slip_and_slip_is_found(domain, tmp_path):
+def test_lateness_is_no_slip_and_slip_is_found(tmp_path):
     drive = simulate(SimOptions(
         scenario='town', duration=135.0, imu_rate=50.0, odometer_rate=50.0, fix_noise='rtk',
         imu_grade='industrial', seed=8))

@@ -13,6 +13,7 @@ import math
 import os
 import signal
 import subprocess
+import sys
 import time
 
 from bench import answer_of, NODE, NodeProcess, PATIENCE, ROOT, wait_for
@@ -67,7 +68,7 @@ def test_a_signal_before_anything_ran_is_clean_too(start, connect):
     (['--help', '--ros-args', '-p', 'imu.grade:=tactical'], 0, 'config/calibrator.yaml'),
     (['--version'], 0, f'odocal_ros {__version__}\n'),
     (['--config', 'x.yaml'], 1, 'calibrator: --config is unknown: settings are ROS')])
-def test_help_is_shown_and_what_is_no_ros_argument_is_refused(domain, arguments, code, words):
+def test_help_is_shown_and_what_is_no_ros_argument_is_refused(arguments, code, words):
     ended = subprocess.run([*NODE, *arguments], capture_output=True, text=True, timeout=PATIENCE,
                            env=os.environ | {'PYTHONPATH': str(ROOT)}, check=False)
     assert ended.returncode == code
@@ -75,7 +76,7 @@ def test_help_is_shown_and_what_is_no_ros_argument_is_refused(domain, arguments,
     assert bool(ended.stdout) == (code == 0)
 
 
-@pytest.mark.parametrize(('override', 'words'), [
+BAD_OVERRIDES = [
     ('leg.min_distance:=3', "'3' of type 'INTEGER', expecting type 'DOUBLE'; write it as a decim"),
     ('leg.min_distance:=0.5', 'leg.min_distance out of range'),
     ('gnss.min_status:=9', 'gnss.min_status out of range'),
@@ -100,14 +101,26 @@ def test_help_is_shown_and_what_is_no_ros_argument_is_refused(domain, arguments,
     ('qos_overrides./odometer.subscription.reliability:=often', 'qos_overrides'),
     ('qos_overrides./imu/data.subscription.depth:=x', "'x' is not a whole number"),
     ('leg.min_distance', "Couldn't parse parameter override rule"),
-])
-def test_a_bad_override_is_one_line_and_exit_1(domain, override, words):
-    node = NodeProcess('-p', override)
+]
+# one process for all: most of a start is the import
+EACH = ('import sys\nfrom odocal_ros.live.node import main\nfor override in sys.argv[1:]:\n'
+        '    sys.stderr.write(f"{main([\'\', \'--ros-args\', \'-p\', override])}\\n")')
+
+
+def test_a_bad_override_is_one_line_and_exit_1():
+    overrides = [override for override, _ in BAD_OVERRIDES]
+    said = subprocess.run([sys.executable, '-c', EACH, *overrides], capture_output=True, text=True,
+                          timeout=PATIENCE, env=os.environ | {'PYTHONPATH': str(ROOT)}, check=True)
+    lines = said.stderr.splitlines()
+    assert lines[1::2] == ['1'] * len(overrides), said.stderr
+    assert not said.stdout
+    for (override, words), line in zip(BAD_OVERRIDES, lines[::2], strict=True):
+        assert line.startswith('calibrator: '), override
+        assert words in line, override
+        assert 'internal' not in line, override
+    node = NodeProcess('-p', overrides[0])
     assert node.wait() == 1
-    line, = node.lines
-    assert line.startswith('calibrator: ')
-    assert words in line
-    assert 'internal' not in line
+    assert node.lines == lines[:1]
 
 
 def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
@@ -397,7 +410,7 @@ def test_1_khz_arrives_whole_and_services_answer_meanwhile(start, connect):
         assert health['dropped'] == '0'
 
 
-def test_each_node_has_a_folder_of_its_own_in_the_ros_home(domain, tmp_path, monkeypatch):
+def test_each_node_has_a_folder_of_its_own_in_the_ros_home(tmp_path, monkeypatch):
     from odocal_ros.live.result_files import output_root
     from odocal_ros.settings.config import Config, with_settings
     monkeypatch.setenv('ROS_HOME', str(tmp_path))

@@ -12,7 +12,7 @@
 from bench import NodeProcess, wait_for
 
 
-def test_two_nodes_of_one_name_say_so(domain, tmp_path):
+def test_two_nodes_of_one_name_say_so(tmp_path):
     nodes = [NodeProcess('-p', f'output.directory:={tmp_path / name}') for name in 'ab']
     try:
         for node in nodes:

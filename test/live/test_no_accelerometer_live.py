@@ -36,7 +36,7 @@ def drive():
 
 
 @pytest.fixture(scope='module')
-def session(drive, domain, tmp_path_factory):
+def session(drive, tmp_path_factory):
     """Drive one leg; keep what the node said."""
     node = NodeProcess('-p', f'output.directory:={tmp_path_factory.mktemp("out")}')
     client, seen = Client(), SimpleNamespace()

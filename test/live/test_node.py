@@ -57,7 +57,7 @@ def drive():
 
 
 @pytest.fixture(scope='module')
-def session(drive, tmp_path_factory, domain):
+def session(drive, tmp_path_factory):
     """Drive two legs through one node and keep everything it said; the tests then look."""
     folder = tmp_path_factory.mktemp('results')
     settings = [x for name, value in SETTINGS.items() for x in ('-p', f'{name}:={value}')]

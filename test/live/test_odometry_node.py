@@ -70,7 +70,7 @@ def given(replayed):
 
 
 @pytest.fixture(scope='module')
-def received(drive, replayed, domain):
+def received(drive, replayed):
     """Play the drive to a node with that calibration; keep what it publishes."""
     from geometry_msgs.msg import TwistWithCovarianceStamped
     from nav_msgs.msg import Odometry
@@ -130,7 +130,7 @@ def test_messages_are_what_robot_localization_takes(received):
         np.testing.assert_allclose(matrix, matrix.T, atol=1e-12 * np.trace(matrix))
 
 
-def test_without_a_calibration_it_says_what_to_give(domain, tmp_path):
+def test_without_a_calibration_it_says_what_to_give(tmp_path):
     rejected = tmp_path / 'rejected.yaml'
     rejected.write_text('/**: {ros__parameters: {result: {scale_factor: 0.02, valid: false}}}')
     for more, why in (((), 'no calibration is given'),
@@ -155,7 +155,7 @@ def test_the_launch_file_starts_it_with_both_files():
     assert node.remappings['imu/data'] == '/a/imu'
 
 
-def test_the_node_takes_its_own_settings_file_and_is_what_the_policy_allows(replayed, domain):
+def test_the_node_takes_its_own_settings_file_and_is_what_the_policy_allows(replayed):
     policy = ElementTree.parse(ROOT / 'config' / 'sros2_policy.xml').getroot()
     profile, = policy.findall('enclaves/enclave[@path="/odometry"]/profiles/profile')
     allowed = {kind: {one.text for group in profile.findall(f'*[@{kind}="ALLOW"]')

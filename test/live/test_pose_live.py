@@ -33,7 +33,7 @@ def drive():
 
 
 @pytest.fixture(scope='module')
-def session(drive, domain, tmp_path_factory):
+def session(drive, tmp_path_factory):
     """Drive one leg; keep what the node said and wrote."""
     topics = {'imu': encode.imu('imu/data', drive.imu),
               'odometer': encode.twist('odometer', drive.odometer),

@@ -51,7 +51,7 @@ jobs.compute = held
 
 
 @pytest.fixture(scope='module')
-def seen(domain, tmp_path_factory):
+def seen(tmp_path_factory):
     """Drive two legs, the second too short for a running estimate; keep what the node said."""
     folder = tmp_path_factory.mktemp('out')
     gate = folder / 'go on'

@@ -25,7 +25,7 @@ OBEY = (f'import sys; sys.path.insert(0, {str(Path(__file__).resolve().parents[1
 
 
 @pytest.fixture(scope='module')
-def driven(domain):
+def driven():
     return drive()
 
 

@@ -40,7 +40,7 @@ def of(*start):
 
 
 @pytest.fixture(scope='module')
-def driven(domain, tmp_path_factory):
+def driven(tmp_path_factory):
     """Start the node as the README does and drive a leg with the services as written there."""
     run = next(words for words in of('run') if words[1] == 'calibrator')     # the README's
     ros_args = run[run.index('--ros-args') + 1:]

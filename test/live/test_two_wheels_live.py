@@ -33,7 +33,7 @@ def drive():
 
 
 @pytest.fixture(scope='module')
-def session(drive, domain, tmp_path_factory):
+def session(drive, tmp_path_factory):
     """Drive one leg; keep what the node said."""
     folder = tmp_path_factory.mktemp('two')
     # no setting says which joints are the wheels: their names do

@@ -98,7 +98,7 @@ def test_the_bars_are_shares_of_what_is_asked():
     assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {}
 
 
-def test_what_anybody_publishes_does_not_reach_the_terminal(domain):
+def test_what_anybody_publishes_does_not_reach_the_terminal():
     from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
     from std_msgs.msg import String
 

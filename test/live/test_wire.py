@@ -18,7 +18,7 @@ CLEAN, FEW, HALF = 2, 3, 5      # seeds: how much of a round is hostile
 
 
 @pytest.fixture(scope='module')
-def wire(domain, tmp_path_factory):
+def wire(tmp_path_factory):
     one = Wire(drive(), tmp_path_factory.mktemp('wire'), 15.0)
     yield one
     one.close()
