@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 import faulthandler
+from functools import cache
+from importlib import import_module
 import json
 import os
 from pathlib import Path
@@ -21,6 +23,8 @@ import signal
 import threading
 import time
 from typing import Any
+
+import numpy as np
 
 from odocal_ros.errors import OdocalError
 from odocal_ros.fleet.bags import at_hand, FleetBag, seen_as
@@ -79,6 +83,7 @@ def calibrate_bag(job: BagJob) -> Done:
     """Have the row of a bag in the data set, computed if it is not there."""
     store, began = RowStore(job.folder), time.monotonic()
     seen = ''
+    _load_libraries()
     with _bounded(job, lambda why: store.put(job.failed(why, seen=seen))):
         try:
             seen = seen_as(job.bag.bag, job.settings)
@@ -99,6 +104,20 @@ def calibrate_bag(job: BagJob) -> Done:
     row = job.failed(why, seen=seen, seconds=time.monotonic() - began)
     store.put(row)
     return Done(row.key, FAILED, row.reason, row.seconds, True)
+
+
+@cache
+def _load_libraries() -> None:
+    """
+    Load the libraries of a calibration before its memory is limited.
+
+    OpenBLAS maps a buffer when it is loaded or first used, and tries for ever if that is refused.
+    """
+    for name in ('odocal_ros.calib.smoother', 'odocal_ros.library.calibrate_bag'):
+        import_module(name)
+    from scipy.linalg import cho_factor
+    matrix = np.eye(128)        # larger than what OpenBLAS multiplies without a buffer
+    cho_factor(matrix @ matrix)
 
 
 def _known(store: RowStore, job: BagJob, seen: str) -> Row | None:

@@ -228,11 +228,21 @@ def kill_at(client, job):
 
 def test_a_bag_that_needs_more_memory_than_it_may_is_a_row_that_says_so(fleet, client, tmp_path):
     bag = find_bags([fleet.manifest], None)[0]
-    jobs = fleet.jobs(tmp_path, '--method', 'smoother', bags=[bag], memory=2**23)
+    jobs = fleet.jobs(tmp_path, '--method', 'smoother', bags=[bag], memory=2**23, seconds=60.0)
     assert computed(client, jobs) == (1, [FAILED])
     assert 'exceeds the memory limit --task-memory' in stored(tmp_path)[bag.bag].reason
     # the worker lives, and has its memory back
     assert computed(client, fleet.jobs(tmp_path / 'b', bags=[bag])) == (1, [DONE])
+
+
+def test_libraries_are_loaded_before_memory_is_limited():
+    """OpenBLAS that is loaded with 8 to 64 MB left tries for ever to map its buffer."""
+    code = ('import resource\nimport numpy as np\nfrom odocal_ros.fleet import bag_task\n'
+            'bag_task._load_libraries()\nmost = bag_task._data_bytes() + 2**24\n'
+            'resource.setrlimit(resource.RLIMIT_DATA, (most, -1))\n'
+            'from odocal_ros.calib import smoother\nfrom scipy.linalg import cho_factor\n'
+            'cho_factor(np.eye(128) @ np.eye(128))')
+    assert subprocess.run([sys.executable, '-c', code], timeout=60.0).returncode == 0
 
 
 def test_the_scheduler_is_given_some_tasks_at_a_time(client):
