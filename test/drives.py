@@ -10,7 +10,8 @@
 """Simulated drives for tests: made once, changed by copies; settings that fit them."""
 
 from dataclasses import fields, replace
-from functools import cache
+from functools import wraps
+import inspect
 
 import numpy as np
 
@@ -18,13 +19,34 @@ from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
+from odocal_ros.sim.truth import settings as told
 
 LOW_RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0}
 STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'imu_grade': 'tactical', 'seed': 5}
 TOWN = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'industrial', 'seed': 4}
 
 
-@cache
+def cached(function):
+    """
+    Return a function that computes once for equal arguments, however they are written.
+
+    To functools.cache, a default that is written out, or another order, is another argument.
+    """
+    known, signature = {}, inspect.signature(function)
+
+    @wraps(function)
+    def once(*args, **options):
+        bound = signature.bind(*args, **options)
+        bound.apply_defaults()
+        key = repr([(name, sorted(value.items()) if isinstance(value, dict) else value)
+                    for name, value in bound.arguments.items()])
+        if key not in known:
+            known[key] = function(*args, **options)
+        return known[key]
+    return once
+
+
+@cached
 def drive(**options):
     """Return a drive at low rates; equal options give the same one."""
     return simulate(SimOptions(**(LOW_RATES | options)))
@@ -50,6 +72,13 @@ def settings(made, heading_sigma=1e-3, **changes):
         known |= {'alignment.heading': float(made.truth.heading),
                   'alignment.heading_sigma': heading_sigma}
     return with_settings(Config(), known | {k.replace('__', '.'): v for k, v in changes.items()})
+
+
+def configured(made):
+    """Return the settings that the operator of a drawn vehicle has."""
+    return with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
+                                    for group, keys in told(made).items()
+                                    for key, v in keys.items()})
 
 
 def changed(samples, **columns):

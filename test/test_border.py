@@ -20,6 +20,7 @@ import pytest
 import odocal_ros
 from odocal_ros.offline.cli import COMMANDS
 
+pytestmark = pytest.mark.core
 PACKAGE = Path(odocal_ros.__file__).parent
 HEAVY = ('rclpy', 'rosbags', 'yaml', 'matplotlib', 'scipy', 'pyproj', 'tqdm')
 ROS = {'rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs',
@@ -168,3 +169,10 @@ def test_the_pure_parts_ask_no_clock_and_open_nothing():
         assert not called & {'print', 'open', 'input'}, path
         outside = {name.split('.')[0] for name in _imports(path)}
         assert not outside & {'time', 'datetime', 'logging', 'random', 'os', 'pathlib'}, path
+
+
+def test_each_package_has_a_core_test():
+    """A file that has the mark imports it."""
+    marked = [path for path in Path(__file__).parent.rglob('test_*.py')
+              if 'pytest.mark.core' in path.read_text(encoding='utf-8')]
+    assert set(ROOMS) - set().union(*map(_own_parts, marked)) == set()

@@ -62,6 +62,7 @@ def two_wheels():
                                fix_noise='rtk', imu_grade='tactical', **RATES))
 
 
+@pytest.mark.core
 def test_of_two_wheels_each_has_its_own_factor(two_wheels):
     made = two_wheels
     row = int(np.searchsorted(made.imu.stamp_ns, made.truth.start_ns)) - 5
@@ -235,6 +236,7 @@ def test_the_last_of_the_braking_is_no_tilt():
     assert np.abs(pitch).max() < 0.03
 
 
+@pytest.mark.core
 def test_speeds_that_are_multiplied_as_sent_have_their_own_factor():
     exact = {'scale_factor': Estimate(0.987, 3e-4, '1')}
     assert vehicle_of(exact, ApplyConfig()).scale == 0.987

@@ -31,6 +31,7 @@ from odocal_ros.messages.decode import make_reader
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 SLOTS = {'/imu/data': 'imu', '/odometer': 'odometer', '/fix': 'fix'}
 KINDS = [('mcap', 'none'), ('mcap', 'storage'), ('mcap', 'file'), ('mcap', 'message'),
          ('sqlite3', 'none'), ('sqlite3', 'file'), ('sqlite3', 'message')]

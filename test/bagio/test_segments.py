@@ -28,6 +28,7 @@ from odocal_ros.bagio.segments import SegmentedBag
 from odocal_ros.errors import BadBag
 from odocal_ros.outside.whole import PART
 
+pytestmark = pytest.mark.core
 T0 = ros_bags.T0
 CHANNELS = {
     1: Channel('/imu/data', 'sensor_msgs/msg/Imu'), 2: Channel('/odometer', 'std_msgs/msg/Int64')}

@@ -10,9 +10,8 @@
 """Simulated legs as the smoother sees them, and their truth at its keyframes."""
 
 from dataclasses import replace
-from functools import cache
 
-from drives import settings
+from drives import cached, settings
 import numpy as np
 
 from odocal_ros.calib.smoother import keyframe_times, smoother_leg
@@ -32,7 +31,7 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 VELOCITY_SIGMA = 0.05      # m/s
 
 
-@cache
+@cached
 def made(**options):
     """Return a drive, its settings and its leg for the smoother."""
     drive = simulate(SimOptions(**({'scenario': 'town', 'imu_rate': 50.0} | options)))

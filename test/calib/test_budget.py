@@ -23,6 +23,7 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import exp_so3, matrix_from_quat, matrix_from_rpy, quat_from_matrix
 from odocal_ros.nav.strapdown import attitude
 
+pytestmark = pytest.mark.core
 K, YAW, PITCH = 0.02, 0.05, -0.03
 F = K * forward_b(YAW, PITCH)
 EARTH = np.zeros(3)      # its turn is left out of the budget, which says so

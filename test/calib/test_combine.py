@@ -22,6 +22,7 @@ from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 CONFIG = Config()
 LEGS = count(1)
 SCALE, YAW, PITCH = PARAMETERS

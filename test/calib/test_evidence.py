@@ -25,6 +25,7 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 START_NS = 1_700_000_000_000_000_000
 END = 100.0                                  # s; 10 m/s, east for half of it, then north
 

@@ -29,6 +29,7 @@ from odocal_ros.screening.sanity import imu_sanity
 from odocal_ros.settings.config import Config, ImuConfig, with_settings
 from odocal_ros.settings.nominal import nominal_scale
 
+pytestmark = pytest.mark.core
 CONFIG = Config()
 
 

@@ -10,9 +10,8 @@
 """What the smoother leaves over: against the equations made anew, closed forms, drawn errors."""
 
 from dataclasses import replace
-from functools import cache
 
-from drives import changed
+from drives import cached, changed
 import numpy as np
 import pytest
 from smoother_legs import leg_of, made, truth
@@ -29,7 +28,7 @@ pytestmark = pytest.mark.slow
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
 
-@cache
+@cached
 def fitted(**options):
     """Return a drive, its leg, problem and fit."""
     drive, config, leg = made(**(SHORT | options))

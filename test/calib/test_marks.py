@@ -14,6 +14,7 @@ import pytest
 
 from odocal_ros.calib.marks import fix_at, mean_fix, standing_at
 
+pytestmark = pytest.mark.core
 STATED = np.diag([1.0, 1.0, 4.0])
 RUNS = 200
 

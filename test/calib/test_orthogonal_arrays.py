@@ -30,6 +30,7 @@ from odocal_ros.patent.arrays import (
 )
 from odocal_ros.patent.embodiment import FOUND, LEVELS, PRINTED
 
+pytestmark = pytest.mark.core
 PRIME_POWERS = [2, 3, 4, 5, 7, 8, 9, 11, 13, 16]
 
 

@@ -22,6 +22,8 @@ from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.rests import STILL_SPEED, STILL_TURN
 from odocal_ros.calib.smoother.state import BARE, E, IMPERFECT, M, SLOW, WITH_SLOW
 
+pytestmark = pytest.mark.core
+
 
 @pytest.mark.parametrize('correlation_time', [0.0, 40.0])
 def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):

@@ -14,6 +14,7 @@ import pytest
 
 from odocal_ros.calib.smoother.chain import Normal, NotPositive, solve
 
+pytestmark = pytest.mark.core
 N, SIZE, BORDER = 6, 4, 3
 TOTAL = N * SIZE + BORDER
 

@@ -10,9 +10,8 @@
 """Each wheel beside the mean of both: ratio and track width on simulated drives, and refusals."""
 
 from dataclasses import asdict, replace
-from functools import cache
 
-from drives import changed, drive, settings
+from drives import cached, changed, drive, settings
 import numpy as np
 import pytest
 
@@ -29,7 +28,7 @@ SIGMAS = 4.0        # 1 in 16 000 of a normal error; seeds are fixed
 SCALE = Estimate(0.02, 2e-6, 'm/pulse')
 
 
-@cache
+@cached
 def result_of(given=0.0, **options):
     """Return a drive and what the smoother says of it."""
     made = drive(**TOWN | options)

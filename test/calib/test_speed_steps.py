@@ -10,9 +10,8 @@
 """Coarse speeds and counters through the whole pipeline: covered, named, and no slip."""
 
 from dataclasses import replace
-from functools import cache
 
-from drives import settings
+from drives import cached, settings
 import numpy as np
 import pytest
 
@@ -27,7 +26,7 @@ KMH = 1 / 3.6
 SEED = 31
 
 
-@cache
+@cached
 def calibrated(how='floor', rate=10.0, step=KMH, between=0.0, **options):
     """Return a drive and what is made of it; between: Hz to which the speeds are interpolated."""
     drive = simulate(SimOptions(**({
@@ -55,7 +54,7 @@ def codes(result):
 
 
 @pytest.mark.parametrize(('rate', 'between', 'most'), [
-    (10.0, 0.0, 1.5e-3), (5.0, 0.0, 2e-3), (1.0, 0.0, 4e-3), (1.0, 10.0, 5e-3)])
+    (10.0, 0.0, 1.5e-3), (1.0, 0.0, 4e-3), (1.0, 10.0, 5e-3)])
 @pytest.mark.parametrize('how', ['floor', 'round'])
 def test_the_scale_of_a_speed_in_whole_kmh_is_held_by_its_sigma(how, rate, between, most):
     drive, result = calibrated(how, rate, between=between)
@@ -83,11 +82,10 @@ def test_the_factor_as_sent_gives_the_path_length_of_the_sent_speeds(how):
     assert found.sigma < 2e-3
 
 
-@pytest.mark.parametrize('seed', [2, 3, 31])
-def test_a_slow_yard_told_once_a_second_is_held_by_its_sigma(seed):
+def test_a_slow_yard_told_once_a_second_is_held_by_its_sigma():
     # squat and turns give the way directions of its own, which tell nothing of the scale
-    drive, result = calibrated(scenario='yard', rate=1.0, duration=400.0, seed=seed,
-                               imu_grade='industrial', fix_noise='rtk', fix_sigma=0.02,
+    drive, result = calibrated(scenario='yard', rate=1.0, duration=400.0, imu_grade='industrial',
+                               fix_noise='rtk', fix_sigma=0.02,
                                real=Real(speed_step=KMH, squat=0.002, sideslip=0.004))
     off, sigma = error(drive, result.methods['smoother'])
     assert abs(off) < 3.3 * sigma
@@ -140,10 +138,9 @@ def test_what_a_robot_at_one_speed_rounds_is_in_its_sigma():
     assert (np.array(errors)**2).sum() < 18.5, errors
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3])
-def test_half_metre_pulses_are_named_and_no_slip(seed):
+def test_half_metre_pulses_are_named_and_no_slip():
     drive, result = calibrated(odometer='counts', rate=50.0, step=0.0, scale=0.505,
-                               nominal_scale=0.5, seed=seed)
+                               nominal_scale=0.5)
     seen = codes(result)
     assert Code.COUNTER_COARSE in seen
     assert Code.WHEEL_SLIP not in seen

@@ -28,6 +28,7 @@ from odocal_ros.data.samples import take
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
 
+pytestmark = pytest.mark.core
 CLEAN = {'imu_grade': 'perfect', 'fix_sigma': 0.0, 'odometer': 'angle', 'imu_rate': 100.0,
          'odometer_rate': 50.0}
 DEG = np.pi / 180

@@ -10,9 +10,8 @@
 """Wheels that fail one by one are named, with where; wheels that count are let be."""
 
 from dataclasses import replace
-from functools import cache
 
-from drives import changed, drive, seconds, settings
+from drives import cached, changed, drive, seconds, settings
 import numpy as np
 import pytest
 
@@ -34,7 +33,7 @@ TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
 COUNT = 0.0213      # m
 
 
-@cache
+@cached
 def prepared(**options):
     """Return the inputs of a drive, its track, latitude and rough scale."""
     made = drive(**options)

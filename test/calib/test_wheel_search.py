@@ -10,10 +10,9 @@
 """The wheels' search: many sets at once, criteria, response surface, least squares, embodiment."""
 
 from dataclasses import replace
-from functools import cache
 import json
 
-from drives import drive
+from drives import cached, drive
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -53,7 +52,7 @@ TRUE = np.array([0.99, 1.015, 0.03])       # of the drives on a plane
 RANGES = ranges_of(WheelsConfig())
 
 
-@cache
+@cached
 def simulated(heading_error=0.0, **options):
     """Return a simulated drive and its planar leg, heading given wrong by an angle from north."""
     made = drive(**options)

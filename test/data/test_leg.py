@@ -19,6 +19,7 @@ from odocal_ros.data.leg import LegRecorder, SLOTS
 from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples, take
 from odocal_ros.errors import BadData
 
+pytestmark = pytest.mark.core
 S = 10**9
 START, STOP = 20 * S, 40 * S
 

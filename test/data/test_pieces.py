@@ -15,6 +15,8 @@ import pytest
 from odocal_ros.data.pieces import across, lengths, median, medians, PIECE_ROWS
 from odocal_ros.nav.integral import integral_at, integrals_at, twice_integral_at
 
+pytestmark = pytest.mark.core
+
 
 def wild(*shape):
     """Return values of all sizes, some of them zero, NaN or infinite."""

@@ -15,6 +15,8 @@ import pytest
 from odocal_ros.data import samples as s
 from odocal_ros.errors import BadData
 
+pytestmark = pytest.mark.core
+
 
 def imu(n, first=0):
     row = np.arange(first, first + n)

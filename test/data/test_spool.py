@@ -23,6 +23,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.samples import ImuSamples, take
 
+pytestmark = pytest.mark.core
 ROW = 104      # bytes of an IMU row
 N = 20_000
 

@@ -22,6 +22,8 @@ from odocal_ros.fleet.bags import at_hand, find_bags, FleetBag, seen_as
 from odocal_ros.fleet.rows import key_of, Row, rows_of, RowStore
 from odocal_ros.fleet.second_stage import file_name
 
+pytestmark = pytest.mark.core
+
 
 def test_a_manifest_is_read_as_csv_and_as_parquet_alike(fleet, tmp_path):
     from pyarrow import csv, parquet

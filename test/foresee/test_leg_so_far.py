@@ -22,6 +22,8 @@ from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.screen import screen
 
+pytestmark = pytest.mark.core
+
 
 @pytest.fixture(scope='module')
 def made():

@@ -31,6 +31,7 @@ from odocal_ros.live.status import level
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 CONFIG = Config()
 GOOD, BAD = Prospect(1e-4, 1e-3, 0.0), Prospect(2e-3, 1e-3, 300.0)
 YAW, NO_YAW = Prospect(0.005, 0.0087, 0.0), Prospect(None, 0.0087, None, (), 'not told')

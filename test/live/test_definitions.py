@@ -18,6 +18,8 @@ pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]'
 from odocal_ros.errors import BadConfig
 from odocal_ros.live.definitions import message_class
 
+pytestmark = pytest.mark.core
+
 
 def test_a_type_is_imported():
     assert message_class('sensor_msgs/msg/Imu').__name__ == 'Imu'

@@ -18,6 +18,8 @@ import pytest
 from odocal_ros.live import result_folders as module
 from odocal_ros.live.result_folders import ResultFolders
 
+pytestmark = pytest.mark.core
+
 
 @pytest.fixture
 def make(tmp_path, monkeypatch):

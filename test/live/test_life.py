@@ -56,6 +56,7 @@ def test_signals_end_the_node_cleanly_even_in_a_leg(start, connect, sent, how):
     assert kept.endswith('_leg_1')
 
 
+@pytest.mark.core
 def test_a_signal_before_anything_ran_is_clean_too(start, connect):
     node = start()
     connect().until(state='waiting')

@@ -24,6 +24,7 @@ from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
+pytestmark = pytest.mark.core
 CONFIG = Config()
 
 

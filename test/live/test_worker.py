@@ -12,7 +12,11 @@
 import threading
 import time
 
+import pytest
+
 from odocal_ros.live.worker import Worker
+
+pytestmark = pytest.mark.core
 
 
 def test_jobs_given_before_the_end_are_done():

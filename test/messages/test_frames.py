@@ -27,6 +27,8 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
+
 
 def read(frames, pieces=(), wanted='', little_endian=True):
     """Return the rows by slot of messages of some frames, read in pieces; and the reader."""

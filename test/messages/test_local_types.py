@@ -24,6 +24,7 @@ from odocal_ros.nav.local_frame import FRAME_LONGITUDE, geodetic_of, LARGEST_FRA
 from odocal_ros.screening.fix_screen import covariances, placed
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 TENTH_MM = 1e-4
 
 

@@ -22,6 +22,7 @@ from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix
 from odocal_ros.settings.grades import GRADES
 
+pytestmark = pytest.mark.core
 LATITUDE, SECONDS, RATE = 0.7, 60.0, 5.0
 RPY = np.array([0.05, -0.08, 2.3])
 EXACT = replace(GRADES['navigation'], gyro_bias=1e-3)    # a sigma that rejects no measured bias

@@ -18,6 +18,7 @@ import pytest
 
 from odocal_ros.nav.angles import arctan2, heading_from_yaw, wrap, yaw_from_heading
 
+pytestmark = pytest.mark.core
 ANGLES = st.floats(-50.0, 50.0)
 
 

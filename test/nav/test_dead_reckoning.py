@@ -31,6 +31,7 @@ from odocal_ros.nav.rotations import (
     quat_multiply,
 )
 
+pytestmark = pytest.mark.core
 RADIUS = 20.0
 X = np.array([1.0, 0.0, 0.0])
 

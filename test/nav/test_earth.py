@@ -17,6 +17,8 @@ import pytest
 from odocal_ros.nav import earth
 from odocal_ros.nav.rotations import skew
 
+pytestmark = pytest.mark.core
+
 # Earth-fixed coordinates of 6.4e6 m have an ulp of 9.3e-10 m; three roundings on the way
 METRES = 3e-9
 LATITUDES_DEG = [-90, -89.9999999, -60, -1e-9, 0, 1e-7, 33, 45, 89, 89.9999999, 90]

@@ -18,6 +18,8 @@ from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.odometer import mean_travel, Travel, travel
 from odocal_ros.reasons import Code
 
+pytestmark = pytest.mark.core
+
 
 def counter(modulus):
     return OdometerForm('cumulative', modulus, 'm/pulse')

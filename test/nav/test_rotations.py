@@ -29,6 +29,7 @@ from odocal_ros.nav.rotations import (
     yaw_from_quat,
 )
 
+pytestmark = pytest.mark.core
 ROUND_OFF = 2e-15    # a dozen operations on numbers up to 2, an ulp of 2.2e-16 each
 AXIS = st.floats(-3.0, 3.0)
 VECTORS = st.tuples(AXIS, AXIS, AXIS).map(np.array)

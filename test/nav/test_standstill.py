@@ -19,6 +19,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import GRADES
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.core
 RATE = 100.0       # Hz
 K = 0.02           # m per count
 

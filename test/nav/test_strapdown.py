@@ -26,6 +26,7 @@ from odocal_ros.nav.rotations import (
 )
 from odocal_ros.nav.strapdown import attitude, prefix_product, rotation_increments
 
+pytestmark = pytest.mark.core
 ONE = np.array([0.0, 0.0, 0.0, 1.0])
 STILL = np.zeros(3)
 

@@ -29,6 +29,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.core
 S = 10**9
 
 

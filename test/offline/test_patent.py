@@ -17,6 +17,8 @@ from odocal_ros.offline import patent
 from odocal_ros.offline.cli import main
 from odocal_ros.patent.embodiment import FOUND
 
+pytestmark = pytest.mark.core
+
 
 @pytest.fixture(scope='module')
 def drive():

@@ -16,6 +16,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.library.topics import choose_topics, local_reference
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
 INT, TWIST = 'std_msgs/msg/Int64', 'geometry_msgs/msg/TwistStamped'
 BASE = {'/imu/data': IMU, '/odometer': INT, '/fix': FIX}

@@ -20,6 +20,7 @@ from odocal_ros.output import files
 from odocal_ros.output.files import as_json, write_results
 from odocal_ros.settings.config import Config, SETTINGS, with_settings
 
+pytestmark = pytest.mark.core
 CREATED = '2026-01-02T03:04:05+00:00'
 INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
 

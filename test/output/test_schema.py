@@ -22,6 +22,7 @@ from odocal_ros.output.stored import read_stored
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.settings.config import Config
 
+pytestmark = pytest.mark.core
 ROOT = Path(__file__).resolve().parents[2]
 SCHEMA = json.loads((ROOT / 'config' / 'calibration-1.schema.json').read_text())
 EARLIER = sorted(Path(__file__).parent.glob('calibration_*.json'))

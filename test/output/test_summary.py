@@ -24,6 +24,8 @@ from odocal_ros.output.summary import screen, sentence
 from odocal_ros.output.track_table import overall
 from odocal_ros.reasons import Code, Reason
 
+pytestmark = pytest.mark.core
+
 
 @pytest.mark.parametrize(('others', 'percent'), [(9e-6, 58), (11e-6, 48)])
 def test_the_largest_error_source_is_given_with_its_share_of_the_variance(good, others, percent):

@@ -22,6 +22,7 @@ from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
+pytestmark = pytest.mark.core
 DEAD = Reason(Code.WHEEL_DEAD, 'the left wheel does not count')
 SLIP = Reason(Code.WHEEL_SLIP, 'a wheel spun')
 FAR = Reason(Code.SCALE_FAR_FROM_NOMINAL, 'far off')

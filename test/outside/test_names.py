@@ -29,6 +29,7 @@ from odocal_ros.outside.yaml_text import parameters, value_text
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 ATTACKS = ["imu$(command 'touch x')", '$(env HOME)', 'a b', '-x', "x'; touch x; '", '`touch x`',
            'imu\ntouch x', 'imu\x1b[2J', 'imu --', 'a"b', 'a: b', '<imu>', 'x' * 300, 'imü',
            'imu\udcff', 'imu\u202e', '#', '/', '//']

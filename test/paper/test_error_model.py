@@ -32,6 +32,7 @@ from odocal_ros.paper.path import path_of_track, planned_path
 from odocal_ros.sim.motion import attitude as true_attitude
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.core
 RATE = 100.0
 FORWARD = forward_b(np.deg2rad(1.0), np.deg2rad(0.4))
 # of phi (rad), dL, dlam (rad), dh (m), eps (rad/s): each moves the end by a metre or so

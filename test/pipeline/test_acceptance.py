@@ -22,6 +22,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.accept_option import parse_accept
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 LIMITS = {'accept.scale_ratio_min': 0.995, 'accept.scale_ratio_max': 1.005}
 CAUTION = Reason(Code.SPEED_TOO_LOW, 'slow')
 

@@ -18,6 +18,7 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.pipeline.automatic import LEG_END_REST_NS, LegSearch, PARKED_NS, STOOD_NS
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 SECOND = 10**9
 START = 1_750_000_000 * SECOND
 COUNTER = OdometerForm('cumulative', 2**16, 'm/pulse')

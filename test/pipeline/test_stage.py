@@ -13,6 +13,8 @@ import pytest
 
 from odocal_ros.pipeline.stage import Stage
 
+pytestmark = pytest.mark.core
+
 
 @pytest.mark.parametrize(('stage', 'words'), [
     (Stage(), ''),

@@ -15,6 +15,8 @@ import pytest
 from odocal_ros.planning.drive import from_rates
 from odocal_ros.planning.manoeuvres import left_and_right_turns, stop_and_start, town_driving
 
+pytestmark = pytest.mark.core
+
 
 def straight(rest=30.0):
     t = np.arange(0.0, 120.0 + 2 * rest + 0.05, 0.1)

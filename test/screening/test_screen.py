@@ -21,6 +21,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 MS = 10**6
 
 

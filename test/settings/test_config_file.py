@@ -21,6 +21,7 @@ from odocal_ros.errors import BadConfig, BadUsage, OdocalError
 from odocal_ros.settings.config import Config, SETTINGS, value_of, with_settings
 from odocal_ros.settings.config_file import parse_set, read_config_file, scalar
 
+pytestmark = pytest.mark.core
 BLOCK = '/**/calibrator:\n  ros__parameters:\n'
 
 

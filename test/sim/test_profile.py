@@ -15,6 +15,8 @@ import pytest
 
 from odocal_ros.sim.profile import chain, hold, ramp, smooth, turn
 
+pytestmark = pytest.mark.core
+
 
 def test_a_ramp_gains_its_speed_and_covers_half_the_way():
     speed = chain(hold(3) + ramp(10, 12, 1.0) + hold(5)).integral()

@@ -21,6 +21,7 @@ from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import motion_of, simulate
 
+pytestmark = pytest.mark.core
 PAPER = SimOptions(scenario='paper', duration=600.0, imu_rate=20.0, heading=0.0)
 
 

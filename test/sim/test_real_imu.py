@@ -21,6 +21,7 @@ from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
 
+pytestmark = pytest.mark.core
 STRAIGHT = SimOptions(scenario='straight', duration=200.0, imu_rate=20.0, imu_grade='perfect')
 MANY = 40_000
 

@@ -20,6 +20,8 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.sim.options import BY_SCENARIO, resolved
 from odocal_ros.sim.scenarios import motion_of, SCENARIOS, SimOptions, simulate
 
+pytestmark = pytest.mark.core
+
 
 def states(name, step=0.1, **options):
     options = resolved(SimOptions(scenario=name, **options))

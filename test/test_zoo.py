@@ -1,0 +1,58 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""A small zoo: the errors of twelve drawn vehicles, in sigmas, are those that are stored here."""
+
+from drives import configured
+import pytest
+
+from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.sim.draw import drawn
+from odocal_ros.sim.scenarios import simulate
+
+pytestmark = [pytest.mark.core, pytest.mark.slow]
+FIRST_SEED = 70_000_000     # as benchmarks/zoo.py, whose drives are longer
+NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
+# a fit ends when a pass moves it by less than 0.03 sigma; versions of numpy differ by some passes
+TOLERANCE = 0.1
+ZOO = [    # kind, grade, verdict, errors of NAMES over their sigmas
+    ('town', 'consumer', 'caution', (-0.75, -0.41, 1.12)),
+    ('straight', 'industrial', 'caution', (-0.27, 0.18, -0.17)),
+    ('out_and_back', 'tactical', 'accepted', (-0.88, 0.29, 0.20)),
+    ('motorway', 'consumer', 'caution', (0.98, -0.41, -0.62)),
+    ('yard', 'industrial', 'caution', (-1.11, -1.18, -0.04)),
+    ('town', 'tactical', 'caution', (-0.21, -0.09, 1.97)),
+    ('straight', 'consumer', 'accepted', (0.95, 1.09, 0.98)),
+    ('out_and_back', 'industrial', 'caution', (-2.49, 1.59, 0.22)),
+    ('motorway', 'tactical', 'accepted', (1.18, 0.36, -0.04)),
+    ('yard', 'consumer', 'caution', (1.47, 0.74, 0.27)),
+    ('town', 'industrial', 'caution', (0.38, -0.85, 0.48)),
+    ('straight', 'tactical', 'accepted', (-1.08, -1.19, 0.90))]
+
+
+def error_in_sigmas(estimate, true):
+    """Return the error of an estimate over its sigma, None where nothing is stated."""
+    if estimate is None or estimate.value is None:
+        return None
+    return round((estimate.value - true) / estimate.sigma, 2)
+
+
+@pytest.mark.parametrize(('seed', 'row'), enumerate(ZOO, FIRST_SEED))
+def test_a_drawn_vehicle_has_its_verdict_and_errors(seed, row):
+    kind, grade, *_ = row
+    options, _ = drawn(seed, kind, grade, imu_rate=50.0,
+                       duration=320.0 if kind == 'out_and_back' else 240.0)
+    made = simulate(options)
+    config, truth = configured(made), made.truth
+    whole = combine([calibrate(made.leg(), config)], config)
+    found = tuple(error_in_sigmas(whole.estimates.get(name), true) for name, true in zip(
+        NAMES, (truth.scale, truth.yaw, truth.pitch), strict=True))
+    now = kind, grade, whole.verdict.value, found
+    assert now[:3] == row[:3], now
+    assert found == pytest.approx(row[3], abs=TOLERANCE), f'now {now}'
