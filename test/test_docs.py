@@ -72,16 +72,17 @@ def put_bag(folder, words, named):
                                   counter(names['odometer'], made.odometer)])
 
 
-def put_results(folder, names):
-    """Write result folders to compare, of drives that differ by their noise alone."""
-    for k, name in enumerate(names):
-        made = drive(**STRAIGHT, seed=k + 1)
-        write_bag(folder / f'bag_{k}', [imu('/imu/data', made.imu), fix('/fix', made.fix),
-                                        counter('/odometer', made.odometer)])
-        code = cli.main(['replay', str(folder / f'bag_{k}'), '--output', str(folder / name),
-                         '--quiet'])
+@pytest.fixture(scope='module')
+def results(tmp_path_factory):
+    """Return two result folders to compare, of drives that differ by their noise alone."""
+    folder = tmp_path_factory.mktemp('results')
+    for seed in (1, 2):
+        made, bag = drive(**STRAIGHT, seed=seed), folder / f'bag_{seed}'
+        write_bag(bag, [imu('/imu/data', made.imu), fix('/fix', made.fix),
+                        counter('/odometer', made.odometer)])
+        code = cli.main(['replay', str(bag), '--output', str(folder / f'{seed}'), '--quiet'])
         assert code in (0, 1)
-        shutil.rmtree(folder / f'bag_{k}')
+    return folder / '1', folder / '2'
 
 
 def meant_to_be_typed(line):
@@ -94,7 +95,7 @@ def meant_to_be_typed(line):
     (page, line) for page, line in all_commands('odocal')
     if meant_to_be_typed(line) and page != FLEET],
     ids=lambda text: text[:60])
-def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch, capfd):
+def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch, capfd, results):
     words = shlex.split(line)[1:]
     monkeypatch.chdir(tmp_path)
     for text in yaml_blocks(page_of(page)):
@@ -102,7 +103,8 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
     if words[0] in ('replay', 'inspect', 'try'):
         put_bag(tmp_path, words, {'odometer': '/ticks'} if page == 'README.md' else {})
     if words[0] == 'compare':
-        put_results(tmp_path, [w for w in words[1:] if not w.startswith('-')])
+        for made, name in zip(results, words[1:3], strict=True):
+            shutil.copytree(made, tmp_path / name)
     capfd.readouterr()
     code = cli.main(words)
     out, err = capfd.readouterr()

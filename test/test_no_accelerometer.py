@@ -11,7 +11,7 @@
 
 from dataclasses import replace
 
-from drives import drive, everything_said, settings
+from drives import cached, drive, everything_said, settings
 import numpy as np
 import pytest
 
@@ -22,6 +22,7 @@ from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config
 
+pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 300.0, 'slope': 0.03}
 ANGLES = ('yaw_mounting_angle', 'pitch_mounting_angle')
 
@@ -33,12 +34,18 @@ def without_force(made, value=0.0, planar=False):
     return replace(leg, imu=replace(leg.imu, w_i=w_i, f_i=np.full_like(leg.imu.f_i, value)))
 
 
+@cached
+def calibrated(how='zero', **options):
+    """Return a drive, its settings and what its leg without force gives."""
+    made = drive(**TOWN | options)
+    config = settings(made, heading_sigma=None, method='auto')
+    leg = without_force(made, np.nan if how == 'nan' else 0.0, how == 'yaw rate alone')
+    return made, config, calibrate(leg, config)
+
+
 @pytest.mark.parametrize('how', ['zero', 'nan', 'yaw rate alone'])
 def test_one_counter_gives_the_scale_within_its_sigma(how):
-    made = drive(**TOWN)
-    leg = without_force(made, np.nan if how == 'nan' else 0.0, how == 'yaw rate alone')
-    config = settings(made, heading_sigma=None, method='auto')
-    result = calibrate(leg, config)
+    made, config, result = calibrated(how)
     calibration = combine([result], config)
     scale = calibration.estimates['scale_factor']
     assert scale.method == 'smoother'
@@ -58,9 +65,8 @@ def test_one_counter_gives_the_scale_within_its_sigma(how):
 
 
 def test_two_wheels_give_both_scales_and_the_track_width():
-    made = drive(**TOWN, two_wheels=True)
-    config = settings(made, heading_sigma=None, method='auto')
-    found = combine([calibrate(without_force(made), config)], config).estimates
+    made, config, result = calibrated(two_wheels=True)
+    found = combine([result], config).estimates
     for side, true in zip(('left', 'right'), made.truth.wheel_scales, strict=True):
         e = found[f'scale_factor_{side}']
         assert abs(e.value - true) < 3 * e.sigma < 0.003 * true
@@ -69,10 +75,7 @@ def test_two_wheels_give_both_scales_and_the_track_width():
 
 
 def test_hills_are_in_the_sigma():
-    made = drive(**TOWN)
-    config = settings(made, heading_sigma=None, method='auto')
-    method = calibrate(without_force(made), config).methods['smoother']
-    sources = {s.name: s for s in method.sources}
+    sources = {s.name: s for s in calibrated()[2].methods['smoother'].sources}
     assert sources['hills'].effects[0, 0] == 5e-4
 
 
@@ -99,18 +102,16 @@ def test_a_heading_from_outside_gives_the_yaw_all_the_same():
 
 def test_a_leg_without_force_tells_another_no_angle():
     """Its angles are held as set: they are no observation, however small their sigmas."""
-    one = drive(**TOWN)
-    other = drive(**TOWN, seed=8, start_ns=one.options.start_ns + 10**13)
-    config = settings(one, heading_sigma=None, method='auto')
-    felt, unfelt = calibrate(one.leg(), config), calibrate(without_force(other), config)
+    one, config, first = calibrated()
+    _, _, unfelt = calibrated(seed=8, start_ns=one.options.start_ns + 10**13)
+    felt = calibrate(one.leg(), config)
     alone = combine([felt], config).estimates
     for legs in ([felt, unfelt], [unfelt, felt]):
         both = combine(legs, config).estimates
         for name in ANGLES:
             assert abs(both[name].value - alone[name].value) < alone[name].sigma
             assert both[name].sigma > 0.5 * alone[name].sigma
-    two = [calibrate(without_force(x), config) for x in (one, other)]
-    found = combine(two, config)
+    found = combine([first, unfelt], config)
     assert all(found.estimates[name].value is None for name in ANGLES)
     scale = found.estimates['scale_factor']
     assert abs(scale.value - one.truth.scale) < 3 * scale.sigma

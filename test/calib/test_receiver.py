@@ -23,6 +23,8 @@ from odocal_ros.reasons import Code
 from odocal_ros.sim.noise import gauss_markov
 from odocal_ros.sim.real import Real
 
+pytestmark = pytest.mark.slow
+
 # quadratic sums and expectations of levels that are as the rows have them
 AS_IT_IS = dict.fromkeys(('fix', 'fix_up', 'slow', 'slow_up'), (1.0, 1.0))
 DRIVE = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'fix_noise': 'rtk'}

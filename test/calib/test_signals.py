@@ -21,6 +21,7 @@ from odocal_ros.calib.smoother.smoother import smooth
 from odocal_ros.calib.smoother.state import ACCEL_ERRORS, CONSTANTS, GYRO_ERRORS
 from odocal_ros.settings.config import with_settings
 
+pytestmark = pytest.mark.slow
 SCALES = [name for name in CONSTANTS if name.startswith(('gyro_scale', 'accelerometer_scale'))]
 
 

@@ -23,6 +23,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+pytestmark = pytest.mark.slow
 LOW = {'imu_rate': 50.0, 'odometer_rate': 20.0}
 
 

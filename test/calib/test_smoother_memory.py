@@ -24,7 +24,6 @@ from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import first_state
 from odocal_ros.data.mapped import HELD_BYTES, let_go, room
 
-pytestmark = pytest.mark.slow
 MOST = 36e3     # bytes a keyframe: the chain and its covariances are 12e3, sums and rows the rest
 
 

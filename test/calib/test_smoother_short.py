@@ -18,6 +18,7 @@ from smoother_legs import made
 from odocal_ros.calib.smoother import smooth
 from odocal_ros.sim.real import Real
 
+pytestmark = pytest.mark.slow
 WINDOW, WINDOWS = 45.0, 6      # s, of one drive
 TOWN = {'scenario': 'town', 'duration': 420.0, 'imu_grade': 'consumer', 'seed': 3}
 

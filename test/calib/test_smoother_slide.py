@@ -28,6 +28,8 @@ from odocal_ros.calib.smoother.slide import (
 )
 from odocal_ros.reasons import Code
 
+pytestmark = pytest.mark.slow
+
 
 def said(method):
     """Tell whether the result says that a road's noise was assumed."""

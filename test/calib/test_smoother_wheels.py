@@ -23,6 +23,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import GRADES
 
+pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'imu_grade': 'industrial'}
 SIGMAS = 4.0        # 1 in 16 000 of a normal error; seeds are fixed
 SCALE = Estimate(0.02, 2e-6, 'm/pulse')

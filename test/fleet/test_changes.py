@@ -15,6 +15,7 @@ import pytest
 from odocal_ros.fleet.changes import covariance, history
 from odocal_ros.fleet.population import FAR, population
 
+pytestmark = pytest.mark.slow
 N = 10
 DAYS = 7.0 * np.arange(N)
 V = covariance(np.full(N, 1e-5**2), [], DAYS, 1e-4)      # the walk rules: 265 ppm in a week

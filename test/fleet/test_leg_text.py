@@ -16,7 +16,7 @@ from odocal_ros.fleet.leg_text import leg_text, legs_from
 from odocal_ros.output.files import as_json
 from odocal_ros.pipeline.calibrate import calibrate, combine
 
-pytestmark = [pytest.mark.core, pytest.mark.slow]
+pytestmark = pytest.mark.core
 
 
 def test_legs_from_text_combine_to_the_same_digits():

@@ -18,6 +18,7 @@ from odocal_ros.messages.wheel_choice import choose
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 
+pytestmark = pytest.mark.slow
 REAL = {
     'turtlebot3': (['wheel_left_joint', 'wheel_right_joint'],
                    ('wheel_left_joint', 'wheel_right_joint')),

@@ -19,7 +19,7 @@ from odocal_ros import __version__
 from odocal_ros.errors import BadBag
 from odocal_ros.offline import cli
 
-pytestmark = [pytest.mark.core, pytest.mark.slow]
+pytestmark = pytest.mark.core
 
 
 def test_help_of_everything_is_there(capsys):

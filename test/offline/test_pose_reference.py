@@ -23,6 +23,8 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import cli
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):

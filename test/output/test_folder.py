@@ -26,7 +26,6 @@ from odocal_ros.output import folder as module
 from odocal_ros.output.folder import ResultFolder
 from odocal_ros.outside import whole
 
-pytestmark = pytest.mark.slow
 MAIN, OURS = 'main.json', frozenset({'main.json', 'a.txt', 'b.txt', 'late.html'})
 
 

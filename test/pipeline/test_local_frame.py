@@ -31,6 +31,7 @@ from odocal_ros.screening.screen import screen
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.sim.real import Real
 
+pytestmark = pytest.mark.slow
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 # method smoother, a heading that is not given
 SMOOTHER = {'heading_sigma': None, 'method': 'smoother'}

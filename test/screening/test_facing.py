@@ -22,6 +22,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.screening.facing import axes_reasons, Facing, facing, toward
 from odocal_ros.screening.screen import screen
 
+pytestmark = pytest.mark.slow
 DEG = np.pi / 180
 
 

@@ -28,7 +28,7 @@ from odocal_ros.sim.motion import (
 )
 from odocal_ros.sim.profile import chain, hold, ramp, turn
 
-pytestmark = [pytest.mark.core, pytest.mark.slow]
+pytestmark = pytest.mark.core
 HOME = Start(np.radians(40), 0.2, 50.0, 0.7)
 ARM = (1.5, -0.5, 1.0)
 
