@@ -21,8 +21,6 @@ from odocal_ros import OdocalError
 from odocal_ros.library.export import KNOWN
 from odocal_ros.offline.cli import main
 
-pytestmark = pytest.mark.core
-
 
 @pytest.fixture(scope='module')
 def exported(calibration, tmp_path_factory):

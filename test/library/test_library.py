@@ -31,7 +31,7 @@ from odocal_ros.offline.cli import main
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.motion import attitude
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.core, pytest.mark.slow]
 
 
 def without_time(content):

@@ -18,6 +18,7 @@ import pytest
 import odocal_ros
 from odocal_ros.library.calibration import Calibration
 
+pytestmark = pytest.mark.core
 SIGNATURES = {
     'calibrate_bag': '(path, topics=None, config=None, legs=None, *, holdout=False, hearer=None)',
     'read_bag': '(path, topics=None, config=None, *, hearer=None)',

@@ -24,6 +24,7 @@ from odocal_ros.live.worker import Worker
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 NOW_NS = 10**18
 GOOD = Calibration((), {}, {}, ())
 BAD = Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())

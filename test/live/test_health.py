@@ -20,6 +20,7 @@ from odocal_ros.foresee.progress import FixPath, known_scale, Progress, Travel
 from odocal_ros.live.health import Health
 from odocal_ros.settings.config import Config, with_settings
 
+pytestmark = pytest.mark.core
 SECOND = 1_000_000_000
 COUNTER = OdometerForm('cumulative', 2**16, 'm/pulse')
 

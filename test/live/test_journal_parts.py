@@ -32,6 +32,7 @@ from odocal_ros.live.journal_writer import PreRoll
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config import Config, flat, with_settings
 
+pytestmark = pytest.mark.core
 SECOND = 10**9
 
 

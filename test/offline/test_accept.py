@@ -17,6 +17,8 @@ import pytest
 from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.offline.cli import main
 
+pytestmark = pytest.mark.core
+
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):

@@ -16,6 +16,7 @@ import yaml
 
 from odocal_ros.offline.against_truth import main, rows
 
+pytestmark = pytest.mark.core
 DEG = 0.017453292519943295
 
 

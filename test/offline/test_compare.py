@@ -18,6 +18,7 @@ import pytest
 from odocal_ros.library.compare import CAUSES
 from odocal_ros.offline.cli import main
 
+pytestmark = pytest.mark.core
 ENTRY = {'value': 0.02, 'sigma': 3e-6, 'unit': 'm/pulse', 'method': 'two_point'}
 YAW = {'value': 0.01, 'sigma': 0.004, 'unit': 'rad', 'method': 'two_point'}
 START = 10**18

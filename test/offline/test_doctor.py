@@ -13,9 +13,13 @@ from importlib.metadata import version
 import shutil
 import sys
 
+import pytest
+
 from odocal_ros import __version__
 from odocal_ros.offline import doctor
 from odocal_ros.offline.cli import main
+
+pytestmark = pytest.mark.core
 
 
 def shown(capsys):

@@ -183,6 +183,7 @@ def test_bag_that_cannot_be_read(tmp_path, capsys):
 
 # ---- made drives ---------------------------------------------------------------------------
 
+@pytest.mark.core
 def test_a_good_drive_lacks_only_a_heading(tmp_path, capsys):
     told, text = inspect(ros_bags.write(tmp_path / 'bag', drive()), capsys)
     assert codes(told) == {'YAW_NOT_SEPARABLE'}

@@ -14,6 +14,9 @@ import pty
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.core
 CODE = """
 from odocal_ros.offline.phases import Phase
 with Phase('reading town', quiet={quiet}) as phase:

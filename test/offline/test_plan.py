@@ -200,6 +200,7 @@ def test_the_methods_asked_for_are_planned(method, shown, by):
     assert {plan.by(name) for name in NAMES[:2]} == {by}
 
 
+@pytest.mark.core
 def test_the_page_shows_what_is_printed(capsys):
     section = (Path(__file__).parents[2] / 'docs' / 'planning.md').read_text(encoding='utf-8')
     command = next(line for line in section.splitlines() if line.startswith('odocal plan '))

@@ -106,6 +106,7 @@ def test_a_reader_that_goes_away_takes_no_file_with_it(drive, bag, tmp_path):
     assert (tmp_path / 'out' / 'report.html').exists()
 
 
+@pytest.mark.core
 def test_result_meets_the_truth_within_its_sigma(drive, bag, tmp_path, capsys):
     assert replay(bag, *known(drive), '--output', tmp_path / 'out', '--json') == 0
     told = json.loads(capsys.readouterr().out)

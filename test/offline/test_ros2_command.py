@@ -19,6 +19,7 @@ import pytest
 
 from odocal_ros.offline import cli
 
+pytestmark = pytest.mark.core
 SETUP = Path(__file__).resolve().parents[2] / 'setup.py'
 
 
