@@ -12,16 +12,19 @@
 import re
 from types import SimpleNamespace
 
+from drives import settings
 import numpy as np
 import pytest
-from smoother_legs import made
+from smoother_legs import leg_of, made
 
 from odocal_ros.calib.smoother import smooth
 from odocal_ros.calib.smoother.long_run import long_run
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.reasons import Code
 from odocal_ros.sim.noise import gauss_markov
+from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
+from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.slow
 
@@ -58,8 +61,20 @@ def test_a_filter_of_position_and_velocity_is_said_with_its_time():
 
 
 def test_of_a_plain_receiver_nothing_is_said():
-    _, _, said = smoothed()
+    found, _, said = smoothed()
     assert not {Code.FIXES_FOLLOW_ODOMETER, Code.FIXES_SMOOTHED} & said.keys()
+    assert not any('wheel speeds' in r.text for r in found.reasons)
+
+
+def test_an_odometer_in_the_receiver_is_found_beside_a_consumer_accelerometer():
+    """A short yard, where an accelerometer error of the same size explains speeds as well."""
+    drive = simulate(SimOptions(scenario='yard', duration=300.0, seed=5, imu_rate=50.0,
+                                imu_grade='consumer', real=Real(receiver_odometer=0.05)))
+    config = settings(drive, None)
+    found = smooth(leg_of(drive.leg(), config), config)
+    scale = found.estimates['scale_factor']
+    assert abs(scale.value - drive.truth.scale) < 3 * scale.sigma
+    assert Code.FIXES_FOLLOW_ODOMETER in {r.code for r in found.reasons}
 
 
 def fixes_of(error, t):

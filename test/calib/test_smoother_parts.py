@@ -20,7 +20,7 @@ from odocal_ros.calib.smoother.axle import Axle
 from odocal_ros.calib.smoother.chain import Normal, solve
 from odocal_ros.calib.smoother.equations import Equations, PARTS
 from odocal_ros.calib.smoother.motion import D
-from odocal_ros.calib.smoother.priors import PriorRows, SIZE
+from odocal_ros.calib.smoother.priors import PriorRows, SIZE, SIZE_SPREADS
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_error import SlowError, TIME_SPREAD, USUAL_TIME
 from odocal_ros.calib.smoother.state import (
@@ -265,18 +265,20 @@ def sized(problem, where, sigma, centre):
 @pytest.mark.parametrize(('name', 'where', 'prior'), [
     ('size_fix_lag_square', constants_from('fix_lag_square', 'fix_lag_square'), 1.0),
     ('size_scale_by_force', constants_from('scale_by_pull', 'scale_by_braking'), 0.1)])
-def test_sizes_of_what_is_well_known_climb_the_restricted_likelihood(shaken, name, where, prior):
+def test_sizes_of_what_is_well_known_have_the_largest_likelihood(shaken, name, where, prior):
     problem, state = shaken
     problem = sized(problem, where, prior, 1.5 * prior)
     levels = problem.first_levels
     weighted, solved, at = least(problem, state, levels)
-    quadratic, expected = weighted[PriorRows].components(solved.neighbours())[name]
-    # 1.5 of the prior squared, by the size, for each; each is known
+    found = weighted[PriorRows].sizes(solved.neighbours())[name]
     count = where.stop - where.start
-    assert quadratic == pytest.approx(count * 1.5**2 / SIZE, rel=0.02)
-    assert expected == pytest.approx(count, rel=1e-3)
-    score = (quadratic - expected) / 2
-    assert score == pytest.approx(slope(at, levels, name), rel=1e-3)
+    # 1.5 of the prior for each, against the log-normal prior of the size
+    likelihood = slope(at, levels.but(**{name: found}), name)
+    prior_slope = -np.log(found / SIZE) / SIZE_SPREADS[name]**2
+    # half a step of the grid, times the curvature: of each constant less than its square
+    most = 0.025 * (count * 1.5**2 / found + 1)
+    assert likelihood + prior_slope == pytest.approx(0.0, abs=most)
+    assert found > 1.5 * SIZE      # far from where it started
 
 
 def test_what_the_drive_hardly_knows_has_no_say_in_its_size(shaken):
@@ -288,5 +290,6 @@ def test_what_the_drive_hardly_knows_has_no_say_in_its_size(shaken):
     weighted, solved, at = least(problem, state, levels)
     name = 'size_squat_by_jerk'
     assert slope(at, levels, name) > 0.1         # the likelihood would have it grow
-    # (7e-6 / 1e-3)^2 of that: 5e-5
-    assert max(weighted[PriorRows].components(solved.neighbours())[name]) < 2e-4
+    # (7e-6 / 1e-3)^2 of that slope, 5e-5: it stays at its median, within half a step of the grid
+    assert np.log(weighted[PriorRows].sizes(solved.neighbours())[name] / SIZE) == pytest.approx(
+        0.0, abs=0.03)

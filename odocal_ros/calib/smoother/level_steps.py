@@ -18,7 +18,7 @@ from odocal_ros.calib.smoother.equations import Weighted
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.long_run import long_run
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.priors import SIZE, SIZE_SPREADS, SIZES
+from odocal_ros.calib.smoother.priors import PriorRows, SIZE_SPREADS, SIZES
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_error import TIME_SPREAD
 
@@ -60,12 +60,6 @@ def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: 
             found[name] = by * found[name][0], found[name][1]
     for name, (quadratic, expected) in found.items():
         level = levels[name]
-        if name in SIZES:
-            if not fitted:      # sizes are constant while residuals contain the start
-                continue
-            step = _size_step(level, quadratic, expected, SIZE_SPREADS[name])
-            new[name] = max(level * step, problem.least[name])
-            continue
         # the others have one, at their current value: more would stop at too large a noise
         pseudo = PRIOR_ROWS.get(name, 1.0)
         pull = pseudo * (problem.first_levels[name] / level if name in PRIOR_ROWS else 1.0)
@@ -77,12 +71,6 @@ def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: 
         pace[name] = min(power, RELAXATION.most), step
         move = np.clip(pace[name][0] * step, np.log(0.03), np.log(30.0))
         new[name] = max(level * float(np.exp(move)), problem.least[name])
+    if fitted:      # while residuals contain the start, sizes are constant
+        new |= weighted[PriorRows].sizes(neighbours)
     return levels.but(**new)
-
-
-def _size_step(level: float, quadratic: float, expected: float, spread: float) -> float:
-    """Return the factor on a size with a log-normal prior: a safeguarded Newton step."""
-    gradient = (quadratic - expected) / 2 - np.log(level / SIZE) / spread**2
-    ratio = gradient / (max(expected, quadratic) / 2 + spread**-2)
-    step = np.log1p(max(ratio, -0.9)) if ratio < 0 else ratio
-    return float(np.exp(min(step, 2.0)))

@@ -48,6 +48,8 @@ SIZES, SIZE = tuple(f'size_{kind}' for kind in KIND_SIZES), 0.5
 # the logarithm apart: at 1 the sigma of the scale is up to 2.8 times as large in drives without
 # one, at 3 1.7 times (docs/decisions/0019)
 SIZE_SPREADS = dict.fromkeys(SIZES, 1.0) | {'size_fix_error_by_motion': 3.0}
+# definition: logarithms of sizes that are compared, from the least on
+LOG_SIZES = np.arange(np.log(1e-6), np.log(1e6), 0.05)
 # priors of the first keyframe: m, m/s, rad about east, north, up. Judgement: far wider than any
 # data
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
@@ -98,21 +100,25 @@ class PriorRows(Part):
         self.priors = replace(self.base, constants=constants)
         self.log_R = float(np.log(size).sum())
 
-    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
+    def sizes(self, near: Neighbours) -> dict[str, float]:
         """
-        Return the quadratic sum and its expectation for each size: docs/method.md (S29).
+        Return the most likely size of each type, all else as it is: docs/method.md (S29).
 
         An imperfection is weighted by the share of the drive in its information: a model error
         elsewhere would move the size of one that is hardly observable.
         """
         at = 2 * self.n + np.arange(IMPERFECT.start, IMPERFECT.stop)
-        variance = near[0][at, at]
+        usual = self.base.constants[IMPERFECT]**2
         weight = 1 / self.priors.constants[IMPERFECT]**2
-        data = np.maximum(1 / variance - weight, 0.0)
-        known = data / (data + 1 / (SIZE * self.base.constants[IMPERFECT]**2))
-        off = self._constants_off()[IMPERFECT]
-        q, e = (np.bincount(KIND_OF, known * x) for x in (weight * off**2, 1 - weight * variance))
-        return {name: (float(a), float(b)) for name, a, b in zip(SIZES, q, e, strict=True)}
+        total = 1 / near[0][at, at]
+        data = np.maximum(total - weight, 1e-9 * total)     # a share lost in rounding
+        known = data / (data + 1 / (SIZE * usual))
+        found = (self._constants_off()[IMPERFECT] * total / data)**2
+        variance = np.exp(LOG_SIZES)[:, None] * usual + 1 / data
+        off = (known * (found / variance + np.log(variance))) @ np.eye(len(SIZES))[KIND_OF]
+        spread = np.array([SIZE_SPREADS[name] for name in SIZES])
+        best = np.argmin(off + ((LOG_SIZES[:, None] - np.log(SIZE)) / spread)**2, axis=0)
+        return dict(zip(SIZES, np.exp(LOG_SIZES[best]).tolist(), strict=True))
 
     def add_levels(self, out: LevelSides) -> None:
         """Add the right-hand sides of the sizes."""

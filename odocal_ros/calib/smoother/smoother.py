@@ -34,6 +34,9 @@ from odocal_ros.settings.config import Config
 # rad, passes, judgement: a heading from accelerations with a larger sigma may be one of two; both
 # are tried for this number of passes
 TWO_HEADINGS, START_PASSES = 0.1, 3
+# sizes that start larger. Tuned: two yards of 300 s with a receiver odometer 5 % off. From 0.5 the
+# fit finds a scale and an accelerometer 3 % off instead (docs/decisions/0019)
+FIRST_SIZES = {'size_fix_error_by_motion': 50.0}
 
 
 def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> MethodResult:
@@ -108,7 +111,7 @@ def _first_levels(problem: Problem, start: Start) -> Levels:
     wide = max(1.0, (start.fix_spread / problem.fix_sigma)**2)
     time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
     return problem.first_levels.but(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE * wide,
-                                    correlation_time=time, **problem.shaken)
+                                    correlation_time=time, **FIRST_SIZES, **problem.shaken)
 
 
 def too_little_of(leg: SmootherLeg) -> Reason | None:
