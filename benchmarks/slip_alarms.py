@@ -13,14 +13,17 @@ Slip alarms: how often WHEEL_SLIP is said of wheels that hold, and of wheels tha
     python benchmarks/slip_alarms.py [--drives 15] [--only RUN] [--duration 300] [--jobs 1]
                                      [--file F]
 
-Vehicles are those of the zoo (docs/zoo.md) without any of its effects, kinds and grades by turns,
-towns where wheels slip or the odometer is in steps; ``zoo``: with all effects but slip, tyres and
-vibration. What is put into the odometer stands in RUNS: lateness, a first-order low pass, steps of
-whole km/h at 2 Hz, spins. Drive k of run e has seed 83_000_000 + 1_000_000 e + k, fixed before the
-first run. Rows go to the file line by line: an interrupted run continues where it stopped.
+Vehicles are those of the zoo (docs/zoo.md) without any of its effects: an industrial IMU with RTK
+and a consumer IMU with slow fix errors by turns, kinds of drive by turns, towns where wheels slip
+or the odometer is in steps; ``zoo``: with all effects but slip, tyres and vibration. RUNS names
+what is done to the odometer: a delay, jitter of arrival stamps, lost messages, a first-order low
+pass, steps of whole km/h at 2 Hz, spins. Drive k of run e has seed 83_000_000 + 1_000_000 e + k,
+fixed before the first run. Rows go to the file line by line: an interrupted run continues where
+it stopped.
 
-Printed by run: how many drives say WHEEL_SLIP, DELAY_SEEN and SPEED_FILTERED, and the verdicts;
-drives of spins in which chance has put none are left out.
+Printed by run: the number of drives with WHEEL_SLIP, DELAY_SEEN and others, the rms and the
+largest size of scale error over sigma, the largest size in accepted drives, the median sigma, and
+the verdicts. Drives of spins without any spin are left out.
 """
 
 import argparse
@@ -35,13 +38,16 @@ import sys
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-from alarms import CHEAP, shifted
+from alarms import CHEAP, RTK, shifted
 import numpy as np
 from resumed import read_rows
-from zoo import configured, GRADES, KINDS
+from zoo import configured, KINDS, outcome
+from zoo_table import BY_KIND, NEVER_FALSE
 
 FIRST_SEED, SEEDS_A_RUN = 83_000_000, 1_000_000
+VEHICLES = (('industrial', RTK), ('consumer', {'fix_noise': 'correlated', 'fix_sigma': 1.5}))
 SPEED = {'odometer': 'speed', 'scale': 1.01}
+FAST = {'odometer_rate': 50.0}
 SPINS = {'slip_events': 60.0, 'slip_size': 0.5}
 NOT_OF_ZOO = {'slip', 'speed_law', 'warming', 'vibration', 'coarse_pulses', 'coarse_speed'}
 
@@ -49,6 +55,20 @@ NOT_OF_ZOO = {'slip', 'speed_law', 'warming', 'vibration', 'coarse_pulses', 'coa
 def late(leg, seconds):
     """Return a leg whose odometer is stamped late."""
     return replace(leg, odometer=shifted(leg.odometer, seconds))
+
+
+def arriving(leg, rng, seconds, lost=0.0):
+    """
+    Return a leg whose odometer is stamped at arrival, late by an exponential time of that mean.
+
+    Messages keep their order, so one that is late holds up the next.   lost : share of messages.
+    """
+    sent = leg.odometer
+    late_ns = np.round(rng.exponential(seconds, len(sent.stamp_ns)) * 1e9).astype(np.int64)
+    stamps = np.maximum.accumulate(sent.stamp_ns + late_ns)
+    kept = rng.random(len(stamps)) >= lost
+    return replace(leg, odometer=replace(sent, stamp_ns=stamps[kept], received_ns=stamps[kept],
+                                         value=sent.value[kept]))
 
 
 def low_passed(leg, seconds):
@@ -76,14 +96,27 @@ def whole_kmh(leg):
 RUNS = {
     'plain': ({}, None, KINDS),
     'zoo': ({}, None, KINDS),
-    'late 0.3 s': ({}, lambda leg: late(leg, 0.3), KINDS),
-    'low pass 0.4 s': ({}, lambda leg: low_passed(leg, 0.4), KINDS),
-    'km/h at 2 Hz': (SPEED, whole_kmh, ('town', 'motorway')),
-    'low pass, km/h at 2 Hz': (SPEED, lambda leg: whole_kmh(low_passed(leg, 0.4)), ('town',)),
+    'late 0.3 s': ({}, lambda leg, _: late(leg, 0.3), KINDS),
+    'low pass 0.4 s': ({}, lambda leg, _: low_passed(leg, 0.4), KINDS),
+    'km/h at 2 Hz': (SPEED, lambda leg, _: whole_kmh(leg), ('town', 'motorway')),
+    'low pass, km/h at 2 Hz': (SPEED, lambda leg, _: whole_kmh(low_passed(leg, 0.4)), ('town',)),
     'spins 0.5 m': (SPINS, None, ('town',)),
-    'spins 0.5 m, late 0.3 s': (SPINS, lambda leg: late(leg, 0.3), ('town',)),
-    'spins 0.5 m, low pass 0.4 s': (SPINS, lambda leg: low_passed(leg, 0.4), ('town',)),
-    'spins 3 m, km/h at 2 Hz': (SPEED | SPINS | {'slip_size': 3.0}, whole_kmh, ('town',)),
+    'spins 0.5 m, late 0.3 s': (SPINS, lambda leg, _: late(leg, 0.3), ('town',)),
+    'spins 0.5 m, low pass 0.4 s': (SPINS, lambda leg, _: low_passed(leg, 0.4), ('town',)),
+    'spins 3 m, km/h at 2 Hz': (SPEED | SPINS | {'slip_size': 3.0}, lambda leg, _: whole_kmh(leg),
+                                ('town',)),
+    'jitter 5 ms': ({}, lambda leg, rng: arriving(leg, rng, 0.005), KINDS),
+    'jitter 20 ms': ({}, lambda leg, rng: arriving(leg, rng, 0.02), KINDS),
+    'jitter 50 ms': ({}, lambda leg, rng: arriving(leg, rng, 0.05), KINDS),
+    'jitter 20 ms, 50 Hz': (FAST, lambda leg, rng: arriving(leg, rng, 0.02), ('town',)),
+    'jitter 50 ms, 50 Hz': (FAST, lambda leg, rng: arriving(leg, rng, 0.05), ('town',)),
+    'jitter 20 ms, 1 % lost': ({}, lambda leg, rng: arriving(leg, rng, 0.02, 0.01), ('town',)),
+    'speed, jitter 50 ms': (SPEED, lambda leg, rng: arriving(leg, rng, 0.05), ('town',)),
+    'speed, low pass 0.4 s': (SPEED, lambda leg, _: low_passed(leg, 0.4), ('town',)),
+    'km/h at 2 Hz, late 0.3 s': (SPEED, lambda leg, _: late(whole_kmh(leg), 0.3), ('town',)),
+    'spins 0.5 m, jitter 5 ms': (SPINS, lambda leg, rng: arriving(leg, rng, 0.005), ('town',)),
+    'spins 0.5 m, jitter 20 ms': (SPINS, lambda leg, rng: arriving(leg, rng, 0.02), ('town',)),
+    'spins 0.5 m, jitter 50 ms': (SPINS, lambda leg, rng: arriving(leg, rng, 0.05), ('town',)),
 }
 
 
@@ -104,29 +137,43 @@ def run_drive(seed, duration):
     run = list(RUNS)[e]
     options, change, kinds = RUNS[run]
     effects = tuple(n for n in EFFECTS if n not in NOT_OF_ZOO) if run == 'zoo' else ()
-    kind, grade = kinds[k % len(kinds)], GRADES[k % len(GRADES)]
-    made, _ = drawn(seed, kind, grade, effects, **(CHEAP | {'duration': duration} | options))
+    kind, (grade, fixes) = kinds[k % len(kinds)], VEHICLES[k % len(VEHICLES)]
+    own = CHEAP | fixes | {'duration': duration} | options
+    made, _ = drawn(seed, kind, grade, effects, **own)
     drive = simulate(made)
     config = configured(drive)
-    leg = drive.leg() if change is None else change(drive.leg())
+    leg = drive.leg() if change is None else change(
+        drive.leg(), np.random.default_rng(seed))
     calibration = combine([calibrate(leg, config)], config)
     return {'seed': seed, 'run': run, 'kind': kind, 'grade': grade, 'asked': duration,
             'holds': 'spins' in run and not spins_of(made, drive),
-            'verdict': calibration.verdict.value,
-            'codes': sorted({r.code.name for r in calibration.reasons}),
-            'slip': [r.text for r in calibration.reasons if r.code.name == 'WHEEL_SLIP']}
+            'slip': [r.text for r in calibration.reasons if r.code.name == 'WHEEL_SLIP'],
+            **outcome(calibration, drive.truth)}
 
 
 def table(rows):
-    """Print how often slip is said, by run."""
-    codes = 'WHEEL_SLIP', 'DELAY_SEEN', 'SPEED_FILTERED'
-    print(f'{"":30}{"drives":>7}{"".join(f"{code:>16}" for code in codes)}  verdicts')
+    """Print by run how often slip is said, what else, and the scale errors."""
+    codes = 'WHEEL_SLIP', 'DELAY_SEEN', 'SPEED_FILTERED', 'ODOMETER_LATE'
+    print(f'{"":28}{"drives":>7}{"".join(f"{code:>15}" for code in codes)}{"z rms":>7}'
+          f'{"most":>6}{"acc.":>6}{"sigma":>7}  verdicts, other reasons')
     for run in RUNS:
         own = [row for row in rows if row['run'] == run and not row['holds']]
         if own:
-            said = ''.join(f'{sum(code in row["codes"] for row in own):16}' for code in codes)
-            print(f'{run:30}{len(own):7}{said}  '
-                  f'{dict(Counter(row["verdict"] for row in own))}')
+            said = ''.join(f'{sum(code in row["codes"] for row in own):15}' for code in codes)
+            other = Counter(code for row in own for code in row['codes'] if code not in codes
+                            and code not in NEVER_FALSE | BY_KIND.get(row['kind'], set()))
+            print(f'{run:28}{len(own):7}{said}{errors(own)}  '
+                  f'{dict(Counter(row["verdict"] for row in own))} {dict(other)}')
+
+
+def errors(rows):
+    """Return rms and largest size of scale error over sigma, of accepted ones, sigma in ppm."""
+    z = {row['seed']: abs(row['scale_error']) / row['scale_sigma']
+         for row in rows if row.get('scale_sigma')}
+    accepted = [z[row['seed']] for row in rows if row['verdict'] == 'accepted']
+    sigma = np.median([1e6 * row['scale_sigma'] for row in rows if row['seed'] in z])
+    return (f'{np.sqrt(np.mean(np.square(list(z.values())))):7.2f}{max(z.values()):6.1f}'
+            f'{max(accepted, default=np.nan):6.1f}{sigma:7.0f}')
 
 
 def main():

@@ -170,7 +170,8 @@ def _bridged(t: Floats, step: Floats, resets: Bools) -> Floats:
     good = np.flatnonzero(~resets & (dt > 0))
     if len(good):
         bad = np.flatnonzero(resets)
-        step[bad] = np.interp(bad, good, step[good] / dt[good]) * dt[bad]
+        rate = step[good] / np.maximum(dt[good], np.median(dt))    # as in _resets
+        step[bad] = np.interp(bad, good, rate) * dt[bad]
     else:
         step[resets] = 0.0
     return step

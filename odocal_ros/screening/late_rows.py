@@ -8,19 +8,18 @@
 # the License.
 
 """
-Odometer rows that came late: a pause, then rows in a burst that catch up.
+Odometer rows that came late: now and then in a burst that catches up, or all of them by chance.
 
 A counter without a header is stamped at arrival: what delays a message (a serial line, a busy
-machine) looks like a wheel that slid and spun. No row is early, so the sender's even rhythm shows
-in the rows that came soonest; that, later by what all rows are, is where the others are put, where
-the counts bear it out; else where the travel on both sides of a burst has them.
+machine) looks like a wheel that slid and spun. No row is early, so the sender's even rhythm is
+below the stamps: it goes through the rows that came soonest. The middle of this lateness is a
+delay; the rest is taken out where the travel is more even on the rhythm. Rows of a burst that
+are not on it are placed by their travel.
 """
-
-from itertools import pairwise
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.pieces import median
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
@@ -28,11 +27,14 @@ from odocal_ros.screening.odometer_care import counter_steps
 
 ON_TIME_WINDOW = 5.0      # s, judgement: within which some row comes on time
 EVEN_BESIDE = 5           # judgement: rows to either side that determine the place of a row
-LINE = (-EVEN_BESIDE, EVEN_BESIDE)
-# definition: a line takes half the acceleration for lateness
-CUBIC = (2 * LINE[0], *LINE, 2 * LINE[1])
+# definition: a line would take half the acceleration for lateness
+CUBIC = (-2 * EVEN_BESIDE, -EVEN_BESIDE, EVEN_BESIDE, 2 * EVEN_BESIDE)
+MIDDLE_WINDOW = 20.0      # s, judgement: whose median is the middle, at least
+MIDDLE_SIGMA = 5e-4       # s, judgement: which it then has; at 15 m/s a centimetre
 LEAST_JITTER = 1e-4       # s, judgement: off the rhythm that is worth it
 ROUNDING_COUNTS = 2.5     # judgement: that rounding may put a row off by
+TESTED_ROWS = 20_000      # judgement: at the most, of those off the rhythm
+APART = 1e-9              # s, judgement: that rows are apart at least
 
 
 def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -42,20 +44,21 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
 
     samples : OdometerSamples, usable.   t : (n,) s by stamps.   found : list that findings join.
     """
-    if form.quantity == 'rate' or len(t) < 4 * EVEN_BESIDE:
-        return t       # the travel of a late speed is still correct
-    step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
-            else samples.value[1:].astype(float))
-    travel = np.concatenate([[0.0], np.cumsum(step)])
-    whole = np.issubdtype(samples.value.dtype, np.integer)
-    usual = interval(t)
-    even_share = 0.3    # share of the intervals that are within a quarter of the median
-    if np.mean(np.abs(np.diff(t) - usual) < usual / 4) < even_share:
+    if len(t) < 4 * EVEN_BESIDE:
         return t
-    true = _put_back(t, travel, usual, ROUNDING_COUNTS if whole else 0.0)
+    whole = np.issubdtype(samples.value.dtype, np.integer)
+    if form.quantity == 'rate':
+        # a speed is as smooth as travel, but does not say where a row of a burst belongs
+        _, even, evener = _rhythm(t, samples.value.astype(float))
+        true = _rising(even) if evener else t
+    else:
+        step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
+                else samples.value[1:].astype(float))
+        travel = np.concatenate([[0.0], np.cumsum(step)])
+        true = _put_back(t, travel, ROUNDING_COUNTS if whole else 0.0)
     late = t - true
     named_late, named_late_share = 0.02, 0.3    # s, of an interval: the more is worth a word
-    named = late > max(named_late, named_late_share * usual)
+    named = late > max(named_late, named_late_share * intervals(t)[0])
     if named.any():
         worst, times = int(np.argmax(late)), int((np.diff(named.astype(int)) == 1).sum())
         found.append(Reason(Code.ODOMETER_LATE, f'{int(named.sum())} of {len(t)} {name} messages '
@@ -65,71 +68,132 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
     return true
 
 
-def interval(t: Floats) -> float:
-    """Return the sender's interval, s, lost and late rows notwithstanding."""
-    usual = median(np.diff(t))
-    interval_span = 5.0    # s over which the interval is taken
-    n = min(max(int(interval_span / usual), 1), len(t) - 1) if usual > 0 else 1
-    mean = median(t[n:] - t[:-n]) / n
-    steady_share = 0.005    # by which it is another than the median: rows are lost
-    return mean if abs(mean - usual) < steady_share * usual else usual
+def intervals(t: Floats) -> list[float]:
+    """Return what the sender's interval may be, s: the usual one, the mean one if different."""
+    interval_span = 5.0    # s over which the mean is taken
+    n = max(1, int(interval_span * (len(t) - 1) / max(t[-1] - t[0], interval_span)))
+    step = np.diff(t)
+    usual, mean = median(step), median(t[n:] - t[:-n]) / n
+    steady_share = 0.005    # by which they differ: rows are lost, or all are late by chance
+    if abs(mean - usual) < steady_share * mean:
+        return [mean]
+    even_share = 0.3    # share of the intervals that are within a quarter of the usual one
+    even = np.mean(np.abs(step - usual) < usual / 4) > even_share
+    # where more than half are lost the median is not the interval
+    return [usual, mean] if even and usual > mean / 2 else [mean]
 
 
-def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
+def _put_back(t: Floats, travel: Floats, least: float) -> Floats:
     """Return times with late rows put back."""
-    rows = usual * np.arange(len(t))
-    ahead = int(ON_TIME_WINDOW / usual) + 1
-    # those to come, not those before: a lost row sets the rhythm back
-    even = rows + _least_of_next(t - rows, ahead)
-    even += np.median(t - even)         # what all have is a delay, and no lateness
+    usual, even, evener = _rhythm(t, travel)
     least_late, late_share = 0.004, 0.1    # s, of an interval: the more of both matters
-    late = t - even > max(least_late, late_share * usual)
-    true = t.copy()
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]]).astype(int)))
-    fitting_share = 0.4    # of what rows are off as sent
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        about = np.arange(max(begin - EVEN_BESIDE, 0), min(end + EVEN_BESIDE, len(t)))
-        sent, put = (_off(x, travel, LINE, about) for x in (t, even))
-        fits = np.linalg.norm(put) < fitting_share * np.linalg.norm(sent)
-        if np.abs(put).max() <= least or fits:
+    late = t - even > (usual if evener else max(least_late, late_share * usual))
+    true = even.copy() if evener else t.copy()
+    for begin, end, fits in _fitting(t, even, travel, late, least):
+        if fits:
             true[begin:end] = even[begin:end]
         elif begin > 0 and end < len(t):
             true[begin:end] = _by_travel(t, travel, begin - 1, end, usual)
-    true = _on_rhythm(true, t, travel, [even, *_middle(t, usual)], usual)
-    floor = np.maximum.accumulate(np.concatenate([[-np.inf], true[:-1] + 1e-9]))
-    return np.where((true > floor) | ~late, true, np.minimum(floor, t))
+    return _rising(true)
 
 
-def _on_rhythm(true: Floats, t: Floats, travel: Floats, rhythms: list[Floats],
-               usual: float) -> Floats:
+def _rising(t: Floats) -> Floats:
+    """Return times none of which is before the last."""
+    order = APART * np.arange(len(t))
+    out: Floats = np.maximum.accumulate(t - order) + order
+    return out
+
+
+def _fitting(t: Floats, even: Floats, travel: Floats, late: Bools,
+             least: float) -> list[tuple[int, int, bool]]:
+    """Return begin and end of the runs of late rows, and whether they fit the rhythm."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]]).astype(int)))
+    begin, end = edges[::2], edges[1::2]
+    if not len(begin):
+        return []
+    low, high = np.maximum(begin - EVEN_BESIDE, 0), np.minimum(end + EVEN_BESIDE, len(t))
+    about = np.zeros(len(t) + 1, bool)      # rows that are looked at
+    for shift in range(-EVEN_BESIDE, EVEN_BESIDE + 1):
+        about[np.clip(np.flatnonzero(late) + shift, 0, len(t) - 1)] = True
+    off = np.zeros((2, len(t) + 1))
+    rows = np.flatnonzero(about)
+    off[:, rows] = [_off(x, travel, rows) for x in (t, even)]
+    # by reduceat, between the ends of each run
+    ends = np.stack([low, high], -1).ravel()
+    sent, put = np.sqrt(np.add.reduceat(off**2, ends, axis=1)[:, ::2])
+    most = np.maximum.reduceat(np.abs(off[1]), ends)[::2]
+    fitting_share = 0.25    # of what rows are off as sent: a lost row in a burst leaves more
+    fits = (most <= least) | (put < fitting_share * sent)
+    return list(zip(begin.tolist(), end.tolist(), fits.tolist(), strict=True))
+
+
+def _rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
     """
-    Return times on that of several rhythms on which the travel is evenest, as they are if on none.
+    Return the interval, the times on the rhythm on which the travel is evenest, and if it is.
 
-    What is left off a rhythm is stamped some milliseconds late, as a busy machine comes to it, or
-    both ways, by a sender's clock that ticks seldom.
+    What is off a rhythm is stamped late, as a busy machine comes to it, or both ways, by a
+    sender's clock that ticks seldom. True: as a whole these rows are more even on it.
     """
-    best, least = true, 1.0
-    evener_share = 0.9    # of it, where all rows that are not late are put on the rhythm
-    for even in rhythms:
-        left = np.abs(true - even)
-        jitters = (left > LEAST_JITTER) & (left < usual)
-        rows = np.flatnonzero(jitters)
-        sent, put = (np.linalg.norm(_off(x, travel, CUBIC, rows)) for x in (t, even))
-        if put < evener_share * least * sent:
-            best, least = np.where(jitters, even, true), float(put / sent)
-    return best
+    # of two as even that of the middle: the soonest rows make a stair
+    found = [(_unevenness(t, even, travel), usual, even) for usual in reversed(intervals(t))
+             for even in (*_middle(t, usual), _soonest(t, usual))]
+    least = min(ratio for ratio, _, _ in found)
+    evener_share, as_even = 0.9, 1.1
+    evener = least < evener_share
+    _, usual, even = next(x for x in found if x[0] <= as_even * least) if evener else found[-1]
+    return usual, even, evener
+
+
+def _unevenness(t: Floats, even: Floats, travel: Floats) -> float:
+    """Return how uneven the travel of rows off a rhythm is on it: 1 as at t."""
+    rows = np.flatnonzero(np.abs(t - even) > LEAST_JITTER)
+    rows = rows[::1 + len(rows) // TESTED_ROWS]
+    off = np.array([np.abs(_off(x, travel, rows)) for x in (t, even)])
+    off = off[:, off.any(axis=0)]       # of rows in motion
+    if not off.size:
+        return 1.0
+    most = 90    # percentile: a rhythm that is wrong at a lost row is so for some rows beside it
+    sent, put = np.percentile(off, most, axis=1)
+    return float(put / max(sent, APART))
+
+
+def _soonest(t: Floats, usual: float) -> Floats:
+    """
+    Return the rhythm of the rows that came soonest, later by what the middle of all rows is.
+
+    By the morphological opening of the lateness over ON_TIME_WINDOW: what is later for a shorter
+    time is lateness; a rise that stays is a lost row, or another interval.
+    """
+    rows = usual * np.arange(len(t))
+    window = min(int(ON_TIME_WINDOW / usual) + 1, len(t))
+    least = _least_of_next(t - rows, window)
+    least[len(t) - window + 1:] = -np.inf       # of whole windows only
+    even = rows - _least_of_next(-least[::-1], window)[::-1]
+    out: Floats = even + np.median(t - even)      # what all have is a delay, and no lateness
+    return out
 
 
 def _middle(t: Floats, usual: float) -> list[Floats]:
     """Return the rhythm in the middle of rows, some of them early; none where rows are lost."""
-    rows = usual * np.arange(len(t))
-    middle_window = 20.0    # s of rows whose median is the middle: jitter over sqrt(600)
-    blocks = np.array_split(t - rows, max(1, int(len(t) * usual / middle_window)))
-    ends = np.cumsum([len(block) for block in blocks])
-    at = [end - len(block) / 2 for end, block in zip(ends, blocks, strict=True)]
-    off = [float(np.median(block)) for block in blocks]
-    lost = any(abs(b - a) > usual / 4 for a, b in pairwise(off))
-    return [] if lost else [rows + np.interp(np.arange(len(t)), at, off)]
+    row = np.arange(len(t))
+    late = t - usual * row
+    at, middle = _medians(late, MIDDLE_WINDOW / usual)
+    jitter = float(np.median(np.abs(late - np.interp(row, at, middle))))
+    # a lost row moves the middle by an interval; jitter moves it too, by a tenth of its size
+    step = np.diff(middle)
+    if len(step) and np.abs(step - np.median(step)).max() > max(usual / 2, jitter / 2):
+        return []
+    line = np.polyval(np.polyfit(at, middle, min(1, len(at) - 1)), row)
+    # exponential lateness has a sigma of 1.4 jitters, its median of n rows 1.4 / sqrt(n)
+    per = max(MIDDLE_WINDOW / usual, (1.4 * jitter / MIDDLE_SIGMA)**2)
+    return [usual * row + line + np.interp(row, *_medians(late - line, per))]
+
+
+def _medians(x: Floats, per: float) -> tuple[Floats, Floats]:
+    """Return the middle rows of blocks of so many rows, and their medians."""
+    blocks = np.array_split(x, max(1, int(len(x) / per)))
+    size = np.array([len(block) for block in blocks])
+    return np.cumsum(size) - size / 2, np.array([np.median(block) for block in blocks])
 
 
 def _least_of_next(x: Floats, count: int) -> Floats:
@@ -141,10 +205,10 @@ def _least_of_next(x: Floats, count: int) -> Floats:
     return np.minimum(until[:n], since[count - 1:count - 1 + n])
 
 
-def _off(t: Floats, travel: Floats, beside: tuple[int, ...], rows: Ints) -> Floats:
-    """Return by how much rows' travel is off the polynomial through rows so far beside: (m,)."""
+def _off(t: Floats, travel: Floats, rows: Ints) -> Floats:
+    """Return by how much rows' travel is off the cubic through rows beside them: (m,)."""
     last = len(t) - 1
-    nodes = [np.clip(rows + step, 0, last) for step in beside]
+    nodes = [np.clip(rows + step, 0, last) for step in CUBIC]
     times, here = [t[at] for at in nodes], t[rows]
     meant = np.zeros(len(rows))
     for at, time in zip(nodes, times, strict=True):
@@ -154,7 +218,7 @@ def _off(t: Floats, travel: Floats, beside: tuple[int, ...], rows: Ints) -> Floa
                 apart = time - other        # none of rows that came at once, or at an end
                 weight *= (here - other) / np.where(np.abs(apart) > 1e-9, apart, 1e-9)
         meant += weight * (travel[at] - travel[rows])
-    whole = (rows + min(beside) >= 0) & (rows + max(beside) <= last)
+    whole = (rows + CUBIC[0] >= 0) & (rows + CUBIC[-1] <= last)
     return np.where(whole, -meant, 0.0)
 
 

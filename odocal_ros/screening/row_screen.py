@@ -10,6 +10,7 @@
 """Rows of one topic made usable: finite, beyond no sensor, stamps that rise, no single spikes."""
 
 from bisect import bisect_left
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     sent = getattr(leg, slot)
     good, wild = _finite(sent, slot, leg, found)
     clean = sent if good.all() else take(sent, good)
+    clean = _one_by_one(clean)
     order = _rising(clean, slot, leg, found)
     clean = clean if order is None else take(clean, order)
     t = room(len(clean.stamp_ns))
@@ -118,6 +120,16 @@ def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
                             f'{int((suspect & good & ~wild).sum())} messages next to them were '
                             'dropped too'))
     return suspect
+
+
+def _one_by_one(samples: Any) -> Any:
+    """Return samples without a header, stamped at arrival, with equal stamps 1 ns apart."""
+    stamp = samples.stamp_ns
+    step = np.diff(stamp)
+    if (step > 0).all() or (step < 0).any() or (stamp != samples.received_ns).any():
+        return samples
+    order = np.arange(len(stamp))
+    return replace(samples, stamp_ns=np.maximum.accumulate(stamp - order) + order)
 
 
 def _rising(samples: Samples, slot: str, leg: Leg, found: list[Reason]) -> Ints | None:

@@ -15,7 +15,7 @@ from drives import drive, everything_said, held_up, settings
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import OdometerForm, take
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening import late_rows
@@ -86,6 +86,80 @@ def test_rows_that_are_all_some_milliseconds_late_are_put_on_their_rhythm(made):
     assert Code.WHEEL_SLIP not in said
 
 
+def arrivals(samples, seconds, lost=0.0, seed=3):
+    """Return rows stamped at arrival, in order, late by an exponential time of that mean."""
+    rng = np.random.default_rng(seed)
+    late_ns = np.round(rng.exponential(seconds, len(samples.stamp_ns)) * 1e9).astype(np.int64)
+    stamps = np.maximum.accumulate(samples.stamp_ns + late_ns)
+    kept = rng.random(len(stamps)) >= lost
+    return take(OdometerSamples(stamps, stamps, samples.value), kept)
+
+
+@pytest.mark.parametrize(('seconds', 'off_s'), [(0.005, 0.0005), (0.02, 0.002), (0.05, 0.01)])
+def test_rows_that_all_arrive_late_by_chance_are_put_on_their_rhythm(made, seconds, off_s):
+    """Up to several intervals late, some together: 1000 rows have a mean to 50 ms / sqrt(100)."""
+    late = arrivals(made.odometer, seconds)
+    inputs, found = screen(replace(made.leg(), odometer=late), settings(made))
+    sent, _ = screen(made.leg(), settings(made))
+    assert len(inputs.travel.t) == len(sent.travel.t)
+    later = inputs.travel.t - sent.travel.t
+    assert np.abs(later - np.median(later)).max() < off_s
+    assert {r.code for r in found} == {Code.ODOMETER_LATE}
+
+
+def test_arrival_jitter_is_no_slip(made):
+    """A jitter of 20 ms at 12 m/s is 0.24 m; the rest is as without it, a slip of 0.5 m too."""
+    method, said = of_smoother(made, arrivals(made.odometer, 0.02))
+    assert Code.WHEEL_SLIP not in said
+    straight, _ = of_smoother(made, made.odometer)
+    a, b = (m.estimates['scale_factor'] for m in (method, straight))
+    assert a.sigma == pytest.approx(b.sigma, rel=0.1)
+    method, said = of_smoother(made, arrivals(spun(made, made.odometer), 0.02))
+    assert Code.WHEEL_SLIP in said
+    assert method.details['slips'][0]['metres'] == pytest.approx(SLIP_M, rel=0.25)
+
+
+def test_lost_rows_keep_their_place_among_late_ones(made):
+    """The rows after a lost one are an interval later: 0.02 s, at 12 m/s 0.24 m."""
+    late = arrivals(made.odometer, 0.002, lost=0.002)
+    inputs, _ = screen(replace(made.leg(), odometer=late), settings(made))
+    truth, _ = screen(made.leg(), settings(made))
+    moving = np.gradient(inputs.travel.s, inputs.travel.t) * made.truth.scale > 2.0
+    # the time at which the vehicle was where a row says
+    at = np.interp(inputs.travel.s, truth.travel.s, truth.travel.t)
+    later = (inputs.travel.t - at)[moving]
+    assert np.percentile(np.abs(later - np.median(later)), 95) < 0.006
+
+
+def test_increments_that_arrive_together_are_all_counted(made):
+    form = OdometerForm('increment', 0, 'm/pulse')
+    steps = replace(made.odometer, value=np.diff(made.odometer.value,
+                                                 prepend=made.odometer.value[:1]))
+    inputs, found = screen(replace(made.leg(), odometer=arrivals(steps, 0.05), form=form),
+                           settings(made))
+    assert inputs.travel.s[-1] == steps.value[1:].sum()
+    assert Code.STAMPS_NOT_RISING not in {r.code for r in found}
+
+
+def test_rows_with_a_header_that_repeat_a_stamp_are_said(made):
+    """Arrivals differ: the stamps are those of a clock, and two of them are one."""
+    stamps = made.odometer.stamp_ns.copy()
+    stamps[1001] = stamps[1000]
+    twice = OdometerSamples(stamps, made.odometer.stamp_ns, made.odometer.value)
+    _, found = screen(replace(made.leg(), odometer=twice), settings(made))
+    assert Code.STAMPS_NOT_RISING in {r.code for r in found}
+
+
+def test_a_sender_that_changes_its_rate_stays_where_it_is(made):
+    """Half of the drive at 25 Hz, half at 50 Hz: no row is late."""
+    n = len(made.odometer.stamp_ns)
+    changed = take(made.odometer, (np.arange(n) > n // 2) | (np.arange(n) % 2 == 0))
+    inputs, found = screen(replace(made.leg(), odometer=changed), settings(made))
+    sent = (changed.stamp_ns - made.leg().start_ns) * 1e-9
+    np.testing.assert_allclose(inputs.travel.t, sent, atol=1e-3)
+    assert not found
+
+
 def test_rows_that_are_early_or_late_are_put_in_their_middle():
     """What comes soonest is no rhythm then: of 250 rows it is 2.8 sigma early, by chance 3.2."""
     fine = drive(scenario='town', duration=400.0, odometer_rate=50.0, seed=8, scale=1e-3,
@@ -122,7 +196,7 @@ def test_rows_that_come_at_once_are_spread(made):
     wait_s = np.where(held, 0.4 - t % 15.0, 0.0)
     stamps = made.odometer.stamp_ns + np.round(wait_s * 1e9).astype(np.int64)
     late = replace(made.odometer, stamp_ns=stamps)
-    usual = late_rows.interval((stamps - stamps[0]) * 1e-9)
+    usual = late_rows.intervals((stamps - stamps[0]) * 1e-9)[0]
     assert usual == pytest.approx(0.02, rel=1e-6)
     true = late_rows.on_time(late, (stamps - stamps[0]) * 1e-9, made.leg().form, [])
     # where it stands nothing tells, and nothing matters
