@@ -19,6 +19,7 @@ import pytest
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.glitches import about_clumps
+from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.slow
 
@@ -109,6 +110,18 @@ def test_what_a_clump_is():
     wild[[405, 410, 414, 419]] = True                # 400 to 419: five apart at most
     assert np.flatnonzero(about_clumps(wild)).tolist() == list(range(390, 430))
     assert not about_clumps(np.zeros(0, bool)).any()
+
+
+def test_a_filtered_speed_that_fades_at_rest_is_zero(made):
+    """A low pass of 0.4 s in double precision is at 1e-50 after 46 s of standing."""
+    leg = made.leg()
+    form = replace(leg.form, quantity='rate', modulus=0, scale_unit='1')
+    t = (leg.odometer.stamp_ns - leg.start_ns) * 1e-9
+    speeds = np.where(t < 40.0, np.sin(t / 30.0)**2, np.exp((40.0 - t) / 0.4))
+    found = screen(replace(leg, odometer=replace(leg.odometer, value=speeds), form=form),
+                   settings(made))[1]
+    assert np.abs(speeds).min() < 1e-60
+    assert not {Code.BAD_ROWS_DROPPED, Code.ROWS_DAMAGED} & {r.code for r in found}
 
 
 @pytest.mark.parametrize('value', [5e-324, -1e-310, 1e-200])

@@ -45,6 +45,8 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     offset : s, added to the stamps.   found : takes what is wrong with the others.
     """
     sent = getattr(leg, slot)
+    if slot in ('odometer', 'odometer_right'):
+        sent = _stood(sent)
     good, wild = _finite(sent, slot, leg, found)
     clean = sent if good.all() else take(sent, good)
     clean = _one_by_one(clean)
@@ -120,6 +122,13 @@ def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
                             f'{int((suspect & good & ~wild).sum())} messages next to them were '
                             'dropped too'))
     return suspect
+
+
+def _stood(samples: Any) -> Any:
+    """Return odometer samples with zero where a low-pass filter has faded to next to nothing."""
+    least_value = 1e-30    # m/s or rad/s: a filter of 0.4 s reaches it after half a minute
+    faded = (samples.value != 0) & (np.abs(samples.value) < least_value)
+    return replace(samples, value=np.where(faded, 0, samples.value)) if faded.any() else samples
 
 
 def _one_by_one(samples: Any) -> Any:
