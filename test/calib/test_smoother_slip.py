@@ -106,6 +106,18 @@ def filtered(method):
     return [r.text for r in method.reasons if r.code is Code.SPEED_FILTERED]
 
 
+def test_what_a_filter_leaves_when_the_speed_changes_is_no_slip():
+    """Three filters one after the other: of no first order, whose shape is taken out."""
+    _, config, leg = made(**SHORT, fix_noise='rtk')
+    for _ in range(3):
+        leg = low_passed(leg, 0.2)
+    method = smooth(leg, config)
+    assert filtered(method)
+    noise = method.details['noise']
+    assert noise['along_hard'] > max(0.006, 3 * noise['along'])
+    assert not said(method)
+
+
 @pytest.mark.parametrize('noise', ['white', 'rtk'])
 def test_a_low_pass_filter_is_named_and_no_slip(noise):
     _, config, leg = made(**SHORT, fix_noise=noise)

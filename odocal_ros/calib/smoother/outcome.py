@@ -37,7 +37,7 @@ from odocal_ros.calib.smoother.slide import assumed
 from odocal_ros.calib.smoother.slip import (
     along,
     find_slips,
-    left_when_changing,
+    level_when_changing,
     Slip,
     slip_reasons,
     SLIP_VARIANCE,
@@ -124,10 +124,12 @@ def _odometer(leg: SmootherLeg, fit: Fit, near: Neighbours,
         return (), []
     turned = along(fit, near)
     low_pass = speed_filter(fit, turned)
-    rest = turned if low_pass is None else low_pass.taken_from(turned)
-    slips = find_slips(fit, rest, count)
-    return slips, [*filter_reasons(low_pass), *slip_reasons(
-        fit, near, slips, count, left_when_changing(fit, turned, rest))]
+    if low_pass is None:
+        slips = find_slips(fit, turned, count)
+        return slips, slip_reasons(slips, level_when_changing(fit, near, count))
+    # the shape of a filter is not known: what it leaves when speeds change is no slip
+    slips = find_slips(fit, low_pass.taken_from(turned), count, filtered=True)
+    return slips, [*filter_reasons(low_pass), *slip_reasons(slips)]
 
 
 def floored(covariance: Floats) -> Floats:

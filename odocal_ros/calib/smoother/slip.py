@@ -17,14 +17,14 @@ from odocal_ros.calib.smoother.chain import Neighbours
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import ROAD
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 # factor on the variance of an interval from which it is a slip. Statistical: it lies 3.7 sigmas
 # off, once in 4200 by chance
 SLIP_VARIANCE = 1.5
-ROAD_NAMES = tuple(ROAD)
+WORTH = 0.05    # m: a shorter slip is not reported. Judgement
 # rows that a level must be worth to be reported. Statistical: its root, with a sigma of
 # root / sqrt(2 rows), then lies REMARK_SIGMAS above zero
 LEVEL_ROWS = REMARK_SIGMAS**2 / 2
@@ -47,48 +47,60 @@ def along(fit: Fit, neighbours: Neighbours) -> Floats:
     return out
 
 
-def left_when_changing(fit: Fit, turned: Floats, rest: Floats) -> float:
-    """Return the share of the rms of ``turned`` that ``rest`` is where speeds change, (K,) m."""
-    hard = fit.weighted[MotionRows].noise.road[:, ROAD_NAMES.index('along_hard')] > 0
-    power = float((turned[hard]**2).sum())
-    return float(np.sqrt((rest[hard]**2).sum() / power)) if power else 1.0
-
-
-def find_slips(fit: Fit, turned: Floats, count: float = 0.0) -> tuple[Slip, ...]:
+def find_slips(fit: Fit, turned: Floats, count: float = 0.0,
+               filtered: bool = False) -> tuple[Slip, ...]:
     """
     Return the runs that lie far out along, by more than a count, m; largest first.
 
     turned : (K,) m, as ``along`` has it, without what a filter of the speed does.
+    filtered : whether there is one; what happens whenever the speed changes is then no slip.
     """
-    t = fit.state.t
-    noise, worth = 4 * float(np.sqrt(fit.levels['along'])), 0.05    # sigmas of a second; m
-    least = max(worth, noise, count)
+    t, variance = fit.state.t, np.full(len(turned), fit.levels['along'])
+    least = max(4 * float(np.sqrt(fit.levels['along'])), WORTH, count)    # sigmas of a second
     far = np.flatnonzero((fit.spread[:, 0] > SLIP_VARIANCE) | (np.abs(turned) > least))
     if not len(far):
         return ()
-    runs = np.split(far, np.flatnonzero(np.diff(far) > 2) + 1)    # a second between
-    slips = [Slip(float(t[run[0]]), float(t[run[-1] + 1] - t[run[0]]), float(turned[run].sum()))
-             for run in runs]
-    return tuple(sorted((s for s in slips if abs(s.metres)
-                         >= max(worth, noise * np.sqrt(s.duration), count)),
-                        key=lambda s: -abs(s.metres)))
+    if filtered:
+        variance += np.where(_speed_changes(fit), fit.levels['along_hard'], 0.0)
+    total = np.append(0.0, np.cumsum(variance * np.diff(t)))
+    slips = []
+    for run in np.split(far, np.flatnonzero(np.diff(far) > 2) + 1):    # a second between
+        begin, end, metres = run[0], run[-1] + 1, float(turned[run].sum())
+        if abs(metres) >= max(WORTH, 4 * np.sqrt(total[end] - total[begin]), count):
+            slips.append(Slip(float(t[begin]), float(t[end] - t[begin]), metres))
+    return tuple(sorted(slips, key=lambda s: -abs(s.metres)))
 
 
-def slip_reasons(fit: Fit, neighbours: Neighbours, slips: tuple[Slip, ...], count: float = 0.0,
-                 left: float = 1.0) -> list[Reason]:
-    """
-    Return WHEEL_SLIP with where the wheels slipped and how much, empty where they did not.
+def _speed_changes(fit: Fit) -> Bools:
+    """Return a mask of the intervals with the noise of acceleration and braking, (K,)."""
+    out: Bools = fit.weighted[MotionRows].noise.road[:, tuple(ROAD).index('along_hard')] > 0
+    return out
 
-    One by one, or whenever the speed changes: by a level, where the drive determines it.
-    left : of the ways when the speed changes, without what a filter of the speed does.
-    """
+
+def level_when_changing(fit: Fit, neighbours: Neighbours, count: float = 0.0) -> str:
+    """Return what is slipped whenever the speed changes, '' if the drive shows no such level."""
     level = fit.levels.roots()
-    level['along_hard'] *= left
     # two readings differ by that whatever the wheel does, over the 10 s that a spell of it lasts
     rounding = count * np.sqrt(2 / 12) / np.sqrt(10.0)
     # one that no row determines stays where the fit began
     known = {name for name, (_, rows) in fit.weighted[MotionRows].components(neighbours).items()
              if rows > LEVEL_ROWS}
+    # m/sqrt(s), times even driving: no wheel without slip has so much when speeds change
+    if 'along_hard' not in known or level['along_hard'] <= max(
+            0.006, 3 * level['along'], rounding):
+        return ''
+    beside = (f', {1e3 * level["along"]:.1f} mm/√s at constant '
+              'speed') if 'along' in known else ''
+    return ('slip while accelerating or braking is about '
+            f'{1e3 * level["along_hard"]:.0f} mm/√s{beside}')
+
+
+def slip_reasons(slips: tuple[Slip, ...], level: str = '') -> list[Reason]:
+    """
+    Return WHEEL_SLIP with where the wheels slipped and how much, empty where they did not.
+
+    level : of slip whenever the speed changes, in words.
+    """
     said, most = [], 3      # runs said one by one
     if slips:
         one = [f'{s.metres:+.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
@@ -96,10 +108,6 @@ def slip_reasons(fit: Fit, neighbours: Neighbours, slips: tuple[Slip, ...], coun
         more = f' and {len(slips) - most} more' if len(slips) > most else ''
         said.append('wheel slip, travel of the wheel minus travel of the vehicle: '
                     + ', '.join(one) + more)
-    # m/sqrt(s), times even driving: no wheel without slip has so much when speeds change
-    if 'along_hard' in known and level['along_hard'] > max(0.006, 3 * level['along'], rounding):
-        beside = (f', {1e3 * level["along"]:.1f} mm/√s at constant '
-                  'speed') if 'along' in known else ''
-        said.append('slip while accelerating or braking is about '
-                    f'{1e3 * level["along_hard"]:.0f} mm/√s{beside}')
+    if level:
+        said.append(level)
     return [Reason(Code.WHEEL_SLIP, '; '.join(said))] if said else []
