@@ -143,7 +143,9 @@ def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
     if not timing:
         return
     if timing['headerless']:
-        yield 'no header: arrival time (bag time) is used as stamp'
+        jitter = timing['arrival_jitter']
+        yield 'no header: arrival time (bag time) is used as stamp' + (
+            '' if jitter is None else f'; arrival jitter {1e3 * jitter:.1f} ms')
     elif abs(timing['header_to_bag']) > 0.5e-3:
         where = 'after' if timing['header_to_bag'] > 0 else 'before'
         yield (f'recorded {abs(timing["header_to_bag"]):.3f} s {where} its header stamp '

@@ -19,6 +19,7 @@ from odocal_ros.data.pieces import across, lengths, median, medians
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.screening.fix_screen import placed
 from odocal_ros.screening.glitches import beyond, oriented
+from odocal_ros.screening.late_rows import arrival_jitter
 from odocal_ros.settings.grades import G
 
 AXES = 'xyz'
@@ -30,7 +31,8 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
     Return rate, gaps and what is odd about the stamps of a topic.
 
     ``at`` is in seconds from the bag's first message; ``header_to_bag`` is how long after its
-    header stamp a message was recorded, None without a header.
+    header stamp a message was recorded, None without a header; ``arrival_jitter`` is the standard
+    deviation of arrivals without a header, s.
     """
     stamped = samples.stamp_ns > 0
     stamp, received = samples.stamp_ns[stamped], samples.received_ns[stamped]
@@ -50,6 +52,8 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
         'header_to_bag': None if headerless or not len(lag) else median(lag),
         'header_to_bag_spread': None if headerless or not len(lag) else float(
             np.subtract(*np.percentile(lag, [97.5, 2.5])) / 4),
+        'arrival_jitter': arrival_jitter(
+            np.maximum.accumulate(stamp - start_ns) * 1e-9) if headerless else None,
         'zero_stamps': int((~stamped).sum()), 'repeated_stamps': int((step == 0).sum()),
         'backward_steps': int((step < 0).sum()), 'gap_count': len(gaps),
         'gaps': [{'at': (int(stamp[k]) - start_ns) * 1e-9, 'length': float(step[k])}

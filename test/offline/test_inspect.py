@@ -120,7 +120,7 @@ def test_comma(data_dir, capsys):
     assert pulses['timing']['headerless']
     assert (pulses['odometer']['quantity'], pulses['rate_hz']) == (
         'cumulative', pytest.approx(82.9, abs=0.1))
-    for line in ('looks z-down', 'no header: arrival time', 'never at rest',
+    for line in ('looks z-down', 'no header: arrival time', 'arrival jitter', 'never at rest',
                  'no covariance', '3 topics can be the odometer', '[180, 0, 0] deg'):
         assert line in text
 

@@ -107,6 +107,17 @@ def test_rows_that_all_arrive_late_by_chance_are_put_on_their_rhythm(made, secon
     assert {r.code for r in found} == {Code.ODOMETER_LATE}
 
 
+@pytest.mark.parametrize('lost', [0.0, 0.001])
+def test_arrival_jitter_is_measured(made, lost):
+    """Of an exponential distribution 95 % in the middle are 3.66 means wide."""
+    late = arrivals(made.odometer, 0.005, lost)
+    assert late_rows.arrival_jitter((late.stamp_ns - late.stamp_ns[0]) * 1e-9) == pytest.approx(
+        0.005 * 3.66 / 4, rel=0.1)
+    t = (made.odometer.stamp_ns - made.odometer.stamp_ns[0]) * 1e-9
+    assert late_rows.arrival_jitter(t) == pytest.approx(0.0, abs=1e-9)
+    assert late_rows.arrival_jitter(t[:10]) is None
+
+
 def test_arrival_jitter_is_no_slip(made):
     """A jitter of 20 ms at 12 m/s is 0.24 m; the rest is as without it, a slip of 0.5 m too."""
     method, said = of_smoother(made, arrivals(made.odometer, 0.02))
