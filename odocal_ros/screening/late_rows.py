@@ -23,6 +23,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.pieces import median
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.imu_rhythm import APART, TESTED_ROWS
 from odocal_ros.screening.odometer_care import counter_steps
 
 ON_TIME_WINDOW = 5.0      # s, judgement: within which some row comes on time
@@ -33,8 +34,6 @@ MIDDLE_WINDOW = 20.0      # s, judgement: whose median is the middle, at least
 MIDDLE_SIGMA = 5e-4       # s, judgement: which it then has; at 15 m/s a centimetre
 LEAST_JITTER = 1e-4       # s, judgement: off the rhythm that is worth it
 ROUNDING_COUNTS = 2.5     # judgement: that rounding may put a row off by
-TESTED_ROWS = 20_000      # judgement: at the most, of those off the rhythm
-APART = 1e-9              # s, judgement: that rows are apart at least
 
 
 def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -78,7 +77,7 @@ def arrival_jitter(t: Floats) -> float | None:
 
 
 def intervals(t: Floats) -> list[float]:
-    """Return what the sender's interval may be, s: the usual one, the mean one if different."""
+    """Return candidates of the sender's interval, s: the median, the mean if different."""
     interval_span = 5.0    # s over which the mean is taken
     n = max(1, int(interval_span * (len(t) - 1) / max(t[-1] - t[0], interval_span)))
     step = np.diff(t)
@@ -154,7 +153,7 @@ def _rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
 
 
 def _unevenness(t: Floats, even: Floats, travel: Floats) -> float:
-    """Return how uneven the travel of rows off a rhythm is on it: 1 as at t."""
+    """Return the ratio of the unevenness of travel on a rhythm to that at t, of rows off it."""
     rows = np.flatnonzero(np.abs(t - even) > LEAST_JITTER)
     rows = rows[::1 + len(rows) // TESTED_ROWS]
     off = np.array([np.abs(_off(x, travel, rows)) for x in (t, even)])

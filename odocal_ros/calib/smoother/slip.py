@@ -24,7 +24,7 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 # factor on the variance of an interval from which it is a slip. Statistical: it lies 3.7 sigmas
 # off, once in 4200 by chance
 SLIP_VARIANCE = 1.5
-WORTH = 0.05    # m: a shorter slip is not reported. Judgement
+LEAST_SLIP = 0.05    # m: a shorter slip is not reported. Judgement
 # rows that a level must be worth to be reported. Statistical: its root, with a sigma of
 # root / sqrt(2 rows), then lies REMARK_SIGMAS above zero
 LEVEL_ROWS = REMARK_SIGMAS**2 / 2
@@ -56,7 +56,7 @@ def find_slips(fit: Fit, turned: Floats, count: float = 0.0,
     filtered : whether there is one; what happens whenever the speed changes is then no slip.
     """
     t, variance = fit.state.t, np.full(len(turned), fit.levels['along'])
-    least = max(4 * float(np.sqrt(fit.levels['along'])), WORTH, count)    # sigmas of a second
+    least = max(4 * float(np.sqrt(fit.levels['along'])), LEAST_SLIP, count)    # sigmas of a second
     far = np.flatnonzero((fit.spread[:, 0] > SLIP_VARIANCE) | (np.abs(turned) > least))
     if not len(far):
         return ()
@@ -66,7 +66,7 @@ def find_slips(fit: Fit, turned: Floats, count: float = 0.0,
     slips = []
     for run in np.split(far, np.flatnonzero(np.diff(far) > 2) + 1):    # a second between
         begin, end, metres = run[0], run[-1] + 1, float(turned[run].sum())
-        if abs(metres) >= max(WORTH, 4 * np.sqrt(total[end] - total[begin]), count):
+        if abs(metres) >= max(LEAST_SLIP, 4 * np.sqrt(total[end] - total[begin]), count):
             slips.append(Slip(float(t[begin]), float(t[end] - t[begin]), metres))
     return tuple(sorted(slips, key=lambda s: -abs(s.metres)))
 
