@@ -171,6 +171,12 @@ class Code(Enum):
     WHEELS_SWAPPED = REJECT, 'Swap odometer.left and odometer.right.'
     WHEEL_DEAD = REJECT, ('Check the sensor and wiring of this wheel, or calibrate the other '
                           'wheel alone: set odometer.field to its joint or index.')
+    WHEEL_LEFT_OUT = CAUTION, ('Check the sensor and wiring of this wheel. The scale factor is '
+                               'that of the mean of the other axles.')
+    WHEELS_STEERED = NOTE, ('No action needed. If these wheels do not steer, check the turn rate '
+                            'of the gyro and the order of odometer.wheels.')
+    WHEEL_DEPARTS = NOTE, ('Check tyre pressure, tyre size and the counts per revolution of '
+                           'this wheel.')
     WHEEL_REVERSED = REJECT, ('Invert the sign of this wheel in its driver. odometer.reversed '
                               'inverts both wheels.')
     WHEEL_COUNTERS_DIFFER = CAUTION, ('Set odometer.wrap to the modulus of the counters. Both '

@@ -48,7 +48,7 @@ def test_a_span_that_the_type_does_not_tell_is_found_and_undone_to_the_count(mad
     text = said[Code.WHEEL_COUNTERS_DIFFER]
     assert f'right wheel counter rolls over at {span},' in text
     # bridging would lose counts; here none is
-    assert np.array_equal(inputs.travel_right.s, clean.travel_right.s)
+    assert np.array_equal(inputs.travels[1].s, clean.travels[1].s)
     assert not len(inputs.doubt_t)
 
 
@@ -75,7 +75,7 @@ def test_a_span_of_no_round_number_is_taken_with_its_doubt(made):
     inputs, said = screened(with_right(made, lambda a: a % 4321), made)
     clean, _ = screened(made.leg(), made)
     assert 'about' in said[Code.WHEEL_COUNTERS_DIFFER]
-    off = inputs.travel_right.s[-1] - clean.travel_right.s[-1]
+    off = inputs.travels[1].s[-1] - clean.travels[1].s[-1]
     doubt = np.linalg.norm(inputs.doubt_sigma)          # of the mean: half the right wheel's
     assert 0 < doubt < 1e-3 * clean.travel.s[-1]
     assert abs(off / 2) < 3 * doubt
@@ -86,7 +86,7 @@ def test_angles_wrapped_at_a_turn_are_unrolled():
     inputs, said = screened(with_right(made, lambda a: np.angle(np.exp(1j * a))), made)
     clean, _ = screened(made.leg(), made)
     assert 'rolls over at 2 pi' in said[Code.WHEEL_COUNTERS_DIFFER]
-    assert_allclose(inputs.travel_right.s, clean.travel_right.s, atol=1e-6)
+    assert_allclose(inputs.travels[1].s, clean.travels[1].s, atol=1e-6)
 
 
 def test_a_reset_is_no_rollover_and_the_wheel_is_named(made):
@@ -104,7 +104,7 @@ def test_one_wheel_of_another_integer_type_rolls_over_at_its_own_span(made):
     inputs, said = screened(leg, made)
     clean, _ = screened(made.leg(), made)
     assert Code.WHEEL_COUNTERS_DIFFER not in said
-    assert np.array_equal(inputs.travel_right.s, clean.travel_right.s)
+    assert np.array_equal(inputs.travels[1].s, clean.travels[1].s)
 
 
 def test_a_count_and_a_speed_have_no_mean(made):
@@ -113,7 +113,7 @@ def test_a_count_and_a_speed_have_no_mean(made):
     text = said[Code.WHEEL_COUNTERS_DIFFER]
     assert 'a speed (1)' in text
     assert 'a running count (m/pulse)' in text
-    assert inputs.travel_right is None
+    assert inputs.travels == ()
     assert_allclose(inputs.travel.s[-1], np.diff(made.odometer.value).sum())
 
 
@@ -130,7 +130,7 @@ def test_a_right_wheel_that_sends_no_number_is_dead(made):
     right = replace(made.odometer_right, value=np.full(len(made.odometer_right.value), np.nan))
     inputs, said = screened(replace(made.leg(), odometer_right=right), made)
     assert 'right wheel has no usable value' in said[Code.WHEEL_DEAD]
-    assert inputs.travel_right is None
+    assert inputs.travels == ()
     assert len(inputs.travel.t)
 
 
@@ -145,8 +145,8 @@ def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made):
     assert t[0] >= seconds(leg, right)[0]
     assert t[-1] <= seconds(leg, right)[-1]
     clean, _ = screened(made.leg(), made)
-    late = clean.travel_right.at(t + 0.007)
-    want = (clean.travel_left.at(t) + late - clean.travel_left.at(t[0]) - late[0]) / 2
+    late = clean.travels[1].at(t + 0.007)
+    want = (clean.travels[0].at(t) + late - clean.travels[0].at(t[0]) - late[0]) / 2
     bound = 3.0 / 8 * 0.1**2 / 0.02 / 2 + 1.5
     assert np.abs(inputs.travel.s - want).max() < bound
 

@@ -217,6 +217,12 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.WHEELS_SWAPPED: 'The wheel configured as left travels farther in left turns. It is '
         'the outer wheel, the right one.',
         Code.WHEEL_DEAD: 'One wheel does not count, or has no messages, while the other turns.',
+        Code.WHEEL_LEFT_OUT: 'One wheel of several axles does not count, or counts down. Its axle '
+        'is not used; the scale is that of the others.',
+        Code.WHEELS_STEERED: 'These wheels travel farther in turns, as steered wheels do. They '
+        'are not in the mean; their factors and positions are estimated.',
+        Code.WHEEL_DEPARTS: 'The factor of one wheel differs from the median of the others by '
+        'more than 1 %.',
         Code.WHEEL_REVERSED: 'One wheel counts down while the other counts up.',
         Code.WHEEL_COUNTERS_DIFFER: 'The two counters differ: another modulus, another kind, or '
         'one counts much more than the other.',

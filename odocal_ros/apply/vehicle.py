@@ -69,7 +69,7 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     Raises
     ------
     BadConfig
-        They hold no scale factor.
+        They hold no scale factor, or more than two wheels are configured.
 
     """
     def estimate_of(name: str, otherwise: float, sigma: float = 0.0) -> tuple[float, float]:
@@ -78,6 +78,9 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
             return otherwise, sigma
         return e.value, sigma if e.sigma is None else e.sigma
 
+    if len(config.odometer.wheels) > len(SIDES):
+        raise BadConfig(f'odometer.wheels has {len(config.odometer.wheels)} wheels; the limit of '
+                        'this node is 2: name the wheels of an axle that does not steer')
     # speeds that are multiplied as they are sent have a factor of their own
     scale, sigma = estimate_of('scale_factor_as_sent', *estimate_of('scale_factor', math.nan))
     left, right = (estimate_of(name, math.nan)[0] for name in SIDES)

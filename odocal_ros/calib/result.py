@@ -9,6 +9,7 @@
 
 """What comes out: estimates with sigmas and units, per method, per leg and combined."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -27,6 +28,10 @@ BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
                     'pitch_mounting_angle_housing_sigma'})
 
 
+AS_SENT = 'scale_factor_as_sent'
+FACTOR = 'scale_factor_'      # format: before the name of a wheel
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A number with its sigma (1 standard deviation) and unit; None: not determined."""
@@ -40,6 +45,11 @@ class Estimate:
         """Return the entry of calibration.json."""
         entry = {'value': self.value, 'sigma': self.sigma, 'unit': self.unit}
         return entry | ({'method': self.method} if self.method else {})
+
+
+def wheel_factors(estimates: Iterable[str]) -> list[str]:
+    """Return the names of the scale factors of single wheels."""
+    return [name for name in estimates if name.startswith(FACTOR) and name != AS_SENT]
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,9 +42,10 @@ from odocal_ros.data.samples import (
 from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
 
+# slots of the wheels, in the order of odometer.wheels. Judgement: an 8x8 truck has most
+WHEELS = ('odometer', 'odometer_right', *(f'odometer_{k}' for k in range(3, 9)))
 EMPTY: dict[str, Callable[[], Samples]] = {
-    'imu': no_imu, 'imu_other': no_other_imu,
-    'odometer': no_odometer, 'odometer_right': no_odometer,
+    'imu': no_imu, 'imu_other': no_other_imu, **dict.fromkeys(WHEELS, no_odometer),
     'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
 }
 SLOTS = tuple(EMPTY)
@@ -58,9 +59,9 @@ class Leg:
     What the sensors said between two marks, with the pre-roll before the first.
 
     Each topic holds the rows from ``start_ns`` minus the pre-roll to the first row after
-    ``stop_ns``, in order of arrival, as sent. ``odometer`` is the left wheel where
-    ``odometer_right`` is not empty; ``form_right`` is what its values mean where its messages are
-    not those of the left.
+    ``stop_ns``, in order of arrival, as sent. ``odometer`` is the only wheel or the first of
+    several; ``form_right`` is what the values of ``odometer_right`` mean where its messages are
+    not those of the first.
     """
 
     start_ns: int
@@ -69,11 +70,26 @@ class Leg:
     imu_other: OtherImuSamples = field(default_factory=no_other_imu)
     odometer: OdometerSamples = field(default_factory=no_odometer)
     odometer_right: OdometerSamples = field(default_factory=no_odometer)
+    odometer_3: OdometerSamples = field(default_factory=no_odometer)
+    odometer_4: OdometerSamples = field(default_factory=no_odometer)
+    odometer_5: OdometerSamples = field(default_factory=no_odometer)
+    odometer_6: OdometerSamples = field(default_factory=no_odometer)
+    odometer_7: OdometerSamples = field(default_factory=no_odometer)
+    odometer_8: OdometerSamples = field(default_factory=no_odometer)
     fix: FixSamples = field(default_factory=no_fix)
     fix_velocity: VelocitySamples = field(default_factory=no_velocity)
     heading: HeadingSamples = field(default_factory=no_heading)
     form: OdometerForm = COUNTER
     form_right: OdometerForm | None = None
+
+    @property
+    def wheel_slots(self) -> tuple[str, ...]:
+        """Return the slots of the wheels that sent messages, the first in any case."""
+        return (WHEELS[0], *(slot for slot in WHEELS[1:] if len(getattr(self, slot).stamp_ns)))
+
+    def form_of(self, slot: str) -> OdometerForm:
+        """Return the meaning of a wheel's values."""
+        return self.form_right or self.form if slot == WHEELS[1] else self.form
 
 
 @final

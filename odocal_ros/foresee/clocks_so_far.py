@@ -14,6 +14,7 @@ from collections import deque
 import numpy as np
 
 from odocal_ros.data.arrays import Ints
+from odocal_ros.data.leg import WHEELS
 from odocal_ros.data.samples import Samples
 from odocal_ros.screening.clocks import remedy
 from odocal_ros.settings.config import Config
@@ -62,9 +63,8 @@ class Clocks:
 
     def differing(self, config: Config) -> list[tuple[str, float]]:
         """Return (slot, s ahead of the IMU) of topics whose clock differs, offsets applied."""
-        offsets = {'odometer': config.odometer.time_offset, 'fix': config.gnss.time_offset,
-                   'odometer_right': config.odometer.time_offset,
-                   'fix_velocity': config.gnss.time_offset}
+        offsets = {'fix': config.gnss.time_offset, 'fix_velocity': config.gnss.time_offset,
+                   **dict.fromkeys(WHEELS, config.odometer.time_offset)}
         result = []
         for slot, ahead in self._ahead_s.items():
             offset = offsets.get(slot, 0.0) - config.imu.time_offset

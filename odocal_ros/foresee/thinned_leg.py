@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints, Values
-from odocal_ros.data.leg import COUNTER, Leg
+from odocal_ros.data.leg import COUNTER, Leg, WHEELS
 from odocal_ros.data.samples import (
     ImuSamples,
     join,
@@ -108,7 +108,7 @@ class ThinnedLeg:
 
     def _averaged(self, slot: str) -> tuple[str, ...]:
         rates = ('value',) if self.form.quantity == 'rate' else ()
-        return {'imu': ('w_i', 'f_i'), 'odometer': rates, 'odometer_right': rates}.get(slot, ())
+        return {'imu': ('w_i', 'f_i'), **dict.fromkeys(WHEELS, rates)}.get(slot, ())
 
     def _unrolled(self, slot: str, samples: OdometerSamples) -> OdometerSamples:
         """Return counts or increments as a running count that never rolls over."""

@@ -59,7 +59,7 @@ class Recording:
         return self.recorder.form
 
     def samples(self, slot: str) -> Samples:
-        """Return the rows of imu, odometer, odometer_right, fix, fix_velocity or heading."""
+        """Return the rows of a slot: imu, fix, fix_velocity, heading, one of data.leg.WHEELS."""
         rows: Samples = self.recorder.rows(slot)
         return rows
 

@@ -78,9 +78,8 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
 
 def wanted(config: Config) -> tuple[str, ...]:
     """Return the slots to fill; odometers and heading first, for what they leave to others."""
-    two = 'topic' in (config.odometer.left, config.odometer.right)
     surveyed = config.reference.start and config.reference.end
-    return (*(('odometer_right',) if two else ()), 'odometer',
+    return (*(('odometer_right',) if config.odometer.own_topics else ()), 'odometer',
             *(('heading',) if config.alignment.heading_source in ('auto', 'heading_topic')
               else ()),
             'imu', *(() if surveyed else ('fix',)),
@@ -97,7 +96,7 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     if slot in ('odometer', 'odometer_right'):
         found = [name for name in found if not _has(name, COMMANDS)]
         found = _unless_all(found, FUSED)
-        if 'topic' in (config.odometer.left, config.odometer.right):
+        if config.odometer.own_topics:
             found = [name for name in found if ('right' in _last(name)) == (slot != 'odometer')]
     elif slot == 'heading':
         if config.alignment.heading_source == 'auto':    # by the name the node listens to

@@ -59,7 +59,7 @@ class Inputs:
     def required(self, config: Config) -> list[Input]:
         """Return the topics without which no leg can be started."""
         surveyed = config.reference.start and config.reference.end
-        slots = ['imu', 'odometer'] + ['odometer_right'] * (config.odometer.right == 'topic')
+        slots = ['imu', 'odometer'] + ['odometer_right'] * config.odometer.own_topics
         slots += [] if surveyed else ['fix']
         slots += ['heading'] * (config.alignment.heading_source == 'heading_topic')
         return [self.by_slot[slot] for slot in slots if slot in self.by_slot]
@@ -95,7 +95,7 @@ def _wanted(config: Config) -> dict[str, tuple[str, ...]]:
     odometer: tuple[str, ...] = () if config.odometer.type == 'auto' else (config.odometer.type,)
     wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer,
                                           'fix': REFERENCES}
-    if config.odometer.right == 'topic':
+    if config.odometer.own_topics:
         wanted['odometer_right'] = odometer
     if config.gnss.use_velocity:
         wanted['fix_velocity'] = VELOCITY

@@ -163,7 +163,7 @@ def _wanted(config: ApplyConfig) -> dict[str, tuple[str, ...]]:
     """Return slot -> message types allowed, empty: any."""
     odometer = () if config.odometer.type == 'auto' else (config.odometer.type,)
     wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer}
-    return wanted | ({'odometer_right': odometer} if config.odometer.right == 'topic' else {})
+    return wanted | ({'odometer_right': odometer} if config.odometer.own_topics else {})
 
 
 def main(args: list[str] | None = None) -> int:

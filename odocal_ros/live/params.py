@@ -104,8 +104,8 @@ def declare(node: Node, kind: type = Config) -> Any:
         try:
             value = node.declare_parameter(name, _as_ros(setting), descriptor(setting)).value
             if value is None:
-                empty = Parameter(name, Parameter.Type.DOUBLE_ARRAY, [])
-                node.set_parameters([empty])
+                array = 'STRING_ARRAY' if setting.kind == 'strs' else 'DOUBLE_ARRAY'
+                node.set_parameters([Parameter(name, Parameter.Type[array], [])])
         except ParameterException as error:
             raise BadConfig(_refusal(name, setting, error)) from None
         values[name] = setting.default if value is None else _plain(value)

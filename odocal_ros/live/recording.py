@@ -17,7 +17,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.leg import LegRecorder, WHEELS
 from odocal_ros.data.samples import Samples, take
 from odocal_ros.foresee.ability import Received
 from odocal_ros.foresee.progress import Progress
@@ -88,11 +88,11 @@ class Recording:
                     since_ns - round((preroll_s + PREROLL_MARGIN_S) * 1e9), slots)
 
     def _beside(self, source: Input) -> tuple[str, ...]:
-        """Return the other slots that the messages of a topic fill: right wheel, other IMUs."""
+        """Return the other slots that the messages of a topic fill: more wheels, other IMUs."""
         if source.slot == 'imu':
             return ('imu_other',)
-        both = source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
-        return ('odometer_right',) * both
+        several = source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
+        return WHEELS[1:] if several else ()
 
     @property
     def newest_imu_ns(self) -> int:
@@ -127,9 +127,10 @@ class Recording:
             source.health.forget()
 
     def two_wheels(self) -> bool:
-        """Return True if the right wheel has its own topic and is known to be the right one."""
+        """Return True if there are two wheels, known as left and right."""
         form = self.inputs.form
-        return self.recorder.newest_ns('odometer_right') > 0 and (form is None or form.sides)
+        sent = [self.recorder.newest_ns(slot) > 0 for slot in WHEELS[:3]]
+        return sent == [True, True, False] and (form is None or form.sides)
 
     def received_before(self, preroll_s: float) -> Received:
         """Return the samples so far that determine what a leg can estimate."""

@@ -14,6 +14,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from odocal_ros.calib.result import wheel_factors
 from odocal_ros.foresee import quantities
 from odocal_ros.foresee.forecast import as_keys
 from odocal_ros.live.guidance import (
@@ -65,7 +66,7 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
         'imu_rate_hz': now.rates_hz.get('imu', 0.0),
         'odometer_rate_hz': now.rates_hz.get('odometer', 0.0),
         'fix_rate_hz': now.rates_hz.get('fix', 0.0),
-    } | {key: results[f'result.{name}'] for key, name in VALUES.items()} | {
+    } | {key: results[f'result.{name}'] for key, name in VALUES.items()} | _of_wheels(now) | {
         'verdict': session.verdict(), 'hint': text, 'legs': legs,
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
         'restored': now.restored,
@@ -85,6 +86,19 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
     return DiagnosticStatus(
         level=level(now), name=NAME, message=sentence(now, text, ok), hardware_id='odocal',
         values=[KeyValue(key=k, value=_bare(v, PLACES.get(k))) for k, v in keys.items()])
+
+
+def _of_wheels(now: SessionView) -> dict[str, object]:
+    """Return the keys of more than two wheels: factor and sigma of each by its name."""
+    calibration = now.session.calibration
+    estimates = calibration.estimates if calibration else {}
+    return {key: value for name in wheel_factors(estimates) if name not in VALUES
+            for key, value in ((name, _or_nan(estimates[name].value)),
+                               (f'{name}_sigma', _or_nan(estimates[name].sigma)))}
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def in_force(now: SessionView, name: str) -> float:

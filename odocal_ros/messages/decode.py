@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
+from odocal_ros.data.leg import WHEELS
 from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
@@ -78,7 +79,7 @@ class Reader:
 
     @property
     def wheels(self) -> tuple[str, ...]:
-        """Return the keys (joints, indices) that odometer values are taken from, left first."""
+        """Return the keys (joints, indices) that odometer values are taken from, in order."""
         return self._plan.keys if isinstance(self._plan, OdometerPlan) else ()
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
@@ -97,7 +98,7 @@ class Reader:
 
         Returns
         -------
-        (slot, block) pairs, two for a message with two wheels, none without a row.
+        (slot, block) pairs, one for each wheel of a message, none without a row.
 
         Raises
         ------
@@ -217,7 +218,7 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
 
     """
     msgtype = full_type(msgtype)
-    if slot in ('odometer', 'odometer_right'):
+    if slot in WHEELS:
         return Reader(slot, msgtype, OdometerPlan(slot, msgtype, config))
     reader = Reader(slot, msgtype, sensor_plan(slot, msgtype, config))
     if slot == 'imu':

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
+from odocal_ros.data.leg import WHEELS
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, of_columns, Samples
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
@@ -54,7 +55,6 @@ class OdometerPlan:
         self.known = msgtype in DEFAULT_FIELD
         self.field = config.odometer.field or DEFAULT_FIELD.get(msgtype, '')
         self.keys = _wheel_keys(slot, config)
-        self.two = len(self.keys) == 2
         self.stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
         self.columns: tuple[Column, ...] = ()
         self.form = OdometerForm('cumulative', self.odometer.wrap, 'm/pulse')
@@ -74,7 +74,7 @@ class OdometerPlan:
 
     def _check(self) -> None:
         """Refuse what can be seen to fail before any message came."""
-        if not self.known and not self.field and not self.two:
+        if not self.known and not self.field and len(self.keys) < 2:
             raise BadData(
                 f'{self.slot}: {self.msgtype} is not a known odometer type: set '
                 f"odometer.field to the path of its value ('ros2 interface show {self.msgtype}' "
@@ -89,13 +89,14 @@ class OdometerPlan:
         if self.field and base not in kinds:
             raise BadData(f'odometer.field: {self.msgtype} has no value {self.field!r}; values: '
                           f'{", ".join(kinds)}')
-        if self.two and not self._listed():
-            raise BadConfig(f'odometer.left and odometer.right: {self.msgtype} holds one value '
-                            f"({self.field}); use 'topic' for wheels on two topics")
+        several = len(self.keys) > 1
+        if several and not self._listed():
+            raise BadConfig(f'odometer.wheels: {self.msgtype} holds one value ({self.field}); '
+                            "use 'topic' for odometer.left and odometer.right on two topics")
         if self.odometer.field and self._listed() and not (
-                key or self.two or self.msgtype == JOINTS):
+                key or several or self.msgtype == JOINTS):
             raise BadConfig(f'odometer.field: {self.field!r} is a list; name one value, such as '
-                            f'{base}[0], or set odometer.left and odometer.right')
+                            f'{base}[0], or set odometer.wheels')
 
     def _listed(self) -> bool:
         """Return True if the field is a list from which one or two values must be selected."""
@@ -126,7 +127,7 @@ class OdometerPlan:
             self.unclear = found
             return
         own = {'odometer_right': 'right'}.get(
-            self.slot, 'left' if self.odometer.right == 'topic' else '')
+            self.slot, 'left' if self.odometer.own_topics else '')
         if own:
             key = sided(found, own)
             if not key:
@@ -134,7 +135,7 @@ class OdometerPlan:
                 return
             self.keys = (key,)
         else:
-            self.keys, self.two = found.keys, len(found.keys) == 2
+            self.keys = found.keys
         self._settle(field)
         self.form = replace(self.form, sides=found.sides, chosen=found.about)
 
@@ -213,22 +214,28 @@ class OdometerPlan:
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:
         """Return (slot, block) pairs."""
         stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
-        slots = ('odometer', 'odometer_right') if self.two else (self.slot,)
         values = columns[2:] if self.stamped else columns
+        slots = WHEELS[:len(values)] if len(values) > 1 else (self.slot,)
         return [(slot, of_columns(OdometerSamples, stamps, received_ns, value[:, 0]))
                 for slot, value in zip(slots, values, strict=True)]
 
 
 def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
-    """Return the keys of the wheels in one message: ('',), or those of left and right."""
-    left, right = config.odometer.left, config.odometer.right
-    if 'topic' in (left, right) or not (left or right):
+    """Return the keys of the wheels in one message; ('',) if none is configured."""
+    odometer = config.odometer
+    keys, both = odometer.keys, (odometer.left, odometer.right)
+    if odometer.wheels and any(both):
+        raise BadConfig('odometer.left and odometer.right are the wheels of odometer.wheels: set '
+                        'only one of both')
+    if odometer.own_topics or not keys:
         return ('',)
-    if not (left and right):
+    if not odometer.wheels and not all(both):
         raise BadConfig('odometer.left and odometer.right belong together: set both or neither')
-    if left == right:
-        raise BadConfig(f'odometer.left and odometer.right are both {left!r}: name two wheels')
-    return (left, right) if slot == 'odometer' else ('',)
+    if len(set(keys)) < len(keys) or '' in keys or len(keys) > len(WHEELS):
+        what = 'odometer.wheels' if odometer.wheels else 'odometer.left and odometer.right'
+        raise BadConfig(f'{what}: {", ".join(map(repr, keys))}; required: different wheels, '
+                        f'{len(WHEELS)} at most')
+    return keys if slot == WHEELS[0] else ('',)
 
 
 def _kinds(msgtype: str) -> dict[str, str]:

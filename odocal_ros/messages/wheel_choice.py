@@ -73,8 +73,8 @@ def choose(names: Sequence[str], count: int) -> Choice | str:
                       f'{second} is used. Left and right cannot be decided from the data; below, '
                       'the first is called left')
     what = f'the joints {_listed(keys)}' if names else f'a list of {count} values'
-    return (f'the wheels among {what} are not clear: set odometer.left and '
-            f'odometer.right{"" if names else " (indices from 0)"}, or odometer.field for one; '
+    return (f'the wheels among {what} are not clear: set odometer.wheels'
+            f'{"" if names else " (indices from 0)"}, or odometer.field for one; '
             'odocal inspect shows how each value moves')
 
 
@@ -107,7 +107,9 @@ def _by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
     rear = [p for p in pairs if _axle(places[p[0]][1]) == 'rear']
     for some, why in ((fixed, ', axle that does not steer'), (rear, ', rear axle')):
         if len(some) == 1:
-            return Choice(some[0], True, _taken(names, some[0], why))
+            every = ', '.join(name for pair in pairs for name in pair)
+            return Choice(some[0], True, f'{_taken(names, some[0], why)}; for all wheels set '
+                          f'odometer.wheels to [{every}]')
     single = [n for n in rolls if _axle(places[n][1]) == 'rear']
     return tuple(single) if len(rolls) == 2 and len(single) == 1 else tuple(rolls)
 

@@ -9,6 +9,7 @@
 
 """Odometer: counters, increments and speeds to travel, with rollover and resets undone."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,12 +35,17 @@ class Travel:
     s : (n,) signed travel from the first row, in scale units (pulses, rad or configured m).
     quantum : size of one count in s, 0 for speeds and floats.
     coarse : the speeds sent, where they lie on a grid and are those of one wheel.
+    name : of the wheel, '' of a single one or of a mean.
+    ahead : by how much a steered wheel is ahead of the axle that does not steer, scale units; 0:
+    it does not steer.
     """
 
     t: NDArray[np.float64]
     s: NDArray[np.float64]
     quantum: float
     coarse: CoarseSpeed | None = None
+    name: str = ''
+    ahead: float = 0.0
 
     def at(self, t: Floats) -> Floats:
         """Return travel at times t, linear between rows, constant outside."""
@@ -102,18 +108,22 @@ def _coarse(t: Floats, value: Floats) -> CoarseSpeed | None:
     return held if held and (coarse is None or coarse.step < held.step / 2) else coarse
 
 
-def mean_travel(left: Travel, right: Travel) -> Travel:
+def mean_travel(travels: Sequence[Travel]) -> Travel:
     """
-    Return the travel of the middle of the axle, on the left wheel's rows both have.
+    Return the mean travel of wheels, on the rows of the first one that all have.
 
-    The wheels round independently: their mean errs like a count of 1 / sqrt(2) of either.
+    n wheels round independently: their mean errs like a count of 1 / sqrt(n) of one.
     """
-    if not len(right.t):
-        return Travel(left.t[:0], left.s[:0], left.quantum)
-    both = (left.t >= right.t[0]) & (left.t <= right.t[-1])
-    t = left.t[both]
-    s = (left.s[both] + right.at(t)) / 2
-    return Travel(t, s - (s[0] if len(s) else 0.0), left.quantum / np.sqrt(2))
+    first, *others = travels
+    if not others:
+        return first
+    if not all(len(one.t) for one in others):
+        return Travel(first.t[:0], first.s[:0], first.quantum)
+    all_have = (first.t >= max(one.t[0] for one in others)) & (
+        first.t <= min(one.t[-1] for one in others))
+    t = first.t[all_have]
+    s = sum((one.at(t) for one in others), first.s[all_have]) / len(travels)
+    return Travel(t, s - (s[0] if len(s) else 0.0), first.quantum / np.sqrt(len(travels)))
 
 
 def _counter_steps(t: Floats, value: Values, modulus: int,

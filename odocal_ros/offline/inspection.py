@@ -18,7 +18,7 @@ import numpy as np
 
 from odocal_ros.bagio.read import Bag, TopicInfo
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.leg import LegRecorder, WHEELS
 from odocal_ros.data.pieces import medians
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
@@ -85,7 +85,8 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     if {'imu', 'odometer'} <= mapping.keys():
         extra += look(bag, _together(taps, mapping), config, found, findings)
     findings += _lacking(found, mapping, config)
-    wheels = config.odometer.left or any('odometer.left=' in option for option in extra)
+    wheels = config.odometer.keys or any(
+        option.startswith(('odometer.left=', 'odometer.wheels=')) for option in extra)
     ends = ENDS - {Code.NO_STANDSTILL} if wheels else ENDS
     found['findings'] = [reason.as_dict() | {'only': 'two_point' if (
         config.method != 'two_point' and reason.code in ends) else None}
@@ -157,7 +158,7 @@ def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
             topics: list[dict[str, Any]]) -> list[str]:
     """Return the travel of each joint or entry of an odometer, and the settings for the wheels."""
     options: list[str] = []
-    open_ = not (config.odometer.left or config.odometer.right or config.odometer.field)
+    open_ = not (config.odometer.keys or config.odometer.field)
     listed = [(tap, tap.values, facts) for facts in topics
               if (tap := taps.get(facts['name'])) and tap.values]
     turn = _turn(taps[mapping['imu']]) if listed and mapping.get('imu') in taps else None
@@ -196,7 +197,8 @@ def _together(taps: dict[str, _Tap], mapping: dict[str, str]) -> LegRecorder:
         rows = taps[topic].recorder
         if slot == 'odometer':
             recorder.form = taps[topic].reader.form or recorder.form
-            recorder.adopt('odometer_right', rows, 'odometer_right')
+            for more in WHEELS[1:]:
+                recorder.adopt(more, rows, more)
         if slot == 'odometer_right':
             recorder.form_right = taps[topic].reader.form
         own = 'odometer' if slot == 'odometer_right' else taps[topic].reader.slot

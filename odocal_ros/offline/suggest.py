@@ -26,7 +26,7 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config,
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     free = candidates(topics, 'odometer', config, chosen)
     sides = [next((t for t in free if side in t), '') for side in ('left', 'right')]
-    if not config.odometer.left and 'odometer' not in chosen and all(sides) and len(free) == 2:
+    if not config.odometer.keys and 'odometer' not in chosen and all(sides) and len(free) == 2:
         config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
     for slot in wanted(config):
         found = [] if slot in chosen else candidates(topics, slot, config, chosen)

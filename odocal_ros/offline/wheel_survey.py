@@ -10,6 +10,7 @@
 """How each value of a list (joints, an array of counters) moves: what could be wheels."""
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from odocal_ros.data.leg import MOST_DAYS
 from odocal_ros.messages.odometer_types import JOINTS
 from odocal_ros.messages.tables import columns, tables
 from odocal_ros.screening.glitches import beyond
+from odocal_ros.settings.config import SIDES
 
 FIELDS = {JOINTS: ('position', 'velocity'), 'std_msgs/msg/Int32MultiArray': ('data',),
           'std_msgs/msg/Int64MultiArray': ('data',)}
@@ -116,11 +118,15 @@ def _sides(t: Floats, s: Floats, rolls: Bools,
 
 
 def suggested(facts: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Return the settings for the two wheels found in the data; none otherwise."""
-    sides = {side: [f['key'] for f in facts if f['side'] == side] for side in ('left', 'right')}
-    if [len(keys) for keys in sides.values()] != [1, 1]:
+    """Return the settings for the wheels found in the data, as many on either side; or none."""
+    left, right = ([f['key'] for f in facts if f['side'] == side] for side in SIDES)
+    if len(left) != len(right) or not left:
         return ()
-    return tuple(f'odometer.{side}={keys[0]}' for side, keys in sides.items())
+    if len(left) > 1:
+        axles = chain.from_iterable(zip(left, right, strict=True))
+        return (f'odometer.wheels=[{", ".join(axles)}]',)
+    return tuple(f'odometer.{side}={keys[0]}' for side, keys in zip(
+        SIDES, (left, right), strict=True))
 
 
 def in_words(facts: list[dict[str, Any]]) -> list[str]:

@@ -15,15 +15,14 @@ import io
 from typing import Any
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.result import Calibration, Estimate, LegResult
+from odocal_ros.calib.result import Calibration, Estimate, LegResult, wheel_factors
 from odocal_ros.output.summary import known
 from odocal_ros.outside.names import for_table
 from odocal_ros.settings.config import Config
 
 LEGS = 'legs.csv'
-SHOWN = {'scale_factor': '', 'scale_ratio': '1', 'scale_factor_left': '',
-         'scale_factor_right': '', 'track_width': 'm', 'yaw_mounting_angle': 'rad',
-         'pitch_mounting_angle': 'rad'}
+SHOWN = {'scale_factor': '', 'scale_ratio': '1'}
+ANGLES = {'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad'}
 
 
 def leg_table(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
@@ -49,7 +48,9 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any
            'imu_samples': leg.imu_samples, 'pulses': leg.pulses, 'fixes': leg.fixes,
            'rejected_fixes': leg.rejected_fixes, 'verdict': leg.verdict.value,
            'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
-    for name, unit in SHOWN.items():
+    wheels = dict.fromkeys(wheel_factors(calibration.estimates), '') | {
+        name: 'm' for name in calibration.estimates if name.startswith('track_width')}
+    for name, unit in (SHOWN | wheels | ANGLES).items():
         if name in calibration.estimates:
             unit = unit or calibration.estimates[name].unit
             found = _estimate(leg, calibration, name)

@@ -15,7 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.result import BESIDE, Calibration, Estimate, LegResult, MethodResult
+from odocal_ros.calib.result import (
+    BESIDE,
+    Calibration,
+    Estimate,
+    FACTOR,
+    LegResult,
+    MethodResult,
+    wheel_factors,
+)
 from odocal_ros.output.budget_table import LABELS as SOURCES, largest_source
 from odocal_ros.output.figures import beyond_one, share, two_digits, with_sigma
 from odocal_ros.output.summary import COUNTS, DEG, DEG_PER_HOUR, inverse, known
@@ -26,9 +34,7 @@ from odocal_ros.settings.config import Config, flat, SETTINGS
 LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'ratio to nominal',
                     'yaw_mounting_angle': 'yaw mounting angle',
                     'pitch_mounting_angle': 'pitch mounting angle',
-                    'scale_factor_as_sent': 'scale factor of the speed as sent',
-                    'scale_factor_left': 'scale factor, left wheel',
-                    'scale_factor_right': 'scale factor, right wheel'}
+                    'scale_factor_as_sent': 'scale factor of the speed as sent'}
 LOST = 'not determined'
 OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
            Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
@@ -39,6 +45,8 @@ OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOP
 
 def label(name: str) -> str:
     """Return the name of an estimate or a source as people say it."""
+    if name in wheel_factors([name]):
+        return f'scale factor, {name.removeprefix(FACTOR)} wheel'
     return LABELS.get(name, name.replace('_', ' '))
 
 

@@ -15,7 +15,14 @@ import math
 import textwrap
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.result import Calibration, Estimate, LegResult
+from odocal_ros.calib.result import (
+    AS_SENT,
+    Calibration,
+    Estimate,
+    FACTOR,
+    LegResult,
+    wheel_factors,
+)
 from odocal_ros.output.budget_table import budget_lines, largest_source, source_label
 from odocal_ros.output.figures import beyond_one, length, share, time_span, with_sigma
 from odocal_ros.output.reason_lines import bag_lines, reason_lines
@@ -27,8 +34,7 @@ from odocal_ros.reasons import Verdict
 WIDTH = 98    # judgement: columns
 DEG = math.degrees(1.0)    # definition
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
-AS_SENT = 'scale_factor_as_sent'
-WHEELS = {'scale_factor_left': 'left', 'scale_factor_right': 'right', 'track_width': 'track width'}
+PLACES = {'lateral': 'left', 'forward': 'ahead'}    # of a wheel: estimate, as people say it
 ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
@@ -86,7 +92,8 @@ def values_in_words(estimates: dict[str, Estimate]) -> str:
     else:
         counts = f' ({inverse(scale)})' if scale.unit in COUNTS else ''
         parts.append(f'scale factor {_with_unit(scale)}{counts}')
-    for name, word in WHEELS.items():
+    words = {name: name.removeprefix(FACTOR) for name in wheel_factors(estimates)}
+    for name, word in (words | {'track_width': 'track width'}).items():
         wheel = known(estimates, name)
         if wheel.value is not None:
             parts.append(f'{word} {_with_unit(wheel)}')
@@ -147,9 +154,11 @@ def _values(calibration: Calibration, width: int) -> list[str]:
     for name, word in ANGLES.items():
         lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name), width)))
     lines += _largest_errors(calibration, width)
+    wheels = _wheels(estimates)
+    lines += wheels.values()
     for name in estimates:
         estimate = known(estimates, name)
-        if name not in ('scale_factor', 'scale_ratio', AS_SENT, *ANGLES, *BIASES) \
+        if name not in ('scale_factor', 'scale_ratio', AS_SENT, *ANGLES, *BIASES, *wheels) \
                 and name[:-2] not in ARMS and estimate.value is not None:
             text = _with_unit(estimate)
             if name == 'heading_error':
@@ -168,6 +177,20 @@ def _values(calibration: Calibration, width: int) -> list[str]:
                         for angle in calibration.imu_rotation_rpy)
         lines.append(_line('IMU on the vehicle', f'roll, pitch, yaw {rpy} deg'))
     return [line for line in lines if line]
+
+
+def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
+    """Return a line for each of more than two wheels, and what is in it: by name of estimate."""
+    lines: dict[str, str] = {}
+    for name in wheel_factors(estimates):
+        wheel = name.removeprefix(FACTOR)
+        places = {f'{way}_position_{wheel}': word for way, word in PLACES.items()}
+        if any(place in estimates for place in places):
+            at = [f'{e.value:+.3f} m {word}' for place, word in places.items()
+                  if (e := known(estimates, place)).value is not None]
+            lines |= dict.fromkeys(places, '') | {
+                name: _line(f'wheel {wheel}', '   '.join((_with_unit(estimates[name]), *at)))}
+    return lines
 
 
 def _path_ratio(calibration: Calibration, scale: Estimate) -> str:

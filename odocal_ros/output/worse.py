@@ -12,13 +12,11 @@
 import math
 from pathlib import Path
 
-from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.result import Estimate, wheel_factors
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.stored import read_stored, Stored
 from odocal_ros.reasons import Code, Verdict
-
-JUDGED = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mounting_angle')
 
 
 def is_worse(old: Stored, new: Stored) -> str:
@@ -40,7 +38,7 @@ def is_worse(old: Stored, new: Stored) -> str:
     if old.legs and old.legs < new.legs \
             or old.carried and new.carried and new.carried.goes_on_from(old.carried):
         return ''
-    for name in JUDGED:
+    for name in ('scale_factor', *wheel_factors(old.estimates), 'yaw_mounting_angle'):
         why = _worse(name.replace('_', ' '), old.estimates.get(name), new.estimates.get(name))
         if why:
             return why

@@ -69,6 +69,5 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
 
 
 def _coarse(inputs: Inputs) -> CoarseSpeed | None:
-    """Return the grid of the speed, of one of two wheels, None where there is none."""
-    each = (inputs.travel, inputs.travel_left, inputs.travel_right)
-    return next((travel.coarse for travel in each if travel is not None and travel.coarse), None)
+    """Return the grid of the speed, of one of several wheels, None where there is none."""
+    return next((one.coarse for one in (inputs.travel, *inputs.travels) if one.coarse), None)

@@ -36,7 +36,7 @@ def _smoother(prepared: PreparedLeg, passed: Passed) -> MethodRun:
 
 def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
     from odocal_ros.calib.smoother.refusal import refused
-    return refused((why,), inputs.scale_unit, inputs.travel_right is not None)
+    return refused((why,), inputs.scale_unit, inputs.travels)
 
 
 # as they are shown; two_point, the operator's own marks, is always computed

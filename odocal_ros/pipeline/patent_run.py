@@ -25,9 +25,10 @@ def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
     without a fix at the start.
     """
     inputs = ready.inputs
-    left, right = inputs.travel_left, inputs.travel_right
-    if left is None or right is None:
+    two = 2
+    if len(inputs.travels) != two:
         return None
+    left, right = inputs.travels
     begin, end = (pick([float(x.t[at]) for x in (ready.track, left, right)])
                   for pick, at in ((max, 0), (min, -1)))
     begin, end = max(0.0, begin), min(ready.t_fit, end)

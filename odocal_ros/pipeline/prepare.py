@@ -18,7 +18,7 @@ from odocal_ros.calib.drive import judge_drive, judge_way, not_moving, uncovered
 from odocal_ros.calib.gyro_axes import gyro_axes
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
-from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, WheelSlips
+from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, of_axles, WheelSlips
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_row
@@ -29,6 +29,7 @@ from odocal_ros.pipeline.align import align
 from odocal_ros.pipeline.coarse_odometer import coarse_reasons
 from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.axles import axles_of
 from odocal_ros.screening.facing import axes_reasons, Facing, facing
 from odocal_ros.screening.placed import place, Placed
 from odocal_ros.screening.screen import imu_gap, Inputs
@@ -141,15 +142,17 @@ def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ..
 
 def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,
                    reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
-    """Return the faults found by comparing two wheels, and the slips of one of them."""
-    odometer, left, right = config.odometer, inputs.travel_left, inputs.travel_right
-    if left is None or right is None or not inputs.felt or BROKEN & {r.code for r in reasons}:
+    """Return the faults found by comparing left and right wheels, and the slips of one of them."""
+    fixed = [axle for axle in axles_of(inputs.travels) if len(axle) > 1 and not axle[0].ahead]
+    if not fixed or not inputs.felt or BROKEN & {r.code for r in reasons}:
         return (), NO_SLIPS
     from odocal_ros.calib.wheels.slips import wheel_faults
-    return wheel_faults(
-        left, right, (inputs.t_imu, inputs.w_b, inputs.f_b),
-        (0.0, inputs.t_stop), track, placed.origin.latitude, placed.rough,
-        odometer.track_width, inputs.doubt_t, odometer.max_scale_deviation)
+    odometer, count = config.odometer, sum(not one.ahead for one in inputs.travels)
+    found, slips = zip(*(wheel_faults(
+        axle, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop), track,
+        placed.origin.latitude, placed.rough, odometer.track_width, inputs.doubt_t,
+        odometer.max_scale_deviation, count) for axle in fixed), strict=True)
+    return tuple(reason for why in found for reason in why), of_axles(slips, count)
 
 
 def _four_fifths(track: Track, t_stop: float) -> float:

@@ -15,12 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.result import MethodResult, Source
+from odocal_ros.calib.result import MethodResult, Source, wheel_factors
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.reasons import Code
 
-WHEELS = ('scale_factor_left', 'scale_factor_right')
-SCALES = ('scale_factor', 'scale_ratio', *WHEELS)
+SCALES = ('scale_factor', 'scale_ratio')
 
 
 def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
@@ -35,11 +34,13 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
     name : str
         Of the source.
     relative : dict
-        1 sigma of each of SCALES, relative.
+        1 sigma of each of SCALES, relative; of a wheel by default that of the scale factor.
     shared : bool
         The same in every leg of the vehicle.
 
     """
+    relative = dict.fromkeys(wheel_factors(method.estimates),
+                             relative['scale_factor']) | dict(relative)
     K = method.estimates['scale_factor'].value
     if not K:
         return method

@@ -14,9 +14,9 @@ It leaves a scale between that of before and that of after; the fixes do not det
 of them is the vehicle's.
 """
 
-from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.result import MethodResult, wheel_factors
 from odocal_ros.pipeline.prepared import PreparedLeg
-from odocal_ros.pipeline.scale_error import SCALES, WHEELS, with_scale_error
+from odocal_ros.pipeline.scale_error import SCALES, with_scale_error
 
 NAME = 'slow_wheel_slip'
 
@@ -26,6 +26,7 @@ def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     change = abs(prepared.wheel_slips.change)
     if not change:
         return method
-    # halves of the path half the change apart in the mean of the wheels: the mean is a quarter off
-    return with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, change / 4)
-                            | dict.fromkeys(WHEELS, change / 2))
+    # halves of the path half the change apart in the mean of two wheels: the mean is a quarter off
+    mean, own = change / 2 / prepared.wheel_slips.count, change / 2
+    return with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, mean)
+                            | dict.fromkeys(wheel_factors(method.estimates), own))

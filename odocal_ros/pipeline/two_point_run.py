@@ -98,9 +98,10 @@ class TwoPointRun:
         ends = chord.start.t, chord.end.t
         slips = slip_check(self.ready, self.track, toward(self.ready.facing, f), ends)
         self.slip = slip_reasons(slips, self.config.odometer.time_offset)
-        one = self.ready.wheel_slips      # of one wheel: half of it goes into the mean
+        one = self.ready.wheel_slips      # of one wheel: its share goes into the mean
         inside = (one.t >= ends[0]) & (one.t <= ends[1])
-        return np.append(slips.t, one.t[inside]), np.append(slips.size, one.size[inside] / 2)
+        in_mean = one.size[inside] / one.count
+        return np.append(slips.t, one.t[inside]), np.append(slips.size, in_mean)
 
     def _chord(self) -> Chord | None:
         """Return the chord between the marks, or None and say why."""

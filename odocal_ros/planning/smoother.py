@@ -56,7 +56,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     """
     few = too_little(int(drive.duration * sigmas.fix_rate), drive.duration)
     if few:
-        return refused([few], '1', False)
+        return refused([few], '1')
     made = ideal(drive, sigmas, spacing_for(drive) if spacing is None else spacing)
     problem = Problem.of(made.leg, sigmas.config, made.imu)
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
@@ -64,7 +64,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
         fit = _fit(problem, made, levels)
     except (NotPositive, np.linalg.LinAlgError) as error:
         return refused([Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}')],
-                       '1', False)
+                       '1')
     return outcome(made.leg, problem, fit, sigmas.config)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.leg import Leg
+from odocal_ros.data.leg import Leg, SLOTS, WHEELS
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks
 from odocal_ros.data.samples import OdometerForm, Samples, take
@@ -31,10 +31,10 @@ from odocal_ros.screening.glitches import (
 )
 from odocal_ros.settings.config import Config
 
-LABEL = {'imu': 'IMU', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
-         'fix_velocity': 'fix velocity', 'heading': 'heading'}
-NOTHING = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'odometer_right': Code.NO_ODOMETER,
-           'fix': Code.FIXES_UNUSABLE}
+LABEL = {slot: slot.replace('_', ' ') for slot in SLOTS} | {
+    'imu': 'IMU', 'odometer_right': 'right odometer'}
+NOTHING = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
+           **dict.fromkeys(WHEELS, Code.NO_ODOMETER)}
 
 
 def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
@@ -55,8 +55,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     t = room(len(clean.stamp_ns))
     for some in chunks(len(t)):
         t[some] = (clean.stamp_ns[some] - leg.start_ns) * 1e-9 + offset
-    form = leg.form_right or leg.form if slot == 'odometer_right' else leg.form
-    spikes = _spikes(slot, clean, t, form, config)
+    spikes = _spikes(slot, clean, t, leg.form_of(slot), config)
     if spikes.any():
         found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
                             f'{LABEL[slot]} messages are isolated outliers, first at t = '
@@ -75,7 +74,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
 def _spikes(slot: str, samples: Any, t: Floats, form: OdometerForm, config: Config) -> Bools:
     if slot == 'imu':
         return imu_glitches(t, samples.w_i, samples.f_i, config.imu)
-    if slot in ('odometer', 'odometer_right') and form.quantity == 'rate':
+    if slot in WHEELS and form.quantity == 'rate':
         return speed_glitches(t, samples.value.astype(float))
     return np.zeros(len(t), bool)
 

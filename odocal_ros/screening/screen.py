@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.leg import Leg
+from odocal_ros.data.leg import Leg, WHEELS
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_step, medians
 from odocal_ros.nav.gaps import gaps_in_rhythm
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.axles import judged_axles
 from odocal_ros.screening.clocks import judge_clocks
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.force import with_force
@@ -40,9 +41,8 @@ from odocal_ros.screening.placed import place
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import LABEL, usable_rows
 from odocal_ros.screening.velocity_screen import contradicted
-from odocal_ros.screening.wheel_faults import broken_wheels
 from odocal_ros.screening.wheel_travel import wheels
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, SIDES
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +57,7 @@ class Inputs:
     yaw_variance: NDArray[np.float64]  # (n,) rad^2, NaN: no orientation
     C_bi: NDArray[np.float64]          # (3, 3) nominal mounting rotation
     travel: Travel                     # mean of the wheels
-    travel_left: Travel | None
-    travel_right: Travel | None
+    travels: tuple[Travel, ...]        # of each of several wheels; () of one, or of unknown sides
     doubt_t: NDArray[np.float64]       # (d,) s, times of uncertain travel (resets, gaps)
     doubt_sigma: NDArray[np.float64]   # (d,) its sigma, scale units
     t_fix: NDArray[np.float64]         # (k,)
@@ -85,8 +84,7 @@ class Inputs:
         if not len(spans):
             return self
         return replace(self, travel=self.travel.mirrored(spans),
-                       travel_left=self.travel_left and self.travel_left.mirrored(spans),
-                       travel_right=self.travel_right and self.travel_right.mirrored(spans))
+                       travels=tuple(one.mirrored(spans) for one in self.travels))
 
 
 def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
@@ -137,23 +135,24 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     found += unlike
     some = slice(0 if unlike else None)
     _gaps('odometer', travelled.mean.t, found)
-    if travelled.right is not None:      # the mean stands on the left wheel's rows
-        _gaps('odometer_right', travelled.right.t, found)
+    for slot, one in zip(leg.wheel_slots[1:], travelled.each[1:], strict=False):
+        _gaps(slot, one.t, found)        # the mean stands on the first wheel's rows
     if judged:
         found += frozen(t_imu, imu.w_i, travelled.mean, config.leg.max_gap)
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     t_stop = (leg.stop_ns - leg.start_ns) * 1e-9
     w_b = _turned(imu.w_i, config.imu.gyro_scale, C_bi)
     f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
-    if judged and travelled.left is not None and travelled.right is not None and not unfelt:
-        found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
+    if judged and (len(travelled.each) > 1 and not unfelt or len(travelled.each) > len(SIDES)):
+        travelled, of_axles = judged_axles(travelled, (t_imu, w_b, f_b), (0.0, t_stop))
+        found += of_axles
     let_go()
-    if not leg.form.sides:       # of two wheels of unknown sides only the mean has a meaning
-        travelled = replace(travelled, left=None, right=None)
     inputs = Inputs(
         t_stop=t_stop, t_imu=t_imu, w_b=w_b, f_b=f_b,
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
-        travel=travelled.mean, travel_left=travelled.left, travel_right=travelled.right,
+        travel=travelled.mean,
+        # of two wheels of unknown sides only the mean has a meaning
+        travels=travelled.several if leg.form.sides else (),
         doubt_t=travelled.doubt_t, doubt_sigma=travelled.doubt_sigma,
         t_fix=t_fix, geodetic=geodetic, covariance_n=covariance[use],
         t_heading=t_heading, q_heading=heading.q_ni, heading_variance=heading.yaw_variance,
@@ -181,8 +180,8 @@ def _offsets(config: Config) -> dict[str, float]:
     """Return the time offset of each topic; marks are IMU stamps, so that of the IMU is 0."""
     imu = config.imu.time_offset
     wheel, gnss = config.odometer.time_offset - imu, config.gnss.time_offset - imu
-    return {'imu': 0.0, 'odometer': wheel, 'odometer_right': wheel, 'fix': gnss,
-            'fix_velocity': gnss, 'heading': -imu}
+    return {'imu': 0.0, **dict.fromkeys(WHEELS, wheel), 'fix': gnss, 'fix_velocity': gnss,
+            'heading': -imu}
 
 
 def _gaps(slot: str, t: Floats, found: list[Reason]) -> None:

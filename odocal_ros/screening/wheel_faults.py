@@ -14,6 +14,8 @@ These are seen by the wheels themselves and the gyro, before any attitude or sca
 them the mean of both wheels is no travel, and whatever rests on it is wrong.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
@@ -27,18 +29,17 @@ from odocal_ros.settings.levels import FAULT_SIGMAS
 FAULT_GRID = 0.5          # s, judgement
 STILL_SHARE = 0.02        # judgement: of the other wheel's travel: limit for not moving
 OTHER_WHEEL_COUNTS = 8    # judgement: the other wheel makes meanwhile, at least
-SIDES = ('left', 'right')
 
 
-def broken_wheels(left: Travel, right: Travel, imu: Imu,
+def broken_wheels(axle: Sequence[Travel], imu: Imu,
                   between: tuple[float, float]) -> tuple[Reason, ...]:
     """
     Return WHEEL_DEAD and WHEEL_REVERSED where one wheel fails, empty where both count.
 
     Parameters
     ----------
-    left, right : Travel
-        Of the wheels, scale units.
+    axle : (2,) sequence of Travel
+        The left and the right wheel, scale units.
     imu : (t, w_b, f_b)
         (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.
     between : (2,)
@@ -49,7 +50,7 @@ def broken_wheels(left: Travel, right: Travel, imu: Imu,
     Reasons, at most one of each code.
 
     """
-    two = pair(left, right, imu, between, FAULT_GRID)
+    two = pair(axle, imu, between, FAULT_GRID)
     if two is None:
         return ()
     steps = np.diff([two.left, two.right])          # (2, n)
@@ -58,9 +59,10 @@ def broken_wheels(left: Travel, right: Travel, imu: Imu,
     if rolled.max() <= OTHER_WHEEL_COUNTS * two.quantum or rolled.max() == 0.0:
         return ()                                   # neither moves: the odometer is still
     if rolled[weak] <= STILL_SHARE * rolled.max():
-        return (Reason(Code.WHEEL_DEAD, f'the {SIDES[weak]} wheel does not count '
-                       f'({rolled[weak]:.6g} against {rolled.max():.6g} of the {SIDES[1 - weak]} '
-                       'wheel): the mean of both is not the travel'),)
+        return (Reason(Code.WHEEL_DEAD, f'the {two.names[weak]} wheel does not count '
+                       f'({rolled[weak]:.6g} against {rolled.max():.6g} of the '
+                       f'{two.names[1 - weak]} wheel): the mean of both is not the travel'),)
+    left, right = axle
     if np.array_equal(left.s, right.s) and np.array_equal(left.t, right.t):
         return (Reason(Code.WHEEL_DEAD, 'both wheels have identical counts: one counter is sent '
                        'twice'),)
@@ -151,8 +153,8 @@ def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
                 f'{(spans[0][1] - first) * FAULT_GRID:.1f} s'
         where += f', last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(
             after and len(spans) > 1)
-    return (Reason(Code.WHEEL_DEAD, f'the {SIDES[k]} wheel does not count {where} while the '
-                   f'{SIDES[1 - k]} wheel advances by {lost:.6g}: the mean of both is not the '
+    return (Reason(Code.WHEEL_DEAD, f'the {two.names[k]} wheel does not count {where} while the '
+                   f'{two.names[1 - k]} wheel advances by {lost:.6g}: the mean of both is not the '
                    'travel'),)
 
 
@@ -161,8 +163,8 @@ def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance
     """Return WHEEL_REVERSED where the right wheel goes against what left wheel and gyro say."""
     if ratio < -FAULT_SIGMAS * np.sqrt(variance) and ratio < -0.1:
         k = _against_imu(two, steps, imu)
-        which = (f'the {SIDES[k]} wheel counts down when the vehicle drives forward, the '
-                 f'{SIDES[1 - k]} wheel counts up' if k is not None else
+        which = (f'the {two.names[k]} wheel counts down when the vehicle drives forward, the '
+                 f'{two.names[1 - k]} wheel counts up' if k is not None else
                  'one wheel counts up while the other counts down; the IMU data cannot decide '
                  'which is correct')
         return (Reason(Code.WHEEL_REVERSED, f'{which}: the mean of both is not the travel'),)
@@ -174,7 +176,7 @@ def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance
         return ()
     back = [-step[step < 0].sum() for step in steps]
     unsigned = [k for k in (0, 1) if back[k] <= 3 * two.quantum + STILL_SHARE * back[1 - k]]
-    which = (f'the {SIDES[unsigned[0]]} wheel also counts up in reverse' if len(unsigned) == 1
+    which = (f'the {two.names[unsigned[0]]} wheel also counts up in reverse' if len(unsigned) == 1
              else 'one wheel counts up while the other counts down')
     a, b = spans[0]
     return (Reason(Code.WHEEL_REVERSED, f'{which}: {len(spans)} time{"s" * (len(spans) > 1)}, '

@@ -20,6 +20,7 @@ from odocal_ros.data.pieces import medians
 from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.settings.config import SIDES
 
 Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2
 # robust sigmas beyond which a row has no weight; statistical: 95 % efficient on normal errors
@@ -33,6 +34,7 @@ class Pair:
 
     t : (n,) s.   left, right : (n,) scale units.   turn : (n,) rad about the vehicle's up axis,
     gyro bias and all.   known : (n - 1,) cells within no gap.   quantum : scale units.
+    names : of left and right.
     """
 
     t: NDArray[np.float64]
@@ -41,6 +43,7 @@ class Pair:
     turn: NDArray[np.float64]
     known: NDArray[np.bool_]
     quantum: float
+    names: tuple[str, ...] = SIDES
 
     @property
     def step(self) -> float:
@@ -49,14 +52,16 @@ class Pair:
         return length
 
 
-def pair(left: Travel, right: Travel, imu: Imu, between: tuple[float, float], step: float,
+def pair(axle: Sequence[Travel], imu: Imu, between: tuple[float, float], step: float,
          doubt_t: Sequence[float] | Floats = ()) -> Pair | None:
     """
     Return the wheels on a grid of ``step`` s, None where they share less than 20 cells.
 
+    axle : the left and the right wheel.
     imu : (t, w_b, f_b), (n,) s, (n, 3), (n, 3).   between : s, the marks.   doubt_t : (d,) s.
     """
     t_imu, w_b, f_b = imu
+    left, right = axle
     if min(len(left.t), len(right.t), len(t_imu)) < 2:
         return None
     begin = max(left.t[0], right.t[0], t_imu[0], between[0])
@@ -74,7 +79,8 @@ def pair(left: Travel, right: Travel, imu: Imu, between: tuple[float, float], st
     for at in doubt_t:
         known &= (t[1:] < at - step) | (t[:-1] > at + step)
     return Pair(t, left.at(t), right.at(t), integral_at(t, t_imu, rate), known,
-                max(left.quantum, right.quantum))
+                max(left.quantum, right.quantum),
+                tuple(one.name or side for one, side in zip(axle, SIDES, strict=True)))
 
 
 def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floats | None = None,

@@ -35,6 +35,7 @@ from odocal_ros.settings.setting import (
 GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
 NAN = math.nan
+SIDES = ('left', 'right')     # names of two wheels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,12 +62,31 @@ class OdometerConfig:
     # a bus and a middleware seldom deliver within less; u-blox asks for 10 ms or better
     time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown latency of the odometer, 1 '
                                 'sigma; matters in turns and at marks set in motion.')
-    left: str = setting('', ro=True, about="Left wheel: joint name, array index, or 'topic' if "
-                        'it has its own topic.')
-    right: str = setting('', ro=True, about="Right wheel: joint name, array index, or 'topic' "
-                         '(odometer_right).')
+    wheels: tuple[str, ...] = setting((), ro=True, item=str, about=(
+        'Wheels in one message: joint names or array indices, the left and the right one of each '
+        'axle in turn.'))
+    left: str = setting('', ro=True, about='Left one of two wheels: joint name, array index, or '
+                        "'topic' if it has its own topic.")
+    right: str = setting('', ro=True, about='Right one of two wheels: joint name, array index, or '
+                         "'topic' (odometer_right).")
     track_width: float = setting(0.0, 'm', 0.0, 20.0, about='Distance between the left and the '
                                  'right wheel; 0: unknown.')
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Return the wheels as configured, none if they are found by name."""
+        return self.wheels or tuple(filter(None, (self.left, self.right)))
+
+    @property
+    def own_topics(self) -> bool:
+        """Return True if the left and the right wheel have a topic each."""
+        return 'topic' in (self.left, self.right)
+
+    def names(self, count: int) -> tuple[str, ...]:
+        """Return the names of so many wheels, for people and results: '' of a single one."""
+        if count <= len(SIDES):
+            return SIDES if count == len(SIDES) else ('',)
+        return self.keys if len(self.keys) == count else tuple(map(str, range(1, count + 1)))
 
 
 @dataclass(frozen=True, kw_only=True)

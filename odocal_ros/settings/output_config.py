@@ -26,8 +26,8 @@ class OutputConfig:
     automatic_kept: int = setting(100, '', 0, 10**6, about='Number of result folders kept with '
                                   'leg.automatic; the oldest are deleted first, but never the '
                                   'one that latest points to and the newest good one. 0: all.')
-    formats: tuple[str, ...] = setting(FORMATS, choices=FORMATS, about='Files written in '
-                                       'addition to calibration.json.')
+    formats: tuple[str, ...] = setting(FORMATS, choices=FORMATS, item=str, about=(
+        'Files written in addition to calibration.json.'))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,15 +33,16 @@ AnyConfig = TypeVar('AnyConfig', bound=Settings)
 
 def setting(default: object, unit: str = '', low: float | None = None, high: float | None = None,
             about: str = '', choices: Sequence[str] = (), ro: bool = False,
-            frame: bool = False) -> Any:
+            frame: bool = False, item: type = float) -> Any:
     """
     Declare a setting; NaN passes where the default is NaN.
 
-    ro : fixed at start-up.   frame : the name of a coordinate frame.
+    ro : fixed at start-up.   frame : the name of a coordinate frame.   item : type of the values
+    of a list.
     """
     return field(default=default, metadata={
         'unit': unit, 'low': low, 'high': high, 'about': about, 'choices': choices, 'ro': ro,
-        'frame': frame})
+        'frame': frame, 'item': item})
 
 
 @dataclass(frozen=True)
@@ -57,22 +58,25 @@ class Setting:
     about: str
     read_only: bool
     frame: bool
+    item: type
 
     @property
     def kind(self) -> str:
         """Return bool, int, float, str, floats or strs (lists)."""
         if not isinstance(self.default, tuple):
             return type(self.default).__name__
-        return 'strs' if self.choices else 'floats'
+        return f'{self.item.__name__}s'
 
     def checked(self, value: Any) -> Any:
         """Return value as this setting's type, or raise BadConfig with what it wants."""
         if isinstance(self.default, tuple):
             if isinstance(value, str) or not hasattr(value, '__len__'):
                 raise BadConfig(f'{self.name}: {value!r} is not a list')
-            items = tuple(self._one(v, str if self.choices else float) for v in value)
+            if self.item is str:        # an index is a name too
+                return tuple(self._one(str(v) if type(v) is int else v, str) for v in value)
+            items = tuple(self._one(v, float) for v in value)
             lengths = (3,) if self.default else (0, 4)
-            if not self.choices and len(items) not in lengths:
+            if len(items) not in lengths:
                 raise BadConfig(f'{self.name}: {len(items)} values; required: {lengths[-1]}')
             return items
         return self._one(value, type(self.default))
@@ -120,7 +124,7 @@ def _settings(owner: Settings, prefix: str = '') -> Iterator[Setting]:
         else:
             m = f.metadata
             yield Setting(prefix + f.name, f.default, m['unit'], m['low'], m['high'],
-                          m['choices'], m['about'], m['ro'], m['frame'])
+                          m['choices'], m['about'], m['ro'], m['frame'], m['item'])
 
 
 @cache

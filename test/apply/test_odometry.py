@@ -69,7 +69,7 @@ def test_of_two_wheels_each_has_its_own_factor(two_wheels):
     alignment, config = alignment_of(made, row), settings(made)
     run, _ = prepare(made.leg(), screen(made.leg(), config)[0], config, alignment=alignment)
     left, right = (run.reckon(travel).P * scale for travel, scale in zip(
-        (run.inputs.travel_left, run.inputs.travel_right), made.truth.wheel_scales, strict=True))
+        (run.inputs.travels[0], run.inputs.travels[1]), made.truth.wheel_scales, strict=True))
     wanted = (left + right) / 2 @ forward_b(made.truth.yaw, made.truth.pitch)
     poses = poses_of(odometry_of(made, **given(alignment, run.origin.latitude)),
                      samples_of(made, made.imu.stamp_ns[row]), made.form)

@@ -9,18 +9,23 @@
 
 """Each wheel beside the mean of both: ratio and track width on simulated drives, and refusals."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 from drives import cached, changed, drive, settings
 import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.calib.smoother.wheel_result import joined, unknown_wheels, wheel_estimates
+from odocal_ros.calib.smoother.wheel_result import (
+    joined,
+    unknown_wheels,
+    wheel_details,
+    wheel_estimates,
+)
 from odocal_ros.calib.smoother.wheels import Wheel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.config import Config, SIDES, with_settings
 from odocal_ros.settings.grades import GRADES
 
 pytestmark = pytest.mark.slow
@@ -147,14 +152,14 @@ def test_a_width_is_no_better_than_the_turns_are_known():
 
 def pair(delta=2e-3, sigma=1e-6, width=1.6, width_sigma=1e-3):
     """Return two wheels, mirrored as lines of one pair are."""
-    return tuple(Wheel(1 / (1 + side * delta), sigma, side * width / 2, width_sigma / 2, (1e-3,))
-                 for side in (1, -1))
+    return {name: Wheel(1 / (1 + side * delta), sigma, side * width / 2, width_sigma / 2, (1e-3,))
+            for name, side in zip(SIDES, (1, -1), strict=True)}
 
 
 def said(wheels, scale=SCALE, **changed_settings):
     config = with_settings(Config(), {k.replace('__', '.'): v
                                       for k, v in changed_settings.items()})
-    return wheel_estimates(wheels, scale, config)
+    return wheel_estimates(SIDES, wheels, scale, config)
 
 
 def test_the_sigma_of_a_wheel_is_that_of_scale_and_ratio():
@@ -170,13 +175,13 @@ def test_wheels_that_are_not_known_are_not_stated_and_said():
     # right by left is off by twice what either is off: 2.5 % is half of 5 %
     near, _ = said(pair(sigma=0.0124))
     assert near['scale_factor_left'].value is not None
-    for wheels, text in ((pair(sigma=0.0126), '2.5 %'), ((), 'is not known')):
+    for wheels, text in ((pair(sigma=0.0126), '2.5 %'), ({}, 'is not known')):
         found, (reason,) = said(wheels)
-        assert found == unknown_wheels('m/pulse')
+        assert found == unknown_wheels(SIDES, 'm/pulse')
         assert reason.code is Code.WHEELS_NOT_SEPARABLE
         assert text in reason.text
     # why there is no scale the method says itself
-    assert said(pair(), Estimate(None, None, '1')) == (unknown_wheels('1'), [])
+    assert said(pair(), Estimate(None, None, '1')) == (unknown_wheels(SIDES, '1'), [])
 
 
 @pytest.mark.parametrize(('width', 'sigma', 'given', 'code'), [
@@ -200,22 +205,22 @@ def test_a_width_far_from_the_one_given_is_said():
 
 
 def leg_of(wheels):
-    return MethodResult('smoother', (), {}, details={'wheels': dict(zip(
-        ('left', 'right'), map(asdict, wheels), strict=True))} if wheels else {})
+    return MethodResult('smoother', (), {}, details=wheel_details(wheels))
 
 
 def test_several_legs_are_a_mean_by_variance():
     one, other = pair(delta=2e-3, sigma=1e-5), pair(delta=2.01e-3, sigma=2e-5, width=1.601)
-    left, right = joined([leg_of(one), leg_of(()), leg_of(other)])
+    left, right = joined([leg_of(one), leg_of({}), leg_of(other)]).values()
     weight = np.array([4.0, 1.0]) / 5
-    assert left.ratio == pytest.approx(weight @ [one[0].ratio, other[0].ratio], rel=1e-12)
+    both = [legs['left'].ratio for legs in (one, other)]
+    assert left.ratio == pytest.approx(weight @ both, rel=1e-12)
     assert left.ratio_sigma == pytest.approx(1e-5 / np.sqrt(1.25))
     assert left.y - right.y == pytest.approx(1.6005)
-    assert joined([leg_of(()), leg_of(())]) == ()
+    assert joined([leg_of({}), leg_of({})]) == {}
 
 
 def test_legs_that_differ_widen_the_sigma():
     legs = [leg_of(pair(delta=delta, sigma=1e-5)) for delta in (1e-3, 2e-3, 3e-3)]
-    left, _ = joined(legs)
+    left, _ = joined(legs).values()
     # 1 permille apart beside 10 ppm: their scatter decides
     assert left.ratio_sigma == pytest.approx(1e-3 / np.sqrt(3), rel=0.01)

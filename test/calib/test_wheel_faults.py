@@ -59,17 +59,17 @@ def faults(options, left=lambda s: s, right=lambda s: s, swap=False, prepare=pre
     also = set() if more.pop('sides', False) else {Code.ODOMETER_CHOSEN}
     inputs, track, latitude, metres = prepare(**options)
     wheels = [replace(w, s=change(w.s)) for w, change in (
-        (inputs.travel_left, left), (inputs.travel_right, right))]
+        (inputs.travels[0], left), (inputs.travels[1], right))]
     imu = inputs.t_imu, inputs.w_b, inputs.f_b
     reasons, slips = wheel_faults(
-        *wheels[::-1 if swap else 1], imu, (0.0, inputs.t_stop), track, latitude,
+        wheels[::-1 if swap else 1], imu, (0.0, inputs.t_stop), track, latitude,
         more.pop('rough', 1.0) * metres, **more)
     return tuple(r for r in reasons if r.code not in also), slips
 
 
 def spun(options, at, length, size):
     """Return a change of a way by a spin, in whole counts, as an encoder would give it."""
-    t = prepared(**options)[0].travel_left.t
+    t = prepared(**options)[0].travels[0].t
     return lambda s: s + np.floor(np.clip((t - at) / length, 0, 1) * size / COUNT)
 
 
@@ -145,10 +145,10 @@ def robot(right_speed, left_speed, track=0.5, seconds_=200.0):
 
 def test_a_robot_may_turn_about_one_wheel_and_on_the_spot():
     wheels, imu = robot(right_speed=[0.5, 0.5, 0.3, 0.6], left_speed=[0.5, 0.0, -0.3, 0.6])
-    assert broken_wheels(*wheels, imu, (0.0, 200.0)) == ()
+    assert broken_wheels(wheels, imu, (0.0, 200.0)) == ()
     # the same wheels with a gyro that does not turn: dead for a while, and against each other
     still = (imu[0], imu[1] * 0, imu[2])
-    codes = {r.code for r in broken_wheels(*wheels, still, (0.0, 200.0))}
+    codes = {r.code for r in broken_wheels(wheels, still, (0.0, 200.0))}
     assert codes == {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
 
@@ -156,7 +156,7 @@ def test_a_wheel_without_direction_is_named_in_reverse_gear():
     wheels, imu = robot(right_speed=[0.5, 0.6, -0.3, 0.7, 0.3],
                         left_speed=[0.5, 0.5, -0.3, 0.7, 0.4])
     up = replace(wheels[1], s=np.append(0.0, np.cumsum(np.abs(np.diff(wheels[1].s)))))
-    (reason,) = broken_wheels(wheels[0], up, imu, (0.0, 200.0))
+    (reason,) = broken_wheels((wheels[0], up), imu, (0.0, 200.0))
     assert reason.code is Code.WHEEL_REVERSED
     assert reason.text.startswith('the right wheel also counts up in reverse')
     assert 'first at t = 20.' in reason.text
@@ -225,7 +225,7 @@ def test_a_long_slip_is_seen_whole_and_no_wheel_is_blamed_without_evidence(lengt
 def test_a_wheel_that_slips_on_and_on_is_said(side):
     """A hundredth from 150 s on, where about half the way is driven: no place stands out."""
     options = TOWN | {'seed': 3}
-    t = prepared(**options)[0].travel_left.t
+    t = prepared(**options)[0].travels[0].t
 
     def slips_on(s):
         return s + np.floor(0.01 * np.maximum(s - s[np.searchsorted(t, 150.0)], 0.0))
@@ -267,7 +267,7 @@ def test_one_counter_sent_twice_is_no_second_wheel():
     assert 'one counter is sent twice' in said_of_copies()[Code.WHEEL_DEAD]
     options = TOWN | {'seed': 3}
     inputs = prepared(**options)[0]
-    copied = np.floor(inputs.travel_left.s / 2)      # in another resolution: not to the digit
+    copied = np.floor(inputs.travels[0].s / 2)      # in another resolution: not to the digit
     reasons, _ = faults(options, right=lambda s: copied, rough=4 / 3, track_width=1.6)
     assert 'one counter is sent twice' in {r.code: r.text for r in reasons}[
         Code.WHEEL_DEAD]

@@ -70,7 +70,7 @@ def simulated(heading_error=0.0, **options):
     pick = inputs.t_imu >= a.t - 1e-9
     t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - a.gyro_bias, a.q_nb,
                        earth_rate_n(origin.latitude))
-    left, right = (dead_reckon(t, q_nb, s) for s in (inputs.travel_left, inputs.travel_right))
+    left, right = (dead_reckon(t, q_nb, s) for s in (inputs.travels[0], inputs.travels[1]))
     start = fixes_n[inputs.t_fix < 0.0].mean(axis=0)
     lever_v = np.subtract(made.options.antenna_lever_arm, made.options.odometer_lever_arm)
     return made, planar_leg(left, right, inputs.t_fix, fixes_n, inputs.covariance_n, (0.0, start),

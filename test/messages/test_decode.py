@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import ros_messages as make
 
-from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.leg import LegRecorder, WHEELS
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import make_reader
@@ -157,7 +157,7 @@ def test_a_longer_array_is_refused_with_the_settings_that_name_its_wheels():
     pairs, reader = read('odometer', [make.whole_array([4, 5, 6, 7])])
     assert pairs == []
     assert 'a list of 4 values' in reader.trouble
-    assert 'odometer.left and odometer.right (indices from 0)' in reader.trouble
+    assert 'odometer.wheels (indices from 0)' in reader.trouble
 
 
 def test_joint_state_gives_the_two_wheels_by_name():
@@ -212,8 +212,38 @@ def test_two_wheels_in_one_message():
         assert [block.value.tolist() for _, block in pairs] == [[1], [2]]
 
 
+def test_any_number_of_wheels_in_one_message():
+    for messages, keys in (
+            ([make.joints(1, ['x', 'a', 'b', 'c', 'd'], [0, 1, 2, 3, 4])], ('a', 'b', 'c', 'd')),
+            ([make.whole_array([0, 1, 2, 3, 4])], ('1', '2', '3', '4'))):
+        pairs, reader = read('odometer', messages, config(odometer__wheels=keys))
+        assert [slot for slot, _ in pairs] == list(WHEELS[:4])
+        assert [block.value.tolist() for _, block in pairs] == [[1], [2], [3], [4]]
+        assert reader.wheels == keys
+
+
+def test_two_wheels_as_a_list_are_left_and_right():
+    message = [make.joints(1, ['l', 'r'], [1, 2])]
+    as_list, _ = read('odometer', message, config(odometer__wheels=('l', 'r')))
+    by_side, _ = read('odometer', message, config(odometer__left='l', odometer__right='r'))
+    assert [(slot, block.value.tolist()) for slot, block in as_list] == [
+        (slot, block.value.tolist()) for slot, block in by_side]
+    assert config(odometer__wheels=('l', 'r')).odometer.names(2) == ('left', 'right')
+    # a list of indices is one of numbers in YAML
+    assert config(odometer__wheels=[0, 1]).odometer.keys == ('0', '1')
+
+
+@pytest.mark.parametrize(('more', 'words'), [
+    ({'odometer__wheels': ('a', 'b'), 'odometer__left': 'a'}, 'only one of both'),
+    ({'odometer__wheels': tuple('abcdefghi')}, '8 at most'),
+    ({'odometer__wheels': ('a', 'a')}, "'a', 'a'; required: different wheels")], ids=str)
+def test_impossible_lists_of_wheels_are_refused(more, words):
+    with pytest.raises(BadConfig, match=words):
+        read('odometer', [make.joints(1, ['a', 'b'], [1, 2])], config(**more))
+
+
 def test_one_joint_is_not_two_wheels():
-    with pytest.raises(BadConfig, match="both 'l': name two wheels"):
+    with pytest.raises(BadConfig, match="'l', 'l'; required: different wheels"):
         read('odometer', [make.joints(1, ['l', 'r'], [1, 2])],
              config(odometer__left='l', odometer__right='l'))
 

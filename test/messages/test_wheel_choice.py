@@ -55,6 +55,13 @@ def test_wheels_of_real_robots(robot):
     assert pair[0] in found.about
 
 
+def test_of_several_axles_the_list_of_all_wheels_is_named():
+    names, _ = REAL['husky']
+    assert choose(names, 4).about.endswith(
+        '; for all wheels set odometer.wheels to [front_left_wheel, front_right_wheel, '
+        'rear_left_wheel, rear_right_wheel]')
+
+
 @pytest.mark.parametrize(('names', 'keys'), [
     (['joint'], ('joint',)),
     (['steering_joint', 'drive_joint'], ('drive_joint',)),

@@ -62,6 +62,14 @@ def test_unnamed_joints_are_told_apart_by_how_they_move(tmp_path, capsys):
     assert 'j1 travels' in text
 
 
+def test_four_unnamed_joints_are_a_list_of_axles(tmp_path, capsys):
+    path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.joints(
+        ns, ['a', 'b', 'c', 'd'], [right, left, 1.01 * right, 0.99 * left])))
+    told, wheels, _ = inspect(path, capsys)
+    assert [v['side'] for v in wheels['values']] == ['right', 'left', 'right', 'left']
+    assert told['command'].endswith("--set 'odometer.wheels=[b, a, d, c]'")
+
+
 def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, capsys):
     path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.whole_array(
         [int(right * 50), int(left * 50)])))

@@ -387,7 +387,7 @@ def test_two_wheels_give_their_mean(made):
     inputs, codes, _ = said(two.leg(), settings(two))
     assert codes == {}
     np.testing.assert_allclose(
-        inputs.travel.s[-1], (inputs.travel_left.s[-1] + inputs.travel_right.s[-1]) / 2)
+        inputs.travel.s[-1], (inputs.travels[0].s[-1] + inputs.travels[1].s[-1]) / 2)
     _, codes, _ = said(replace(two.leg(), odometer_right=changed(
         two.odometer_right, stamp_ns=lambda a: a * 0)))
     assert Code.NO_ODOMETER in codes

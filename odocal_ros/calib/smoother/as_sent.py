@@ -13,12 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.result import AS_SENT, Estimate, MethodResult
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.state import LN_K, SPEED_OFFSET, State
 from odocal_ros.data.arrays import Floats
-
-AS_SENT = 'scale_factor_as_sent'
 
 
 def as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Estimate]:

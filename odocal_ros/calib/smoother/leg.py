@@ -60,7 +60,7 @@ class SmootherLeg:
     doubt_sigma: Floats = _none()        # scale units
     velocity: Velocity = Velocity()
     heading: Heading = Heading()
-    wheels: tuple[Travel, ...] = ()     # each by itself, the left one of two first
+    wheels: tuple[Travel, ...] = ()     # each by itself, as in odometer.wheels
     felt: bool = True                   # False: no accelerometer, f_b is gravity, made up
 
     @property
@@ -112,5 +112,4 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
         doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma,
         velocity=outside_velocity(inputs, config, origin),
         heading=outside_heading(inputs, config, origin), felt=inputs.felt,
-        wheels=() if inputs.travel_left is None or inputs.travel_right is None else (
-            inputs.travel_left, inputs.travel_right))
+        wheels=inputs.travels)

@@ -90,7 +90,8 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     drift = float(np.sqrt(up_b @ near[0][BG, BG] @ up_b) * widen)
     wheels = wheels_beside(problem, fit, covariance, drift, config.odometer.track_width)
     if leg.wheels:
-        of_wheels, why = wheel_estimates(wheels, found['scale_factor'], config)
+        of_wheels, why = wheel_estimates(
+            [wheel.name for wheel in leg.wheels], wheels, found['scale_factor'], config)
         found, reasons = found | of_wheels, reasons + why
     bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
     for i, axis in enumerate('xyz'):

@@ -17,6 +17,7 @@ from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.remarks import IMU_SCALES
 from odocal_ros.calib.smoother.state import CONSTANTS, HEADING, ODO_ARM
 from odocal_ros.calib.smoother.wheel_result import unknown_wheels
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
@@ -26,9 +27,10 @@ UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
 OPTIONAL = range(ODO_ARM.start, HEADING)
 
 
-def refused(reasons: Iterable[Reason], scale_unit: str, two_wheels: bool) -> MethodResult:
+def refused(reasons: Iterable[Reason], scale_unit: str,
+            wheels: Iterable[Travel] = ()) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
-    found = unknown(scale_unit) | (unknown_wheels(scale_unit) if two_wheels else {})
+    found = unknown(scale_unit) | unknown_wheels((one.name for one in wheels), scale_unit)
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS)
 
 

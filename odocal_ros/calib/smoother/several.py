@@ -86,7 +86,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     estimates |= as_sent_of(legs, estimates['scale_factor'])
     wheels = joined(legs)
     if wheels:
-        of_wheels, more = wheel_estimates(wheels, estimates['scale_factor'], config)
+        of_wheels, more = wheel_estimates(wheels, wheels, estimates['scale_factor'], config)
         estimates, why = estimates | of_wheels, why + more
     estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]

@@ -57,18 +57,18 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
     MethodResult named ``smoother``; what the leg cannot determine is None with its reason.
 
     """
-    few, two_wheels = too_little_of(leg), len(leg.wheels) > 1
+    few = too_little_of(leg)
     if few:
-        return refused([few], leg.scale_unit, two_wheels)
+        return refused([few], leg.scale_unit, leg.wheels)
     problem = Problem.of(leg, config)
     try:
         best = best_fit(problem, config, trace)
     except (NotPositive, np.linalg.LinAlgError) as error:
         return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}. '
                                'Likely cause: missing or invalid samples '
-                               'there')], leg.scale_unit, two_wheels)
+                               'there')], leg.scale_unit, leg.wheels)
     if implausible := no_imu(best):
-        return refused(implausible, leg.scale_unit, two_wheels)
+        return refused(implausible, leg.scale_unit, leg.wheels)
     return outcome(leg, problem, best, config)
 
 

@@ -9,63 +9,110 @@
 
 """What the wheels of a leg, or of several, say: factors, track width, and why there are none."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.result import Estimate, FACTOR, MethodResult
 from odocal_ros.calib.smoother.wheels import Wheel
 from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.config import Config
-from odocal_ros.settings.levels import INFORMED_SHARE, REMARK_SIGMAS, TYRE_SPREAD
+from odocal_ros.screening.axles import axles_of
+from odocal_ros.settings.config import Config, SIDES
+from odocal_ros.settings.levels import (
+    FAULT_SIGMAS,
+    INFORMED_SHARE,
+    REMARK_SIGMAS,
+    TYRE_SPREAD,
+)
 
-SIDES = ('left', 'right')
-FACTORS = tuple(f'scale_factor_{side}' for side in SIDES)
+Found = tuple[dict[str, Estimate], list[Reason]]
+FEWEST_ALIKE = 3        # definition: of less nobody knows which one departs
+# judgement: of new tyres of one size; a tyre without a third of its air has lost half of that
+DEPARTS = 0.01
 
 
-def wheel_details(wheels: Sequence[Wheel]) -> dict[str, Any]:
+def wheel_details(wheels: Mapping[str, Wheel]) -> dict[str, Any]:
     """Return what calibration.json holds of the wheels of a leg, {} of one counter."""
-    return {'wheels': {side: asdict(wheel) for side, wheel in zip(SIDES, wheels, strict=True)}} \
-        if wheels else {}
+    return {'wheels': {name: wheel.as_dict() for name, wheel in wheels.items()}} if wheels else {}
 
 
-def unknown_wheels(scale_unit: str) -> dict[str, Estimate]:
-    """Return the estimates of two wheels of which nothing is known."""
-    return dict.fromkeys(FACTORS, Estimate(None, None, scale_unit)) | {
-        'track_width': Estimate(None, None, 'm')}
+def unknown_wheels(names: Iterable[str], scale_unit: str) -> dict[str, Estimate]:
+    """Return the estimates of wheels of which nothing is known, {} of one counter."""
+    names = list(names)
+    return {FACTOR + name: Estimate(None, None, scale_unit) for name in names} | {
+        width: Estimate(None, None, 'm') for width in _widths(names)}
 
 
-def wheel_estimates(wheels: Sequence[Wheel], scale: Estimate,
-                    config: Config) -> tuple[dict[str, Estimate], list[Reason]]:
+def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Estimate,
+                    config: Config) -> Found:
     """
-    Return the estimates of two wheels and what is to be said of them, docs/method.md (W4), (W8).
+    Return the estimates of several wheels and the reasons, docs/method.md (W4), (W8).
 
-    wheels : left and right, () where nothing is known of them.   scale : of their mean.
+    names : of the wheels.   wheels : by name, none where nothing is known of them.   scale : of
+    their mean.
     """
-    found = unknown_wheels(scale.unit)
+    names = list(names)
+    found = unknown_wheels(names, scale.unit)
     if scale.value is None or scale.sigma is None:
         return found, []
     limit = INFORMED_SHARE * (config.wheels.radius_range or TYRE_SPREAD)
-    # one line, seen twice: right by left is off by twice what either is off from the mean
-    sigma = 2 * wheels[0].ratio_sigma if wheels else np.inf
+    # left and right are one line, seen twice: right by left is off by twice what either is off
+    # from the mean
+    sigma = 2 * max((wheel.ratio_sigma for wheel in wheels.values()), default=np.inf)
     if sigma > limit:
         known = f'has an uncertainty of {100 * sigma:.2g} %' if wheels else 'is not known'
-        return found, [Reason(Code.WHEELS_NOT_SEPARABLE, 'the ratio of right to left wheel '
+        return found, [Reason(Code.WHEELS_NOT_SEPARABLE, f'the ratio of {_pair(names)} '
                               f'{known}; the limit is {100 * limit:.2g} %. The factors of the '
                               'wheels are not stated')]
-    for name, wheel in zip(FACTORS, wheels, strict=True):
+    for name, wheel in wheels.items():
         value = scale.value * wheel.ratio
         relative = np.hypot(scale.sigma / scale.value, wheel.ratio_sigma)
-        found[name] = Estimate(value, float(value * relative), scale.unit)
-    width, why = _track_width(wheels, config.odometer.track_width)
-    return found | {'track_width': width}, why
+        found[FACTOR + name] = Estimate(value, float(value * relative), scale.unit)
+    reasons = _departing(wheels)
+    for width, (left, right) in _widths(names).items():
+        found[width], why = _track_width(wheels[left], wheels[right], config.odometer.track_width)
+        reasons += why
+        if (left, right) != SIDES and found[width].value is not None:
+            found |= _places({name: wheels[name] for name in (left, right)})
+    return found, reasons
 
 
-def _track_width(wheels: Sequence[Wheel], given: float) -> tuple[Estimate, list[Reason]]:
-    left, right = wheels
+def _pair(names: Sequence[str]) -> str:
+    return 'right to left wheel' if tuple(names) == SIDES else 'the wheels'
+
+
+def _widths(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return the names of the track widths, and the left and the right wheel of each."""
+    axles = [axle for axle in axles_of(names) if len(axle) == len(SIDES)]
+    return {'_'.join(('track_width', *(axle if axle != SIDES else ()))): axle for axle in axles}
+
+
+def _places(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
+    """Return where the wheels of an axle roll, m to the left and ahead of the mean."""
+    found = {f'lateral_position_{name}': Estimate(wheel.y, wheel.y_sigma, 'm')
+             for name, wheel in axle.items()}
+    return found | {f'forward_position_{name}': Estimate(wheel.x, wheel.x_sigma, 'm')
+                    for name, wheel in axle.items() if wheel.x is not None}
+
+
+def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
+    """Return the reason for one wheel whose factor is unlike that of all others."""
+    if len(wheels) < FEWEST_ALIKE:
+        return []
+    off = {}
+    for name, wheel in wheels.items():
+        usual = float(np.median([w.ratio for other, w in wheels.items() if other != name]))
+        if abs(wheel.ratio / usual - 1) > max(DEPARTS, FAULT_SIGMAS * wheel.ratio_sigma):
+            off[name] = wheel.ratio / usual - 1
+    return [Reason(Code.WHEEL_DEPARTS, f'the factor of wheel {name} is {100 * abs(x):.2f} % '
+                   f'{"larger" if x > 0 else "smaller"} than that of the others. Likely cause: '
+                   'tyre pressure, another tyre, or continuous slip')
+            for name, x in off.items()] if len(off) == 1 else []
+
+
+def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, list[Reason]]:
     width, sigma = left.y - right.y, left.y_sigma + right.y_sigma     # one line, seen twice
     none = Estimate(None, None, 'm')
     if given and sigma >= INFORMED_SHARE * TRACK_WIDTH.taped_share * given:
@@ -84,19 +131,24 @@ def _track_width(wheels: Sequence[Wheel], given: float) -> tuple[Estimate, list[
     return Estimate(width, sigma, 'm'), []
 
 
-def joined(legs: Sequence[MethodResult]) -> tuple[Wheel, ...]:
+def joined(legs: Sequence[MethodResult]) -> dict[str, Wheel]:
     """
-    Return the wheels of several legs, means by their variances: () where no leg knows them.
+    Return the wheels of several legs, means by their variances: {} where no leg knows them.
 
     Where legs differ by more than their sigmas allow, the sigma is as much larger.
     """
-    each = [leg.details['wheels'] for leg in legs if leg.details.get('wheels')]
-    return tuple(_mean([one[side] for one in each]) for side in SIDES) if each else ()
+    each: dict[str, list[Mapping[str, Any]]] = {}
+    for leg in legs:
+        for name, wheel in leg.details.get('wheels', {}).items():
+            each.setdefault(name, []).append(wheel)
+    return {name: _mean(wheels) for name, wheels in each.items()}
 
 
 def _mean(wheels: Sequence[Mapping[str, Any]]) -> Wheel:
     mean = {}
-    for name in ('ratio', 'y'):
+    for name in ('ratio', 'y', 'x'):
+        if any(name not in wheel for wheel in wheels):
+            continue
         x, sigma = (np.array([w[key] for w in wheels]) for key in (name, f'{name}_sigma'))
         weight = 1 / sigma**2
         mean[name] = float(x @ weight / weight.sum())

@@ -8,21 +8,23 @@
 # the License.
 
 """
-Each wheel beside the mean of all: its factor, and where it rolls, docs/method.md (W1) to (W4).
+Each wheel beside the mean: its factor, and where it rolls, docs/method.md (W1) to (W4).
 
-The scale factor of the fit is that of the mean reading. What a wheel reads beyond the mean is the
-turn of the vehicle times the wheel's distance from the middle, and the difference of the tyres:
+The scale factor of the fit is that of the mean reading of the wheels that do not steer. What a
+wheel reads beyond the mean is the turn of the vehicle times the wheel's distance from the middle,
+and the difference of the tyres; a steered wheel also rolls farther in turns, (W9):
 
-    K (s_i - s) = (a_i - 1) K s - a_i y_i psi,        K_i = K / a_i
+    K (s_i - s) = (a_i - 1) K s - a_i y_i psi + a_i x_i^2 q,        K_i = K / a_i
 
 s_i and s the readings of wheel i and of the mean, psi the turn, y_i the wheel's place, positive to
-the left. The attitudes of the fit give the turn; any number of wheels is one line each. The places
-are those of the leg's turns: an outer tyre, which is pressed more, rolls on a smaller radius, and
-that is in them.
+the left, x_i its distance ahead. The attitudes of the fit give the turn; any number of wheels is
+one line each. The places are those of the leg's turns: an outer tyre, which is pressed more, rolls
+on a smaller radius, and that is in them.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -32,16 +34,30 @@ from odocal_ros.calib.smoother.motion import rotvec
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import hard_and_turning
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import GYRO, GYRO_AXIS, GYRO_SIGNAL, LN_K, ODO_DELAY
+from odocal_ros.calib.smoother.state import (
+    GYRO,
+    GYRO_AXIS,
+    GYRO_SIGNAL,
+    LN_K,
+    ODO_DELAY,
+    State,
+)
 from odocal_ros.calib.smoother.wheel_noise import fit_line, Increments, Line
 from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.pieces import by_row
+from odocal_ros.nav.integral import integral_at
+from odocal_ros.screening.axles import STEER_GRID, steering_path
 
 OWN_DELAY = 0.02        # s, 1 sigma of a wheel's stamps against the others'. Judgement
 FIRST_WALK = 2e-3**2    # m^2/s, definition: where the levels set out
 DOUBTED = 1e10          # definition: share of a walk that makes an increment say nothing
 GAP = 0.3               # s, judgement: a line between readings is then off by a centimetre or two
 FEWEST = 20             # increments, judgement: levels by fewer are good to 30 % at best
+NUISANCE = range(2, 5)  # definition: unknowns of a line that nobody asks for
+# physical: 1 sigma of it by sideslip and body motion; 20 mm of 2.7 m in docs/decisions/0022
+PLACE_SHARE = 8e-3
+WHEELBASE = 5.0         # m, 1 sigma of how far a steered wheel is ahead. Physical: of a lorry
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +67,7 @@ class Wheel:
 
     ratio : K_i / K.   ratio_sigma : relative.   y : m to the left of the middle of all wheels.
     y_sigma : m.   walk : m/sqrt(s), by which it parts from the mean: even, hard, in turns.
+    x, x_sigma : m, of a steered wheel ahead of the mean, None of one that does not steer.
     """
 
     ratio: float
@@ -58,12 +75,18 @@ class Wheel:
     y: float
     y_sigma: float
     walk: tuple[float, ...]
+    x: float | None = None
+    x_sigma: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entry of calibration.json."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
 
 
 def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
-                  width: float) -> tuple[Wheel, ...]:
+                  width: float) -> dict[str, Wheel]:
     """
-    Return each wheel of a leg beside their mean, () where there are no two or too little motion.
+    Return each wheel of a leg by name, none where there are no two or too little motion.
 
     Parameters
     ----------
@@ -79,21 +102,22 @@ def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
     """
     wheels, state = problem.leg.wheels, fit.state
     if len(wheels) < 2:
-        return ()
+        return {}
     t = state.t + state.constants[ODO_DELAY]
     inside = np.flatnonzero((t >= max(w.t[0] for w in wheels))
                             & (t <= min(w.t[-1] for w in wheels)))
     if len(inside) < FEWEST:
-        return ()
+        return {}
     s = np.stack([w.at(t[inside]) for w in wheels]) * state.scale
     at = _nodes(s, state.scale * max(w.quantum for w in wheels))
     if len(at) < FEWEST:
-        return ()
+        return {}
     common = _Common(problem, fit, inside[at], s[:, at])
     delay = float(np.sqrt(covariance[ODO_DELAY, ODO_DELAY]))
     own = [LN_K, *range(GYRO.start, GYRO.stop)]
     lines = [common.line(i, delay, drift, width) for i in range(len(wheels))]
-    return tuple(_wheel(line, common.moved(line), covariance[np.ix_(own, own)]) for line in lines)
+    return {wheel.name: _wheel(line, common.moved(i, line), covariance[np.ix_(own, own)])
+            for i, (wheel, line) in enumerate(zip(wheels, lines, strict=True))}
 
 
 def _nodes(s: Floats, quantum: float) -> Ints:
@@ -122,7 +146,9 @@ class _Common:
     def __init__(self, problem: Problem, fit: Fit, at: Ints, s: Floats) -> None:
         state, motion = fit.state, fit.weighted[MotionRows].motion
         self.leg, self.s = problem.leg, s
-        self.way = np.diff(s.mean(axis=0))
+        self.fixed = np.array([not wheel.ahead for wheel in self.leg.wheels])
+        self.mean = s[self.fixed].mean(axis=0)
+        self.way = np.diff(self.mean)
         up = state.C_bv[:, 2]
         turn = rotvec(np.swapaxes(state.C_nb[:-1], 1, 2) @ state.C_nb[1:]) @ up
         self.turn = np.diff(np.append(0.0, np.cumsum(turn))[at])
@@ -144,36 +170,69 @@ class _Common:
         for begin, end in _unknown(problem.leg):
             self.share[(self.t[1:] > begin - delay) & (self.t[:-1] < end - delay)] = DOUBTED
         self.scale = state.scale
+        self.steer = {i: self._steering(state, up, i) for i, fixed in enumerate(self.fixed)
+                      if not fixed}
+
+    def _left(self, i: int, width: float) -> float:
+        """Return the prior place of a wheel: axles are left, right; an odd last one between."""
+        alone = i == len(self.leg.wheels) - 1 and i % 2 == 0
+        return 0.0 if alone else (width or TRACK_WIDTH.of_a_car) / 2 * (1 if i % 2 == 0 else -1)
+
+    def _steering(self, state: State, up: Floats, i: int) -> Floats:
+        """Return the path of a steered wheel beyond a fixed one by its squared distance, 1/m."""
+        leg, scale = self.leg, state.scale
+        t = np.arange(self.t[0], self.t[-1], STEER_GRID)
+        turn = integral_at(t, leg.t_imu, by_row(
+            lambda w_b: (w_b - state.gyro_bias.mean(axis=0)) @ up, leg.w_b))
+        wheels = [wheel for wheel in leg.wheels if not wheel.ahead]
+        s = np.mean([wheel.at(t + state.constants[ODO_DELAY]) for wheel in wheels], axis=0)
+        path = steering_path(t, turn, scale * s, scale * leg.wheels[i].ahead, self._left(i, 0.0))
+        return np.diff(np.interp(self.t, t, path))
 
     def line(self, i: int, delay: float, drift: float, width: float) -> Line:
-        """Return the line of a wheel: a - 1, a y, own delay, common delay, drift of the turn."""
-        wheels = self.leg.wheels
-        n = len(wheels)
-        # of two the left one comes first
-        y0 = (width or TRACK_WIDTH.of_a_car) / 2 * (1 if i == 0 else -1) if n == 2 else 0.0
+        """
+        Return the line of a wheel.
+
+        Unknown are a - 1, a y, own delay, common delay, drift of the turn; a x^2 if it steers.
+        """
+        y0 = self._left(i, width)
         X = np.stack([self.way, -self.turn, self.faster, y0 * self.turning, y0 * self.T], -1)
-        taped = TRACK_WIDTH.taped_share * width / 2 if n == 2 else 0.0
+        taped = TRACK_WIDTH.taped_share * width / 2
         prior = np.array([1.0, taped or TRACK_WIDTH.any_sigma, OWN_DELAY,
                           max(delay, 1e-4), max(drift, 1e-9)])
         centre = np.array([0.0, y0 if taped else 0.0, 0.0, 0.0, 0.0])
-        weight = np.full(n, -1 / n)
+        if i in self.steer:
+            X = np.column_stack([X, self.steer[i]])
+            prior, centre = np.append(prior, WHEELBASE**2), np.append(centre, 0.0)
+        weight = np.where(self.fixed, -1 / self.fixed.sum(), 0.0)
         weight[i] += 1.0
         rounding = sum((w * q.quantum * self.scale)**2 / 12 for w, q in zip(
-            weight, wheels, strict=True))
+            weight, self.leg.wheels, strict=True))
         return fit_line(Increments(
-            np.diff(self.s[i] - self.s.mean(axis=0)), X, prior, centre,
+            np.diff(self.s[i] - self.mean), X, prior, centre,
             max(float(rounding), 1e-4**2), self.share, self.kind, np.full(3, FIRST_WALK)))
 
-    def moved(self, line: Line) -> Floats:
-        """Return the derivatives of a - 1 and a y by ln K and the gyro's errors: (2, 1 + g)."""
-        by_gyro = -line.gain[:2] @ self.turn_errors * line.x[1]
-        return np.column_stack([[0.0, line.x[1]], by_gyro])
+    def moved(self, i: int, line: Line) -> Floats:
+        """Return the derivatives of a - 1, a y and a x^2 by ln K and the gyro's errors."""
+        rows = [0, 1, *range(NUISANCE.stop, len(line.x))]
+        by_scale, by_gyro = [0.0, line.x[1]], -line.gain[rows] @ self.turn_errors * line.x[1]
+        if i in self.steer:     # q grows with the square of the turn, and falls with the speed
+            by_scale.append(2 * line.x[-1])
+            curvature = self.turn / np.where(self.way, self.way, np.inf)
+            by_gyro += line.gain[rows] @ (curvature[:, None] * self.turn_errors) * line.x[-1]
+        return np.column_stack([by_scale, by_gyro])
 
 
 def _wheel(line: Line, moved: Floats, of_fit: Floats) -> Wheel:
+    rows = [k for k in range(len(line.x)) if k not in NUISANCE]
     a, y = 1 + line.x[0], line.x[1] / (1 + line.x[0])
-    covariance = line.covariance[:2, :2] + moved @ of_fit @ moved.T
+    covariance = line.covariance[np.ix_(rows, rows)] + moved @ of_fit @ moved.T
     gradient = np.array([-y, 1.0]) / a
-    return Wheel(float(1 / a), float(np.sqrt(covariance[0, 0]) / a), float(y),
-                 float(np.sqrt(gradient @ covariance @ gradient)),
-                 tuple(np.sqrt(line.levels).tolist()))
+    whole = Wheel(float(1 / a), float(np.sqrt(covariance[0, 0]) / a), float(y),
+                  float(np.sqrt(gradient @ covariance[:2, :2] @ gradient)),
+                  tuple(np.sqrt(line.levels).tolist()))
+    if len(rows) == 2:
+        return whole
+    x = float(np.sqrt(max(line.x[-1], 0.0) / a))
+    sigma = float(np.sqrt(covariance[2, 2])) / (2 * a * max(x, 0.1))
+    return replace(whole, x=x, x_sigma=float(np.hypot(sigma, PLACE_SHARE * x)))

@@ -15,6 +15,7 @@ difference is rounding and gyro noise, millimetres over seconds; a wheel that sp
 its own stands out of it by centimetres, where the IMU's acceleration alone sees half a metre.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -52,17 +53,18 @@ SLIP_SPANS = (10, 30, 80, 200, 500)
 TYRE_BLUR, TURN_DOUBT = 0.005, 0.01
 
 
-def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats],
+def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
                  between: tuple[float, float], track: Track, latitude: float,
                  metres_per_unit: float, track_width: float = 0.0, doubt_t: Floats | None = None,
-                 max_deviation: float = 0.35) -> tuple[tuple[Reason, ...], WheelSlips]:
+                 max_deviation: float = 0.35,
+                 count: int = 2) -> tuple[tuple[Reason, ...], WheelSlips]:
     """
     Return what the gyro finds wrong with wheels that both count, and the slips of one of them.
 
     Parameters
     ----------
-    left, right : Travel
-        Of the wheels, scale units.
+    axle : (2,) sequence of Travel
+        The left and the right wheel, scale units.
     imu : (t, w_b, f_b)
         (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.
     between : (2,)
@@ -79,13 +81,15 @@ def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats]
         s, where travel is in doubt for other reasons (gaps, resets).
     max_deviation : float
         Ratio of the counts less one, from which on it is said.
+    count : int
+        Of the wheels in the mean.
 
     Returns
     -------
     Reasons (WHEELS_SWAPPED, WHEEL_COUNTERS_DIFFER, WHEEL_SLIP), and WheelSlips.
 
     """
-    two = pair(left, right, imu, between, SLIP_GRID,
+    two = pair(axle, imu, between, SLIP_GRID,
                np.empty(0) if doubt_t is None else doubt_t)
     if two is None or not metres_per_unit:
         return (), NO_SLIPS
@@ -95,14 +99,14 @@ def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats]
         return (), NO_SLIPS
     ratio = x[0]                                          # right counts over left ones
     per_right = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
-    reasons = swapped(x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right,
+    reasons = swapped(two, x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right,
                        track_width)
-    reasons += unlike(ratio, track_width or abs(x[1]) * per_right, max_deviation)
+    reasons += unlike(two, ratio, track_width or abs(x[1]) * per_right, max_deviation)
     quantum_m = per_right * (1 + ratio) / 2
     apart = (two.right - signals @ x) * per_right         # m, what turn and ratio leave
     width = track_width or abs(x[1]) * per_right
     events, lasting = _events(two, apart, quantum_m, width)
-    found, change = changed(_without(two, events), signals, metres_per_unit)
+    found, change = changed(_without(two, events), signals, metres_per_unit, count)
     reasons += found
     # what seemed a change and is none is a slip; beside one only what is twice as steep is
     events = sorted(events + lasting)
@@ -114,7 +118,7 @@ def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats]
     mean = (two.left * ratio + two.right) / 2 * per_right
     wheel = [_which(two, mean, imu, track, latitude, e) for e in events]
     slips = replace(slips_of(events, wheel), change=change)
-    return reasons + slip_reason(slips), slips
+    return reasons + slip_reason(slips, two.names), slips
 
 
 def _level(two: Pair, apart: Floats, quantum_m: float) -> Floats:

@@ -9,7 +9,9 @@
 
 """Slips of the wheels as they are found and said."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+import math
 from typing import Any
 
 import numpy as np
@@ -34,6 +36,7 @@ class WheelSlips:
     begin, end : (k,) s.   size : (k,) m, > 0 where the wheel ran farther than the ground (for a
     wheel that is not known: right less left).   wheel : (k,) -1 left, +1 right, 0 one of them.
     change : of the ratio right over left at some place, as much as at half the way does the same.
+    count : of the wheels in the mean.
     """
 
     begin: NDArray[np.float64] = _none()
@@ -41,6 +44,7 @@ class WheelSlips:
     size: NDArray[np.float64] = _none()
     wheel: NDArray[np.int64] = _none(np.int64)
     change: float = 0.0
+    count: int = 2
 
     @property
     def t(self) -> Floats:
@@ -49,18 +53,28 @@ class WheelSlips:
 
     def doubts(self) -> tuple[Floats, Floats]:
         """
-        Return where the mean of both wheels is in doubt, and by how much: (d,) s, (d,) m.
+        Return where the mean of the wheels is in doubt, and by how much: (d,) s, (d,) m.
 
-        A slip of one wheel is half as large in the mean, drawn out over the seconds it lasts.
+        A slip of one of two wheels is half as large in the mean, drawn out over the seconds it
+        lasts.
         """
         seconds = np.maximum(np.ceil(self.end - self.begin), 1.0).astype(int)
         t = [begin + (end - begin) * (np.arange(n) + 0.5) / n
              for begin, end, n in zip(self.begin, self.end, seconds, strict=True)]
-        sigma = np.repeat(np.abs(self.size) / 2 / np.sqrt(seconds), seconds)
+        sigma = np.repeat(np.abs(self.size) / self.count / np.sqrt(seconds), seconds)
         return np.concatenate([*t, []]), sigma
 
 
 NO_SLIPS = WheelSlips()
+
+
+def of_axles(axles: Sequence[WheelSlips], count: int) -> WheelSlips:
+    """Return the slips of the wheels of several axles; count: of the wheels in the mean."""
+    columns = {name: np.concatenate([getattr(one, name) for one in axles]) for name in (
+        'begin', 'end', 'size', 'wheel')}
+    order = np.argsort(columns['begin'], kind='stable')
+    return WheelSlips(**{name: column[order] for name, column in columns.items()},
+                      change=math.hypot(*(one.change for one in axles)), count=count)
 
 
 def slips_of(events: list[tuple[float, float, float]], wheel: list[int]) -> WheelSlips:
@@ -71,11 +85,12 @@ def slips_of(events: list[tuple[float, float, float]], wheel: list[int]) -> Whee
     return WheelSlips(begin, end, np.where(which < 0, -size, size), which)
 
 
-def slip_reason(slips: WheelSlips) -> tuple[Reason]:
+def slip_reason(slips: WheelSlips, names: tuple[str, ...]) -> tuple[Reason]:
     """Say which wheel slipped most, by how much and when."""
     n = len(slips.size)
     worst = int(np.argmax(np.abs(slips.size)))
-    which = ('one of the wheels', 'the right wheel', 'the left wheel')[slips.wheel[worst]]
+    left, right = (f'the {name} wheel' for name in names)
+    which = ('one of the wheels', right, left)[slips.wheel[worst]]
     done = 'deviates' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
     other = ' from the other' * (not slips.wheel[worst])
     return (Reason(Code.WHEEL_SLIP, f'{which} {done}{other} by '

@@ -67,7 +67,7 @@ def fitted(two: Pair, signals: Floats, metres_per_unit: float,
     return x, covariance
 
 
-def swapped(width: float, sigma: float, track_width: float) -> tuple[Reason, ...]:
+def swapped(two: Pair, width: float, sigma: float, track_width: float) -> tuple[Reason, ...]:
     if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least,
                                                        track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
@@ -79,14 +79,16 @@ def swapped(width: float, sigma: float, track_width: float) -> tuple[Reason, ...
                        'configured sides are used'),)
     if width > -TRACK_WIDTH.least:
         return ()
-    return (Reason(Code.WHEELS_SWAPPED, 'the left wheel travels farther in left turns (track '
-                   f'width {width:.2f} m, +-{sigma:.2g} m)'),)
+    return (Reason(Code.WHEELS_SWAPPED, f'the {two.names[0]} wheel travels farther in left turns '
+                   f'(track width {width:.2f} m, +-{sigma:.2g} m)'),)
 
 
-def changed(two: Pair, signals: Floats,
-            metres_per_unit: float) -> tuple[tuple[Reason, ...], float]:
+def changed(two: Pair, signals: Floats, metres_per_unit: float,
+            count: int) -> tuple[tuple[Reason, ...], float]:
     """
     Say that the wheels' ratio is not the same before and after some place of the way.
+
+    count : of the wheels in the mean.
 
     Returns
     -------
@@ -110,22 +112,24 @@ def changed(two: Pair, signals: Floats,
         return (), 0.0
     # before it as likely as after it: the fit lies between, (1 - share) of the change from before
     held = float(change * np.sqrt(2 * (share**2 + (1 - share)**2)))
+    left, right = two.names
     return (Reason(Code.WHEEL_SLIP, f'from t = {two.t[at]:.0f} s on, after about '
-                   f'{100 * share:.0f} % of the path, the right wheel counts '
+                   f'{100 * share:.0f} % of the path, the {right} wheel counts '
                    f'{100 * abs(change):.2f} % (+-{100 * abs(change) / odds:.2f}) '
-                   f'{"more" if change > 0 else "less"} relative to the left wheel and the gyro. '
-                   'Likely cause: continuous slip or a tyre that loses pressure. Which section '
-                   f'is correct cannot be decided from the data: {25 * abs(held):.2f} % is added '
-                   f'to the uncertainty of the scale, {50 * abs(held):.2f} % to that of each '
-                   'wheel'),), held
+                   f'{"more" if change > 0 else "less"} relative to the {left} wheel and the '
+                   'gyro. Likely cause: continuous slip or a tyre that loses pressure. Which '
+                   'section is correct cannot be decided from the data: '
+                   f'{50 / count * abs(held):.2f} % is added to the uncertainty of the scale, '
+                   f'{50 * abs(held):.2f} % to that of each wheel'),), held
 
 
-def unlike(ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
+def unlike(two: Pair, ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
     """Say that one wheel counts far finer: the mean count is no longer of the axle's middle."""
     if max(ratio, 1 / ratio) <= 1 + limit:
         return ()
     # the mean count weighs each wheel by its counts a metre
     off = (ratio / (1 + ratio) - 0.5) * width
-    return (Reason(Code.WHEEL_COUNTERS_DIFFER, f'the right wheel counts {ratio:.3f} times as '
-                   'much as the left wheel: the scale refers to the mean count, at a point '
+    left, right = two.names
+    return (Reason(Code.WHEEL_COUNTERS_DIFFER, f'the {right} wheel counts {ratio:.3f} times as '
+                   f'much as the {left} wheel: the scale refers to the mean count, at a point '
                    f'{abs(off):.2f} m {"right" if off > 0 else "left"} of the axle centre'),)

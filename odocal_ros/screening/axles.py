@@ -1,0 +1,157 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The axles of a vehicle: those that count, and those that steer."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.odometer import mean_travel, Travel
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.wheel_faults import broken_wheels, STILL_SHARE
+from odocal_ros.screening.wheel_pair import Imu, pair, robust_fit
+from odocal_ros.screening.wheel_travel import Wheels
+from odocal_ros.settings.levels import FAULT_SIGMAS
+
+T = TypeVar('T')
+Axle = tuple[Travel, ...]
+STEER_GRID = 0.1          # s, judgement: in which turn rates are squared
+CELL = 10                 # judgement: steps of a cell that is compared, 1 s
+SMOOTH = np.full(11, 1 / 11)      # judgement: of the speed, 1.1 s; its counts are coarse
+SLOW = 0.05               # judgement: of the top speed, below which a turn rate is noise
+# judgement: of the path, by which a steered axle rolls farther; less is below any scale sigma
+LEAST_STEERED = 2e-5
+
+
+def axles_of(wheels: Sequence[T]) -> list[tuple[T, ...]]:
+    """Return wheels in pairs, left and right; an odd last one is alone."""
+    return [tuple(wheels[k:k + 2]) for k in range(0, len(wheels), 2)]
+
+
+def judged_axles(wheels: Wheels, imu: Imu,
+                 between: tuple[float, float]) -> tuple[Wheels, list[Reason]]:
+    """
+    Return the wheels that count, steered ones marked, and the reasons.
+
+    imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   between : s, the marks.
+
+    A broken axle is left out if another one counts and does not steer: without one of its wheels
+    its mean is not in the middle.
+    """
+    axles = axles_of(wheels.each)
+    faults = [_faults(axle, axles, imu, between) for axle in axles]
+    reasons = [reason for why in faults for reason in why]
+    if len(axles) < 2:
+        return wheels, reasons
+    # of a broken axle the wheel that counts shows whether the others steer
+    seen = [axle if not why else _counting(axle, why) for axle, why in zip(
+        axles, faults, strict=True)]
+    ahead = iter(_ahead([axle for axle in seen if axle], imu, between, wheels.doubt_t))
+    places = [next(ahead) if axle else np.inf for axle in seen]
+    whole = [replace(wheel, ahead=x) for axle, why, x in zip(axles, faults, places, strict=True)
+             if not why for wheel in axle]
+    turning, fixed = ([wheel for wheel in whole if bool(wheel.ahead) is steers]
+                      for steers in (True, False))
+    if reasons and (not fixed or sum(map(bool, seen)) < 2):
+        return wheels, reasons
+    found = [Reason(Code.WHEEL_LEFT_OUT, f'{reason.text}; {_listed(axle)} left out of the mean')
+             for axle, why in zip(axles, faults, strict=True) for reason in why]
+    if turning:
+        found.append(Reason(Code.WHEELS_STEERED, f'{_listed(turning)} steered: the travel is more '
+                            f'in turns. The scale factor is that of the mean of {_names(fixed)}'))
+    return wheels.only(whole), found
+
+
+def _counting(axle: Axle, why: Sequence[Reason]) -> Axle:
+    """Return the wheel of a broken axle that counts, none if that is not certain."""
+    rolled = [_rolled(wheel) for wheel in axle]
+    alone = len(axle) > 1 and {reason.code for reason in why} == {Code.WHEEL_DEAD}
+    return (axle[int(np.argmax(rolled))],) if alone and max(rolled) > 0 else ()
+
+
+def _rolled(wheel: Travel) -> float:
+    return float(np.abs(np.diff(wheel.s)).sum())
+
+
+def _faults(axle: Axle, axles: list[Axle], imu: Imu,
+            between: tuple[float, float]) -> tuple[Reason, ...]:
+    """Return the faults of an axle; a single wheel is compared with the first axle."""
+    most = max(_rolled(wheel) for other in axles for wheel in other)
+    if max(map(_rolled, axle)) <= STILL_SHARE * most:
+        return (Reason(Code.WHEEL_DEAD, f'{_names(axle)} did not count while others advanced by '
+                       f'{most:.6g}'),) if most else ()
+    if len(axle) == 1:
+        axle = (*axle, replace(mean_travel(axles[0]), name='mean'))
+    return broken_wheels(axle, imu, between)
+
+
+def _ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
+           doubt_t: Floats) -> list[float]:
+    """Return by how much each axle is ahead of the one that steers least, scale units."""
+    first = mean_travel(axles[0])
+    found = [(0.0, 0.0), *(_square(mean_travel(axle), first, imu, between, doubt_t)
+                           for axle in axles[1:])]
+    squares, sigmas = np.transpose(found)
+    least = int(np.argmin(squares))
+    more, sigma = squares - squares[least], np.hypot(sigmas, sigmas[least])
+    ahead: list[float] = np.where(more > FAULT_SIGMAS * sigma, np.sqrt(more), 0.0).tolist()
+    return ahead
+
+
+def _square(own: Travel, other: Travel, imu: Imu, between: tuple[float, float],
+            doubt_t: Floats) -> tuple[float, float]:
+    """Return the squared distance of an axle ahead of another, and its sigma; 0 if it is less."""
+    two = pair((own, other), imu, between, STEER_GRID, doubt_t)
+    if two is None:
+        return 0.0, 0.0
+    at = np.arange(0, len(two.t), CELL)
+    steer = steering_path(two.t, two.turn, two.right)
+    A, y = np.diff(np.stack([two.right, steer, two.turn], -1)[at], axis=0), np.diff(two.left[at])
+    keep = np.logical_and.reduceat(two.known, at[:-1])[:len(y)] & (np.abs(y) > 2 * two.quantum)
+    if keep.sum() < CELL or not A[keep, 1].any():
+        return 0.0, 0.0
+    x, covariance, _ = robust_fit(A[keep], y[keep], 0.3 * two.quantum + 1e-4 * float(
+        np.median(np.abs(y[keep]))))
+    beyond = abs(x[1]) * np.abs(A[keep, 1]).sum() > LEAST_STEERED * np.abs(y[keep]).sum()
+    return (float(x[1]), float(np.sqrt(covariance[1, 1]))) if beyond else (0.0, 0.0)
+
+
+def steering_path(t: Floats, turn: Floats, s: Floats, ahead: float = 0.0,
+                  left: float = 0.0) -> Floats:
+    """
+    Return the path of a steered wheel beyond that of a fixed one, by its squared distance: (n,).
+
+    Parameters
+    ----------
+    t : (n,) array
+        Equal steps, s.
+    turn, s : (n,) arrays
+        Turn of the vehicle, rad, and travel of its unsteered axle.
+    ahead, left : float
+        Place of the wheel from the middle of that axle, in the unit of s.
+
+    """
+    rate, speed = np.gradient(turn, t), np.gradient(s, t)
+    speed = np.convolve(np.pad(speed, len(SMOOTH) // 2, mode='edge'), SMOOTH, mode='valid')
+    along = speed - left * rate
+    more = np.sign(along) * rate**2 / (np.hypot(along, ahead * rate) + np.abs(along) + 1e-12)
+    more[np.abs(speed) < SLOW * np.abs(speed).max()] = 0.0
+    return np.append(0.0, np.cumsum((more[1:] + more[:-1]) / 2 * np.diff(t)))
+
+
+def _listed(wheels: Sequence[Travel]) -> str:
+    return f'{_names(wheels)} {"is" if len(wheels) == 1 else "are"}'
+
+
+def _names(wheels: Sequence[Travel]) -> str:
+    return ' and '.join(one.name for one in wheels)
