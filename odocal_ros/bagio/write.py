@@ -26,7 +26,6 @@ from odocal_ros.errors import BadUsage
 STORAGES = ('mcap', 'sqlite3', 'rosbag1')
 COMPRESSIONS = ('none', 'message', 'file', 'storage')   # all zstd
 BLOCK = 20_000         # judgement: messages packed at a time, to bound memory
-LEFT_JOINT, RIGHT_JOINT = 'left_wheel_joint', 'right_wheel_joint'
 
 
 def drive_topics(drive: Any) -> list[Topic]:
@@ -35,13 +34,12 @@ def drive_topics(drive: Any) -> list[Topic]:
               encode.pose('/pose', drive.fix, drive.positions())
               if drive.options.reference == 'pose' else encode.fix('/fix', drive.fix)]
     kind, left, right = drive.options.odometer, drive.odometer, drive.odometer_right
-    two = len(right.stamp_ns) > 0
     if kind == 'angle':
-        wheels = {LEFT_JOINT: left, RIGHT_JOINT: right} if two else {'wheel_joint': left}
-        topics.append(encode.joints('/joint_states', wheels))
+        topics.append(encode.joints('/joint_states', dict(zip(
+            drive.joints, drive.wheels, strict=True))))
     elif kind == 'speed':
         topics.append(encode.twist('/odometer', left))
-    elif two:
+    elif len(drive.wheels) > 1:
         topics += [encode.counter('/odometer/left', left),
                    encode.counter('/odometer/right', right)]
     else:

@@ -37,8 +37,10 @@ NUMBERS = {
     'nominal_scale': ('K0', 'scale factor as configured'),
     'speed_noise': ('M/S', 'white noise of --odometer speed'),
     'odometer_delay': ('S', 'delay of odometer stamps, s'),
-    'wheel_difference': ('X', 'right scale divided by left scale, minus 1 (default 0.004)'),
-    'track_width': ('M', 'distance between the two wheels (default 1.6)'),
+    'wheel_difference': ('X', 'right scale divided by left scale, minus 1 (default 0.004); of '
+                         'more than 2 wheels 1 sigma of each'),
+    'track_width': ('M', 'distance between left and right wheels (default 1.6)'),
+    'wheelbase': ('M', 'distance of the front wheels from the odometer point (default 2.7)'),
     'slip_events': ('N', 'wheel spins per hour of motion'),
     'slip_size': ('M', 'metres lost in each spin (default 0.1)'),
     'start_slip': ('SHARE', 'wheel spin after each start, as a fraction of travel'),
@@ -86,6 +88,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--odometer', metavar='KIND', help='counts (Int64, default), speed (TwistStamped) or '
         'angle (JointState)')
     add('--two-wheels', action='store_true', default=None, help='left and right odometer')
+    add('--wheels', type=int, metavar='N', help='number of wheels, 1 to 8 (default 1); more than '
+        '2 are joints of one JointState')
+    add('--front-fixed', action='store_const', const=False, dest='front_steers',
+        help='the front ones of more than 2 wheels do not steer')
     add('--reference', metavar='KIND', help='fix (NavSatFix on /fix, default) or pose '
         '(PoseStamped on /pose in a local frame, with the errors of the fixes)')
     add('--fix-noise', metavar='KIND', help='white (default), correlated or rtk')
@@ -137,9 +143,8 @@ def _span(text: str) -> tuple[float, float]:
 def options_of(args: argparse.Namespace) -> 'SimOptions':
     """Return the SimOptions that parsed arguments ask for."""
     from odocal_ros.sim.options import SimOptions
-    plain = ['scenario', 'seed', 'imu_grade', 'odometer', 'two_wheels', 'reference',
-             'fix_noise', 'slip_walk',
-             *NUMBERS]
+    plain = ['scenario', 'seed', 'imu_grade', 'odometer', 'two_wheels', 'wheels',
+             'front_steers', 'reference', 'fix_noise', 'slip_walk', *NUMBERS]
     given = {name: getattr(args, name) for name in plain if getattr(args, name) is not None}
     for name in DEGREES:
         if getattr(args, f'{name}_deg') is not None:

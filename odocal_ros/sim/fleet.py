@@ -118,4 +118,4 @@ def as_driven(drive: Drive, broken: bool) -> Drive:
     value = rows.value.copy()
     third = int(1 / 3 * len(value))
     value[third:] = value[third]
-    return replace(drive, odometer=replace(rows, value=value))
+    return replace(drive, wheels=(replace(rows, value=value), *drive.wheels[1:]))

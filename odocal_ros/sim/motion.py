@@ -274,8 +274,13 @@ def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float
 def contact_speed(state: State, lever_arm_v: Floats | tuple[float, float, float]) -> Floats:
     """Return the speed of such a wheel, m/s: (n,)."""
     _, y, z = lever_arm_v
+    speed: Floats = state.speed - y * turn_rate(state) - z * state.slope_rate
+    return speed
+
+
+def turn_rate(state: State) -> Floats:
+    """Return the turn rate about the vehicle's up axis relative to the ground, rad/s: (n,)."""
     east = state.speed * np.cos(state.slope) * np.cos(state.yaw)
     level_turn = east * np.tan(state.latitude) / (radii(state.latitude)[1] + state.height)
-    turn = state.yaw_rate * np.cos(state.slope) + level_turn
-    speed: Floats = state.speed - y * turn - z * state.slope_rate
-    return speed
+    turn: Floats = state.yaw_rate * np.cos(state.slope) + level_turn
+    return turn

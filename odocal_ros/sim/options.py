@@ -22,6 +22,7 @@ SIM_GRADES = {**GRADES, 'perfect': Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 FIX_NOISES = ('white', 'correlated', 'rtk')
 ODOMETERS = ('counts', 'speed', 'angle')
 REFERENCES = ('fix', 'pose')
+MOST_OWN_TOPICS, MOST_WHEELS = 2, 8    # definition: as in odometer.wheels
 BY_SCENARIO: Any = None   # filled in by ``resolved``
 
 
@@ -63,8 +64,11 @@ class SimOptions:
     scale: float = BY_SCENARIO   # m/pulse, 1 or m/rad: the true value
     nominal_scale: float = BY_SCENARIO   # K0, configured by the operator
     speed_noise: float = 0.0               # m/s, white, of kind speed
-    two_wheels: bool = False
-    wheel_difference: float = 0.004        # K_right / K_left - 1
+    two_wheels: bool = False               # as wheels = 2
+    wheels: int = 1                        # more than 2: joints of one JointState
+    wheel_difference: float = 0.004        # K_right / K_left - 1; of more wheels 1 sigma each
+    wheelbase: float = 2.7                 # m, from the odometer's point to the front axle
+    front_steers: bool = True              # of more than 2 wheels the front ones steer
     track_width: float = 1.6               # m
     slip_walk: float = 0.0                 # m/sqrt(s) while moving
     slip_events: float = 0.0               # per hour of motion
@@ -97,6 +101,11 @@ class SimOptions:
 
     real: Real = Real()                    # what real sensors do beyond this
 
+    @property
+    def wheel_count(self) -> int:
+        """Return the number of wheels that are sent."""
+        return max(self.wheels, 1 + self.two_wheels)
+
 
 # what differs by scenario
 DEFAULTS = {
@@ -109,7 +118,7 @@ DEFAULTS = {
 }
 SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0
 POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'velocity_rate', 'scale',
-            'nominal_scale', 'track_width', 'fix_correlation_time', 'duration')
+            'nominal_scale', 'track_width', 'wheelbase', 'fix_correlation_time', 'duration')
 NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise', 'slip_walk',
                 'slip_events', 'slip_size', 'start_slip', 'start_slip_time', 'sway', 'outliers',
                 'outlier_size', 'seed', 'velocity_sigma', 'velocity_correlation_time',
@@ -139,6 +148,8 @@ def resolved(options: SimOptions) -> SimOptions:
     _choice('--fix-noise', options.fix_noise, FIX_NOISES)
     _choice('--odometer', options.odometer, ODOMETERS)
     _choice('--reference', options.reference, REFERENCES)
+    if options.wheel_count > MOST_OWN_TOPICS and options.odometer == 'counts':
+        options = replace(options, odometer='angle')
     defaults: dict[str, Any] = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4),
                                 **DEFAULTS[options.scenario]}
     scale, nominal = SCALES[options.odometer]
@@ -165,8 +176,10 @@ def _check(options: SimOptions) -> None:
         for one in value if isinstance(value, tuple) else (value,):
             if isinstance(one, (int, float)) and not isinstance(one, bool):
                 _check_number(field.name, one)
-    if options.two_wheels and options.odometer == 'speed':
-        raise BadUsage('--two-wheels requires --odometer counts or angle, not speed')
+    if options.wheel_count > 1 and options.odometer == 'speed':
+        raise BadUsage('--two-wheels and --wheels require --odometer counts or angle, not speed')
+    if not 1 <= options.wheels <= MOST_WHEELS:
+        raise BadUsage(f'--wheels {options.wheels}: required: 1 to {MOST_WHEELS}')
     for begin, end in options.outages:
         if not 0 <= begin < end:
             raise BadUsage(f'--outage {begin:g}:{end:g}: required: A:B, seconds with 0 <= A < B')

@@ -10,11 +10,12 @@
 """Simulate a drive: a named route, its sensors, and the truth."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.leg import Leg
+from odocal_ros.data.leg import Leg, WHEELS
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
@@ -35,6 +36,7 @@ from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Profile
 from odocal_ros.sim.routes import Route, ROUTES
+from odocal_ros.sim.vehicle_wheels import wheels_of
 from odocal_ros.sim.velocity import velocity
 
 __all__ = ['Drive', 'SCENARIOS', 'SimOptions', 'Truth', 'motion_of', 'simulate']
@@ -80,17 +82,32 @@ class Drive:
     truth: Truth
     form: OdometerForm
     imu: ImuSamples
-    odometer: OdometerSamples         # the left one of two wheels
-    odometer_right: OdometerSamples
+    wheels: tuple[OdometerSamples, ...]
     fix: FixSamples
     heading: HeadingSamples
     velocity: VelocitySamples
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Return the names of the wheels in a JointState."""
+        return tuple(wheel.name for wheel in wheels_of(self.options))
+
+    @property
+    def odometer(self) -> OdometerSamples:
+        """Return the samples of the only or the left wheel."""
+        return self.wheels[0]
+
+    @property
+    def odometer_right(self) -> OdometerSamples:
+        """Return the samples of the right wheel, no rows without one."""
+        return self.wheels[1] if len(self.wheels) > 1 else no_odometer()
+
     def leg(self) -> Leg:
         """Return the drive as one leg between its marks, with all that came before."""
+        wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
         return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
-                   odometer=self.odometer, odometer_right=self.odometer_right, fix=self.fix,
-                   heading=self.heading, fix_velocity=self.velocity, form=self.form)
+                   fix=self.fix, heading=self.heading, fix_velocity=self.velocity,
+                   form=self.form, **wheels)
 
     def positions(self) -> Floats:
         """Return the fixes as a SLAM has them: from the start on, x forward there; (n, 3) m."""
@@ -140,12 +157,11 @@ def simulate(options: SimOptions | None = None) -> Drive:
     """
     options = resolved(options or SimOptions())
     motion = motion_of(options)
-    wheels = sensors.odometers(motion, options)
     imu = sensors.imu(motion, options)
     return Drive(
         options=options, motion=motion, truth=_truth(motion, options, imu),
-        form=FORMS[options.odometer], imu=imu, odometer=wheels[0],
-        odometer_right=wheels[1] if len(wheels) > 1 else no_odometer(),
+        form=FORMS[options.odometer], imu=imu,
+        wheels=tuple(sensors.odometers(motion, options)),
         fix=sensors.fixes(motion, options),
         heading=(no_heading() if options.heading_sigma is None
                  else sensors.heading(motion, options, options.heading_sigma)),
@@ -165,7 +181,7 @@ def _truth(motion: Motion, options: SimOptions, imu: ImuSamples) -> Truth:
     yaw, pitch, yaw_housing, pitch_housing = _angles(options)
     return Truth(
         scale=scale, scale_ratio=scale / options.nominal_scale,
-        wheel_scales=tuple(factor * x for x in sensors.wheel_scales(options)),
+        wheel_scales=tuple(factor * wheel.scale for wheel in wheels_of(options)),
         yaw=yaw, pitch=pitch, yaw_housing=yaw_housing, pitch_housing=pitch_housing,
         heading=float(heading_from_yaw(np.arctan2(x_n[1], x_n[0]))), distance=motion.distance,
         start_ns=int(imu.stamp_ns[start]), stop_ns=int(imu.stamp_ns[-1]),

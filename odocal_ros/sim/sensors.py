@@ -34,6 +34,7 @@ from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motio
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
 from odocal_ros.sim.options import SIM_GRADES, SimOptions
 from odocal_ros.sim.real import NONE3
+from odocal_ros.sim.vehicle_wheels import SimWheel, steered_path, wheels_of
 
 # s from the first IMU sample, so that no two topics sample together
 PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004}
@@ -123,34 +124,13 @@ def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> 
     return quat_multiply(quat_from_rotvec([0.0, 0.0, error]), q_ni)
 
 
-def wheel_arms(options: SimOptions) -> list[Floats]:
-    """Return the contact points: one, or left and right about the middle."""
-    middle = np.asarray(options.odometer_lever_arm, dtype=float)
-    half = np.array([0.0, options.track_width / 2, 0.0])
-    return [middle + half, middle - half] if options.two_wheels else [middle]
-
-
-def wheel_scales(options: SimOptions) -> list[float]:
-    """
-    Return the true scale of each wheel.
-
-    ``options.scale`` is what turns the mean of two counts into metres: their harmonic mean.
-    """
-    if not options.two_wheels:
-        return [options.scale]
-    ratio = 1 + options.wheel_difference        # right over left
-    left = options.scale * (1 + 1 / ratio) / 2
-    return [left, left * ratio]
-
-
 def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
     """Return the samples of each wheel; pulses are whole counts, so late by up to one."""
     ns, t = stamps(motion.duration, options.odometer_rate, PHASE['odometer'])
     state = motion.at(t)
     stamp = options.start_ns + _late(ns, options, 'odometer')
-    wheels = zip('LR', wheel_arms(options), wheel_scales(options), strict=False)
-    return [OdometerSamples(stamp, stamp, _reading(state, options, side, arm, scale))
-            for side, arm, scale in wheels]
+    return [OdometerSamples(stamp, stamp, _reading(state, options, wheel))
+            for wheel in wheels_of(options)]
 
 
 def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
@@ -163,9 +143,9 @@ def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
     return real_imu.stamped(ns, stream(options.seed, f'real {name} stamps'), delay, jitter)
 
 
-def _reading(state: State, options: SimOptions, side: str, arm: Floats,
-             scale: float) -> Floats | Ints:
-    real, spun = options.real, slip(state, options, side)
+def _reading(state: State, options: SimOptions, wheel: SimWheel) -> Floats | Ints:
+    arm, scale = wheel.arm, wheel.scale
+    real, spun = options.real, slip(state, options, wheel.draws)
     grown = 1 + real_wheels.growth(state, real)
     if options.odometer == 'speed':
         noise = options.speed_noise * stream(options.seed, 'speed').standard_normal(len(state.t))
@@ -174,11 +154,13 @@ def _reading(state: State, options: SimOptions, side: str, arm: Floats,
         rate = (contact_speed(state, arm) + pulled + np.gradient(spun, state.t)) / grown
         return real_wheels.coarse((rate + noise) / scale, real)
     rolled = contact_travel(state, arm) + spun + real_wheels.tyre_slip(state, real)
+    if wheel.steered:
+        rolled = rolled + steered_path(state, arm)
     if np.ndim(grown):
         between = (grown + np.roll(grown, 1)) / 2
         rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / between)
     rolled = rolled / scale
-    phase = stream(options.seed, f'pulse phase {side}').uniform()   # where the disc stands
+    phase = stream(options.seed, f'pulse phase {wheel.draws}').uniform()   # where the disc stands
     if options.odometer == 'angle':
         return rolled + phase
     return FIRST_COUNT + np.floor(rolled + phase).astype(np.int64)

@@ -13,9 +13,11 @@ from dataclasses import asdict
 import math
 from typing import Any
 
+from odocal_ros.settings.config import SIDES
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import Drive
+from odocal_ros.sim.vehicle_wheels import wheels_of
 
 STANDS_FOR_PERFECT = 'navigation'   # the best grade there is in the settings
 
@@ -31,6 +33,7 @@ def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
         'scale': {'value': truth.scale, 'ratio': truth.scale_ratio,
                   'unit': drive.form.scale_unit, 'nominal': options.nominal_scale,
                   'wheels': list(truth.wheel_scales)},
+        **_wheels(drive),
         'yaw_mounting_deg': {'value': math.degrees(truth.yaw)},
         'pitch_mounting_deg': {'value': math.degrees(truth.pitch)},
         # above by the IMU's own axes, here by its housing: equal for perpendicular axes
@@ -57,11 +60,20 @@ def _topics(drive: Drive) -> dict[str, Any]:
     odometer: Any = '/odometer'
     if drive.options.odometer == 'angle':
         odometer = '/joint_states'
-    elif drive.options.two_wheels:
+    elif len(drive.wheels) > 1:
         odometer = {'left': '/odometer/left', 'right': '/odometer/right'}
     topics = {'imu_topic': '/imu/data', 'odometer_topic': odometer,
               'fix_topic': f'/{drive.options.reference}'}
     return topics | ({'heading_topic': '/heading'} if len(drive.heading.stamp_ns) else {})
+
+
+def _wheels(drive: Drive) -> dict[str, Any]:
+    """Return the truth of each of several wheels: factor, position in base_link, steering."""
+    wheels = wheels_of(drive.options)
+    return {'wheels': {wheel.name: {'scale_factor': scale, 'position': wheel.arm.tolist(),
+                                    'steered': wheel.steered}
+                       for wheel, scale in zip(wheels, drive.truth.wheel_scales, strict=True)}
+            } if len(wheels) > 1 else {}
 
 
 def _plain(value: Any) -> Any:
@@ -89,9 +101,10 @@ def settings(drive: Drive,
     grade = options.real.told_grade or options.imu_grade
     odometer: dict[str, Any] = {'nominal_scale': float(options.nominal_scale),
                       'lever_arm': _told_arm(options, 'odometer')}
-    if options.two_wheels:
-        left, right = (('left_wheel_joint', 'right_wheel_joint')
-                       if options.odometer == 'angle' else ('topic', 'topic'))
+    if options.wheel_count > len(SIDES):
+        odometer['wheels'] = list(drive.joints)
+    elif options.wheel_count > 1:
+        left, right = drive.joints if options.odometer == 'angle' else ('topic', 'topic')
         odometer |= {'left': left, 'right': right, 'track_width': float(options.track_width)}
     groups = {
         'odometer': odometer,
@@ -111,7 +124,7 @@ def settings(drive: Drive,
 def topic_arguments(drive: Drive) -> list[str]:
     """Return the topic options replay needs if the type is not unique."""
     arguments = []
-    if drive.options.two_wheels and drive.options.odometer == 'counts':
+    if len(drive.wheels) > 1 and drive.options.odometer == 'counts':
         arguments += ['--odometer-topic', '/odometer/left',
                       '--odometer-right-topic', '/odometer/right']
     if len(drive.heading.stamp_ns):

@@ -23,7 +23,6 @@ from odocal_ros.pipeline.methods import found_by, METHODS, run_methods
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.screen import screen
-from odocal_ros.sim.sensors import wheel_scales
 
 pytestmark = pytest.mark.slow
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'imu_grade': 'industrial'}
@@ -52,7 +51,7 @@ def off(estimate, truth):
 
 def test_both_factors_the_angle_and_the_width_come_out(made, result):
     found = result.methods['smoother'].estimates
-    truth = dict(zip(WHEELS, (made.options.scale, *wheel_scales(made.options)), strict=True))
+    truth = dict(zip(WHEELS, (made.options.scale, *made.truth.wheel_scales), strict=True))
     for name, true in truth.items():
         assert off(found[name], true) < SIGMAS
         # the leg tells each wheel better than the two differ by: 4 permille
@@ -208,7 +207,7 @@ def test_legs_of_two_wheels_combine(made, result):
     for name in WHEELS:
         alone = [leg.methods['smoother'].estimates[name] for leg in legs]
         assert whole.estimates[name].sigma < min(e.sigma for e in alone)
-    for name, true in zip(WHEELS, (made.options.scale, *wheel_scales(made.options)), strict=True):
+    for name, true in zip(WHEELS, (made.options.scale, *made.truth.wheel_scales), strict=True):
         assert off(whole.estimates[name], true) < SIGMAS
     alone = [leg.methods['smoother'].estimates['track_width'].value for leg in legs]
     assert min(alone) <= whole.estimates['track_width'].value <= max(alone)

@@ -140,7 +140,7 @@ def test_every_choice_is_filled_in():
     ({'antenna_lever_arm': (0.0, np.inf, 0.0)}, '--antenna-lever-arm inf: required: '),
     ({'outliers': 0.6}, '--outliers 0.6: the limit is 0.5'),
     ({'outages': ((5.0, 2.0),)}, '--outage 5:2: required: A:B'),
-    ({'two_wheels': True, 'odometer': 'speed'}, '--two-wheels requires'),
+    ({'two_wheels': True, 'odometer': 'speed'}, '--wheels require'),
     ({'duration': 30_000.0, 'imu_rate': 1000.0}, 'more than 20,000,000 samples'),
     ({'duration': 100.0}, 'scenario straight: --duration 100 s is too short, give 180'),
     ({'scenario': 'paper', 'duration': 411.0}, 'scenario paper: .* give 420'),
