@@ -1,0 +1,97 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Four wheels: errors of each wheel's factor and place over their sigmas.
+
+    python benchmarks/four_wheels.py --drives 10
+
+Town, 600 s, industrial and consumer IMU in turn. Cells: front wheels that steer, none that steers
+(skid steering), and front wheels that steer on vehicles with all effects of docs/zoo.md.
+"""
+
+import argparse
+import math
+
+import numpy as np
+
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.sim.draw import drawn, EFFECTS, ODOMETER_EFFECTS
+from odocal_ros.sim.scenarios import simulate
+from odocal_ros.sim.truth import settings
+from odocal_ros.sim.vehicle_wheels import wheels_of
+
+FIRST_SEED = 92_000_000
+GRADES = ('industrial', 'consumer')
+CELLS = {'steered': {'front_steers': True, 'all': False},
+         'fixed': {'front_steers': False, 'all': False},
+         'steered, all effects': {'front_steers': True, 'all': True}}
+
+
+def errors_of(seed, cell):
+    """Return name -> (error, sigma) pairs of a drive, and the codes of its reasons."""
+    effects = [name for name in EFFECTS if name not in ODOMETER_EFFECTS] * cell['all']
+    made = simulate(drawn(seed, 'town', GRADES[seed % 2], effects, duration=600.0, wheels=4,
+                          odometer='angle', front_steers=cell['front_steers'])[0])
+    config = with_settings(Config(), {
+        f'{group}.{key}': tuple(value) if isinstance(value, list) else value
+        for group, keys in settings(made).items() for key, value in keys.items()})
+    leg = calibrate(made.leg(), config)
+    method = leg.methods['smoother']
+    scale = method.estimates['scale_factor']
+    found = {'scale': [(scale.value / made.truth.scale - 1, scale.sigma / scale.value)]}
+    wheels = list(zip(wheels_of(made.options), made.truth.wheel_scales, strict=True))
+    fixed = [(wheel, true) for wheel, true in wheels if not wheel.steered]
+    middle = np.average([wheel.arm[1] for wheel, _ in fixed], weights=[1 / k for _, k in fixed])
+    for wheel, true in wheels:
+        e = method.estimates[f'scale_factor_{wheel.name}']
+        beside = method.details['wheels'].get(wheel.name)
+        if e.value is None or beside is None:
+            continue
+        ratio = beside['ratio'] * made.truth.scale / true - 1
+        place = beside['y'] - (wheel.arm[1] - middle)
+        for name, error, sigma in (('factor', e.value / true - 1, e.sigma / true),
+                                   ('ratio', ratio, beside['ratio_sigma']),
+                                   ('left', place, beside['y_sigma'])):
+            found.setdefault(f'{name} {wheel.name}', []).append((error, sigma))
+        if 'x' in beside:
+            found.setdefault(f'ahead {wheel.name}', []).append(
+                (beside['x'] - made.options.wheelbase, beside['x_sigma']))
+    return found, sorted({r.code.name for r in (*leg.reasons, *method.reasons)})
+
+
+def main():
+    """Run the drives, print a row for each quantity."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--drives', type=int, default=10, help='drives a cell')
+    parser.add_argument('--cell', default='', help='cells whose name holds it')
+    args = parser.parse_args()
+    for number, (name, cell) in enumerate(CELLS.items()):
+        if args.cell not in name:
+            continue
+        rows: dict[str, list[tuple[float, float]]] = {}
+        for k in range(args.drives):
+            found, codes = errors_of(FIRST_SEED + 1000 * number + k, cell)
+            print(f'{name} {k}: {" ".join(codes)}', flush=True)
+            for key, pairs in found.items():
+                rows.setdefault(key, []).extend(pairs)
+        print(f'{name:22}{"ppm or mm":20}{"of":>4}{"rms error":>12}{"sigma":>10}'
+              f'{"rms/sigma":>11}{"worst":>7}')
+        for key, pairs in rows.items():
+            error, sigma = np.transpose(pairs)
+            z = error / sigma
+            unit = 1e3 if key.startswith(('left', 'ahead')) else 1e6
+            print(f'{"":22}{key:20}{len(z):4d}{unit * math.sqrt((error**2).mean()):12.3f}'
+                  f'{unit * np.median(sigma):10.3f}{math.sqrt((z**2).mean()):11.2f}'
+                  f'{np.abs(z).max():7.1f}')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,89 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Four wheels on one JointState topic, over DDS: the node and its journal give the same result."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+from bench import Client, NodeProcess, wait_for
+from kills import replayed
+from player import part, Player, sent_of
+import pytest
+
+from odocal_ros.bagio import encode
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 30.0
+REST_S = 30.0            # of the drive played before the mark
+SIGMAS = 4.0             # 1 in 16 000 of a normal error; the seed is fixed
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Simulate some minutes of town with four wheels, the front ones of which steer."""
+    return simulate(SimOptions(
+        scenario='town', duration=240.0, imu_rate=50.0, odometer_rate=25.0, fix_noise='rtk',
+        imu_grade='tactical', wheels=4, heading=0.7, seed=4))
+
+
+@pytest.fixture(scope='module')
+def session(drive, tmp_path_factory):
+    """Drive one leg; keep what the node said."""
+    folder = tmp_path_factory.mktemp('four')
+    wheels = dict(zip(drive.joints, drive.wheels, strict=True))
+    topics = {'imu': encode.imu('imu/data', drive.imu), 'fix': encode.fix('fix', drive.fix),
+              'odometer': encode.joints('odometer', {'steering': drive.odometer, **wheels})}
+    sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)),
+                  key=lambda one: one.stamp_ns)
+    start_s = (drive.leg().start_ns - sent[0].stamp_ns) * 1e-9
+    settings = {'output.directory': folder, 'method': 'smoother', 'imu.grade': 'tactical',
+                'odometer.wheels': f'[{", ".join(drive.joints)}]'}
+    node = NodeProcess(*(x for name, value in settings.items() for x in (
+        '-p', f'{name}:={value}')))
+    client, seen = Client(), SimpleNamespace()
+    try:
+        player = Player(client.node, {slot: topic.msgtype for slot, topic in topics.items()})
+        wait_for(player.matched, 'subscriptions of the node')
+        player.play(part(sent, start_s - REST_S, start_s), SPEED)
+        client.until(state='idle')
+        seen.start = client.call('start_leg')
+        player.play(part(sent, start_s, start_s + 160), SPEED)
+        stopping = client.ask('stop_leg')
+        client.until(state='computing')
+        player.play(part(sent, start_s + 160, start_s + 163), SPEED)
+        seen.stop = client.result(stopping)
+        seen.status = wait_for(lambda: client.status['saved'] and client.status, 'saved files')
+        seen.journal = Path(seen.status['journal'])
+        wait_for((seen.journal / 'metadata.yaml').exists, 'the joined journal')
+        seen.live = json.loads((Path(seen.status['saved']) / 'calibration.json').read_text())
+    finally:
+        node.end()
+        client.close()
+    return seen
+
+
+def test_the_journal_gives_the_same_result_to_the_last_bit(session):
+    code, result, said = replayed(session.journal)
+    assert code == 0, said
+    for key in ('result', 'verdict', 'reasons', 'methods', 'check', 'config'):
+        assert session.live[key] == result[key], key
+
+
+def test_status_and_answer_have_each_wheel_by_its_name(session, drive):
+    assert session.stop.success
+    for name, true in zip(drive.joints, drive.truth.wheel_scales, strict=True):
+        assert f', {name} 0.3' in session.stop.message
+        value, sigma = (float(session.status[f'scale_factor_{name}{end}'])
+                        for end in ('', '_sigma'))
+        assert abs(value - true) < SIGMAS * sigma
+        assert session.live['result'][f'scale_factor_{name}']['value'] == value
+    assert session.status['left_right_ok'] == 'unknown'
+    assert 'WHEELS_STEERED' in session.status['reasons']
