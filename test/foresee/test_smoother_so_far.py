@@ -220,7 +220,7 @@ def test_slow_errors_are_allowed_for_before_they_can_be_seen(config, looks):
     def seen(leg, config):
         return SmootherSoFar().look(leg, config)
 
-    drive = drive_of(fix_noise='correlated', seed=27)
+    drive = drive_of(fix_noise='correlated', seed=58)
     leg = looked(drive, config, (30.0,))[0].leg       # and the standstill
     slow, white = (e.method.estimates['scale_factor'] for e in (seen(leg, config),
                                                                 seen(leg, whites)))
