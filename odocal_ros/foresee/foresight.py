@@ -72,13 +72,13 @@ class DriveSoFar(PlannedDrive):
         if not self.wanted():
             raise Abandoned
         moving = np.flatnonzero(np.abs(self.speed) > REST_SPEED)
-        here = int(moving[-1])
+        point = int(moving[-1])
         usual = float(np.median(np.abs(self.speed[moving])))
         on = np.linspace(0.0, metres / usual, 50)[1:]
         speed, yaw, slope = (
-            np.insert(row, here + 1, np.full(len(on), value)) for row, value in (
-                (self.speed, usual), (self.yaw, self.yaw[here]), (self.slope, self.slope[here])))
-        t = np.concatenate([self.t[:here + 1], self.t[here] + on, self.t[here + 1:] + on[-1]])
+            np.insert(row, point + 1, np.full(len(on), value)) for row, value in (
+                (self.speed, usual), (self.yaw, self.yaw[point]), (self.slope, self.slope[point])))
+        t = np.concatenate([self.t[:point + 1], self.t[point] + on, self.t[point + 1:] + on[-1]])
         return replace(self, t=t, speed=speed, yaw=yaw, slope=slope)
 
 

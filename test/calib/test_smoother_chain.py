@@ -55,7 +55,7 @@ def test_step_and_covariances_are_those_of_a_dense_solve():
     c = np.arange(N * SIZE, TOTAL)
     np.testing.assert_allclose(solved.covariance, P[np.ix_(c, c)], rtol=1e-9)
     assert solved.log_determinant == pytest.approx(np.linalg.slogdet(H)[1], abs=1e-9)
-    near = solved.neighbours()
+    near = solved.marginals()
     for k in range(N - 1):
         i = np.r_[k * SIZE:(k + 2) * SIZE, c]
         np.testing.assert_allclose(near[k], P[np.ix_(i, i)], rtol=1e-8,

@@ -37,7 +37,7 @@ def peak_of_a_pass(duration):
     weighted = Equations(problem, state).at(levels)
     solved = solve(weighted.normal())
     weighted.after(solved)
-    near = solved.neighbours()
+    near = solved.marginals()
     weighted.components(near)
     weighted[MotionRows].road_noise(near)
     peak = tracemalloc.get_traced_memory()[1]

@@ -98,7 +98,7 @@ def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
         problem = Problem.of(leg, config)
         state = truth(drive, config, leg)
         axle = Axle(problem, state)
-        found.append((axle.pushes()[:, :2], axle.speeding_up(), problem))
+        found.append((axle.accelerations()[:, :2], axle.acceleration(), problem))
     (at_axle, ahead, problem), (pushed, faster, _) = found
     change = np.abs(np.diff(problem.rate_b[:, 2])).max()
     assert change > 0.15
@@ -174,7 +174,7 @@ def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
     fast = there.speed > 2.0
     want = there.acceleration + G * there.slope
     # means of a second of what changes by up to 1 m/s^3 within it
-    assert np.abs(motion.axle.speeding_up() - want)[fast].max() < 0.3
+    assert np.abs(motion.axle.acceleration() - want)[fast].max() < 0.3
     assert np.ptp(G * there.slope[fast]) > 0.5
     # the body's axes are those of the road here
     assert np.abs(motion.pushed[:, 0] - want)[fast].max() < 0.3

@@ -18,7 +18,7 @@ from smoother_legs import leg_of, made, truth, with_velocity
 
 from odocal_ros.calib.smoother.axle import Axle
 from odocal_ros.calib.smoother.chain import Normal, solve
-from odocal_ros.calib.smoother.equations import Equations, PARTS
+from odocal_ros.calib.smoother.equations import Equations, FACTORS
 from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.priors import PriorRows, SIZE, SIZE_SPREADS
 from odocal_ros.calib.smoother.problem import Problem
@@ -139,17 +139,17 @@ def test_derivatives_are_those_of_finite_differences(shaken, stepping, name):
         if GYRO.start <= i - N < GYRO.stop and name != 'motion':
             continue
         h = 1.0 if (i, name) == (E, 'motion') else 1e-5 if name == 'motion' else 1e-4
-        here = problem
+        point = problem
         if (i, name) == (N + ODO_DELAY, 'motion'):      # counts have steps, a derivative has none
-            here, h = without_steps(problem, state), 1e-3
+            point, h = without_steps(problem, state), 1e-3
 
-        def raw(size, i=i, here=here):
+        def raw(size, i=i, point=point):
             step, c = np.zeros((len(state.t), N)), np.zeros(M)
             if i < N:
                 step[even, i] = size
             else:
                 c[i - N] = size
-            return part_at(here, state.moved(step, c), name).raw
+            return part_at(point, state.moved(step, c), name).raw
 
         expected = constants[:, :, i - N] if i >= N else np.where(
             even[k][:, None], begin[:, :, i], end[:, :, i])
@@ -188,7 +188,7 @@ def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
     assert {0, 1} == set(np.rint(moves))        # seconds that moved, of each interval
 
 
-@pytest.mark.parametrize('name', [part.name for part in PARTS])
+@pytest.mark.parametrize('name', [part.name for part in FACTORS])
 def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, name):
     problem, state = stepping if name == 'steps' else shaken
     # so wide that nothing lies far out: squares only
@@ -220,7 +220,7 @@ def test_levels_of_slow_errors_climb_the_restricted_likelihood(shaken, name):
                                       fix=1e4, fix_up=1e4, velocity=1.0)
 
     weighted, solved, at = least(problem, state, levels)
-    quadratic, expected = weighted[SlowError].components(solved.neighbours())[name]
+    quadratic, expected = weighted[SlowError].components(solved.marginals())[name]
     score = (quadratic - expected) / 2
     if name == 'correlation_time':      # a score as it is, and the prior of the time
         score = quadratic - expected + np.log(20.0 / USUAL_TIME) / TIME_SPREAD**2
@@ -270,7 +270,7 @@ def test_sizes_of_what_is_well_known_have_the_largest_likelihood(shaken, name, w
     problem = sized(problem, where, prior, 1.5 * prior)
     levels = problem.first_levels
     weighted, solved, at = least(problem, state, levels)
-    found = weighted[PriorRows].sizes(solved.neighbours())[name]
+    found = weighted[PriorRows].sizes(solved.marginals())[name]
     count = where.stop - where.start
     # 1.5 of the prior for each, against the log-normal prior of the size
     likelihood = slope(at, levels.but(**{name: found}), name)
@@ -291,5 +291,5 @@ def test_what_the_drive_hardly_knows_has_no_say_in_its_size(shaken):
     name = 'size_squat_by_jerk'
     assert slope(at, levels, name) > 0.1         # the likelihood would have it grow
     # (7e-6 / 1e-3)^2 of that slope, 5e-5: it stays at its median, within half a step of the grid
-    assert np.log(weighted[PriorRows].sizes(solved.neighbours())[name] / SIZE) == pytest.approx(
+    assert np.log(weighted[PriorRows].sizes(solved.marginals())[name] / SIZE) == pytest.approx(
         0.0, abs=0.03)

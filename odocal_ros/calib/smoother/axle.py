@@ -63,7 +63,7 @@ class Axle:
         speed: Floats = np.einsum('ki,ki->k', v_n, self.state.C_nb @ self.state.forward)
         return speed
 
-    def _climb(self) -> Floats:
+    def _slope(self) -> Floats:
         """
         Return the slope of the road ahead in each interval, by the way that goes up: (K,) rad.
 
@@ -74,7 +74,7 @@ class Axle:
         slope: Floats = (rise[1:] + rise[:-1]) * ahead / np.maximum(ahead**2, (2 * WALK_SPEED)**2)
         return slope
 
-    def pushes(self) -> Floats:
+    def accelerations(self) -> Floats:
         """
         Return what springs and tyres answer to in each interval, as LEAN has it: (K, 4).
 
@@ -85,11 +85,11 @@ class Axle:
         # by the axes at mid interval: those at its begin would take the push of a turn for braking
         C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
         force = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
-        force[:, 0] += G * self._climb()
+        force[:, 0] += G * self._slope()
         jerk = np.gradient(force, axis=0) / T if len(T) > 1 else np.zeros_like(force)
         return np.concatenate([force, jerk], axis=1)
 
-    def speeding_up(self) -> Floats:
+    def acceleration(self) -> Floats:
         """
         Return by how much the way is driven faster, and what it climbs: (K,) m/s^2.
 
@@ -97,7 +97,7 @@ class Axle:
         part of its push ahead.
         """
         speed = self._ahead(self.v_n)
-        up: Floats = G * self._climb() * np.sign(speed[1:] + speed[:-1])
+        up: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
         return np.diff(np.abs(speed)) / np.diff(self.state.t) + up
 
     def means_by_way(self, sums: Intervals) -> Floats:
@@ -106,7 +106,7 @@ class Axle:
         way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
         share = way / max(way.sum(), 1e-9)
-        mean: Floats = share @ varies_with(way / sums.T, t - state.t[0], self.speeding_up())
+        mean: Floats = share @ varies_with(way / sums.T, t - state.t[0], self.acceleration())
         return mean
 
 

@@ -67,11 +67,11 @@ class Solved:
     log_determinant: float    # of H
     reduced: Floats           # (m, m) Schur complement of the border
     g_reduced: Floats         # (m,)
-    _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n), until neighbours
+    _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n), until marginals
     _scale: Floats            # (N, n)
     _scale_border: Floats     # (m,)
 
-    def neighbours(self) -> 'Neighbours':
+    def marginals(self) -> 'JointMarginals':
         """Return the joint marginals of adjacent blocks; once, since they reuse the memory."""
         assert self._chain is not None, 'the chain was used up'
         (wide, own), self._chain = self._chain, None
@@ -95,7 +95,7 @@ class Solved:
             z[n:, :n] = across[:, n:].T
         return self._unscaled(own, wide[:, :, :n + m])
 
-    def _unscaled(self, own: Floats, across: Floats) -> 'Neighbours':
+    def _unscaled(self, own: Floats, across: Floats) -> 'JointMarginals':
         """Return covariances in the units of the unknowns, computed in place."""
         n, s, s_c = own.shape[1], self._scale, self._scale_border
         for rows in blocks(len(own)):
@@ -104,14 +104,14 @@ class Solved:
             across[rows, :, n:] *= s_c
         for rows in blocks(len(own) - 1):
             across[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
-        return Neighbours(own, across, self.covariance)
+        return JointMarginals(own, across, self.covariance)
 
     def products(self, chain: Floats, border: Floats) -> tuple[Floats, Floats]:
         """
         Return g' H^-1 g of right-hand sides g, (r, r), and H^-1 g of the border, (m, r).
 
         chain : (N, n, r), border : (m, r).   By the forward elimination alone; before
-        ``neighbours``.
+        ``marginals``.
         """
         assert self._chain is not None, 'the chain was used up'
         wide, own = self._chain
@@ -136,7 +136,7 @@ class Solved:
 
 
 @dataclass(frozen=True, eq=False)
-class Neighbours:
+class JointMarginals:
     """
     Joint marginals: the covariance of block k, block k + 1 and the border, for N - 1 intervals.
 

@@ -10,18 +10,18 @@
 """
 The least-squares problem of a leg at one state: factors, normal equations, cost, components.
 
-An additional sensor or prior is one more class in ``PARTS`` (``part.Part``).
+An additional sensor or prior is one more class in ``FACTORS`` (``factor.Factor``).
 """
 
 from typing import TYPE_CHECKING, TypeVar
 
-from odocal_ros.calib.smoother.chain import Neighbours, Normal, Solved
+from odocal_ros.calib.smoother.chain import JointMarginals, Normal, Solved
+from odocal_ros.calib.smoother.factor import Factor, LinearisationPoint
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.heading import HeadingRows
 from odocal_ros.calib.smoother.level_information import LevelInformation, LevelSides
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.part import Here, Part
 from odocal_ros.calib.smoother.priors import PriorRows, SIZES
 from odocal_ros.calib.smoother.rests import Rests
 from odocal_ros.calib.smoother.slow_error import SlowError
@@ -34,8 +34,8 @@ from odocal_ros.data.arrays import Floats
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
-SomePart = TypeVar('SomePart', bound=Part)
-PARTS: tuple[type[Part], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, SpeedSteps,
+SomeFactor = TypeVar('SomeFactor', bound=Factor)
+FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, SpeedSteps,
                                  TravelError, SlowError, Rests, PriorRows)
 
 
@@ -46,8 +46,9 @@ class Equations:
                  priors: Priors | None = None, spread: Floats | None = None,
                  fitted: bool = False) -> None:
         self.state = state
-        here = Here(state, *problem.sums(state), priors or problem.priors, spread, fitted)
-        self.parts = {kind.name: kind(problem, here) for kind in PARTS if kind.there(problem)}
+        point = LinearisationPoint(state, *problem.sums(state), priors or problem.priors, spread,
+                                   fitted)
+        self.parts = {kind.name: kind(problem, point) for kind in FACTORS if kind.there(problem)}
 
     def at(self, levels: Levels) -> 'Weighted':
         """Return the equations weighted by levels."""
@@ -58,7 +59,7 @@ class Weighted:
     """
     The factors at given levels.
 
-    ``after`` applies a step; cost and components then refer to the new state. ``neighbours`` are
+    ``after`` applies a step; cost and components then refer to the new state. ``marginals`` are
     those of ``Solved``.
     """
 
@@ -68,7 +69,7 @@ class Weighted:
         self.parts = {name: part.weighed(levels) for name, part in equations.parts.items()
                       if part.in_use(levels)}
 
-    def __getitem__(self, kind: type[SomePart]) -> SomePart:
+    def __getitem__(self, kind: type[SomeFactor]) -> SomeFactor:
         return next(part for part in self.parts.values() if isinstance(part, kind))
 
     def normal(self) -> Normal:
@@ -87,7 +88,7 @@ class Weighted:
         return self
 
     def information(self, solved: Solved) -> LevelInformation:
-        """Return the information on the levels, sizes last; call before ``solved.neighbours``."""
+        """Return the information on the levels, sizes last; call before ``solved.marginals``."""
         names = sorted(self.levels.values, key=SIZES.__contains__)
         sides = LevelSides(len(self.state.t), self.n, M, names)
         for part in self.parts.values():
@@ -108,7 +109,7 @@ class Weighted:
         """Return the log determinant of the covariance of all rows that the levels change."""
         return float(sum(part.log_R for part in self.parts.values()))
 
-    def components(self, neighbours: Neighbours) -> dict[str, tuple[float, float]]:
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """
         Return the quadratic sum and its expectation for each variance component: (S26).
 
@@ -117,4 +118,4 @@ class Weighted:
         unknowns take up, P J' R^-1 s V R^-1 J (P the covariance of the unknowns).
         """
         return {name: pair for part in self.parts.values()
-                for name, pair in part.components(neighbours).items()}
+                for name, pair in part.components(marginals).items()}

@@ -21,12 +21,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import Neighbours, solve, Solved
+from odocal_ros.calib.smoother.chain import JointMarginals, solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
+from odocal_ros.calib.smoother.factor import JUMP, SPREAD, WANTED
 from odocal_ros.calib.smoother.level_steps import prior_information, update
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels, ROAD
-from odocal_ros.calib.smoother.part import JUMP, SPREAD, WANTED
 from odocal_ros.calib.smoother.point_rows import TAIL_SIGMAS
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.relaxed_priors import relaxed
@@ -39,7 +39,7 @@ Trace = Callable[[int, State, Levels, Weighted, Solved, float], None]
 
 
 @dataclass(frozen=True)
-class Settling:
+class Convergence:
     """
     Convergence limits: steps of the constants in the last pass, in sigmas.
 
@@ -59,7 +59,7 @@ class Settling:
     flat_angle: float = 0.1
 
 
-SETTLING = Settling()
+CONVERGENCE = Convergence()
 # share of the last step from which on a step that turns back is shortened. Judgement: those that
 # turn back by less are halved with each pass by themselves
 TURNS_BACK = -0.5
@@ -78,7 +78,7 @@ class WarmStart:
 
 
 @dataclass(frozen=True, eq=False)
-class Outline(WarmStart):
+class FitSummary(WarmStart):
     """The result of the iteration without the equations, which are large."""
 
     settled: bool
@@ -88,7 +88,7 @@ class Outline(WarmStart):
 
 
 @dataclass(frozen=True, eq=False)
-class Fit(Outline):
+class Fit(FitSummary):
     """The result of the iteration."""
 
     weighted: Weighted
@@ -104,14 +104,14 @@ class Fit(Outline):
         """Return the covariance of the constants including that by the levels, (S27b): (M, M)."""
         return self.solved.covariance + self.by_levels @ self.by_levels.T
 
-    def outline(self) -> Outline:
+    def summary(self) -> FitSummary:
         """Return everything but the equations, so that their memory can be released."""
-        return Outline(self.state, self.levels, self.priors, self.first, self.spread,
+        return FitSummary(self.state, self.levels, self.priors, self.first, self.spread,
                        self.settled, self.creeping, self.iterations, self.likelihood)
 
-    def neighbours(self) -> Neighbours:
+    def marginals(self) -> JointMarginals:
         """Return the joint marginals of adjacent keyframes; not stored, since they are large."""
-        return solve(self.weighted.normal()).neighbours()
+        return solve(self.weighted.normal()).marginals()
 
 
 def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, frozen: bool = False,
@@ -142,8 +142,8 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     tails, last_tails = 1 if about else 3, 15
     # pass that estimates the effective sample size; of two starts only that of the better one
     judged = 3 if about is None else 0 if problem.per_effective else 1
-    of_all = np.where(np.arange(M) < WANTED, 1.0, SETTLING.others)
-    flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), SETTLING.flat_angle, np.inf)
+    of_all = np.where(np.arange(M) < WANTED, 1.0, CONVERGENCE.others)
+    flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), CONVERGENCE.flat_angle, np.inf)
     pace: dict[str, tuple[float, float]] = {}
     count, state, taken = 0, state.level(), np.zeros(M)
     while True:
@@ -156,33 +156,33 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
         move = np.abs(solved.step_border / sigma * weight).max()
         change = np.abs(np.log(sigma[:3] / before)).max()
         before = sigma[:3]
-        settled = bool(fitted and move < SETTLING.moves
-                       and (frozen or change < SETTLING.sigmas and count > tails + 2))
+        settled = bool(fitted and move < CONVERGENCE.moves
+                       and (frozen or change < CONVERGENCE.sigmas and count > tails + 2))
         first_fitted, was_fitted = fitted and not was_fitted, fitted
         fitted = bool(first_fitted or move < (
-            SETTLING.measured_above if fitted else SETTLING.fitted_below))
+            CONVERGENCE.measured_above if fitted else CONVERGENCE.fitted_below))
         state = state.moved(solved.step, solved.step_border)
         weighted.after(solved)
         if trace is not None:
             trace(count, state, levels, weighted, solved, float(move))
         if settled or count >= most:
             still = np.abs(solved.step_border / sigma)[:3].max()
-            settled = settled or bool(max(still, change) < SETTLING.nearly)
+            settled = settled or bool(max(still, change) < CONVERGENCE.nearly)
             break
         if count == judged:
             problem.judge_effective(weighted)
         if not frozen:
-            near = solved.neighbours()
+            marginals = solved.marginals()
             tail, before_levels = tails <= count <= last_tails, levels
-            levels = update(weighted, near, levels, problem, pace, fitted)
+            levels = update(weighted, marginals, levels, problem, pace, fitted)
             # slips and levels are factors on the same rows: slips are evaluated at the new levels
             if tail:
-                spread = slips(weighted, near, spread, before_levels, levels)
+                spread = slips(weighted, marginals, spread, before_levels, levels)
             if tail:
-                priors = relaxed(first, priors, state, solved, near)
-            del near
+                priors = relaxed(first, priors, state, solved, marginals)
+            del marginals
         del weighted, solved      # the largest memory of a long leg
-    creeping = not settled and bool(max(still, change) < SETTLING.creeping)
+    creeping = not settled and bool(max(still, change) < CONVERGENCE.creeping)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     by_levels = weighted.information(solved).effects(prior_information(levels))
     return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
@@ -203,17 +203,17 @@ def damped(solved: Solved, taken: Floats) -> Solved:
     return replace(solved, step=by * solved.step, step_border=by * solved.step_border)
 
 
-def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats, levels: Levels,
+def slips(weighted: Weighted, marginals: JointMarginals, spread: Floats, levels: Levels,
           onward: Levels) -> Floats:
     """
     Return the variance factors of outlier intervals: (K, SPREAD).
 
     levels, onward : of this pass and of the next; outliers are evaluated at the next.
     """
-    noise, found = weighted[MotionRows].road_noise(neighbours)
+    noise, found = weighted[MotionRows].road_noise(marginals)
     jumps = np.zeros((2, len(noise), 1))
     if 'slow' in weighted.parts:
-        jumps = weighted[SlowError].jumps(neighbours)
+        jumps = weighted[SlowError].jumps(marginals)
     noise, found = (np.concatenate(x, axis=1) for x in zip((noise, found), jumps, strict=True))
     grown = weighted[MotionRows].noise.grown({n: onward[n] / levels[n] for n in ROAD})
     jumped = onward['slow'] / levels['slow'] if 'slow' in weighted.parts else 1.0

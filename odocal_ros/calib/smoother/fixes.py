@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from odocal_ros.calib.smoother.factor import LinearisationPoint
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import gravity_n
-from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
@@ -52,8 +52,8 @@ class Fixes(PointRows):
     levels_of = {'fix': slice(0, 2), 'fix_up': slice(2, 3)}
     share: Floats
 
-    def __init__(self, problem: 'Problem', here: Here) -> None:
-        leg, state, points = problem.leg, here.state, here.points['fixes']
+    def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
+        leg, state, points = problem.leg, point.state, point.points['fixes']
         self.state, self.points, self.root = state, points, problem.root
         k, tau = points.interval, points.tau[:, None]
         self.k = k
@@ -72,11 +72,11 @@ class Fixes(PointRows):
             + state.slow_n[k + 1] * self.share[:, None]
         self.dp = dp
         self.v_n = v + turn(self.C, points.dv) + g * tau + turn(
-            self.C_t, np.cross(here.intervals.mean_rate[k], arm_b))
+            self.C_t, np.cross(point.intervals.mean_rate[k], arm_b))
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
         raw = leg.fixes_n[problem.use] - place - self.arm_n - slow
         # of a receiver that smooths the mean age is a delay
-        track = (state.t, *antenna(state, here.intervals.mean_rate, arm_b),
+        track = (state.t, *antenna(state, point.intervals.mean_rate, arm_b),
                  state.t[k] + points.tau)
         smoothed, self.by_lag = smoothing(*track, state.constants[FIX_LAG2])
         added, self.by_motion, self.by_time = odometer_error(

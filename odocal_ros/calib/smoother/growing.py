@@ -115,7 +115,7 @@ class GrowingFit:
             return best, problem
         # the levels are let alone until the state is on the new stretch too
         near = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun,
-                   trace=trace).outline()
+                   trace=trace).summary()
         best = fit(problem, near.state, near.levels, LOOK_PASSES, about=near, trace=trace)
         if not best.settled or best.creeping:
             best = fit(problem, best.state, best.levels, AGAIN_PASSES, about=best, trace=trace)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from odocal_ros.calib.smoother.factor import LinearisationPoint
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.outside import Heading
 from odocal_ros.calib.smoother.outside_rows import OutsideRows, Rows
-from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.preintegrate import Points
 from odocal_ros.calib.smoother.state import BARE, BG, GYRO_SCALE, HEADING, M, PHI, State
 from odocal_ros.nav.angles import arctan2, wrap
@@ -31,11 +31,11 @@ class HeadingRows(OutsideRows):
     name, source = 'heading', 'heading_noise'
     levels_of = {'heading': slice(0, 1)}
 
-    def rows(self, problem: 'Problem', here: Here) -> Rows:
+    def rows(self, problem: 'Problem', point: LinearisationPoint) -> Rows:
         """Return the rows."""
         sent = problem.outside['heading']
         assert isinstance(sent, Heading)
-        return _heading(sent, here.state, here.points['heading'])
+        return _heading(sent, point.state, point.points['heading'])
 
     @staticmethod
     def least(sent: Heading) -> dict[str, float]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.smoother.chain import blocks, Neighbours
+from odocal_ros.calib.smoother.chain import blocks, JointMarginals
 from odocal_ros.calib.smoother.equations import Weighted
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.fixes import Fixes
@@ -30,7 +30,7 @@ from odocal_ros.nav.rotations import transpose
 OF_INTERVALS = ('odometer', 'gyro', 'accelerometer')
 
 
-def bias_sigmas(near: Neighbours, widen: float) -> Floats:
+def bias_sigmas(near: JointMarginals, widen: float) -> Floats:
     """Return the sigmas of the biases at the keyframes: (2, N, 3), gyro first, rad/s, m/s^2."""
     variance = near.variances()
     return np.sqrt(np.stack([variance[:, BG], variance[:, BA]])) * widen

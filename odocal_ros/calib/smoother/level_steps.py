@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import Neighbours
+from odocal_ros.calib.smoother.chain import JointMarginals
 from odocal_ros.calib.smoother.equations import Weighted
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.long_run import long_run
@@ -47,14 +47,14 @@ def prior_information(levels: Levels) -> dict[str, float]:
             else PRIOR_ROWS.get(name, 1.0) / 2 for name in levels.values}
 
 
-def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: Problem,
+def update(weighted: Weighted, marginals: JointMarginals, levels: Levels, problem: Problem,
            pace: dict[str, tuple[float, float]], fitted: bool = True) -> Levels:
     """
     Return the levels after one step of (S27), docs/method.md.
 
     pace : exponent and last step of each level, updated in place.
     """
-    new, found = {}, weighted.components(neighbours)
+    new, found = {}, weighted.components(marginals)
     if 'slow' in found and 'fix' in found:
         for name, by in long_run(weighted[Fixes], levels, found).items():
             found[name] = by * found[name][0], found[name][1]
@@ -72,5 +72,5 @@ def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: 
         move = np.clip(pace[name][0] * step, np.log(0.03), np.log(30.0))
         new[name] = max(level * float(np.exp(move)), problem.least[name])
     if fitted:      # while residuals contain the start, sizes are constant
-        new |= weighted[PriorRows].sizes(neighbours)
+        new |= weighted[PriorRows].sizes(marginals)
     return levels.but(**new)

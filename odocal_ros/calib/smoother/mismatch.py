@@ -11,12 +11,12 @@
 
 import numpy as np
 
-from odocal_ros.calib.smoother.estimate import Fit, SETTLING
+from odocal_ros.calib.smoother.estimate import CONVERGENCE, Fit
+from odocal_ros.calib.smoother.factor import WANTED
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.noise_cause import noise_remedy
 from odocal_ros.calib.smoother.outside import Heading
-from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slip import SLIP_VARIANCE
 from odocal_ros.calib.smoother.state import HEADING
@@ -56,7 +56,7 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
         move = moving(fit)
         odd.append(f'after {fit.iterations} passes ' + (
             f'the estimates still changed by {move:.2g} sigma'
-            if move > SETTLING.nearly else 'the noise levels still changed'))
+            if move > CONVERGENCE.nearly else 'the noise levels still changed'))
     odd_share = 0.15        # of fixes far off, of intervals with a slip: judgement
     noisy = []
     if over_grade > WORSE_THAN_GRADE:      # vibration is not white, and of no known spectrum

@@ -103,11 +103,11 @@ class Motion:
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
         self._vary()
         way = turn(intervals.S, self.f + self.leaned) * self.varied
-        self.faster = self._faster()
+        self.faster = self._by_odometer_delay()
         self.rolled = turn(half @ self.C, way)
         self.heaved = turn(self.C, self.pitched * state.constants[PITCH_CENTRE])
         self.way = self.rolled + self.heaved
-        self.unsaid = self._unsaid(leg.travel.coarse)
+        self.unsaid = self._by_speed_offset(leg.travel.coarse)
         if self.unsaid is not None:
             self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
         self.dv, self.dp = dv, dp
@@ -141,11 +141,11 @@ class Motion:
     def _vary(self) -> None:
         """Work out how scale and forward axis change on the way: docs/method.md (S11), (S12)."""
         state, T, c = self.state, self.T, self.state.constants
-        self.pushed = self.axle.pushes()
+        self.pushed = self.axle.accelerations()
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         t = (state.t[1:] + state.t[:-1]) / 2
         self.from_mean = varies_with(
-            speed, t - state.t[0], self.axle.speeding_up()) - self.axle.means_by_way(self.sums)
+            speed, t - state.t[0], self.axle.acceleration()) - self.axle.means_by_way(self.sums)
         self.varied = 1 + self.from_mean @ c[TYRES, None]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
         self.leaned = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
@@ -153,7 +153,7 @@ class Motion:
         nose_down = (self.sums.mean_rate - state.gyro_bias[:-1]) @ self.left * T[:, 0]
         self.pitched = np.outer(nose_down, self.up)
 
-    def _unsaid(self, coarse: CoarseSpeed | None) -> Floats | None:
+    def _by_speed_offset(self, coarse: CoarseSpeed | None) -> Floats | None:
         """Return the derivative of the way by what speeds in steps lack: (K, 3), or None."""
         if coarse is None:
             return None
@@ -162,7 +162,7 @@ class Motion:
         ahead: Floats = (self.f_n + self.f_n_end) / 2 * (np.sign(said) * moves)[:, None]
         return np.asarray(ahead * self.T)
 
-    def _faster(self) -> Floats:
+    def _by_odometer_delay(self) -> Floats:
         """Return the derivative of the way by a delay of the odometer: (K, 3)."""
         faster = np.diff(self.axle.wheel / self.state.scale)
         return (self.f_n + self.f_n_end) / 2 * faster[:, None]

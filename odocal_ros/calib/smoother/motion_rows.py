@@ -16,13 +16,13 @@ from weakref import ref
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal
+from odocal_ros.calib.smoother.chain import blocks, JointMarginals, Normal
+from odocal_ros.calib.smoother.factor import ChunkedSum, Factor, LinearisationPoint
 from odocal_ros.calib.smoother.imu_noise import at_rest, sensor_noise
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise, Levels
-from odocal_ros.calib.smoother.part import Here, Part, Total
 from odocal_ros.calib.smoother.signals import Signals
 from odocal_ros.calib.smoother.slide import HEAVE, least_slide, SIDEWAYS
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
@@ -42,7 +42,7 @@ NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyr
 ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up',))
 
 
-class MotionRows(Part):
+class MotionRows(Factor):
     """
     Rows of ``Motion`` with the noise of ``IntervalNoise``.
 
@@ -54,12 +54,12 @@ class MotionRows(Part):
 
     name = 'motion'
 
-    def __init__(self, problem: 'Problem', here: Here) -> None:
-        self.motion = Motion(problem, here.state, here.intervals, here.fitted)
+    def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
+        self.motion = Motion(problem, point.state, point.intervals, point.fitted)
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
-        self.signals = Signals(self.motion) if here.fitted else None
+        self.signals = Signals(self.motion) if point.fitted else None
         self.noise = interval_noise(self.motion, problem.leg,
-                                    problem.still[:-1] & problem.still[1:], here.spread)
+                                    problem.still[:-1] & problem.still[1:], point.spread)
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
@@ -74,7 +74,7 @@ class MotionRows(Part):
 
     def weigh(self, levels: Levels) -> None:
         """Whiten the rows by the Cholesky factor of their covariance."""
-        self._found: tuple[ref[Neighbours], Floats, Floats] | None = None
+        self._found: tuple[ref[JointMarginals], Floats, Floats] | None = None
         self.whiten = room(len(self.raw), ROWS, ROWS)
         self.r, logs = np.empty((2, len(self.raw), ROWS))
         for rows in blocks(len(self.raw)):
@@ -122,7 +122,7 @@ class MotionRows(Part):
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
         n = self.n
-        corner, g_border = Total(), Total()
+        corner, g_border = ChunkedSum(), ChunkedSum()
         for rows in blocks(len(self.r)):
             ends = slice(rows.start + 1, rows.stop + 1)
             J = self.J[rows]
@@ -158,9 +158,9 @@ class MotionRows(Part):
         """Return which unit noises belong to these levels: (c,) bool."""
         return np.isin(self.noise.component, [INTERVAL.index(name) for name in names])
 
-    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """Return the quadratic sum and its expectation for each level."""
-        estimates, seen = self._noises(near)
+        estimates, seen = self._noises(marginals)
         quadratic, expected = np.einsum('kc,kc->c', estimates, estimates), seen.sum(axis=0)
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
                 for name in INTERVAL}
@@ -169,7 +169,7 @@ class MotionRows(Part):
         """Add the right-hand sides of its levels."""
         n, columns = self.n, out.at(INTERVAL)
         of = np.eye(len(INTERVAL))[self.noise.component]
-        square, border = Total(), Total()
+        square, border = ChunkedSum(), ChunkedSum()
         for rows in blocks(len(self.r)):
             ends = slice(rows.start + 1, rows.stop + 1)
             A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
@@ -182,25 +182,25 @@ class MotionRows(Part):
         out.border[:, columns] += border.sum
         out.square[np.ix_(columns, columns)] += square.sum
 
-    def _noises(self, near: Neighbours) -> tuple[Floats, Floats]:
+    def _noises(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
         """
         Return the estimates of the unit noises and their expected variances.
 
-        (K, c) each; computed once for one ``near``, since levels and slips both use them.
+        (K, c) each; computed once for one ``marginals``, since levels and slips both use them.
         """
-        if self._found is None or self._found[0]() is not near:
+        if self._found is None or self._found[0]() is not marginals:
             estimates, variances = np.empty((2, len(self.r), len(self.noise.component)))
-            for rows, block in near.blocks():
+            for rows, block in marginals.blocks():
                 A, Y = self._units(rows)
                 estimates[rows] = np.einsum('kic,ki->kc', A, self.r[rows])
                 variances[rows] = (A**2).sum(axis=1) - (Y * (block @ Y)).sum(axis=1)
-            self._found = ref(near), estimates, variances
+            self._found = ref(marginals), estimates, variances
         return self._found[1:]
 
-    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
+    def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         """Yield the effects of the unit noises of each level."""
         units, given = [], []
-        for rows, block in near.blocks():
+        for rows, block in marginals.blocks():
             cross = self.with_wanted(block)
             units.append(cross @ self._units(rows)[1])
             given.append(cross @ np.swapaxes(self.J[rows], 1, 2)
@@ -211,14 +211,14 @@ class MotionRows(Part):
         if self.noise.given.shape[2]:
             yield SpeedSteps.source, np.concatenate(given)
 
-    def road_noise(self, near: Neighbours) -> tuple[Floats, Floats]:
+    def road_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
         """
         Return the odometer's noise in each interval, forward, sideways, up: (K, 3) each.
 
         First the estimate in its own sigmas, second its expected variance: the observable part
         of 1.
         """
-        estimate, seen = self._noises(near)
+        estimate, seen = self._noises(marginals)
         columns = [self.of(*names) for names in ODOMETER_AXES]
         return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
                 np.stack([seen[:, c].sum(axis=1) for c in columns], -1))

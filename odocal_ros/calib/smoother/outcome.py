@@ -21,7 +21,7 @@ from odocal_ros.calib.mounting import FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.smoother.as_sent import as_sent
 from odocal_ros.calib.smoother.border import border_of
-from odocal_ros.calib.smoother.chain import Neighbours
+from odocal_ros.calib.smoother.chain import JointMarginals
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.filtered import filter_reasons, speed_filter
 from odocal_ros.calib.smoother.fixes import Fixes
@@ -70,7 +70,7 @@ SCALES = range(GYRO.start, VELOCITY.start)    # errors of Imu, receiver, tyres, 
 
 def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
     """Return what a settled fit says of the leg."""
-    near = fit.neighbours()
+    near = fit.marginals()
     widen, reasons = mismatch(problem, fit, config)
     count = leg.travel.quantum * fit.state.scale
     slips, along_reasons = _odometer(leg, fit, near, count)
@@ -118,7 +118,7 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
                         border_of(fit, configured(leg)).widened(widen))
 
 
-def _odometer(leg: SmootherLeg, fit: Fit, near: Neighbours,
+def _odometer(leg: SmootherLeg, fit: Fit, near: JointMarginals,
               count: float) -> tuple[tuple[Slip, ...], list[Reason]]:
     """Return the slips, and what is said of the odometer: a filter of its speed before slip."""
     if leg.by_steps:    # of a coarse speed only its steps are used: its way along shows no slip

@@ -14,9 +14,9 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from odocal_ros.calib.smoother.factor import LinearisationPoint
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outside import Heading, Velocity
-from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.state import BARE
 from odocal_ros.data.arrays import Floats
@@ -39,12 +39,12 @@ class Rows:
 class OutsideRows(PointRows):
     """Rows of one of ``problem.outside``."""
 
-    def __init__(self, problem: 'Problem', here: Here) -> None:
-        self._rows = self.rows(problem, here)
+    def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
+        self._rows = self.rows(problem, point)
         self.k, self.raw = self._rows.k, self._rows.raw
         self.per_effective = problem.per_effective.get(self.name, 1.0)
 
-    def rows(self, problem: 'Problem', here: Here) -> Rows:
+    def rows(self, problem: 'Problem', point: LinearisationPoint) -> Rows:
         """Return the rows at a state."""
         raise NotImplementedError
 

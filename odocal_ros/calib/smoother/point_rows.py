@@ -20,10 +20,10 @@ from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal
+from odocal_ros.calib.smoother.chain import blocks, JointMarginals, Normal
+from odocal_ros.calib.smoother.factor import ChunkedSum, Factor
 from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.part import Part, Total
 from odocal_ros.calib.smoother.state import M, SLOW, State, WITH_SLOW
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import room
@@ -41,7 +41,7 @@ FEWEST_JUDGED = 5    # rows, of which one may be an outlier: judgement
 Gather = Callable[[Floats], Floats]     # rows (m, d, c) to (intervals, d most, c)
 
 
-class PointRows(Part):
+class PointRows(Factor):
     """
     Rows of d components each.
 
@@ -60,7 +60,7 @@ class PointRows(Part):
 
     @classmethod
     def times(cls, problem: 'Problem', constants: Floats) -> Floats:
-        """Return the times of validity, s: (m,); ``here`` holds the sums up to these times."""
+        """Return the times of validity, s: (m,); ``point`` holds the sums up to these times."""
         raise NotImplementedError
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
@@ -137,7 +137,7 @@ class PointRows(Part):
 
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
-        n, corner, g_border = self.n, Total(), Total()
+        n, corner, g_border = self.n, ChunkedSum(), ChunkedSum()
         for present, gather in self._intervals():
             J, r = gather(self.J), gather(self.r[:, :, None])
             H = np.swapaxes(J, 1, 2) @ J
@@ -184,11 +184,11 @@ class PointRows(Part):
         n = self.n
         return np.r_[0:n, 2 * n:2 * n + M], np.arange(n + SLOW.start, n + SLOW.stop)
 
-    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """Return the quadratic sum and its expectation for each level."""
         if len(self.k) < FEWEST_JUDGED:
             return {}
-        taken = np.concatenate([self._taken(near.of(present), gather)
+        taken = np.concatenate([self._taken(marginals.of(present), gather)
                                 for present, gather in self._intervals()])
         known = np.broadcast_to(self.known(), self.r.shape)
         r2 = np.where(known, self.r, 0.0)**2 * self.per_effective
@@ -204,7 +204,7 @@ class PointRows(Part):
         q = np.zeros((*self.r.shape, len(columns)))
         for i, own in enumerate(self.levels_of.values()):
             q[:, own, i] = self.r[:, own]
-        border = Total()
+        border = ChunkedSum()
         for present, gather in self._intervals():
             some = gather(q)
             g = np.swapaxes(gather(self.J), 1, 2) @ some
@@ -227,12 +227,12 @@ class PointRows(Part):
         out: Floats = taken.reshape(len(block), -1, self.r.shape[1])
         return out
 
-    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
+    def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         """Yield the effect of a unit error of each row."""
         own, end = self._columns()
         parts = []
         for present, gather in self._intervals():
-            cross = np.ascontiguousarray(self.with_wanted(near.of(present)))
+            cross = np.ascontiguousarray(self.with_wanted(marginals.of(present)))
             X = cross[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
             if self.J_end is not None:
                 X = X + cross[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)

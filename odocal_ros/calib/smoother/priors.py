@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import Neighbours, Normal
+from odocal_ros.calib.smoother.chain import JointMarginals, Normal
+from odocal_ros.calib.smoother.factor import add_prior, Factor, LinearisationPoint, WANTED
 from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.part import Here, hold, Part, WANTED
 from odocal_ros.calib.smoother.state import (
     BA,
     BG,
@@ -74,13 +74,13 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'heading': constants_from('heading_offset'), 'velocity': VELOCITY}
 
 
-class PriorRows(Part):
+class PriorRows(Factor):
     """Rows of the unknowns with their priors."""
 
     name = 'priors'
 
-    def __init__(self, problem: 'Problem', here: Here) -> None:
-        self.state, self.base = here.state, here.priors
+    def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
+        self.state, self.base = point.state, point.priors
         absent = {'heading', 'velocity'} - {*problem.outside}
         coarse = problem.leg.travel.coarse
         absent |= set() if coarse and coarse.truncation else {'speed_truncation'}
@@ -100,7 +100,7 @@ class PriorRows(Part):
         self.priors = replace(self.base, constants=constants)
         self.log_R = float(np.log(size).sum())
 
-    def sizes(self, near: Neighbours) -> dict[str, float]:
+    def sizes(self, marginals: JointMarginals) -> dict[str, float]:
         """
         Return the most likely size of each type, all else as it is: docs/method.md (S29).
 
@@ -110,7 +110,7 @@ class PriorRows(Part):
         at = 2 * self.n + np.arange(IMPERFECT.start, IMPERFECT.stop)
         usual = self.base.constants[IMPERFECT]**2
         weight = 1 / self.priors.constants[IMPERFECT]**2
-        total = 1 / near[0][at, at]
+        total = 1 / marginals[0][at, at]
         data = np.maximum(total - weight, 1e-9 * total)     # a share lost in rounding
         known = data / (data + 1 / (SIZE * usual))
         found = (self._constants_off()[IMPERFECT] * total / data)**2
@@ -140,11 +140,11 @@ class PriorRows(Part):
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations; the first keyframe has a wide prior at its value."""
         for columns, sigma in START_SIGMAS.values():
-            hold(out, 0, columns, sigma**2, 0.0)
+            add_prior(out, 0, columns, sigma**2, 0.0)
         if self.level:
-            hold(out, 0, UP, LEVEL_START**2, 0.0)
+            add_prior(out, 0, UP, LEVEL_START**2, 0.0)
         for columns, value, sigma in self._biases():
-            hold(out, 0, columns, sigma**2, value)
+            add_prior(out, 0, columns, sigma**2, value)
         w = 1 / self.priors.constants**2
         out.corner[range(M), range(M)] += w
         out.g_border -= w * self._constants_off()
@@ -155,9 +155,9 @@ class PriorRows(Part):
         out: float = total + (self._constants_off()**2 / self.priors.constants**2).sum()
         return out
 
-    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
+    def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         """Yield the effects of the turn-on biases."""
-        first = self.with_wanted(near[0][None])[0]
+        first = self.with_wanted(marginals[0][None])[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from odocal_ros.calib.smoother.axle import rates_at, WARM_TIME
-from odocal_ros.calib.smoother.equations import PARTS, Weighted
+from odocal_ros.calib.smoother.equations import FACTORS, Weighted
 from odocal_ros.calib.smoother.fixes import whitener
 from odocal_ros.calib.smoother.imu_noise import at_rest, shaken, unfelt
 from odocal_ros.calib.smoother.imu_steps import ImuSteps
@@ -91,7 +91,7 @@ class Problem:
         made = cls(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
                    used(leg, t), turned(leg, imu), config.gnss.correlation_time,
                    rates_at(leg.t_imu, leg.w_b, t))
-        for part in PARTS:
+        for part in FACTORS:
             if part.there(made):
                 first, least = part.first_levels(made)
                 made.first_levels = made.first_levels.but(**first)
@@ -115,7 +115,7 @@ class Problem:
         """Return the sums over all intervals, and to the times of rows by their part."""
         leg, c = self.leg, state.constants
         delay = c[ODO_DELAY]
-        times = {part.name: part.times(self, c) for part in PARTS
+        times = {part.name: part.times(self, c) for part in FACTORS
                  if issubclass(part, PointRows) and part.there(self)}
         all_t = np.concatenate(list(times.values()))
         order = np.argsort(all_t, kind='stable')

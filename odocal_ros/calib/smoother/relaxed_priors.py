@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import Neighbours, Solved
+from odocal_ros.calib.smoother.chain import JointMarginals, Solved
 from odocal_ros.calib.smoother.state import FIX_TIME, IMPERFECT, Priors, SPEED_OFFSET, State
 from odocal_ros.data.arrays import Floats
 
@@ -22,14 +22,14 @@ RELAXED_BEYOND = 2.0
 
 
 def relaxed(first: Priors, now: Priors, state: State, solved: Solved,
-            neighbours: Neighbours) -> Priors:
+            marginals: JointMarginals) -> Priors:
     """
     Return priors widened where the data are far from their centre, docs/method.md (S30).
 
     Those of imperfections stay: their sizes are levels.
     """
     n = solved.step.shape[1]
-    P0 = np.diagonal(neighbours[0])[:n]
+    P0 = np.diagonal(marginals[0])[:n]
     variance = np.diag(solved.covariance)
     constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
     constants[IMPERFECT] = now.constants[IMPERFECT]       # whose sizes are levels

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.receiver import lag_reasons, odometer_reasons
-from odocal_ros.calib.smoother.chain import Neighbours
+from odocal_ros.calib.smoother.chain import JointMarginals
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels
@@ -93,7 +93,7 @@ def _of_housing(found: float, found_sigma: float, sigma: float, misalignment: fl
     return out
 
 
-def level_pitch(fit: Fit, near: Neighbours, widen: float) -> dict[str, Any]:
+def level_pitch(fit: Fit, near: JointMarginals, widen: float) -> dict[str, Any]:
     """Return the pitch against what the accelerometer calls level: method_real's third pitch."""
     k = len(near) // 2
     n = fit.solved.step.shape[1]

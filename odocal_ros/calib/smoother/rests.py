@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from odocal_ros.calib.smoother.chain import Normal
+from odocal_ros.calib.smoother.factor import add_prior, add_process, Factor, LinearisationPoint
 from odocal_ros.calib.smoother.motion import rotvec
-from odocal_ros.calib.smoother.part import Here, hold, link, Part
 from odocal_ros.calib.smoother.state import PHI, V
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import transpose
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 STILL_SPEED, STILL_TURN = 0.005, np.array([1e-4, 1e-4, 2e-5])
 
 
-class Rests(Part):
+class Rests(Factor):
     """Rows of the velocity of keyframes at rest, of the turn of intervals at rest."""
 
     name = 'rests'
 
-    def __init__(self, problem: 'Problem', here: Here) -> None:
-        self.state, self.still = here.state, problem.still
+    def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
+        self.state, self.still = point.state, problem.still
         self.pair = self.still[:-1] & self.still[1:]
-        self.turn_variance = STILL_TURN**2 * here.intervals.T[:, None]
+        self.turn_variance = STILL_TURN**2 * point.intervals.T[:, None]
 
     def turned(self) -> Floats:
         """Return the turn within each interval, rad: (K, 3)."""
@@ -48,8 +48,8 @@ class Rests(Part):
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
         weight = self.still[:, None] / STILL_SPEED**2
-        hold(out, slice(None), V, 1.0, self.state.v_n, weight)
-        link(out, PHI, 1.0, self.pair[:, None] / self.turn_variance, self.turned())
+        add_prior(out, slice(None), V, 1.0, self.state.v_n, weight)
+        add_process(out, PHI, 1.0, self.pair[:, None] / self.turn_variance, self.turned())
 
     def cost(self) -> float:
         """Return the sum of squares, in sigmas."""

@@ -23,8 +23,8 @@ from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps, ScaleStep
 from odocal_ros.calib.smoother.as_sent import as_sent_of
+from odocal_ros.calib.smoother.factor import WANTED
 from odocal_ros.calib.smoother.outcome import determined, floored, in_words, SCALES
-from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.priors import SHARED, SIZE
 from odocal_ros.calib.smoother.refusal import OPTIONAL
 from odocal_ros.calib.smoother.remarks import beside, MODEL_FLOOR

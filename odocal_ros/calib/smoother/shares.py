@@ -12,14 +12,14 @@
 import numpy as np
 
 from odocal_ros.calib.result import Source
-from odocal_ros.calib.smoother.chain import Neighbours
+from odocal_ros.calib.smoother.chain import JointMarginals
 from odocal_ros.calib.smoother.estimate import Fit
-from odocal_ros.calib.smoother.part import WANTED
+from odocal_ros.calib.smoother.factor import WANTED
 from odocal_ros.calib.smoother.priors import PriorRows, SIZES
 from odocal_ros.data.arrays import Floats
 
 
-def shares(fit: Fit, neighbours: Neighbours) -> tuple[Source, ...]:
+def shares(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
     """
     Return the error sources of (ln K, yaw, pitch); their covariances add up to the total.
 
@@ -29,7 +29,7 @@ def shares(fit: Fit, neighbours: Neighbours) -> tuple[Source, ...]:
     parts, solved = fit.weighted.parts, fit.solved.covariance
     covariance: dict[str, np.ndarray] = {}
     for part in parts.values():
-        for name, effects in part.effects(neighbours):
+        for name, effects in part.effects(marginals):
             flat = np.moveaxis(effects, -2, 0).reshape(WANTED, -1)
             covariance[name] = covariance.get(name, 0.0) + flat @ flat.T
     shared = [Source(name, effects, True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import Neighbours
+from odocal_ros.calib.smoother.chain import JointMarginals
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import ROAD
@@ -39,10 +39,10 @@ class Slip:
     metres: float
 
 
-def along(fit: Fit, neighbours: Neighbours) -> Floats:
+def along(fit: Fit, marginals: JointMarginals) -> Floats:
     """Return what the odometer turned beyond the ground in each interval, m: (K,)."""
     rows = fit.weighted[MotionRows]
-    estimate, _ = rows.road_noise(neighbours)
+    estimate, _ = rows.road_noise(marginals)
     out: Floats = -estimate[:, 0] * rows.along_size()
     return out
 
@@ -77,13 +77,13 @@ def _speed_changes(fit: Fit) -> Bools:
     return out
 
 
-def level_when_changing(fit: Fit, neighbours: Neighbours, count: float = 0.0) -> str:
+def level_when_changing(fit: Fit, marginals: JointMarginals, count: float = 0.0) -> str:
     """Return what is slipped whenever the speed changes, '' if the drive shows no such level."""
     level = fit.levels.roots()
     # two readings differ by that whatever the wheel does, over the 10 s that a spell of it lasts
     rounding = count * np.sqrt(2 / 12) / np.sqrt(10.0)
     # one that no row determines stays where the fit began
-    known = {name for name, (_, rows) in fit.weighted[MotionRows].components(neighbours).items()
+    known = {name for name, (_, rows) in fit.weighted[MotionRows].components(marginals).items()
              if rows > LEVEL_ROWS}
     # m/sqrt(s), times even driving: no wheel without slip has so much when speeds change
     if 'along_hard' not in known or level['along_hard'] <= max(

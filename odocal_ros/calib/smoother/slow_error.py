@@ -15,11 +15,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from odocal_ros.calib.smoother.chain import Neighbours, Normal
+from odocal_ros.calib.smoother.chain import JointMarginals, Normal
+from odocal_ros.calib.smoother.factor import (
+    add_prior,
+    add_process,
+    Factor,
+    JUMP,
+    LinearisationPoint,
+)
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.part import Here, hold, JUMP, link, Part
 from odocal_ros.calib.smoother.state import SLOW
 from odocal_ros.data.arrays import Floats
 
@@ -32,7 +38,7 @@ USUAL_TIME, TIME_SPREAD = 100.0, 0.6
 WHITE_SHARE = 0.2       # of the variance, beside a slow part of 0.9, to start from: judgement
 
 
-class SlowError(Part):
+class SlowError(Factor):
     """
     Rows of the driving noise of the correlated fix error, and of its first value.
 
@@ -43,12 +49,12 @@ class SlowError(Part):
 
     name = 'slow'
 
-    def __init__(self, problem: 'Problem', here: Here) -> None:
-        self.state, self.T = here.state, here.intervals.T
-        self.jump = 1.0 if here.spread is None else here.spread[:, JUMP:]
+    def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
+        self.state, self.T = point.state, point.intervals.T
+        self.jump = 1.0 if point.spread is None else point.spread[:, JUMP:]
         self.time_given = not np.isnan(problem.fix_time)
         # where runs of intervals without fixes begin: a fix ends a run
-        ends = np.bincount(here.points['fixes'].interval, minlength=len(self.T)) > 0
+        ends = np.bincount(point.points['fixes'].interval, minlength=len(self.T)) > 0
         self.runs = np.flatnonzero(np.append(True, ends[:-1] | ends[1:]))
 
     @classmethod
@@ -79,8 +85,8 @@ class SlowError(Part):
 
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
-        link(out, SLOW, self.decay, 1 / self.drive, self.residual())
-        hold(out, 0, SLOW, self.power, self.state.slow_n[0])
+        add_process(out, SLOW, self.decay, 1 / self.drive, self.residual())
+        add_prior(out, 0, SLOW, self.power, self.state.slow_n[0])
 
     def cost(self) -> float:
         """Return the sum of squares, in sigmas."""
@@ -88,13 +94,13 @@ class SlowError(Part):
         out: float = (self.residual()**2 / self.drive).sum() + first
         return out
 
-    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """Return the quadratic sum and its expectation for each level."""
         i, s = np.arange(SLOW.start, SLOW.stop), self.state.slow_n
         a, q, r = self.decay, self.drive, self.residual()
-        before, both, var = self._variances(near)
+        before, both, var = self._variances(marginals)
         num, den = r**2 / q, 1 - var / q
-        begin, begin_var = s[0]**2 / self.power, near[0][i, i] / self.power
+        begin, begin_var = s[0]**2 / self.power, marginals[0][i, i] / self.power
         level = num.sum(axis=0) + begin, den.sum(axis=0) + (1 - begin_var)
         q_sum, expected = level
         found = {'slow': (float(q_sum[:2].sum()), float(expected[:2].sum())),
@@ -104,21 +110,21 @@ class SlowError(Part):
                 r * s[:-1] + both - a * before, num - den, begin + begin_var - 1)
         return found
 
-    def _variances(self, near: Neighbours) -> tuple[Floats, Floats, Floats]:
+    def _variances(self, marginals: JointMarginals) -> tuple[Floats, Floats, Floats]:
         """Return covariances: of the value before, with that after, of driving noise: (K, 3)."""
         i, n, a = np.arange(SLOW.start, SLOW.stop), self.n, self.decay
-        before, both, after = np.split(near.entries(np.r_[i, i, n + i], np.r_[i, n + i, n + i]), 3,
-                                       axis=1)
+        both_ends = marginals.entries(np.r_[i, i, n + i], np.r_[i, n + i, n + i])
+        before, both, after = np.split(both_ends, 3, axis=1)
         return before, both, after + a**2 * before - 2 * a * both
 
-    def jumps(self, near: Neighbours) -> Floats:
+    def jumps(self, marginals: JointMarginals) -> Floats:
         """
         Return the driving noise of each interval, on the axis with the largest: (2, K, 1).
 
         The estimate in its own sigmas and its expected variance. Intervals without fixes between
         them determine only their sum, which is used for all of them.
         """
-        seen = 1 - self._variances(near)[2] / self.drive
+        seen = 1 - self._variances(marginals)[2] / self.drive
         seen, push, drive = (np.add.reduceat(x, self.runs) for x in (
             seen, self.residual(), self.drive))
         seen, z = np.clip(seen, 1e-12, None), push / np.sqrt(drive)
@@ -191,9 +197,9 @@ class SlowError(Part):
             out[:, axis] = solveh_banded(bands, g[:, axis])
         return out
 
-    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
+    def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         """Yield the effects of unit driving noise and of the first value."""
-        cross, n = self.all_with_wanted(near), self.n
+        cross, n = self.all_with_wanted(marginals), self.n
         end = slice(n + SLOW.start, n + SLOW.stop)
         push = cross[:, :, end] - self.decay[:, :, None] * cross[:, :, SLOW]
         yield 'slow_fix_errors', push / np.sqrt(self.drive)[:, None]

@@ -102,7 +102,7 @@ def _likelier(problem: Problem, config: Config, starts: tuple[Start, Start],
               trace: Trace | None) -> Fit:
     """Return the fit from the start that is likelier after START_PASSES."""
     about = max((fit(problem, one.state, _first_levels(problem, one), START_PASSES, trace=trace)
-                 for one in starts), key=lambda f: f.likelihood).outline()
+                 for one in starts), key=lambda f: f.likelihood).summary()
     last = fit(problem, about.state, about.levels, config.leg.compute_limit, about=about,
                trace=trace)
     return replace(last, iterations=about.iterations + last.iterations)

@@ -41,11 +41,11 @@ def judge_offset(problem: Problem, now: Fit, trace: Trace | None = None) -> Fit:
         return now
     constants = now.state.constants.copy()
     constants[SPEED_OFFSET] = known
-    outline = now.outline()
+    summary = now.summary()
     del now             # the equations of one fit at a time
     sure = 1e-3 * coarse.step       # as good as exact
-    about = replace(outline, priors=_held(outline.priors, known, sure),
-                    first=_held(outline.first, known, sure))
+    about = replace(summary, priors=_held(summary.priors, known, sure),
+                    first=_held(summary.first, known, sure))
     last = fit(problem, replace(about.state, constants=constants), about.levels, AGAIN_PASSES,
                about=about, frozen=True, trace=trace)
     return replace(last, iterations=about.iterations + last.iterations)

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from odocal_ros.calib.smoother.axle import Axle, varies_with
+from odocal_ros.calib.smoother.factor import LinearisationPoint
 from odocal_ros.calib.smoother.motion import gravity_n
-from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
@@ -52,8 +52,8 @@ class SpeedSteps(PointRows):
     name, source = 'steps', 'speed_steps'
     levels_of = {'steps': slice(0, 1)}
 
-    def __init__(self, problem: 'Problem', here: Here) -> None:
-        leg, state, points = problem.leg, here.state, here.points[self.name]
+    def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
+        leg, state, points = problem.leg, point.state, point.points[self.name]
         self.state, self.points = state, points
         self.instants, self.k = _within(problem), points.interval
         self.sigma = self.instants.sigma * leg.rough_scale
@@ -77,8 +77,8 @@ class SpeedSteps(PointRows):
         c = state.constants
         axle = Axle(problem, state)
         self.from_mean = varies_with(
-            self.speed, state.t[self.k] - state.t[0] + points.tau, axle.speeding_up()[self.k]
-        ) - axle.means_by_way(here.intervals)
+            self.speed, state.t[self.k] - state.t[0] + points.tau, axle.acceleration()[self.k]
+        ) - axle.means_by_way(point.intervals)
         self.varied = 1 + self.from_mean @ c[TYRES]
         said = self.instants.value + self.instants.side * c[SPEED_OFFSET]
         self.said = state.scale * self.varied * said

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import Neighbours, Normal
+from odocal_ros.calib.smoother.chain import JointMarginals, Normal
+from odocal_ros.calib.smoother.factor import add_prior, Factor, LinearisationPoint
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.part import Here, hold, Part
 from odocal_ros.calib.smoother.state import E
 from odocal_ros.data.arrays import Bools, Floats
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
 
-class TravelError(Part):
+class TravelError(Factor):
     """Rows of the travel error at each keyframe, with one level: scale units."""
 
     name = 'travel'
 
-    def __init__(self, problem: 'Problem', here: Here) -> None:
-        self.state, self.still = here.state, problem.still
+    def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
+        self.state, self.still = point.state, problem.still
         self.least = problem.least['travel']
         self.weight = once_a_rest(problem.still)
 
@@ -51,19 +51,19 @@ class TravelError(Part):
 
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
-        hold(out, slice(None), slice(E, E + 1), self.variance, self.state.travel_error[:, None],
-             self.weight[:, None])
+        add_prior(out, slice(None), slice(E, E + 1), self.variance,
+                  self.state.travel_error[:, None], self.weight[:, None])
 
     def cost(self) -> float:
         """Return the weighted sum of squares."""
         out: float = (self.weight * self.state.travel_error**2).sum() / self.variance
         return out
 
-    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """Return the quadratic sum and its expectation for the level, in motion."""
         e, moving = self.variance, ~self.still
-        last = near[-1][self.n + E, self.n + E]
-        spread = np.append(near.entries([E], [E])[:, 0], last)
+        last = marginals[-1][self.n + E, self.n + E]
+        spread = np.append(marginals.entries([E], [E])[:, 0], last)
         x = self.state.travel_error[moving]
         return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
 
@@ -74,9 +74,9 @@ class TravelError(Part):
         out.chain[:, E, i] += g
         out.square[i, i] += g @ self.state.travel_error
 
-    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
+    def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         """Yield the effect of a unit error of each reading."""
-        cross = self.all_with_wanted(near)
+        cross = self.all_with_wanted(marginals)
         root = np.sqrt(self.weight / self.variance)
         travel = np.concatenate([cross[:, :, E], cross[-1:, :, self.n + E]]) * root[:, None]
         yield 'quantisation', travel[:, :, None]

@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from odocal_ros.calib.smoother.factor import LinearisationPoint
 from odocal_ros.calib.smoother.fixes import antenna
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.outside import Velocity
 from odocal_ros.calib.smoother.outside_rows import OutsideRows, Rows
-from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.preintegrate import Points, turn
 from odocal_ros.calib.smoother.signals import lasting, UPRIGHT
 from odocal_ros.calib.smoother.state import (
@@ -62,9 +62,9 @@ class VelocityRows(OutsideRows):
     name, source = 'velocity', 'fix_velocity'
     levels_of = {'velocity': slice(0, 2)}
 
-    def rows(self, problem: 'Problem', here: Here) -> Rows:
+    def rows(self, problem: 'Problem', point: LinearisationPoint) -> Rows:
         """Return the rows."""
-        return _velocity(problem, here, here.points['velocity'])
+        return _velocity(problem, point, point.points['velocity'])
 
     @classmethod
     def times(cls, problem: 'Problem', constants: Floats) -> Floats:
@@ -85,8 +85,8 @@ class VelocityRows(OutsideRows):
         return {'velocity': (LEAST.velocity / float(np.median(sent.sigma)))**2}
 
 
-def _velocity(problem: 'Problem', here: Here, points: Points) -> Rows:
-    leg, state, sent, k = problem.leg, here.state, problem.outside['velocity'], points.interval
+def _velocity(problem: 'Problem', point: LinearisationPoint, points: Points) -> Rows:
+    leg, state, sent, k = problem.leg, point.state, problem.outside['velocity'], points.interval
     assert isinstance(sent, Velocity)
     C, tau = state.C_nb[k], points.tau[:, None]
     C_t = C @ points.R
@@ -94,14 +94,14 @@ def _velocity(problem: 'Problem', here: Here, points: Points) -> Rows:
     arm_b = state.C_bv @ arm_v
     dv, g = turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
     swing = turn(C_t, np.cross(points.rate, arm_b))
-    _, at_keys = antenna(state, here.intervals.mean_rate, arm_b)
-    faster = (np.diff(at_keys, axis=0) / here.intervals.T[:, None])[k]
+    _, at_keys = antenna(state, point.intervals.mean_rate, arm_b)
+    faster = (np.diff(at_keys, axis=0) / point.intervals.T[:, None])[k]
     smoothed, by_lag = smoothing(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
                                  state.t[k] + points.tau, state.constants[VELOCITY_LAG2])
     v = state.v_n[k] + dv + g * tau + swing + smoothed
     # on the prediction: on what is sent it would be on its noise too, and the smallest fit best
     times = 1 + state.constants[VELOCITY_SCALE]
-    m, t, rate = len(k), tau[:, :, None], here.intervals.mean_rate[k]
+    m, t, rate = len(k), tau[:, :, None], point.intervals.mean_rate[k]
     J, c = np.zeros((m, 3, BARE)), np.zeros((m, 3, M))
     J[:, :, V] = -np.eye(3)
     J[:, :, PHI] = skew(dv + swing)
@@ -114,19 +114,19 @@ def _velocity(problem: 'Problem', here: Here, points: Points) -> Rows:
     c[:, :, GNSS_ARM] = -W @ state.C_bv
     c[:, :, VELOCITY_DELAY], c[:, :, VELOCITY_LAG2] = faster, -by_lag
     c[:, :, GYRO_SCALE] = J[:, :, BG.start + 2] * rate[:, 2:]
-    c[:, :, ACCEL] = C @ _signals(here, k, turn(transpose(C), faster - g)) * t
+    c[:, :, ACCEL] = C @ _signals(point, k, turn(transpose(C), faster - g)) * t
     J, c = J[:, :2] * times, c[:, :2] * times
     c[:, :, VELOCITY_SCALE] = -v[:, :2]
     return Rows(k, sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
 
 
-def _signals(here: Here, k: Ints, force: Floats) -> Floats:
+def _signals(point: LinearisationPoint, k: Ints, force: Floats) -> Floats:
     """
     Return what errors of the accelerometer multiply, by the axes they enter: (m, 3, a) m/s^2.
 
     As of the intervals (signals.py) it is the force as fitted, and upright what lasts of it.
     """
-    force[:, UPRIGHT] = lasting(here.intervals.mean_force, here.intervals.T)[k, UPRIGHT]
+    force[:, UPRIGHT] = lasting(point.intervals.mean_force, point.intervals.T)[k, UPRIGHT]
     out = np.zeros((len(k), 3, len(ACCEL_AXIS)))
     out[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]
     return out

@@ -19,10 +19,10 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.smoother.estimate import WarmStart
+from odocal_ros.calib.smoother.factor import SPREAD
 from odocal_ros.calib.smoother.imu_steps import ImuSteps
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
-from odocal_ros.calib.smoother.part import SPREAD
 from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import SPEED_WINDOW

@@ -24,7 +24,7 @@ from typing import ClassVar, TYPE_CHECKING
 import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
-from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal
+from odocal_ros.calib.smoother.chain import blocks, JointMarginals, Normal
 from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import Intervals, Points
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 
 # variance factors of an interval: of the odometer forward, sideways and up (slips), and of the
 # driving noise of the correlated fix error (jumps of the receiver)
-FACTORS = ('along', 'side', 'up', 'jump')
-SPREAD, JUMP = len(FACTORS), FACTORS.index('jump')
+VARIANCE_FACTORS = ('along', 'side', 'up', 'jump')
+SPREAD, JUMP = len(VARIANCE_FACTORS), VARIANCE_FACTORS.index('jump')
 WANTED = len(PARAMETERS)    # constants in the error budget: ln K, yaw, pitch
 
 
 @dataclass(frozen=True, eq=False)
-class Here:
+class LinearisationPoint:
     """
     The linearisation point of the equations: a state, and the preintegrated samples at it.
 
@@ -59,13 +59,13 @@ class Here:
     fitted: bool = False
 
 
-class Part:
+class Factor:
     """
     Base class of the factors, without any rows. ``equations`` lists the factors.
 
-    A subclass implements ``__init__(problem, here)`` and overrides what differs. With rows of its
+    A subclass implements ``__init__(problem, point)`` and overrides what differs. With rows of its
     own it also has raw, the residuals, and ``jacobians(n)``, their derivatives by keyframes and
-    constants. ``near`` is the result of ``Solved.neighbours``, or where stated a block of it,
+    constants. ``marginals`` is the result of ``Solved.marginals``, or where stated a block of it,
     (k, 2n + M, 2n + M).
     """
 
@@ -75,8 +75,8 @@ class Part:
     n: int                   # of so many unknowns of a keyframe
     log_R: float = 0.0       # log determinant of the rows' covariance, but for a constant
 
-    def __init__(self, problem: 'Problem', here: Here) -> None:
-        self.state = here.state
+    def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
+        self.state = point.state
 
     @classmethod
     def there(cls, problem: 'Problem') -> bool:
@@ -92,7 +92,7 @@ class Part:
         """Return True if the rows exist at these levels."""
         return True
 
-    def weighed(self, levels: Levels) -> 'Part':
+    def weighed(self, levels: Levels) -> 'Factor':
         """Return a copy with weighted rows."""
         new = copy(self)
         new.levels = levels
@@ -117,14 +117,14 @@ class Part:
         """Return the weighted sum of squares of the residuals."""
         return 0.0
 
-    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """Return the quadratic sum and the redundancy of each level, (S26)."""
         return {}
 
     def add_levels(self, out: LevelSides) -> None:
         """Add the right-hand sides of its levels: docs/method.md (S27b)."""
 
-    def effects(self, near: Neighbours) -> Iterable[tuple[str, Floats]]:
+    def effects(self, marginals: JointMarginals) -> Iterable[tuple[str, Floats]]:
         """Yield the names of error sources and the effects of their unit errors: (..., 3, k)."""
         return ()
 
@@ -132,13 +132,13 @@ class Part:
         """Return the cross-covariance of scale, yaw, pitch and the unknowns: (k, 3, 2n + M)."""
         return block[:, 2 * self.n:2 * self.n + WANTED, :]
 
-    def all_with_wanted(self, near: Neighbours) -> Floats:
+    def all_with_wanted(self, marginals: JointMarginals) -> Floats:
         """Return the cross-covariance for all intervals: (K, 3, 2n + M)."""
         # copies: a view of a few rows would keep the whole block in memory
-        return np.concatenate([self.with_wanted(block).copy() for _, block in near.blocks()])
+        return np.concatenate([self.with_wanted(block).copy() for _, block in marginals.blocks()])
 
 
-class Total:
+class ChunkedSum:
     """A sum of rows that arrive in chunks; equal to the sum of all rows to the last bit."""
 
     _sum: np.ndarray | None = None
@@ -155,7 +155,7 @@ class Total:
         self._sum = rows.sum(axis=0)
 
 
-def hold(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
+def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
          residual: Floats | float, weight: Floats | float = 1.0) -> None:
     """Add priors of single unknowns: columns at keyframes k, a slice or one."""
     i = np.arange(out.g.shape[1])[columns]
@@ -168,7 +168,7 @@ def hold(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
         out.g[at, i] -= pull[rows]
 
 
-def link(out: Normal, columns: slice, decay: Floats | float, weight: Floats,
+def add_process(out: Normal, columns: slice, decay: Floats | float, weight: Floats,
          residual: Floats) -> None:
     """Add a first-order process over all intervals, (K, c): x at the end less decay times x."""
     i = np.arange(out.g.shape[1])[columns]
