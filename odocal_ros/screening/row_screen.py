@@ -45,11 +45,11 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     offset : s, added to the stamps.   found : takes what is wrong with the others.
     """
     sent = getattr(leg, slot)
-    if slot in ('odometer', 'odometer_right'):
+    if slot in WHEELS:
         sent = _stood(sent)
     good, wild = _finite(sent, slot, leg, found)
     clean = sent if good.all() else take(sent, good)
-    clean = _one_by_one(clean)
+    clean = _one_by_one(clean) if slot in WHEELS else clean
     order = _rising(clean, slot, leg, found)
     clean = clean if order is None else take(clean, order)
     t = room(len(clean.stamp_ns))
@@ -131,10 +131,16 @@ def _stood(samples: Any) -> Any:
 
 
 def _one_by_one(samples: Any) -> Any:
-    """Return samples without a header, stamped at arrival, with equal stamps 1 ns apart."""
+    """
+    Return odometer samples without a header, stamped at arrival, with equal stamps 1 ns apart.
+
+    Where all samples with equal stamps have equal values, they are one sample sent twice.
+    """
     stamp = samples.stamp_ns
     step = np.diff(stamp)
     if (step > 0).all() or (step < 0).any() or (stamp != samples.received_ns).any():
+        return samples
+    if not np.diff(samples.value)[step == 0].any():
         return samples
     order = np.arange(len(stamp))
     return replace(samples, stamp_ns=np.maximum.accumulate(stamp - order) + order)

@@ -44,10 +44,10 @@ def drive():
     stop_ns = whole.imu.stamp_ns[0] + round(STOP * 1e9)
     # a smaller wheel turns more: it claims more metres than before
     value = whole.odometer.value / (1 + CHANGE * (whole.odometer.stamp_ns > stop_ns))
-    changed = replace(whole, odometer=replace(whole.odometer, value=value))
+    changed = replace(whole, wheels=(replace(whole.odometer, value=value),))
     later = town(start_ns=whole.options.start_ns + DAY, seed=2)
-    later = replace(later, odometer=replace(later.odometer,
-                                            value=later.odometer.value / (1 + CHANGE)))
+    later = replace(later, wheels=(replace(later.odometer,
+                                           value=later.odometer.value / (1 + CHANGE)),))
     types, sent = messages_of(changed)
     return SimpleNamespace(truth=whole.truth, types=types, sent=sent, later=messages_of(later)[1])
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.smoother.estimate import SETTLING
+from odocal_ros.calib.smoother.estimate import CONVERGENCE
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate, combine
@@ -72,8 +72,8 @@ def test_auto_takes_it_and_computes_two_point_beside_it(made):
     assert [stage.passes for stage in passes] == list(range(1, len(passes) + 1))
     assert {(stage.name, stage.done) for stage in passes} == {('smoother', shares[1])}
     # the change that is left falls from a first guess some sigmas off to what may be left
-    assert passes[0].change > SETTLING.fitted_below
-    assert passes[-1].change < SETTLING.moves
+    assert passes[0].change > CONVERGENCE.fitted_below
+    assert passes[-1].change < CONVERGENCE.moves
     assert set(leg.methods) == {'smoother', 'two_point'}
     assert leg_estimates(leg)['yaw_mounting_angle'].method == 'smoother'
 

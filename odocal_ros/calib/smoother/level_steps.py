@@ -66,11 +66,18 @@ def update(weighted: Weighted, marginals: JointMarginals, levels: Levels, proble
         step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
                                     0.03, 30.0)))
         first = RELAXATION.first if name in SLIPPING or name in PRIOR_ROWS else 1.0
-        power, last = pace.get(name, (first, 0.0))
-        power *= RELAXATION.slower if step * last < 0 else RELAXATION.faster if last else 1.0
-        pace[name] = min(power, RELAXATION.most), step
-        move = np.clip(pace[name][0] * step, np.log(0.03), np.log(30.0))
+        move = np.clip(_paced(pace, name, step, first) * step, np.log(0.03), np.log(30.0))
         new[name] = max(level * float(np.exp(move)), problem.least[name])
-    if fitted:      # while residuals contain the start, sizes are constant
-        new |= weighted[PriorRows].sizes(marginals)
+    # while residuals contain the start, sizes are constant
+    for name, size in weighted[PriorRows].sizes(marginals).items() if fitted else ():
+        step = float(np.log(size / levels[name]))
+        new[name] = levels[name] * float(np.exp(min(_paced(pace, name, step, 1.0), 1.0) * step))
     return levels.but(**new)
+
+
+def _paced(pace: dict[str, tuple[float, float]], name: str, step: float, first: float) -> float:
+    """Return the exponent of a step: larger after one in the same direction, else smaller."""
+    power, last = pace.get(name, (first, 0.0))
+    power *= RELAXATION.slower if step * last < 0 else RELAXATION.faster if last else 1.0
+    pace[name] = min(power, RELAXATION.most), step
+    return pace[name][0]

@@ -36,8 +36,8 @@ from odocal_ros.settings.config import Config
 TWO_HEADINGS, START_PASSES = 0.1, 3
 # initial size of a receiver's own odometer, and s of a leg from which on it is used: ten times the
 # time in which satellites correct it; shorter legs cannot separate it. Tuned: in yards of 300 s
-# with one 5 % off the fit from 0.5 finds a scale and an accelerometer 3 % off instead, 7 to 10
-# sigma in 5 of 6; from 50 it is within 2.3 sigma in all (docs/decisions/0019)
+# with one 5 % off the fit from 0.5 finds a scale and an accelerometer 3 % off instead, 9 to 12
+# sigma in 6 of 6; from 50 so in 1 of 6 (docs/decisions/0019)
 LARGE_SIZE, LARGE_SIZE_FROM = 50.0, 200.0
 
 
@@ -112,7 +112,7 @@ def _first_levels(problem: Problem, start: Start) -> Levels:
     """Return initial levels: fixes no better than their fit to the odometer track."""
     wide = max(1.0, (start.fix_spread / problem.fix_sigma)**2)
     time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
-    long = problem.leg.t_stop - problem.leg.t_begin > LARGE_SIZE_FROM
+    long = problem.leg.felt and problem.leg.t_stop - problem.leg.t_begin > LARGE_SIZE_FROM
     sizes = {'size_fix_error_by_motion': LARGE_SIZE} if long else {}
     return problem.first_levels.but(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE * wide,
                                     correlation_time=time, **sizes, **problem.shaken)
