@@ -43,7 +43,7 @@ def error_in_sigmas(estimate, true):
     return round((estimate.value - true) / estimate.sigma, 2)
 
 
-@pytest.mark.parametrize(('seed', 'row'), enumerate(ZOO, FIRST_SEED))
+@pytest.mark.parametrize(('seed', 'row'), list(enumerate(ZOO, FIRST_SEED)))
 def test_a_drawn_vehicle_has_its_verdict_and_errors(seed, row):
     kind, grade, *_ = row
     options, _ = drawn(seed, kind, grade, imu_rate=50.0,
