@@ -134,13 +134,14 @@ def _one_by_one(samples: Any) -> Any:
     """
     Return odometer samples without a header, stamped at arrival, with equal stamps 1 ns apart.
 
-    Where all samples with equal stamps have equal values, they are one sample sent twice.
+    Where many samples have the stamp and the value of the one before, each was sent twice.
     """
-    stamp = samples.stamp_ns
+    stamp, twice_share = samples.stamp_ns, 1 / 3    # of all, a half: what comes at once moves on
     step = np.diff(stamp)
     if (step > 0).all() or (step < 0).any() or (stamp != samples.received_ns).any():
         return samples
-    if not np.diff(samples.value)[step == 0].any():
+    again = np.diff(samples.value)[step == 0] == 0
+    if again.all() and len(again) > twice_share * len(stamp):
         return samples
     order = np.arange(len(stamp))
     return replace(samples, stamp_ns=np.maximum.accumulate(stamp - order) + order)

@@ -152,10 +152,23 @@ def test_increments_that_arrive_together_are_all_counted(made):
     assert Code.STAMPS_NOT_RISING not in {r.code for r in found}
 
 
+def test_equal_increments_that_arrive_together_are_both_counted(made):
+    """At an even speed they are equal, which is no sign of a row that was sent twice."""
+    form = OdometerForm('increment', 0, 'm/pulse')
+    value = np.diff(made.odometer.value, prepend=made.odometer.value[:1])
+    k = int(np.flatnonzero((np.diff(value) == 0) & (value[1:] > 0))[100])
+    stamps = made.odometer.stamp_ns.copy()
+    stamps[k + 1] = stamps[k]
+    inputs, _ = screen(replace(made.leg(), odometer=OdometerSamples(stamps, stamps, value),
+                               form=form), settings(made))
+    assert inputs.travel.s[-1] == value[1:].sum()
+
+
 def test_rows_with_a_header_that_repeat_a_stamp_are_said(made):
     """Arrivals differ: the stamps are those of a clock, and two of them are one."""
     stamps = made.odometer.stamp_ns.copy()
-    stamps[1001] = stamps[1000]
+    k = int(np.flatnonzero(np.diff(made.odometer.value))[1000])
+    stamps[k + 1] = stamps[k]
     twice = OdometerSamples(stamps, made.odometer.stamp_ns, made.odometer.value)
     _, found = screen(replace(made.leg(), odometer=twice), settings(made))
     assert Code.STAMPS_NOT_RISING in {r.code for r in found}
