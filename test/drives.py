@@ -19,7 +19,7 @@ from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
-from odocal_ros.sim.truth import settings as told
+from odocal_ros.sim.truth import settings as true_settings
 
 LOW_RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0}
 STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'imu_grade': 'tactical', 'seed': 5}
@@ -77,7 +77,7 @@ def settings(made, heading_sigma=1e-3, **changes):
 def configured(made):
     """Return the settings that the operator of a drawn vehicle has."""
     return with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
-                                    for group, keys in told(made).items()
+                                    for group, keys in true_settings(made).items()
                                     for key, v in keys.items()})
 
 

@@ -216,5 +216,5 @@ def test_the_summary_has_a_line_for_each_wheel():
     text = printed(combine([calibrate(one.leg(), its)], its))
     for name in FOUR:
         (line,) = [line for line in text.splitlines() if line.startswith(f'  wheel {name} ')]
-        assert ' m left' in line
+        assert (' m left' if name.endswith('left') else ' m right') in line
         assert (' m ahead' in line) == name.startswith('front')

@@ -13,8 +13,8 @@ from math import tau
 from typing import Any
 
 from odocal_ros.calib.result import Calibration
+from odocal_ros.output.figures import known
 from odocal_ros.output.file_head import head
-from odocal_ros.output.summary import known
 from odocal_ros.outside.yaml_text import parameters
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale

@@ -13,9 +13,8 @@ import textwrap
 from typing import Any
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.output.figures import with_sigma
+from odocal_ros.output.figures import inverse, known, with_sigma
 from odocal_ros.output.file_head import head
-from odocal_ros.output.summary import inverse, known
 from odocal_ros.settings.config import Config
 
 DEVICES = 'wheel_input.txt'

@@ -9,7 +9,13 @@
 
 """Numbers as people read them: digits cut to the sigma, units converted at this rim only."""
 
+from dataclasses import replace
 import math
+
+from odocal_ros.calib.result import Estimate
+
+NONE = Estimate(None, None, '')
+COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 
 
 def decimals(sigma: float) -> int:
@@ -82,3 +88,25 @@ def time_span(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f'{hours} h {minutes:02d} min' if hours else f'{minutes} min {rest:02d} s'
+
+
+def known(estimates: dict[str, Estimate], name: str) -> Estimate:
+    """Return an estimate by name, with None in place of what is missing or no number."""
+    found = estimates.get(name, NONE)
+    value, sigma = (x if x is not None and math.isfinite(x) else None
+                    for x in (found.value, found.sigma))
+    return replace(found, value=value, sigma=sigma)
+
+
+def with_unit(estimate: Estimate) -> str:
+    """Return value and sigma with their unit."""
+    unit = '' if estimate.unit == '1' else f' {estimate.unit}'
+    return with_sigma(estimate.value, estimate.sigma) + unit
+
+
+def inverse(scale: Estimate) -> str:
+    """Return the inverse scale: pulses (or rad) per metre with sigma."""
+    if not scale.value:
+        return ''
+    sigma = None if scale.sigma is None else scale.sigma / scale.value**2
+    return f'{with_sigma(1 / scale.value, sigma)} {COUNTS[scale.unit]}'

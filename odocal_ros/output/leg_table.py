@@ -16,7 +16,7 @@ from typing import Any
 
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, wheel_factors
-from odocal_ros.output.summary import known
+from odocal_ros.output.figures import known
 from odocal_ros.outside.names import for_table
 from odocal_ros.settings.config import Config
 

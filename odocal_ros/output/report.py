@@ -18,10 +18,10 @@ from typing import Any
 from odocal_ros.calib.choice import ABOUT, leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.output import report_tables as tables
-from odocal_ros.output.figures import length, time_span
+from odocal_ros.output.figures import known, length, time_span
 from odocal_ros.output.plots_svg import Drawing
 from odocal_ros.output.reason_lines import shared
-from odocal_ros.output.summary import DEG, known, MEANING, sentence
+from odocal_ros.output.summary import DEG, MEANING, sentence
 from odocal_ros.output.track_table import before_label, check_table
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config

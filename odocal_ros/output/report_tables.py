@@ -25,8 +25,16 @@ from odocal_ros.calib.result import (
     wheel_factors,
 )
 from odocal_ros.output.budget_table import LABELS as SOURCES, largest_source
-from odocal_ros.output.figures import beyond_one, share, two_digits, with_sigma
-from odocal_ros.output.summary import COUNTS, DEG, DEG_PER_HOUR, inverse, known
+from odocal_ros.output.figures import (
+    beyond_one,
+    COUNTS,
+    inverse,
+    known,
+    share,
+    two_digits,
+    with_sigma,
+)
+from odocal_ros.output.summary import DEG, DEG_PER_HOUR
 from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS

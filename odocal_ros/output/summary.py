@@ -9,7 +9,6 @@
 
 """A calibration in words: one screen for a terminal, one sentence for an answer."""
 
-from dataclasses import replace
 from datetime import datetime, UTC
 import math
 import textwrap
@@ -24,7 +23,17 @@ from odocal_ros.calib.result import (
     wheel_factors,
 )
 from odocal_ros.output.budget_table import budget_lines, largest_source, source_label
-from odocal_ros.output.figures import beyond_one, length, share, time_span, with_sigma
+from odocal_ros.output.figures import (
+    beyond_one,
+    COUNTS,
+    inverse,
+    known,
+    length,
+    share,
+    time_span,
+    with_sigma,
+    with_unit,
+)
 from odocal_ros.output.reason_lines import bag_lines, reason_lines
 from odocal_ros.output.search_table import search_lines
 from odocal_ros.output.track_table import track_lines
@@ -34,15 +43,13 @@ from odocal_ros.reasons import Verdict
 WIDTH = 98    # judgement: columns
 DEG = math.degrees(1.0)    # definition
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
-PLACES = {'lateral': 'left', 'forward': 'ahead'}    # of a wheel: estimate, as people say it
+PLACES = {'lateral': ('left', 'right'), 'forward': ('ahead', 'behind')}    # of a wheel: +, -
 ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
-COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the reasons first',
            Verdict.REJECTED: 'do not use these values'}
 ORDER = list(Verdict)
-NONE = Estimate(None, None, '')
 
 
 def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
@@ -91,39 +98,18 @@ def values_in_words(estimates: dict[str, Estimate]) -> str:
         parts.append('scale factor not determined')
     else:
         counts = f' ({inverse(scale)})' if scale.unit in COUNTS else ''
-        parts.append(f'scale factor {_with_unit(scale)}{counts}')
+        parts.append(f'scale factor {with_unit(scale)}{counts}')
     words = {name: name.removeprefix(FACTOR) for name in wheel_factors(estimates)}
     for name, word in (words | {'track_width': 'track width'}).items():
         wheel = known(estimates, name)
         if wheel.value is not None:
-            parts.append(f'{word} {_with_unit(wheel)}')
+            parts.append(f'{word} {with_unit(wheel)}')
     for name, word in ANGLES.items():
         angle = known(estimates, name)
         parts.append(f'{word} mounting ' + (
             'not determined' if angle.value is None else
             f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg'))
     return ', '.join(parts)
-
-
-def known(estimates: dict[str, Estimate], name: str) -> Estimate:
-    """Return an estimate by name, with None in place of what is missing or no number."""
-    found = estimates.get(name, NONE)
-    value, sigma = (x if x is not None and math.isfinite(x) else None
-                    for x in (found.value, found.sigma))
-    return replace(found, value=value, sigma=sigma)
-
-
-def inverse(scale: Estimate) -> str:
-    """Return the inverse scale: pulses (or rad) per metre with sigma."""
-    if not scale.value:
-        return ''
-    sigma = None if scale.sigma is None else scale.sigma / scale.value**2
-    return f'{with_sigma(1 / scale.value, sigma)} {COUNTS[scale.unit]}'
-
-
-def _with_unit(estimate: Estimate) -> str:
-    unit = '' if estimate.unit == '1' else f' {estimate.unit}'
-    return with_sigma(estimate.value, estimate.sigma) + unit
 
 
 def _head(calibration: Calibration, styled: bool) -> list[str]:
@@ -160,7 +146,7 @@ def _values(calibration: Calibration, width: int) -> list[str]:
         estimate = known(estimates, name)
         if name not in ('scale_factor', 'scale_ratio', AS_SENT, *ANGLES, *BIASES, *wheels) \
                 and name[:-2] not in ARMS and estimate.value is not None:
-            text = _with_unit(estimate)
+            text = with_unit(estimate)
             if name == 'heading_error':
                 text = _angle_text(estimate, 0) + (
                     '   heading error minus yaw mounting' if width >= WIDTH else '')
@@ -184,12 +170,12 @@ def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
     lines: dict[str, str] = {}
     for name in wheel_factors(estimates):
         wheel = name.removeprefix(FACTOR)
-        places = {f'{way}_position_{wheel}': word for way, word in PLACES.items()}
+        places = {f'{axis}_position_{wheel}': words for axis, words in PLACES.items()}
         if any(place in estimates for place in places):
-            at = [f'{e.value:+.3f} m {word}' for place, word in places.items()
+            at = [f'{abs(e.value):.3f} m {words[e.value < 0]}' for place, words in places.items()
                   if (e := known(estimates, place)).value is not None]
             lines |= dict.fromkeys(places, '') | {
-                name: _line(f'wheel {wheel}', '   '.join((_with_unit(estimates[name]), *at)))}
+                name: _line(f'wheel {wheel}', '   '.join((with_unit(estimates[name]), *at)))}
     return lines
 
 
@@ -227,7 +213,7 @@ def _largest_errors(calibration: Calibration, width: int) -> list[str]:
     """Return the lines with the largest error source of scale, yaw and pitch, none without."""
     found = []
     for name, word in {'scale_factor': 'scale', **ANGLES}.items():
-        estimate = calibration.estimates.get(name, NONE)
+        estimate = known(calibration.estimates, name)
         source, part = ('', 0.0) if estimate.value is None else largest_source(
             calibration.methods.get(estimate.method), name)
         if source:
@@ -247,7 +233,7 @@ def _scale_text(scale: Estimate) -> str:
         return 'not determined'
     relative = '' if not (scale.sigma and scale.value) else (
         f'   ({share(scale.sigma / abs(scale.value))})')
-    return _with_unit(scale) + relative
+    return with_unit(scale) + relative
 
 
 def _angle_text(angle: Estimate, width: int) -> str:

@@ -71,6 +71,13 @@ def test_samples_that_vary_alike_are_the_noise_of_the_sensor():
     assert 'cause is vibration' not in text
 
 
+def test_noise_that_single_samples_do_not_have_is_neither():
+    """What adds up over seconds is no white noise of the sensor, and no vibration."""
+    text = noise_remedy(noisy(1e-3, 1e-3), {'gyro': 1e-2, 'accel': 1.0}, ['gyro'])
+    assert 'unknown: single samples vary less' in text
+    assert 'at rest it is similar' not in text
+
+
 def test_without_a_standstill_noise_that_does_not_add_up_is_vibration_else_unknown():
     one = noisy(1e-2, 1e-2, rest_s=0.0)
     shaken = noise_remedy(one, {'gyro': 1e-3, 'accel': 1.0}, ['gyro'])

@@ -12,9 +12,13 @@
 import contextlib
 from dataclasses import dataclass
 import importlib
+import json
+from pathlib import Path
 import threading
 import time
+from types import SimpleNamespace
 
+from bench import wait_for
 import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
@@ -94,6 +98,19 @@ def part(messages: list[Sent], first_s: float, last_s: float) -> list[Sent]:
     """Return the messages between two times, seconds from the first message."""
     times = (np.array([one.stamp_ns for one in messages]) - messages[0].stamp_ns) * 1e-9
     return [one for one, t in zip(messages, times, strict=True) if first_s <= t < last_s]
+
+
+def stopped(client, player: Player, rows: list[Sent], speed: float) -> SimpleNamespace:
+    """Stop a leg, with these rows after the mark; return answer, status, journal and result."""
+    asked = client.ask('stop_leg')
+    client.until(state='computing')
+    player.play(rows, speed)
+    answer = client.result(asked)
+    status = wait_for(lambda: client.status['saved'] and client.status, 'saved files')
+    journal = Path(status['journal'])
+    wait_for((journal / 'metadata.yaml').exists, 'the joined journal')
+    live = json.loads((Path(status['saved']) / 'calibration.json').read_text())
+    return SimpleNamespace(stop=answer, status=status, journal=journal, live=live)
 
 
 def by_now(make):

@@ -9,13 +9,9 @@
 
 """Four wheels on one JointState topic, over DDS: the node and its journal give the same result."""
 
-import json
-from pathlib import Path
-from types import SimpleNamespace
-
 from bench import Client, NodeProcess, wait_for
 from kills import replayed
-from player import part, Player, sent_of
+from player import part, Player, sent_of, stopped
 import pytest
 
 from odocal_ros.bagio import encode
@@ -48,26 +44,18 @@ def session(drive, tmp_path_factory):
                 'odometer.wheels': f'[{", ".join(drive.joints)}]'}
     node = NodeProcess(*(x for name, value in settings.items() for x in (
         '-p', f'{name}:={value}')))
-    client, seen = Client(), SimpleNamespace()
+    client = Client()
     try:
         player = Player(client.node, {slot: topic.msgtype for slot, topic in topics.items()})
         wait_for(player.matched, 'subscriptions of the node')
         player.play(part(sent, start_s - REST_S, start_s), SPEED)
         client.until(state='idle')
-        seen.start = client.call('start_leg')
+        client.start()
         player.play(part(sent, start_s, start_s + 160), SPEED)
-        stopping = client.ask('stop_leg')
-        client.until(state='computing')
-        player.play(part(sent, start_s + 160, start_s + 163), SPEED)
-        seen.stop = client.result(stopping)
-        seen.status = wait_for(lambda: client.status['saved'] and client.status, 'saved files')
-        seen.journal = Path(seen.status['journal'])
-        wait_for((seen.journal / 'metadata.yaml').exists, 'the joined journal')
-        seen.live = json.loads((Path(seen.status['saved']) / 'calibration.json').read_text())
+        return stopped(client, player, part(sent, start_s + 160, start_s + 163), SPEED)
     finally:
         node.end()
         client.close()
-    return seen
 
 
 def test_the_journal_gives_the_same_result_to_the_last_bit(session):

@@ -9,13 +9,10 @@
 
 """Poses on the topic fix, over DDS: a leg by services; its journal replays to the same bits."""
 
-import json
-from pathlib import Path
-from types import SimpleNamespace
 
 from bench import Client, NodeProcess, wait_for
 from kills import replayed
-from player import part, Player, sent_of
+from player import part, Player, sent_of, stopped
 import pytest
 
 from odocal_ros.bagio import encode
@@ -43,21 +40,15 @@ def session(drive, tmp_path_factory):
     start_s = (drive.leg().start_ns - sent[0].stamp_ns) * 1e-9
     node = NodeProcess('-p', f'output.directory:={tmp_path_factory.mktemp("posed")}',
                        '-p', 'leg.preroll:=20.0', '-r', 'fix:=/slam/pose')
-    client, seen = Client(), SimpleNamespace(node=node)
+    client = Client()
     try:
         player = Player(client.node, {s: topic.msgtype for s, topic in topics.items()}, NAMES)
         wait_for(player.matched, 'subscriptions')
         player.play(part(sent, start_s - 10, start_s), SPEED)
         client.start()
         player.play(part(sent, start_s, start_s + 150), SPEED)
-        stopping = client.ask('stop_leg')
-        client.until(state='computing')
-        player.play(part(sent, start_s + 150, start_s + 153), SPEED)
-        seen.stop = client.result(stopping)
-        seen.status = wait_for(lambda: client.status['saved'] and client.status, 'saved files')
-        seen.journal = Path(seen.status['journal'])
-        wait_for((seen.journal / 'metadata.yaml').exists, 'the joined journal')
-        seen.live = json.loads((Path(seen.status['saved']) / 'calibration.json').read_text())
+        seen = stopped(client, player, part(sent, start_s + 150, start_s + 153), SPEED)
+        seen.node = node
         yield seen
     finally:
         node.end()

@@ -56,8 +56,8 @@ def bag_result(drive, bag, tmp_path_factory):
 def result_of(bag, drive, folder):
     """Return result and legs of a bag, without its name."""
     assert replay(bag, *known(drive), *QUICK, '--quiet', '--output', folder) == 0
-    told = json.loads((folder / 'calibration.json').read_text(encoding='utf-8'))
-    return told['result'], [leg | {'bag': ''} for leg in told['legs']]
+    stored = json.loads((folder / 'calibration.json').read_text(encoding='utf-8'))
+    return stored['result'], [leg | {'bag': ''} for leg in stored['legs']]
 
 
 def known(drive):

@@ -65,9 +65,9 @@ def test_unnamed_joints_are_told_apart_by_how_they_move(tmp_path, capsys):
 def test_four_unnamed_joints_are_a_list_of_axles(tmp_path, capsys):
     path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.joints(
         ns, ['a', 'b', 'c', 'd'], [right, left, 1.01 * right, 0.99 * left])))
-    told, wheels, _ = inspect(path, capsys)
+    found, wheels, _ = inspect(path, capsys)
     assert [v['side'] for v in wheels['values']] == ['right', 'left', 'right', 'left']
-    assert told['command'].endswith("--set 'odometer.wheels=[b, a, d, c]'")
+    assert found['command'].endswith("--set 'odometer.wheels=[b, a, d, c]'")
 
 
 def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, capsys):
@@ -87,9 +87,9 @@ def test_wheels_told_by_their_names_are_shown_with_the_settings_to_write(tmp_pat
     names = ['left_steer', 'left_wheel', 'right_steer', 'right_wheel']
     path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.joints(
         ns, names, velocity=[0.1, left, 0.1, right])))
-    told, wheels, _ = inspect(path, capsys)
+    found, wheels, _ = inspect(path, capsys)
     assert 'left_wheel is used as left wheel, right_wheel as right' in \
         wheels['chosen']
-    assert told['command'].endswith(
+    assert found['command'].endswith(
         '--set odometer.left=left_wheel --set odometer.right=right_wheel')
     assert 'trouble' not in wheels

@@ -40,15 +40,15 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
     unknown: list[str] = []
     moving, rest = at_rest_and_moving(problem)
     for name in (name for name in worse if name not in coarse):
-        still = rest.get(name, 0.0)
-        if still and moving[name] > VIBRATION * still:
-            shaken.append(f'{NAMES[name]} samples vary {moving[name] / still:.0f} times as much '
+        still, vary = rest.get(name, 0.0), moving.get(name, 0.0)
+        if still and vary > VIBRATION * still:
+            shaken.append(f'{NAMES[name]} samples vary {vary / still:.0f} times as much '
                           'in motion as at rest')
-        elif not still and moving[name] > VIBRATION * level[name]:
-            shaken.append(f'{NAMES[name]} samples vary {moving[name] / level[name]:.0f} times as '
+        elif not still and vary > VIBRATION * level[name]:
+            shaken.append(f'{NAMES[name]} samples vary {vary / level[name]:.0f} times as '
                           'much as their means over seconds')
-        else:
-            (own if still else unknown).append(name)
+        else:       # less at rest than it adds up to: of no single samples
+            (own if VIBRATION * still > level[name] else unknown).append(name)
     said = []
     if coarse:
         said.append(f'The cause is quantisation: {_steps_in_words(coarse)}. Set a finer '
@@ -58,9 +58,10 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
                     'from the engine.')
     said += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
              f'this is its normal noise, {_setting(name, level)}' for name in own]
-    said += [f'The cause of the {NAMES[name]} noise is unknown: there is no standstill to compare '
-             f'with. Mount the IMU firmly. If this is its normal noise, {_setting(name, level)}'
-             for name in unknown]
+    said += [f'The cause of the {NAMES[name]} noise is unknown: ' + (
+        'single samples vary less. ' if rest else 'there is no standstill to compare with. ')
+        + f'Mount the IMU firmly. If this is its normal noise, {_setting(name, level)}'
+        for name in unknown]
     return ' '.join(said)
 
 
