@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; the simulator checks their values."""
     add = parser.add_argument
     add('--scenario', required=True, metavar='NAME',
-        help='paper, straight, out_and_back, town, motorway or yard')
+        help='paper, straight, out_and_back, town, motorway, oval or yard')
     add('--out', required=True, metavar='BAG', help='bag to write; truth.yaml and '
         'calibrator.yaml are written to the same folder')
     add('--seed', type=int, metavar='N', help='seed of all random numbers (default 1); each seed '

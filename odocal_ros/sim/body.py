@@ -18,8 +18,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.sim.motion import Hills, inertial_v, Motion, State
+from odocal_ros.sim.motion import inertial_v, Motion, State
 from odocal_ros.sim.profile import hermite, Profile
+from odocal_ros.sim.road import Hills
 from odocal_ros.sim.zoo import G
 
 # physical: a car's body on its springs goes at some 1.3 Hz, damped by shock absorbers
@@ -28,24 +29,33 @@ DAMPING = 0.3
 
 
 def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
-          hills: Hills | None = None, wheelbase: float = 0.0) -> tuple[Profile, Profile]:
+          hills: Hills | None = None, wheelbase: float = 0.0,
+          cross: Hills | None = None) -> tuple[Profile, Profile]:
     """
     Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles.
 
     What holds it on a slope is a push too. Both axles stand on the road: the body lies along the
-    chord of the wheelbase, the rear axle moves along the road below it.
+    chord of the wheelbase, the rear axle moves along the road below it. ``cross`` is the slope
+    of the road to the right, whose force on the springs is left out.
     """
     hills = hills or Hills()
     step = 0.02    # s; a cubic between is then good to (w h)^4 / 384 = 2e-6
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
     v, s = speed(t), speed.integral()(t)
-    (here, here_by, _), (amid, amid_by, _) = hills(s), hills(s + wheelbase / 2)
+    here, here_by, _ = hills(s)
+    chord, chord_by = here, here_by
+    if wheelbase:
+        chord = (hills.rise(s + wheelbase) - hills.rise(s)) / wheelbase
+        chord_by = (hills(s + wheelbase)[0] - here) / wheelbase
     forward, side = speed.derivative().mean(t) + G * here, v * yaw_rate(t)
     # nose up is a negative pitch; in a turn to the left the left side goes up
     roll, roll_rate = sprung(body_roll * side, step)
     pitch, pitch_rate = sprung(-squat * forward, step)
-    return hermite(t, roll, roll_rate), hermite(t, pitch - (amid - here),
-                                                pitch_rate - (amid_by - here_by) * v)
+    if cross is not None:
+        lean, lean_by, _ = cross(s)
+        roll, roll_rate = roll + lean, roll_rate + lean_by * v
+    return hermite(t, roll, roll_rate), hermite(t, pitch - (chord - here),
+                                                pitch_rate - (chord_by - here_by) * v)
 
 
 def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:

@@ -148,8 +148,42 @@ def held_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
             {'speed_hold': KMH * float(rng.choice((0.2, 0.5)))})
 
 
+def filtered_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Send speeds behind a low-pass filter, as most speed signals of cars are."""
+    ratio = vehicle.options['scale'] / vehicle.options['nominal_scale']
+    return ({'odometer': 'speed', 'odometer_rate': 20.0, 'scale': ratio, 'nominal_scale': 1.0},
+            {'speed_filter': float(rng.uniform(0.2, 0.6))})
+
+
+def late_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Stamp fixes at reception, after a latency that varies."""
+    return {'fix_delay': 0.25}, {'fix_jitter': float(rng.uniform(0.05, 0.1))}
+
+
+def tunnels(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Dead-reckon in the receiver through tunnels, with an odometer and a gyro of its own."""
+    begins = rng.uniform((60.0, 300.0), (200.0, 420.0))
+    return {}, {'tunnels': tuple((float(b), float(rng.uniform(20.0, 120.0))) for b in begins),
+                'tunnel_odometer': float(rng.uniform(0.005, 0.02) * rng.choice((-1, 1))),
+                'tunnel_heading': float(DEG * rng.normal())}
+
+
+def reflections(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Receive only reflections beside a wall for half a minute, which come and go slowly."""
+    return {}, {'bursts': 20.0, 'burst_size': 12.0, 'burst_time': 30.0, 'burst_onset': 10.0}
+
+
+def kerbs(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Drive on ground that leans to the sides; in a yard over kerbs too."""
+    lean = {'cross_slope': float(DEG * rng.uniform(1.0, 2.0))}
+    if vehicle.kind != 'yard':
+        return {}, lean | {'cross_slope_length': 200.0, 'wheelbase': 2.7}
+    return {}, lean | {'kerbs': float(rng.uniform(0.04, 0.08)), 'wheelbase': 0.5}
+
+
 EFFECTS = {f.__name__: f for f in (
     coarse_speed, coarse_pulses, odometer_stamps, speed_law, warming, slip, sideslip, squat,
     lever_arms, receiver_lag, fix_stamps, slow_errors, multipath, covariance, outages)}
 # only with --effect NAME: receivers and buses of some vehicles
-RARE = {f.__name__: f for f in (fused_fixes, tracked_fixes, held_speed)}
+RARE = {f.__name__: f for f in (fused_fixes, tracked_fixes, held_speed, filtered_speed,
+                                late_fixes, tunnels, reflections, kerbs)}

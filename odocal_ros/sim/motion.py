@@ -31,6 +31,7 @@ from odocal_ros.nav.earth import (
 )
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.profile import Profile
+from odocal_ros.sim.road import Hills
 
 STEADY = Profile([0.0, 1.0], [[0.0]])     # definition: no sway
 GAUSS = tuple(zip(*np.polynomial.legendre.leggauss(4), strict=True))     # definition: on -1 to 1
@@ -44,20 +45,6 @@ class Start:
     longitude: float
     height: float
     yaw: float
-
-
-@dataclass(frozen=True)
-class Hills:
-    """Slope of the road by distance: slope * sin(2 pi s / length), rad, positive uphill."""
-
-    slope: float = 0.0
-    length: float = 1000.0   # m
-
-    def __call__(self, travel: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return slope and its first and second derivative by distance."""
-        k = 2 * np.pi / self.length
-        wave, along = self.slope * np.sin(k * travel), self.slope * np.cos(k * travel)
-        return wave, k * along, -k**2 * wave
 
 
 @dataclass(frozen=True, eq=False)

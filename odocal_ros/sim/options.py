@@ -114,6 +114,7 @@ DEFAULTS = {
     'out_and_back': {'duration': 600.0, 'imu_grade': 'industrial'},
     'town': {'duration': 600.0, 'imu_grade': 'consumer'},
     'motorway': {'duration': 600.0, 'imu_grade': 'industrial'},
+    'oval': {'duration': 600.0, 'imu_grade': 'industrial'},
     'yard': {'duration': 600.0, 'imu_grade': 'consumer'},
 }
 SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0

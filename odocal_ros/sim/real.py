@@ -27,9 +27,12 @@ WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_slope',
           'accel_slope', 'warm_rise', 'rectification', 'speed_law', 'warming', 'imu_arm_error',
           'odometer_arm_error', 'antenna_arm_error', 'receiver_odometer', 'sideslip',
-          'squat', 'body_roll')
+          'squat', 'body_roll', 'tunnel_odometer', 'tunnel_heading')
+PAIRS = {'slow_errors': 'sigma and correlation time, such as ((1.2,60),(0.9,900))',
+         'tunnels': 'begin and length, such as ((200,60),(400,30))'}
 POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_factor',
-            'receiver_odometer_time', 'imu_batch')
+            'receiver_odometer_time', 'imu_batch', 'burst_onset', 'kerb_distance',
+            'cross_slope_length')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +66,7 @@ class Real:
     speed_rounding: str = 'floor'    # floor or round
     dead_band: float = 0.0           # speeds below are sent as 0
     speed_hold: float = 0.0          # change of speed that is published
+    speed_filter: float = 0.0        # s, time constant of a low-pass filter on the speed
     odometer_jitter: float = 0.0     # s, 1 sigma, on top of odometer_delay
     speed_law: float = 0.0           # relative growth of the tyres at 36 m/s, as v^2
     warming: float = 0.0             # relative growth of the tyres, warm against cold
@@ -73,7 +77,11 @@ class Real:
     sideslip: float = 0.0            # rad per m/s^2 to the side, rear axle drifts outwards
     squat: float = 0.0               # rad per m/s^2, nose up
     wheelbase: float = 0.0           # m, on whose chord the body lies over a crest; 0: as the road
-    body_roll: float = 0.0           # rad per m/s^2, outwards
+    body_roll: float = 0.0           # rad per m/s^2, outwards; a banked curve is negative
+    kerbs: float = 0.0               # m up and down by turns
+    kerb_distance: float = 15.0      # m, mean, between them
+    cross_slope: float = 0.0         # rad, largest, to either side by turns
+    cross_slope_length: float = 20.0    # m of one turn of it
 
     imu_arm_error: Vector = NONE3        # m, configured less true
     odometer_arm_error: Vector = NONE3
@@ -88,6 +96,11 @@ class Real:
     bursts: float = 0.0              # multipath bursts per hour
     burst_size: float = 12.0         # m, median
     burst_time: float = 8.0          # s, median
+    burst_onset: float = 2.0         # s, mean, in which one comes and goes
+    # (begin, length) s each, in which the receiver dead-reckons by an odometer and a gyro
+    tunnels: tuple[tuple[float, float], ...] = ()
+    tunnel_odometer: float = 0.0     # relative scale error of this odometer
+    tunnel_heading: float = 0.0      # rad, heading error at the end of a tunnel's first minute
     drops: float = 0.0               # share of the fixes that never come
     fix_jitter: float = 0.0          # s, 1 sigma, on top of fix_delay
     stated_factor: float = 1.0       # stated sigma over true sigma
@@ -125,11 +138,10 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 
 def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
     """Return the numbers of a figure whose form is right."""
-    if name == 'slow_errors':
+    if name in PAIRS:
         if not (isinstance(value, tuple) and all(isinstance(v, tuple) and len(v) == 2
                                                  and v[1] for v in value)):
-            raise BadUsage('--real slow_errors: required: pairs of sigma and correlation time, '
-                           'such as ((1.2,60),(0.9,900))')
+            raise BadUsage(f'--real {name}: required: pairs of {PAIRS[name]}')
         return tuple(x for pair in value for x in pair)
     count = 3 if default is None else len(default) if isinstance(default, tuple) else 0
     if isinstance(value, tuple) != bool(count) or count and len(value) != count:

@@ -29,7 +29,7 @@ TRACKING = np.exp(-NODES / 2**0.5) * np.cos(NODES / 2**0.5) * np.repeat(np.diff(
 TRACKING /= TRACKING.sum()
 UP = 2.0             # judgement: errors of the height over those of east and north
 SPREAD = 0.9         # judgement: of the logarithm of a burst's size and length
-ONSET = (1.0, 3.0)   # s, judgement: in which a burst comes and goes
+ONSET = (0.5, 1.5)   # judgement: of the mean time in which a burst comes and goes
 
 
 def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
@@ -90,11 +90,30 @@ def burst_errors(t: Floats, options: SimOptions) -> Floats:
         begin, side = rng.uniform(0.0, t[-1]), rng.uniform(0, 2 * np.pi)
         size, length = (median * np.exp(SPREAD * rng.standard_normal())
                         for median in (real.burst_size, real.burst_time))
-        onset, up = rng.uniform(*ONSET), rng.normal()
+        onset, up = real.burst_onset * rng.uniform(*ONSET), rng.normal()
         x = np.clip(np.minimum(t - begin, begin + length + onset - t) / onset, 0.0, 1.0)
         shape = size * x**2 * (3 - 2 * x)
         total += shape[:, None] * [np.cos(side), np.sin(side), up]
     return total
+
+
+def reckoned(t: Floats, error: Floats, place: Floats, options: SimOptions) -> Floats:
+    """
+    Return errors of a receiver that dead-reckons in tunnels, and is right again after them.
+
+    error, place : (n, 3) m, ENU; the error at the entry stays.
+    """
+    real, out = options.real, error.copy()
+    for begin, length in real.tunnels:
+        inside = np.flatnonzero((t >= begin) & (t < begin + length))
+        if len(inside) < 2:
+            continue
+        steps = np.diff(place[inside], axis=0, prepend=place[inside[:1]])
+        turned = real.tunnel_heading * (t[inside, None] - begin) / 60
+        sideways = np.stack([-steps[:, 1], steps[:, 0], 0 * steps[:, 2]], -1)
+        out[inside] = error[inside[0]] + np.cumsum(
+            real.tunnel_odometer * steps + turned * sideways, axis=0)
+    return out
 
 
 def true_variance(white: Floats, options: SimOptions) -> Floats:

@@ -63,6 +63,16 @@ def leg_factor(state: State, real: Real) -> float:
     return float(np.abs(path_length).sum() / np.abs(counted).sum())
 
 
+def low_passed(speed: Floats, t: Floats, time: float) -> Floats:
+    """Return speeds behind a first-order filter of a time constant, s; 0: none."""
+    if not time:
+        return speed
+    out, share = speed.tolist(), -np.expm1(-np.diff(t) / time)
+    for k, a in enumerate(share.tolist(), 1):
+        out[k] = out[k - 1] + a * (out[k] - out[k - 1])
+    return np.array(out)
+
+
 def coarse(speed: Floats, real: Real) -> Floats:
     """Return the published speeds: in steps, 0 below the dead band, or held."""
     if real.speed_step:

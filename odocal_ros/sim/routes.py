@@ -105,6 +105,19 @@ def motorway(duration: float, rng: np.random.Generator) -> Route:
     return _route(stretches)
 
 
+def oval(duration: float, rng: np.random.Generator) -> Route:
+    """Return laps of an oval, left turns only: half circles and straights at 12 to 20 m/s."""
+    fast, straight = rng.uniform(12, 20), _tenth(rng.uniform(6, 12))
+    bend = _tenth(math.pi * fast / 4.0 + 3.0)     # at 4 m/s^2 to the side, with flanks of 3 s
+    left = _rest('oval', duration, 40 + 12 + 12 + 20, least=math.ceil(2 * (straight + bend)))
+    laps = int(left / (straight + bend))
+    rest = round(left - laps * (straight + bend), 9)
+    stretches = [(hold(40) + ramp(12, fast), hold(52))]
+    stretches += [(hold(straight + bend), hold(straight) + turn(bend, math.pi, 3.0))] * laps
+    stretches.append((ramp(12, -fast) + hold(20 + rest), hold(32 + rest)))
+    return _route(stretches)
+
+
 def yard(duration: float, rng: np.random.Generator) -> Route:
     """
     Return slow work in a yard: moves of 5 to 20 s at 0.6 to 2.2 m/s, turns, a fifth backwards.
@@ -178,4 +191,4 @@ def _clean(speed: Profile) -> Profile:
 
 
 ROUTES = {'paper': paper, 'straight': straight, 'out_and_back': out_and_back, 'town': town,
-          'motorway': motorway, 'yard': yard}
+          'motorway': motorway, 'oval': oval, 'yard': yard}

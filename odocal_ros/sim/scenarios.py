@@ -31,10 +31,11 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim import body, real_wheels, sensors
 from odocal_ros.sim.housing import own_angles
-from odocal_ros.sim.motion import attitude, Hills, Motion, Start
+from odocal_ros.sim.motion import attitude, Motion, Start
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Profile
+from odocal_ros.sim.road import Hills
 from odocal_ros.sim.routes import Route, ROUTES
 from odocal_ros.sim.vehicle_wheels import wheels_of
 from odocal_ros.sim.velocity import velocity
@@ -122,13 +123,26 @@ def motion_of(options: SimOptions) -> Motion:
     route = ROUTES[options.scenario](options.duration, stream(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))
-    real, hills, more = options.real, Hills(options.slope), {}
+    real, more = options.real, {}
+    hills = Hills(options.slope, kerbs=_kerbs(route, options))
     if options.sway or real.sideslip:
         more['sway'] = _sway(route, options)
-    if real.squat or real.body_roll or real.wheelbase:
+    if real.squat or real.body_roll or real.wheelbase or real.cross_slope:
         more['tilt'] = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll, hills,
-                                  real.wheelbase)
+                                  real.wheelbase,
+                                  Hills(real.cross_slope, real.cross_slope_length))
     return Motion(route.speed, route.yaw_rate, start, hills, **more)
+
+
+def _kerbs(route: Route, options: SimOptions) -> tuple[tuple[float, float], ...]:
+    """Return the kerbs along the path, up and down by turns: (distance, height) m each."""
+    real = options.real
+    if not real.kerbs:
+        return ()
+    ways = route.speed.integral()(np.arange(0.0, route.speed.end, 1.0))
+    gaps = stream(options.seed, 'kerbs').uniform(0.5, 1.5, int(np.ptp(ways) / real.kerb_distance))
+    begins = float(ways.min()) + np.cumsum(gaps * real.kerb_distance)
+    return tuple((float(s), real.kerbs * (-1)**k) for k, s in enumerate(begins))
 
 
 def _sway(route: Route, options: SimOptions) -> tuple[Profile, Profile]:

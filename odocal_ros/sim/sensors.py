@@ -152,7 +152,8 @@ def _reading(state: State, options: SimOptions, wheel: SimWheel) -> Floats | Int
         # slip of the moment: of a speed sent twice a second differences would smear it
         pulled = real_wheels.slip_share(state, real) * state.speed
         rate = (contact_speed(state, arm) + pulled + np.gradient(spun, state.t)) / grown
-        return real_wheels.coarse((rate + noise) / scale, real)
+        sent = real_wheels.low_passed(rate + noise, state.t, real.speed_filter)
+        return real_wheels.coarse(sent / scale, real)
     rolled = contact_travel(state, arm) + spun + real_wheels.tyre_slip(state, real)
     if wheel.steered:
         rolled = rolled + steered_path(state, arm)
@@ -202,6 +203,11 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     latitude, longitude, height = real_fixes.places(motion, t, options)
     error = real_fixes.fused(t, fix_errors(t, options) + real_fixes.errors(t, options), options)
     meridian, normal = radii(latitude)
+    by_rad = np.stack([(normal + height) * np.cos(latitude), meridian + height], -1)
+    # from the first fix: metres per radian change along the path
+    off = np.stack([longitude - longitude[:1], latitude - latitude[:1]], -1)
+    place = np.column_stack([by_rad * off, height])
+    error = real_fixes.reckoned(t, error, place, options)
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
     variance = real_fixes.true_variance(_axes(options) ** 2 * _power(options), options)

@@ -119,3 +119,22 @@ def test_fixes_are_dropped_at_random_and_stamped_late():
     n, kept = len(plain.fix.stamp_ns), len(real.fix.stamp_ns)
     assert kept == pytest.approx(0.8 * n, abs=5 * np.sqrt(n * 0.16))
     assert (np.diff(real.fix.stamp_ns) > 0).all()
+
+
+def test_a_receiver_in_a_tunnel_reckons_by_its_odometer_and_is_right_after_it():
+    tunnel, quiet = ((400.0, 60.0),), {'fix_sigma': 0.0, 'fix_rate': 1.0}
+    wrong, right = (simulate(replace(PAPER, real=Real(tunnels=tunnel, tunnel_odometer=x,
+                                                      tunnel_heading=y), **quiet))
+                    for x, y in ((0.02, 0.01), (0.0, 0.0)))
+    north_m, east_m = (6.36e6 * (getattr(wrong.fix, name) - getattr(right.fix, name))
+                       for name in ('latitude', 'longitude'))
+    t = (wrong.fix.stamp_ns - wrong.imu.stamp_ns[0]) * 1e-9
+    inside = (t >= 400) & (t < 460)
+    since = t[inside] - t[inside][0]
+    # to the north at 20 m/s; heading error grows by 0.01 rad a minute; 3e-3: metres of a radian
+    assert_allclose(north_m[inside], 0.02 * 20 * since, rtol=3e-3, atol=1e-6)
+    # 1: a step's turn is that of its end
+    assert_allclose(-east_m[inside] * np.cos(wrong.options.latitude),
+                    20 * 0.01 / 60 * since**2 / 2, rtol=5e-3, atol=0.01 / 60 * 20 * 60)
+    assert not north_m[~inside].any()
+    assert not east_m[~inside].any()

@@ -87,3 +87,11 @@ def test_a_coarse_speed_leaves_the_truth_alone():
     off = fine.odometer.value - coarse.odometer.value
     assert off.min() >= 0
     assert off.max() < 1 / 3.6
+
+
+def test_a_filtered_speed_lags_a_ramp_by_its_time_constant():
+    t = np.arange(0.0, 20.0, 0.05)
+    sent = real_wheels.low_passed(1.5 * t, t, 0.4)
+    # steps of first order: the input of a step counts as its end, half a step early
+    assert sent[-1] == pytest.approx(1.5 * (t[-1] - 0.4 + 0.025), abs=1.5 * 0.05**2 / 0.4)
+    assert real_wheels.low_passed(t, t, 0.0) is t

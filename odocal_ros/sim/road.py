@@ -1,0 +1,49 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The road under a vehicle: its slope by distance, of hills and kerbs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+
+KERB_LENGTH = 0.4    # m, judgement: in which a wheel of a robot climbs a kerb
+
+
+@dataclass(frozen=True)
+class Hills:
+    """Slope of the road by distance: slope * sin(2 pi s / length), rad, positive uphill; kerbs."""
+
+    slope: float = 0.0
+    length: float = 1000.0   # m
+    kerbs: tuple[tuple[float, float], ...] = ()    # (distance of its beginning, height) m each
+
+    def __call__(self, travel: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return slope and its first and second derivative by distance."""
+        k = 2 * np.pi / self.length
+        wave, along = self.slope * np.sin(k * travel), self.slope * np.cos(k * travel)
+        slope, by, by2 = wave, k * along, -k**2 * wave
+        for begin, height in self.kerbs:
+            x = np.clip((travel - begin) / KERB_LENGTH, 0.0, 1.0)
+            h = height / KERB_LENGTH
+            slope = slope + h * 30 * (x * (1 - x))**2
+            by = by + h / KERB_LENGTH * 60 * x * (1 - x) * (1 - 2 * x)
+            by2 = by2 + h / KERB_LENGTH**2 * 60 * (1 + 6 * x * (x - 1)) * ((x > 0) & (x < 1))
+        return slope, by, by2
+
+    def rise(self, travel: Floats) -> Floats:
+        """Return the integral of the slope from 0 on, m."""
+        k = 2 * np.pi / self.length
+        up: Floats = self.slope / k * (1 - np.cos(k * travel))
+        for begin, height in self.kerbs:
+            x = np.clip((travel - begin) / KERB_LENGTH, 0.0, 1.0)
+            up = up + height * x**3 * (10 + x * (6 * x - 15))
+        return up

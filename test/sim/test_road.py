@@ -1,0 +1,78 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+"""Kerbs, cross slopes and the oval: closed forms, and derivatives by differences."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.sim import body
+from odocal_ros.sim.motion import attitude
+from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.real import Real
+from odocal_ros.sim.road import Hills, KERB_LENGTH
+from odocal_ros.sim.scenarios import motion_of, simulate
+
+pytestmark = pytest.mark.core
+KERBS = ((5.0, 0.08), (9.0, -0.08))
+YARD = resolved(SimOptions(scenario='yard', duration=120.0))
+
+
+def test_a_kerb_rises_by_its_height_and_slopes_are_derivatives():
+    road, h = Hills(0.03, 70.0, KERBS), 1e-5
+    s = np.linspace(4.9, 9.6, 600)
+    slope, by, by2 = road(s)
+    # second differences of a quintic: h^2 of its third derivative, and round-off of 1e-16 / h
+    assert_allclose(slope, (road.rise(s + h) - road.rise(s - h)) / (2 * h), atol=1e-8)
+    assert_allclose(by, (road(s + h)[0] - road(s - h)[0]) / (2 * h), atol=1e-6)
+    inside = np.abs(np.mod(s - 5.0, 4.0) - KERB_LENGTH / 2) < KERB_LENGTH / 2 - 1e-3
+    assert_allclose(by2[inside], ((road(s + h)[1] - road(s - h)[1]) / (2 * h))[inside], atol=1e-4)
+    flat = Hills(kerbs=KERBS)
+    assert_allclose(flat.rise(np.array([4.9, 5.5, 9.5])), [0.0, 0.08, 0.0], atol=1e-15)
+
+
+def test_a_drive_over_kerbs_climbs_them_with_its_body_on_both_axles():
+    real = Real(kerbs=0.08, kerb_distance=2.0, wheelbase=0.5)
+    motion = motion_of(resolved(SimOptions(scenario='yard', duration=120.0, real=real)))
+    t = np.arange(0.0, 120.0, 0.05)
+    state = motion.at(t)
+    rise = motion.hills.rise(state.travel)
+    assert len(motion.hills.kerbs) > 3
+    assert np.ptp(state.height) > 0.07
+    # sin(slope) for slope: a sixth of the cube of 0.375 rad, over 0.4 m of each kerb
+    assert_allclose(state.height - state.height[0], rise - rise[0],
+                    atol=0.375**3 / 6 * 0.4 * len(motion.hills.kerbs))
+    x_n = (attitude(state) @ body.rotation(motion, t))[:, :, 0]
+    ahead = motion.hills.rise(state.travel + 0.5) - rise
+    # interpolated over 0.02 s, some 0.02 of a kerb's length
+    assert_allclose(np.arcsin(x_n[:, 2]), ahead / 0.5, atol=2e-3)
+
+
+def test_a_cross_slope_leans_the_vehicle_and_turns_gravity_into_its_side():
+    lean = np.radians(2.0)
+    drive = simulate(SimOptions(scenario='yard', duration=120.0, imu_grade='perfect', pitch=0.0,
+                                yaw=0.0, real=Real(cross_slope=lean)))
+    t = (drive.imu.stamp_ns - drive.imu.stamp_ns[0]) * 1e-9
+    still = np.abs(drive.motion.speed(t)) == 0
+    roll = np.arctan2(drive.imu.f_i[still, 1], drive.imu.f_i[still, 2])
+    want = lean * np.sin(2 * np.pi * drive.motion.at(t[still]).travel / 20.0)
+    assert np.ptp(want) > lean / 2
+    assert_allclose(roll, want, atol=1e-5)      # the Earth's turn has no force at rest
+
+
+def test_an_oval_turns_left_by_half_a_turn_at_each_end_and_closes():
+    motion = motion_of(resolved(SimOptions(scenario='oval', seed=3)))
+    assert motion.duration == 600.0
+    t = np.arange(0.0, 600.0, 0.1)
+    state = motion.at(t)
+    assert (state.yaw_rate >= 0).all()
+    halves = (state.yaw[-1] - state.yaw[0]) / np.pi
+    assert halves == pytest.approx(round(halves), abs=1e-9)
+    assert halves > 10
+    assert (np.abs(state.speed * state.yaw_rate) < 4.6).all()
