@@ -43,7 +43,7 @@ from zoo_table import FIGURES, WITHIN
 FIRST_SEED, SEEDS_A_RUN = 91_000_000, 1_000_000
 VEHICLES = (('industrial', RTK), ('consumer', {'fix_noise': 'correlated', 'fix_sigma': 1.5}))
 ROADS = ('town', 'motorway', 'out_and_back')
-BANKED = {'body_roll': -0.047}      # rad per m/s^2: half of the force to the side
+BANKED = {'banking': 0.5}
 RUNS = {        # effects, kinds of drive, figures of Real, reasons that name it
     'plain': ((), (*ROADS, 'yard'), {}, ()),
     'fused_fixes': (('fused_fixes',), ROADS, {}, ('FIXES_FOLLOW_ODOMETER',)),

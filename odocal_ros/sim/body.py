@@ -20,6 +20,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.motion import inertial_v, Motion, State
 from odocal_ros.sim.profile import hermite, Profile
+from odocal_ros.sim.real import Real
 from odocal_ros.sim.road import Hills
 from odocal_ros.sim.zoo import G
 
@@ -29,14 +30,12 @@ DAMPING = 0.3
 
 
 def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
-          hills: Hills | None = None, wheelbase: float = 0.0,
-          cross: Hills | None = None) -> tuple[Profile, Profile]:
+          hills: Hills | None = None, wheelbase: float = 0.0) -> tuple[Profile, Profile]:
     """
     Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles.
 
     What holds it on a slope is a push too. Both axles stand on the road: the body lies along the
-    chord of the wheelbase, the rear axle moves along the road below it. ``cross`` is the slope
-    of the road to the right, whose force on the springs is left out.
+    chord of the wheelbase, the rear axle moves along the road below it.
     """
     hills = hills or Hills()
     step = 0.02    # s; a cubic between is then good to (w h)^4 / 384 = 2e-6
@@ -51,11 +50,17 @@ def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
     # nose up is a negative pitch; in a turn to the left the left side goes up
     roll, roll_rate = sprung(body_roll * side, step)
     pitch, pitch_rate = sprung(-squat * forward, step)
-    if cross is not None:
-        lean, lean_by, _ = cross(s)
-        roll, roll_rate = roll + lean, roll_rate + lean_by * v
     return hermite(t, roll, roll_rate), hermite(t, pitch - (chord - here),
                                                 pitch_rate - (chord_by - here_by) * v)
+
+
+def leaning(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
+    """Return by how much the road leans to the right by time, rad: cross slopes, banked curves."""
+    step = 0.02    # s, as above
+    t = np.round(np.arange(0.0, speed.end + step, step), 9)
+    cross = Hills(real.cross_slope, real.cross_slope_length)
+    lean = cross(speed.integral()(t))[0] - real.banking * np.arctan(speed(t) * yaw_rate(t) / G)
+    return hermite(t, lean, np.gradient(lean, step))
 
 
 def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:

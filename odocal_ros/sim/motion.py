@@ -75,13 +75,14 @@ class Motion:
 
     sway : velocities along v's y and z axes (m/s), of a vehicle that slides and heaves.
     tilt : roll and pitch (rad) of the body on it; empty: the body is stiff.
+    lean : roll (rad) of the road under its wheels, which is in ``tilt`` too.
     """
 
     def __init__(self, speed: Profile, yaw_rate: Profile, start: Start,
                  hills: Hills | None = None, sway: tuple[Profile, ...] = (STEADY, STEADY),
-                 tilt: tuple[Profile, ...] = ()) -> None:
+                 tilt: tuple[Profile, ...] = (), lean: Profile | None = None) -> None:
         self.speed, self.yaw_rate, self.start = speed, yaw_rate, start
-        self.hills, self.sway, self.tilt = hills or Hills(), sway, tilt
+        self.hills, self.sway, self.tilt, self.lean = hills or Hills(), sway, tilt, lean
         self._jolt = [profile.derivative() for profile in sway]
         self._acceleration, self._travel = speed.derivative(), speed.integral()
         self._yaw_acceleration, self._turn = yaw_rate.derivative(), yaw_rate.integral()
@@ -252,15 +253,26 @@ def point(state: State, lever_arm_v: tuple[float, float, float],
     return geodetic_from_ecef(r_e + C @ np.asarray(lever_arm_v, dtype=float))
 
 
-def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float]) -> Floats:
-    """Return the metres that a wheel touching the ground at lever_arm_v has rolled: (n,)."""
+def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float],
+                   lean: Floats | float = 0.0) -> Floats:
+    """
+    Return the metres that a wheel touching the ground at lever_arm_v has rolled: (n,).
+
+    lean : rad, (n,) roll of the road, which turns the arm about the vehicle's x axis.
+    """
     _, y, z = lever_arm_v
-    return state.travel - y * state.turned - z * state.slope
+    if not np.any(lean):
+        return state.travel - y * state.turned - z * state.slope
+    side = y * np.cos(lean) - z * np.sin(lean)
+    turns = np.diff(state.turned, prepend=0.0)
+    return state.travel - np.cumsum((side + np.append(y, side[:-1])) / 2 * turns) - z * state.slope
 
 
-def contact_speed(state: State, lever_arm_v: Floats | tuple[float, float, float]) -> Floats:
+def contact_speed(state: State, lever_arm_v: Floats | tuple[float, float, float],
+                  lean: Floats | float = 0.0) -> Floats:
     """Return the speed of such a wheel, m/s: (n,)."""
     _, y, z = lever_arm_v
+    y = y * np.cos(lean) - z * np.sin(lean)
     speed: Floats = state.speed - y * turn_rate(state) - z * state.slope_rate
     return speed
 

@@ -77,7 +77,8 @@ class Real:
     sideslip: float = 0.0            # rad per m/s^2 to the side, rear axle drifts outwards
     squat: float = 0.0               # rad per m/s^2, nose up
     wheelbase: float = 0.0           # m, on whose chord the body lies over a crest; 0: as the road
-    body_roll: float = 0.0           # rad per m/s^2, outwards; a banked curve is negative
+    body_roll: float = 0.0           # rad per m/s^2, outwards
+    banking: float = 0.0             # share of a curve's force that its bank takes
     kerbs: float = 0.0               # m up and down by turns
     kerb_distance: float = 15.0      # m, mean, between them
     cross_slope: float = 0.0         # rad, largest, to either side by turns

@@ -125,12 +125,17 @@ def motion_of(options: SimOptions) -> Motion:
                   float(yaw_from_heading(options.heading)))
     real, more = options.real, {}
     hills = Hills(options.slope, kerbs=_kerbs(route, options))
-    if options.sway or real.sideslip:
-        more['sway'] = _sway(route, options)
-    if real.squat or real.body_roll or real.wheelbase or real.cross_slope:
-        more['tilt'] = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll, hills,
-                                  real.wheelbase,
-                                  Hills(real.cross_slope, real.cross_slope_length))
+    lean = (body.leaning(route.speed, route.yaw_rate, real)
+            if real.cross_slope or real.banking else None)
+    if lean:
+        more['lean'] = lean
+    if options.sway or real.sideslip or lean:
+        more['sway'] = _sway(route, options, lean)
+    if real.squat or real.body_roll or real.wheelbase or lean:
+        roll, pitch = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll, hills,
+                                 real.wheelbase)
+        roll = roll if lean is None else Profile(roll.breaks, roll.powers + lean.powers)
+        more['tilt'] = roll, pitch
     return Motion(route.speed, route.yaw_rate, start, hills, **more)
 
 
@@ -145,8 +150,12 @@ def _kerbs(route: Route, options: SimOptions) -> tuple[tuple[float, float], ...]
     return tuple((float(s), real.kerbs * (-1)**k) for k, s in enumerate(begins))
 
 
-def _sway(route: Route, options: SimOptions) -> tuple[Profile, Profile]:
-    """Return velocities to the side and up: straight lines between draws, less below 1 m/s."""
+def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Profile, Profile]:
+    """
+    Return velocities to the side and up: straight lines between draws, less below 1 m/s.
+
+    On a road that leans the axle's centre turns about the contact of the wheels below it.
+    """
     step = 0.1      # s between draws
     breaks = np.round(np.arange(0.0, route.speed.end + step, step), 9)
     size = options.sway * np.clip(np.abs(route.speed(breaks)), 0.0, 1.0)
@@ -154,9 +163,19 @@ def _sway(route: Route, options: SimOptions) -> tuple[Profile, Profile]:
     side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / step], -1)) for x in draws)
     if options.real.sideslip:
         v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, breaks)
-        drift = hermite(breaks, v, np.gradient(v, step))
-        side = Profile(breaks, drift.powers + np.pad(side.powers, ((0, 0), (0, 2))))
+        side = _with(side, v)
+    if lean:
+        phi, rate = lean(breaks), lean.derivative()(breaks) * options.odometer_lever_arm[2]
+        side, up = _with(side, rate * np.cos(phi)), _with(up, rate * np.sin(phi))
     return side, up
+
+
+def _with(sway: Profile, more: Floats) -> Profile:
+    """Return a velocity with another added, as cubics between its breaks."""
+    t = sway.breaks
+    added = hermite(t, more, np.gradient(more, t)).powers
+    lacking = added.shape[1] - sway.powers.shape[1]
+    return Profile(t, added + np.pad(sway.powers, ((0, 0), (0, lacking))))
 
 
 def simulate(options: SimOptions | None = None) -> Drive:

@@ -129,7 +129,8 @@ def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
     ns, t = stamps(motion.duration, options.odometer_rate, PHASE['odometer'])
     state = motion.at(t)
     stamp = options.start_ns + _late(ns, options, 'odometer')
-    return [OdometerSamples(stamp, stamp, _reading(state, options, wheel))
+    lean = motion.lean(t) if motion.lean else 0.0
+    return [OdometerSamples(stamp, stamp, _reading(state, options, wheel, lean))
             for wheel in wheels_of(options)]
 
 
@@ -143,7 +144,8 @@ def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
     return real_imu.stamped(ns, stream(options.seed, f'real {name} stamps'), delay, jitter)
 
 
-def _reading(state: State, options: SimOptions, wheel: SimWheel) -> Floats | Ints:
+def _reading(state: State, options: SimOptions, wheel: SimWheel,
+             lean: Floats | float) -> Floats | Ints:
     arm, scale = wheel.arm, wheel.scale
     real, spun = options.real, slip(state, options, wheel.draws)
     grown = 1 + real_wheels.growth(state, real)
@@ -151,10 +153,10 @@ def _reading(state: State, options: SimOptions, wheel: SimWheel) -> Floats | Int
         noise = options.speed_noise * stream(options.seed, 'speed').standard_normal(len(state.t))
         # slip of the moment: of a speed sent twice a second differences would smear it
         pulled = real_wheels.slip_share(state, real) * state.speed
-        rate = (contact_speed(state, arm) + pulled + np.gradient(spun, state.t)) / grown
+        rate = (contact_speed(state, arm, lean) + pulled + np.gradient(spun, state.t)) / grown
         sent = real_wheels.low_passed(rate + noise, state.t, real.speed_filter)
         return real_wheels.coarse(sent / scale, real)
-    rolled = contact_travel(state, arm) + spun + real_wheels.tyre_slip(state, real)
+    rolled = contact_travel(state, arm, lean) + spun + real_wheels.tyre_slip(state, real)
     if wheel.steered:
         rolled = rolled + steered_path(state, arm)
     if np.ndim(grown):

@@ -13,11 +13,12 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.sim import body
-from odocal_ros.sim.motion import attitude
+from odocal_ros.sim.motion import attitude, velocity_n
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.road import Hills, KERB_LENGTH
 from odocal_ros.sim.scenarios import motion_of, simulate
+from odocal_ros.sim.zoo import G
 
 pytestmark = pytest.mark.core
 KERBS = ((5.0, 0.08), (9.0, -0.08))
@@ -64,6 +65,23 @@ def test_a_cross_slope_leans_the_vehicle_and_turns_gravity_into_its_side():
     want = lean * np.sin(2 * np.pi * drive.motion.at(t[still]).travel / 20.0)
     assert np.ptp(want) > lean / 2
     assert_allclose(roll, want, atol=1e-5)      # the Earth's turn has no force at rest
+
+
+def test_the_contact_of_the_wheels_does_not_slide_in_a_banked_curve():
+    real = Real(banking=0.5)
+    options = resolved(SimOptions(scenario='oval', odometer_lever_arm=(0.0, 0.0, -0.3), real=real))
+    motion = motion_of(options)
+    t = np.arange(40.0, 120.0, 0.05)
+    state = motion.at(t)
+    side = np.swapaxes(attitude(state), 1, 2) @ velocity_n(state)[:, :, None]
+    w_v, h = body.rotation(motion, t), 1e-3
+    before, after = (body.rotation(motion, t + x) for x in (-h, h))
+    contact = side[:, :, 0] + (after - before) @ options.odometer_lever_arm / (2 * h)
+    assert np.ptp(side[:, 1]) > 0.01
+    assert_allclose(contact[:, 1:], 0.0, atol=2e-4)      # cubics of 0.1 s
+    curve = state.speed * state.yaw_rate
+    k = int(np.argmax(curve))
+    assert np.arctan2(w_v[k, 2, 1], w_v[k, 2, 2]) == pytest.approx(-np.arctan(curve[k] / G) / 2)
 
 
 def test_an_oval_turns_left_by_half_a_turn_at_each_end_and_closes():
