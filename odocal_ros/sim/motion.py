@@ -265,7 +265,8 @@ def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float
         return state.travel - y * state.turned - z * state.slope
     side = y * np.cos(lean) - z * np.sin(lean)
     turns = np.diff(state.turned, prepend=0.0)
-    return state.travel - np.cumsum((side + np.append(y, side[:-1])) / 2 * turns) - z * state.slope
+    by_turn: Floats = np.cumsum((side + np.append(y, side[:-1])) / 2 * turns)
+    return state.travel - by_turn - z * state.slope
 
 
 def contact_speed(state: State, lever_arm_v: Floats | tuple[float, float, float],

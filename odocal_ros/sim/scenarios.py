@@ -123,7 +123,8 @@ def motion_of(options: SimOptions) -> Motion:
     route = ROUTES[options.scenario](options.duration, stream(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))
-    real, more = options.real, {}
+    real = options.real
+    more: dict[str, Any] = {}
     hills = Hills(options.slope, kerbs=_kerbs(route, options))
     lean = (body.leaning(route.speed, route.yaw_rate, real)
             if real.cross_slope or real.banking else None)
