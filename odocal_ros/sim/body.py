@@ -38,7 +38,8 @@ def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
     chord of the wheelbase, the rear axle moves along the road below it.
     """
     hills = hills or Hills()
-    step = 0.02    # s; a cubic between is then good to (w h)^4 / 384 = 2e-6
+    # s; a cubic between is then good to (w h)^4 / 384 = 2e-6; a kerb is over within 0.2 s
+    step = 0.005 if hills.kerbs else 0.02
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
     v, s = speed(t), speed.integral()(t)
     here, here_by, _ = hills(s)
@@ -56,7 +57,7 @@ def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
 
 def leaning(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
     """Return by how much the road leans to the right by time, rad: cross slopes, banked curves."""
-    step = 0.02    # s, as above
+    step = 0.005 if real.kerbs else 0.02    # s, as above
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
     cross = Hills(real.cross_slope, real.cross_slope_length)
     lean = cross(speed.integral()(t))[0] - real.banking * np.arctan(speed(t) * yaw_rate(t) / G)

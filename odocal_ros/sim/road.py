@@ -15,7 +15,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 
-KERB_LENGTH = 0.4    # m, judgement: in which a wheel of a robot climbs a kerb
+KERB_LENGTH = 0.5    # m, judgement: in which a wheel of a robot climbs a kerb
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,10 @@ class Hills:
         for begin, height in self.kerbs:
             x = np.clip((travel - begin) / KERB_LENGTH, 0.0, 1.0)
             h = height / KERB_LENGTH
-            slope = slope + h * 30 * (x * (1 - x))**2
-            by = by + h / KERB_LENGTH * 60 * x * (1 - x) * (1 - 2 * x)
-            by2 = by2 + h / KERB_LENGTH**2 * 60 * (1 + 6 * x * (x - 1)) * ((x > 0) & (x < 1))
+            y = x * (1 - x)
+            slope = slope + h * 140 * y**3
+            by = by + h / KERB_LENGTH * 420 * y**2 * (1 - 2 * x)
+            by2 = by2 + h / KERB_LENGTH**2 * 840 * y * (1 - 5 * y)
         return slope, by, by2
 
     def rise(self, travel: Floats) -> Floats:
@@ -45,5 +46,5 @@ class Hills:
         up: Floats = self.slope / k * (1 - np.cos(k * travel))
         for begin, height in self.kerbs:
             x = np.clip((travel - begin) / KERB_LENGTH, 0.0, 1.0)
-            up = up + height * x**3 * (10 + x * (6 * x - 15))
+            up = up + height * x**4 * (35 + x * (x * (70 - 20 * x) - 84))
         return up
