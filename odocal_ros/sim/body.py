@@ -45,8 +45,9 @@ def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
     here, here_by, _ = hills(s)
     chord, chord_by = here, here_by
     if wheelbase:
-        chord = (hills.rise(s + wheelbase) - hills.rise(s)) / wheelbase
-        chord_by = (hills(s + wheelbase)[0] - here) / wheelbase
+        sine = (hills.rise(s + wheelbase) - hills.rise(s)) / wheelbase
+        chord = np.arcsin(sine)
+        chord_by = (np.sin(hills(s + wheelbase)[0]) - np.sin(here)) / wheelbase / np.cos(chord)
     forward, side = speed.derivative().mean(t) + G * here, v * yaw_rate(t)
     # nose up is a negative pitch; in a turn to the left the left side goes up
     roll, roll_rate = sprung(body_roll * side, step)

@@ -30,18 +30,19 @@ class Hills:
         """Return slope and its first and second derivative by distance."""
         k = 2 * np.pi / self.length
         wave, along = self.slope * np.sin(k * travel), self.slope * np.cos(k * travel)
-        slope, by, by2 = wave, k * along, -k**2 * wave
+        sine, by, by2 = np.zeros((3, *np.shape(travel)))    # of the slope of kerbs
         for begin, height in self.kerbs:
             x = np.clip((travel - begin) / KERB_LENGTH, 0.0, 1.0)
-            h = height / KERB_LENGTH
-            y = x * (1 - x)
-            slope = slope + h * 140 * y**3
-            by = by + h / KERB_LENGTH * 420 * y**2 * (1 - 2 * x)
-            by2 = by2 + h / KERB_LENGTH**2 * 840 * y * (1 - 5 * y)
-        return slope, by, by2
+            h, y = height / KERB_LENGTH, x * (1 - x)
+            sine += h * 140 * y**3
+            by += h / KERB_LENGTH * 420 * y**2 * (1 - 2 * x)
+            by2 += h / KERB_LENGTH**2 * 840 * y * (1 - 5 * y)
+        cosine = np.sqrt(1 - sine**2)
+        return (wave + np.arcsin(sine), k * along + by / cosine,
+                -k**2 * wave + by2 / cosine + by**2 * sine / cosine**3)
 
     def rise(self, travel: Floats) -> Floats:
-        """Return the integral of the slope from 0 on, m."""
+        """Return the height above that at 0, m: hills are so level that their slope is its sine."""
         k = 2 * np.pi / self.length
         up: Floats = self.slope / k * (1 - np.cos(k * travel))
         for begin, height in self.kerbs:

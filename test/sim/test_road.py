@@ -30,10 +30,12 @@ def test_a_kerb_rises_by_its_height_and_slopes_are_derivatives():
     s = np.linspace(4.9, 9.6, 600)
     slope, by, by2 = road(s)
     # h^2 of third derivatives, and round-off of 1e-16 / h
-    assert_allclose(slope, (road.rise(s + h) - road.rise(s - h)) / (2 * h), atol=1e-8)
+    # a hill's slope is its sine; on it a kerb's is less by the cosine of 0.37 rad: 0.03 * 0.07
+    assert_allclose(np.sin(slope), (road.rise(s + h) - road.rise(s - h)) / (2 * h), atol=2.1e-3)
+    flat = Hills(kerbs=KERBS)
+    assert_allclose(np.sin(flat(s)[0]), (flat.rise(s + h) - flat.rise(s - h)) / (2 * h), atol=1e-8)
     assert_allclose(by, (road(s + h)[0] - road(s - h)[0]) / (2 * h), atol=1e-6)
     assert_allclose(by2, (road(s + h)[1] - road(s - h)[1]) / (2 * h), atol=2e-4)
-    flat = Hills(kerbs=KERBS)
     assert_allclose(flat.rise(np.array([4.9, 5.6, 9.6])), [0.0, 0.08, 0.0], atol=1e-15)
 
 
@@ -45,12 +47,10 @@ def test_a_drive_over_kerbs_climbs_them_with_its_body_on_both_axles():
     rise = motion.hills.rise(state.travel)
     assert len(motion.hills.kerbs) > 3
     assert np.ptp(state.height) > 0.07
-    # sin(slope) for slope: a sixth of the cube of 0.35 rad, over 0.5 m of each kerb
-    assert_allclose(state.height - state.height[0], rise - rise[0],
-                    atol=0.35**3 / 6 * 0.5 * len(motion.hills.kerbs))
+    assert_allclose(state.height - state.height[0], rise - rise[0], atol=1e-4)
     x_n = (attitude(state) @ body.rotation(motion, t))[:, :, 0]
     ahead = motion.hills.rise(state.travel + 0.5) - rise
-    assert_allclose(np.arcsin(x_n[:, 2]), ahead / 0.5, atol=1e-5)
+    assert_allclose(x_n[:, 2], ahead / 0.5, atol=1e-5)
 
 
 def test_a_cross_slope_leans_the_vehicle_and_turns_gravity_into_its_side():
