@@ -25,7 +25,6 @@ from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.outside import Velocity
 from odocal_ros.calib.smoother.outside_rows import OutsideRows, Rows
 from odocal_ros.calib.smoother.preintegrate import Points, turn
-from odocal_ros.calib.smoother.signals import lasting, UPRIGHT
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     ACCEL_AXIS,
@@ -44,7 +43,7 @@ from odocal_ros.calib.smoother.state import (
     VELOCITY_SCALE,
     YAW,
 )
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.receiver_filter import smoothing
 from odocal_ros.nav.rotations import skew, transpose
 
@@ -114,19 +113,10 @@ def _velocity(problem: 'Problem', point: LinearisationPoint, points: Points) -> 
     c[:, :, GNSS_ARM] = -W @ state.C_bv
     c[:, :, VELOCITY_DELAY], c[:, :, VELOCITY_LAG2] = faster, -by_lag
     c[:, :, GYRO_SCALE] = J[:, :, BG.start + 2] * rate[:, 2:]
-    c[:, :, ACCEL] = C @ _signals(point, k, turn(transpose(C), faster - g)) * t
+    force, signals = turn(transpose(C), faster - g), np.zeros((m, 3, len(ACCEL_AXIS)))
+    # as fitted, (m, 3) m/s^2, by the axes that it enters
+    signals[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]
+    c[:, :, ACCEL] = C @ signals * t
     J, c = J[:, :2] * times, c[:, :2] * times
     c[:, :, VELOCITY_SCALE] = -v[:, :2]
     return Rows(k, sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
-
-
-def _signals(point: LinearisationPoint, k: Ints, force: Floats) -> Floats:
-    """
-    Return what errors of the accelerometer multiply, by the axes they enter: (m, 3, a) m/s^2.
-
-    As of the intervals (signals.py) it is the force as fitted, and upright what lasts of it.
-    """
-    force[:, UPRIGHT] = lasting(point.intervals.mean_force, point.intervals.T)[k, UPRIGHT]
-    out = np.zeros((len(k), 3, len(ACCEL_AXIS)))
-    out[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]
-    return out
