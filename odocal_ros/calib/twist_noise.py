@@ -21,6 +21,8 @@ from odocal_ros.calib.smoother.state import FAST_SPEED
 from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.config import SIDES
 
+SWAY_TIME = 0.1      # s; judgement: a body does not change its sideways velocity faster
+
 
 @dataclass(frozen=True, eq=False)
 class TwistNoise:
@@ -64,13 +66,17 @@ class TwistNoise:
         turned, hard = min(max(v, 0.02), 1.0) / T, odometer['hard']
         reading = (K * odometer['reading'])**2 / T**2       # of one reading; an interval has two
         along = (1 - hard) * noise['along']**2 + hard * noise['along_hard']**2
+        swayed = turned * T / max(T, SWAY_TIME)
+        grid = noise.get('steps')
+        if grid is not None:      # the fit does not use the integral of such a speed
+            along, reading = 0.0, 0.0
         side = noise['side_turn' if w > TURNING_RATE else 'side']**2
         white = leg['widened']**2 * np.array(
-            [along * turned + 2 * reading, side * turned, noise['up']**2 * turned])
+            [along * turned + 2 * reading, side * swayed, noise['up']**2 * swayed])
         arm_x, arm_y = (_square(self._known(f'odometer_lever_arm_{axis}')) for axis in 'xy')
         constant = np.array([self._scale_variance(leg, v) + arm_y * w**2,
                              _square(_of(leg['sideslip'])) * (v**2 * w)**2 + arm_x * w**2, 0.0])
-        coarse = (K * odometer['speed_step'])**2 / 12 + (
+        coarse = (K * odometer['speed_step'])**2 / 12 * max(grid or 1.0, 1.0)**2 + (
             (factor - K) / K * v - K * leg['speed_offset']['value'])**2 * (factor != K)
         return np.append(white + constant + [coarse, 0.0, 0.0],
                          self._turn_rate(leg, v, w, turned, reading))

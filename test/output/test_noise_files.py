@@ -67,6 +67,18 @@ def test_the_table_by_speed_and_turn_rate(smoothed):
     assert slid[-1] == pytest.approx(expected[-1] - expected[1], rel=0.02)
 
 
+def test_of_a_speed_in_coarse_steps_only_the_grid_counts(smoothed):
+    """The fit does not use the integral of such a speed: its travel noise is not estimated."""
+    leg = smoothed.legs[0]
+    details = leg.methods['smoother'].details
+    details = details | {'noise': details['noise'] | {'steps': 1.2, 'along_hard': 1.0},
+                         'odometer': details['odometer'] | {'reading': 0.0, 'speed_step': 5.0}}
+    method = replace(leg.methods['smoother'], details=details)
+    text = written(replace(smoothed, legs=(replace(leg, methods={'smoother': method}),)))[TWIST]
+    x = blocks(text)['diff_drive_controller'][foreign_keys.TWIST_COVARIANCE][0]
+    assert x == pytest.approx((0.05 * 5)**2 / 12 * 1.2**2, rel=0.01)
+
+
 def test_one_wheel_gives_no_turn_rate(smoothed):
     estimates = {name: e for name, e in smoothed.estimates.items() if name != 'track_width'}
     text = written(replace(smoothed, estimates=estimates))[TWIST]
