@@ -24,7 +24,7 @@ from odocal_ros.settings.config import GnssConfig
 # temperature 0.48 or less; where fix errors are most of the variance (always 1 m/s, fixes of
 # 0.8 m), odometers 0.65
 EXPLAINED, EXPLAINED_OF_NOISE = 0.9, 0.5
-FEWEST = 10      # judgement: cells of a path that can be compared
+FEWEST_STEPS = 10      # judgement: cells of a path that can be compared
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Match:
 
 
 # definition: of no comparison
-NONE = Match(0.0, 0.0, False)
+NO_MATCH = Match(0.0, 0.0, False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,20 +60,20 @@ class FixPath:
 
     def match(self, t_ns: Ints, travel: Floats) -> Match:
         """Return the comparison with a travel, (n,) in any unit at (n,) rising arrival times."""
-        if len(t_ns) < FEWEST:
-            return NONE
+        if len(t_ns) < FEWEST_STEPS:
+            return NO_MATCH
         inside = (self.t_ns[:-1] >= t_ns[0]) & (self.t_ns[1:] <= t_ns[-1])
         step = np.diff(np.interp(self.t_ns, t_ns, travel))[inside]
         length, run = self.length[inside], np.abs(step)
         moved = (run > 0) & (length > length.mean()) if len(length) else inside[:0]
-        if len(length) < FEWEST or not moved.any() or not np.isfinite(run).all():
-            return NONE
+        if len(length) < FEWEST_STEPS or not moved.any() or not np.isfinite(run).all():
+            return NO_MATCH
         error = np.abs(length - np.median(length[moved] / run[moved]) * run)
         outliers = 0.05      # share of cells with a reset of a counter or a jump of the fixes
         kept = error <= np.quantile(error, 1 - outliers)
         length, run, step = length[kept], run[kept], step[kept]
         if not run.any() or not np.ptp(length):
-            return NONE
+            return NO_MATCH
         scale = float(length.sum() / run.sum())
         left = float(np.mean((length - scale * run)**2))
         explained = 1 - left / float(np.var(length))
@@ -86,7 +86,7 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     """Return the path of the usable fixes by arrival time; None if it is too short."""
     use, covariance_n, _ = usable_fixes(rows, len(rows.stamp_ns), gnss)
     use &= np.append(True, np.diff(rows.received_ns) > 0)
-    if use.sum() < FEWEST:
+    if use.sum() < FEWEST_STEPS:
         return None
     t_ns = rows.received_ns[use]
     t = (t_ns - t_ns[0]) * 1e-9
