@@ -25,6 +25,10 @@ ROS2_CONTROLLERS = {     # ros2_controllers, <name>/src/<name>.yaml or <name>_pa
     'tricycle_steering_controller': {'traction_wheels_radius'},
     'bicycle_steering_controller': {'traction_wheel_radius'},
     'tricycle_controller': {'wheel_radius'}}
+# ros2_controllers, diff_drive_controller_parameter.yaml: six values, in the order of a Twist
+TWIST_COVARIANCE = 'twist_covariance_diagonal'
+# VINS-Fusion forks with wheels (VIW-Fusion), estimator/parameters.cpp; m/s per sqrt(Hz)
+WHEEL_INERTIAL = 'wheel_velocity_noise_sigma'
 DEVICES = {              # how the line begins that the system is to be given
     'u-blox': 'CFG-SFODO-FACTOR = ',          # ZED-F9R application note UBX-22035176, page 22
     'SBG': 'gain: ',                          # sbg_ros2_driver, config/example; sbgEComCmdOdo.h

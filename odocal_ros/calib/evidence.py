@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from odocal_ros.calib.drive import rate_over_second
 from odocal_ros.calib.marks import MarkFix, Path
 from odocal_ros.calib.sections import Sections, sections
+from odocal_ros.calib.speed_scale import NO_BINS, speed_scale, SpeedScale
 from odocal_ros.data.arrays import Bools, Complexes, Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row, chunks
@@ -59,6 +60,7 @@ class Evidence:
     excluded: int
     gaps: tuple[tuple[str, float, float], ...] = ()   # of Imu and odometer: which, begin, end
     t_fit: float = np.inf                # s: what comes after it was kept back from the fit
+    by_speed: SpeedScale = SpeedScale(NO_BINS)     # of the odometer as sent
 
 
 def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools, pin: MarkFix,
@@ -118,7 +120,7 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
         sections=sections(fix_distance, fixed_n, fix_n, sigma),
         t_excluded=t_out[x], excluded_because=tuple(because[i] for i in x),
         fixes=len(t_fix), excluded=len(because), gaps=_gaps(inputs, span, config),
-        t_fit=t_fit)
+        t_fit=t_fit, by_speed=speed_scale(t_fix, fix_n, fixed_n, fix_distance, inputs.travel))
 
 
 def _gaps(inputs: Inputs, span: tuple[float, float],

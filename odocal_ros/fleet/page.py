@@ -20,7 +20,7 @@ import numpy as np
 
 from odocal_ros import __version__
 from odocal_ros.fleet.outcome import remarks
-from odocal_ros.fleet.population import LEAST, population
+from odocal_ros.fleet.population import LEAST, Population, population
 from odocal_ros.fleet.second_stage import COMPARED, file_name
 from odocal_ros.fleet.tables import LEGS
 from odocal_ros.output.figures import with_sigma
@@ -76,14 +76,20 @@ def _model(model: str, unit: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
                              for key in (name, f'{name}_sigma')))
         few = len(have) < LEAST
         if name == 'scale_factor':
-            cells += [f'{with_sigma(found.mean, found.sigma)} {unit}',
+            cells += [f'{_mean(found, few)} {unit}',
                       '-' if few else f'{100 * found.spread / found.mean:.2f} %']
         else:
-            cells += [with_sigma(found.mean, found.sigma, DEG, signed=True),
+            cells += [_mean(found, few, DEG, signed=True),
                       '-' if few else f'{DEG * found.spread:.2f}']
     far = sorted(row['vehicle'] for row in rows if row['outlier'])
     return {'model': model, 'vehicles': len(rows), 'cells': cells, 'far': ', '.join(far[:20])
             + (f' and {len(far) - 20} more' if len(far) > 20 else '')}
+
+
+def _mean(found: Population, few: bool, factor: float = 1.0, signed: bool = False) -> str:
+    """Return the mean of a model, without its sigma if there are too few vehicles for one."""
+    text = with_sigma(found.mean, found.sigma, factor, signed)
+    return text.partition(' ±')[0] if few else text
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:

@@ -24,8 +24,10 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.export_rerun import INSTALL as RERUN, rrd
+from odocal_ros.library.export_speed import draw_scale_by_speed, scale_by_speed
 from odocal_ros.library.residuals import Left, left_in, residuals
 from odocal_ros.library.series import Series, stacked, states, trajectory
+from odocal_ros.output.pictures import PICTURES
 from odocal_ros.outside.whole import whole_file
 
 TABLES = 'pip install pandas pyarrow'
@@ -146,11 +148,12 @@ def _there(module: str) -> bool:
 
 
 SERIES: dict[str, Callable[[Calibration], Series]] = {
-    'trajectory': trajectory, 'track': trajectory, 'states': states, 'residuals': residuals}
+    'trajectory': trajectory, 'track': trajectory, 'states': states, 'residuals': residuals,
+    'scale_by_speed': scale_by_speed}
 TEXTS = {'tum': tum, 'csv': csv, 'kml': kml}
 KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
-    f'{name}.{ending}' for name in ('trajectory', 'states', 'residuals')
-    for ending in ('csv', 'parquet')))
+    f'{name}.{ending}' for name in ('trajectory', 'states', 'residuals', 'scale_by_speed')
+    for ending in ('csv', 'parquet')), *(f'scale_by_speed{ending}' for ending in PICTURES))
 
 
 def check_names(files: Iterable[Path | str]) -> None:
@@ -187,7 +190,9 @@ def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
 
 def _write(result: Calibration, file: Path) -> None:
     name, ending = file.stem, file.suffix[1:]
-    if ending == 'mcap':
+    if file.suffix in PICTURES:
+        draw_scale_by_speed(result, file)
+    elif ending == 'mcap':
         mcap(result, file)
     elif ending == 'rrd':
         rrd(result, file)

@@ -74,6 +74,9 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
     'nav_msgs/msg/Odometry': (
         *_HEADER, 'string child_frame_id', *_pose('pose.pose'), 'float64[36] pose.covariance',
         *_twist('twist.twist'), 'float64[36] twist.covariance'),
+    'autoware_vehicle_msgs/msg/VelocityReport': (
+        *_HEADER, 'float32 longitudinal_velocity', 'float32 lateral_velocity',
+        'float32 heading_rate'),
     'std_msgs/msg/Int32MultiArray': (*_LAYOUT, 'int32[] data'),
     'std_msgs/msg/Int64MultiArray': (*_LAYOUT, 'int64[] data'),
 } | {f'std_msgs/msg/{name}': (f'{name.lower()} data',) for name in (

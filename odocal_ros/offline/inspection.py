@@ -28,12 +28,27 @@ from odocal_ros.messages.decode import Deserialize, make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.offline import survey
+from odocal_ros.offline.fix_path import fix_path, FixPath, Match
 from odocal_ros.offline.inspection_drive import closed, look
+from odocal_ros.offline.odometer_search import (
+    best_topic,
+    configured,
+    match_of,
+    only_near_best,
+    searched,
+    still,
+)
 from odocal_ros.offline.suggest import command, left_open, likely_mapping
-from odocal_ros.offline.wheel_survey import FIELDS as LISTS, in_words, suggested, Values
+from odocal_ros.offline.wheel_survey import (
+    alone,
+    FIELDS as LISTS,
+    in_words,
+    suggested,
+    Values,
+)
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, SIDES
 
 # what only a method that begins with an alignment, or sees the ends alone, minds
 ENDS = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARABLE, Code.LEG_NOT_STRAIGHT}
@@ -68,8 +83,16 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     Times are seconds from the bag's first message, angles rad, the rest SI.
     """
     taps, refused = _taps(bag, config, overrides)
-    bag.read(taps, print)       # a tap gives nothing on
+    search = searched(bag.topics, taps, overrides.values())
+    bag.read({**taps, **search}, print)       # a tap gives nothing on
     mapping, config = likely_mapping(bag.topics, config, overrides)
+    turn = _turn(taps[mapping['imu']]) if mapping.get('imu') in taps else None
+    fixes = fix_path(taps[mapping['fix']].recorder.rows('fix'), config.gnss) if mapping.get(
+        'fix') in taps else None
+    lists = {name: tap.values.facts(turn, fixes) for name, tap in taps.items() if tap.values}
+    matches = _matches(taps, lists, fixes) if fixes else {}
+    idle = still(matches)
+    mapping, config = likely_mapping(bag.topics, config, overrides, idle)
     topics = [_topic(bag, info, taps.get(name), refused.get(name, ''))
               for name, info in bag.topics.items()]
     found: dict[str, Any] = {
@@ -78,10 +101,26 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         'start_utc': datetime.fromtimestamp(bag.start_ns // 10**9, UTC).isoformat(),
         'messages': sum(info.count for info in bag.topics.values()),
         'notes': [note for note in bag.notes if isinstance(note, str)],
-        'topics': topics, 'mapping': mapping, 'mounting': None, 'drive': None,
+        'topics': topics, 'mapping': mapping, 'still': sorted(idle),
+        'mounting': None, 'drive': None,
         'standstills': [], 'legs': [], 'each_stop': [], 'straight': []}
     findings: list[Reason] = [note for note in bag.notes if isinstance(note, Reason)]
-    extra = _wheels(taps, mapping, config, topics)
+    for facts in topics:
+        if 'odometer' in facts:
+            facts['odometer']['still'] = facts['name'] in idle
+        if fixes and (tried := search.get(facts['name'])) and not tried.trouble:
+            facts['fields'] = tried.facts(fixes)
+    only_near_best([facts['fields'] for facts in topics if 'fields' in facts])
+    own = config
+    if mapping.get('odometer') not in taps and (
+            best := best_topic(topics, overrides.get('odometer', ''))):
+        mapping['odometer'] = best['name']
+        extra = search[best['name']].settings(best['fields']['found'], turn)
+    else:
+        extra = _wheels(taps, mapping, config, topics, lists)
+    if extra:
+        config = configured(config, extra)
+        _read_again(bag, taps, mapping['odometer'], config, topics)
     if {'imu', 'odometer'} <= mapping.keys():
         extra += look(bag, _together(taps, mapping), config, found, findings)
     findings += _lacking(found, mapping, config)
@@ -91,8 +130,8 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     found['findings'] = [reason.as_dict() | {'only': 'two_point' if (
         config.method != 'two_point' and reason.code in ends) else None}
         for reason in dict.fromkeys(findings)]
-    found['open'] = left_open(bag.topics, config, overrides)
-    found['command'] = command(path, bag.topics, config, overrides, mapping, extra)
+    found['open'] = left_open(bag.topics, own, overrides)
+    found['command'] = command(path, bag.topics, own, overrides, mapping, extra)
     plain: dict[str, Any] = _plain(found)
     return plain
 
@@ -154,28 +193,49 @@ def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[st
     return facts
 
 
+def _matches(taps: dict[str, _Tap], lists: dict[str, list[dict[str, Any]]],
+             fixes: FixPath) -> dict[str, Match]:
+    """Return the comparison of each odometer topic with the path of the fixes."""
+    found = {name: match_of(tap.recorder.rows('odometer'), tap.reader.form, fixes)
+             for name, tap in taps.items() if tap.reader.form and not lists.get(name)}
+    grows = {name: any(one['scale'] for one in some) for name, some in lists.items() if some}
+    return found | {name: Match(float(some), 0.0, some) for name, some in grows.items()}
+
+
 def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
-            topics: list[dict[str, Any]]) -> list[str]:
-    """Return the travel of each joint or entry of an odometer, and the settings for the wheels."""
+            topics: list[dict[str, Any]], lists: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """Return the settings for the wheels; add the travel of each joint or entry to ``topics``."""
     options: list[str] = []
     open_ = not (config.odometer.keys or config.odometer.field)
-    listed = [(tap, tap.values, facts) for facts in topics
-              if (tap := taps.get(facts['name'])) and tap.values]
-    turn = _turn(taps[mapping['imu']]) if listed and mapping.get('imu') in taps else None
-    for tap, values, facts in listed:
-        facts['values'] = values.facts(turn)
-        if len(facts['values']) > 1:
-            facts['moves'] = in_words(facts['values'])
+    for facts in topics:
+        if facts['name'] not in lists:
+            continue
+        tap, moves = taps[facts['name']], lists[facts['name']]
+        facts['values'] = moves
+        if len(moves) > 1:
+            facts['moves'] = in_words(moves)
         form = tap.reader.form
         assert form is not None      # a topic of lists is an odometer's
         if form.chosen:
             facts['chosen'] = form.chosen
         if facts['name'] == mapping.get('odometer') and open_:
             named = tap.reader.wheels if form.sides else ()
-            options += suggested(facts['values']) if len(named) < 2 else [
-                f'odometer.{side}={key}' for side, key in zip(('left', 'right'), named,
-                                                              strict=True)]
+            rolling = {one['key'] for one in moves if one['rolls']}
+            if len(named) > 1 and rolling.issuperset(named):
+                options += [f'odometer.{side}={key}' for side, key in zip(
+                    SIDES, named, strict=True)]
+            else:
+                options += suggested(moves) or alone(moves, tap.reader.wheels)
     return options
+
+
+def _read_again(bag: Bag, taps: dict[str, _Tap], topic: str, config: Config,
+                topics: list[dict[str, Any]]) -> None:
+    """Read the odometer with the settings that were found."""
+    tap = taps[topic] = _Tap(make_reader('odometer', bag.topics[topic].msgtype, config))
+    bag.read({topic: tap}, print)
+    facts = next(facts for facts in topics if facts['name'] == topic)
+    facts.update(_topic(bag, bag.topics[topic], tap, '') | facts)
 
 
 def _turn(imu: _Tap) -> tuple[Ints, Floats] | None:

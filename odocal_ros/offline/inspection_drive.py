@@ -9,6 +9,7 @@
 
 """What a bag's inputs show together: units, axes, standstills, legs."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from odocal_ros.offline.stretches import (
     survey_drive,
 )
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.sanity import imu_sanity, MAX_RATE
 from odocal_ros.screening.screen import Inputs, screen
 from odocal_ros.settings.config import Config
@@ -79,7 +81,8 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
         findings += far_from_nominal(float(f'{scale:.3g}'), inputs.scale_unit,
                                      nominal_scale(config, inputs.scale_unit), config)
     found['standstills'] = [[base + a, base + b] for a, b in drive.stops.tolist()]
-    options += _axes(inputs, w_i, f_i, drive, config, found, findings)
+    options += _axes(inputs, w_i, f_i, drive, config, found, findings) + _sigma_limit(
+        recorder, config)
     options += _legs(bag, recorder, inputs, drive, first, config, found)
     return options
 
@@ -111,15 +114,25 @@ def _units(inputs: Inputs, config: Config,
     return options, w_i, f_i
 
 
+def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
+    """Return the default of gnss.max_sigma as an option if the limit drops most of the fixes."""
+    rows = recorder.rows('fix')
+    every, kept = (int(usable_fixes(rows, 0, replace(config.gnss, max_sigma=limit))[0].sum())
+                   for limit in (0.0, config.gnss.max_sigma))
+    return ['gnss.max_sigma=nan'] if kept < every / 2 else []
+
+
 def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: Drive, config: Config,
           found: dict[str, Any], findings: list[Reason]) -> list[str]:
     """Return the IMU orientation, and whether its gyro turns with the course."""
     m = mounting(inputs.t_imu, w_i, f_i, inputs.travel, drive.scale or 1.0)
+    if not inputs.felt:
+        m = replace(m, C_bi=None)      # gravity is made up
     set_already = bool(np.any(config.imu.mounting_rpy))
     agrees = m.C_bi is not None and np.allclose(
         m.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
     found['mounting'] = {
-        'rpy': m.rpy, 'assumed_forward': m.assumed, 'off': m.off,
+        'accelerometer': inputs.felt, 'rpy': m.rpy, 'assumed_forward': m.assumed, 'off': m.off,
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}

@@ -16,7 +16,7 @@ from typing import Any
 
 from odocal_ros.data.samples import LOCAL
 from odocal_ros.output.summary import WIDTH
-from odocal_ros.outside.names import one_line
+from odocal_ros.outside.names import for_shell, one_line
 
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
           str(LOCAL): 'positions in a local frame'}
@@ -27,7 +27,7 @@ def text(found: dict[str, Any]) -> str:
     roles = {topic: slot for slot, topic in found['mapping'].items()}
     blocks = [_head(found), _topics(found, roles)]
     blocks += [_details(topic, roles) for topic in found['topics']
-               if 'timing' in topic or 'moves' in topic]
+               if {'timing', 'moves', 'fields'} & topic.keys()]
     blocks += [_drive(found), _findings(found), _length_text(found)]
     return '\n\n'.join('\n'.join(block) for block in blocks if block)
 
@@ -60,12 +60,31 @@ def _short(msgtype: str) -> str:
 
 def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:
     """Return the description of one input, one statement per line."""
-    points = [*_of_imu(topic), *_of_odometer(topic), *_of_fix(topic), *_of_timing(topic)]
+    points = [*_of_fields(topic), *_of_imu(topic), *_of_odometer(topic), *_of_fix(topic),
+              *_of_timing(topic)]
     if topic.get('trouble'):
         points.append(topic['trouble'])
     if topic['name'] not in roles and not any('warning:' in p for p in points):
-        points = points[:2]      # of topics not used, a look is enough
+        points = points[:2 + len(topic.get('moves', ()))]     # of topics not used, a look
     return [one_line(topic['name']), *(line for point in points for line in _wrapped(point, 2))]
+
+
+def _of_fields(topic: dict[str, Any]) -> Iterator[str]:
+    """Return a statement for each field of an unknown type that follows the path of the fixes."""
+    fields = topic.get('fields')
+    if not fields:
+        return
+    for field in fields['found']:
+        unit = 'm/count' if field['whole'] and field['quantity'] != 'rate' else 'm per unit'
+        grows = (f'is proportional to the speed, {field["scale"]:.3g} m/s per unit'
+                 if field['quantity'] == 'rate' else f'grows with distance, '
+                 f'{field["scale"]:.3g} {unit}' + ' (counts since the previous message)' * (
+                     field['quantity'] == 'increment'))
+        yield (f'{topic["name"]}.{field["path"]} {grows}: '
+               f'{for_shell([w for s in field["settings"] for w in ("--set", s)])}')
+    if not fields['found']:
+        yield (f'no numeric field grows with the distance between the fixes ({fields["tried"]} '
+               'tried)')
 
 
 def _of_imu(topic: dict[str, Any]) -> Iterator[str]:
@@ -113,6 +132,8 @@ def _of_odometer(topic: dict[str, Any]) -> Iterator[str]:
     if odometer['least'] is None:
         yield 'warning: no valid value'
         return
+    if odometer['quantity'] == 'rate' and odometer.get('still'):
+        what = 'one component of a velocity, not the speed along the path of the fixes'
     yield f'{what}: {odometer["least"]:.6g} to {odometer["most"]:.6g} {unit}'
     if odometer['not_finite']:
         yield f'warning: {odometer["not_finite"]} messages hold NaN or Inf'
@@ -205,6 +226,9 @@ def _leg(leg: dict[str, Any]) -> str:
 
 
 def _mounting(mounting: dict[str, Any]) -> list[str]:
+    if not mounting['accelerometer']:
+        return _wrapped('axes: an upright IMU is assumed, as there is no accelerometer; if it is '
+                        'not upright, set imu.mounting_rpy', 2)
     if mounting['rpy'] is None:
         text = ('the IMU orientation cannot be estimated from gravity and driving; set '
                 'imu.mounting_rpy manually')

@@ -41,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'and check the correction on it')
     add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
     add('--export', metavar='FILES', default='', help='time series files, separated by commas: '
-        'trajectory.tum, states.csv, residuals.parquet, track.kml, debug.mcap, drive.rrd ...')
+        'trajectory.tum, states.csv, residuals.parquet, track.kml, scale_by_speed.png, '
+        'debug.mcap, drive.rrd ...')
     add('--force', action='store_true', help='replace an existing calibration.json')
     add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')

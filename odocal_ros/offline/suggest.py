@@ -9,6 +9,7 @@
 
 """Most likely topics of the inputs of a bag, and the replay command with these topics."""
 
+from collections.abc import Collection
 
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
@@ -20,9 +21,13 @@ from odocal_ros.settings.config import Config, with_settings
 COUNTER_WORDS = ('pulse', 'tick', 'encoder', 'odom', 'wheel', 'count')
 
 
-def likely_mapping(topics: dict[str, TopicInfo], config: Config,
-                   overrides: dict[str, str]) -> tuple[dict[str, str], Config]:
-    """Return slot -> most likely topic, and the settings that this mapping needs."""
+def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
+                   still: Collection[str] = ()) -> tuple[dict[str, str], Config]:
+    """
+    Return slot -> most likely topic, and the settings that this mapping needs.
+
+    still : odometer topics that do not grow with the path of the fixes, while another does.
+    """
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     free = candidates(topics, 'odometer', config, chosen)
     sides = [next((t for t in free if side in t), '') for side in ('left', 'right')]
@@ -31,35 +36,38 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config,
     for slot in wanted(config):
         found = [] if slot in chosen else candidates(topics, slot, config, chosen)
         if found:
-            chosen[slot] = min(found, key=lambda name: _rank(slot, topics[name]))
+            chosen[slot] = min(found, key=lambda name: _rank(slot, topics[name], still))
     return chosen, config
 
 
-def _rank(slot: str, info: TopicInfo) -> tuple[int | str, ...]:
-    """Return a sort key: counters before speeds, usual names, more messages first."""
+def _rank(slot: str, info: TopicInfo, still: Collection[str]) -> tuple[int | str, ...]:
+    """Return a sort key: what grows, counters before speeds, usual names, more messages first."""
     usual = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
     kinds = [i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype]
     worded = any(word in info.name.lower() for word in COUNTER_WORDS)
-    return (kinds[0] if 'odometer' in slot else 0, not info.name.endswith(usual),
-            not worded if 'odometer' in slot else 0, -info.count, info.name)
+    return (info.name in still, kinds[0] if 'odometer' in slot else 0,
+            not info.name.endswith(usual), not worded if 'odometer' in slot else 0, -info.count,
+            info.name)
 
 
 # reasons for a topic, by the first element of the ranks that differs
-WHY = ('it is a counter, other candidates are speeds', 'it has the usual name',
+WHY = ('it grows with the distance between the fixes',
+       'it is a counter, other candidates are speeds', 'it has the usual name',
        'its name is that of an odometer', 'it has the most messages', 'it is the first by name')
 
 
 def others(topics: dict[str, TopicInfo], slot: str, config: Config,
-           mapping: dict[str, str]) -> list[str]:
+           mapping: dict[str, str], still: Collection[str]) -> list[str]:
     """Return the other candidates for a slot, the most likely first."""
     taken = {s: t for s, t in mapping.items() if s != slot}
     return sorted(set(candidates(topics, slot, config, taken)) - {mapping[slot]},
-                  key=lambda name: _rank(slot, topics[name]))
+                  key=lambda name: _rank(slot, topics[name], still))
 
 
-def why_before(topics: dict[str, TopicInfo], slot: str, topic: str, other: str) -> str:
+def why_before(topics: dict[str, TopicInfo], slot: str, topic: str, other: str,
+               still: Collection[str]) -> str:
     """Return the reason for suggesting ``topic`` for a slot instead of ``other``."""
-    pairs = zip(_rank(slot, topics[topic]), _rank(slot, topics[other]), strict=True)
+    pairs = zip(_rank(slot, topics[topic], still), _rank(slot, topics[other], still), strict=True)
     return next(why for why, (own, its) in zip(WHY, pairs, strict=True) if own != its)
 
 
@@ -80,10 +88,9 @@ def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: 
     words = ['odocal', 'replay', path]
     for slot, topic in mapping.items():
         others = {s: t for s, t in mapping.items() if s != slot}
-        found = candidates(topics, slot, config, others) + [topic] * (topic not in candidates(
-            topics, slot, config, others))
+        found = candidates(topics, slot, config, others)
         local = slot == 'fix' and topics[topic].msgtype != FIX      # said, as it is unusual
-        if slot in overrides or len(found) > 1 or local:
+        if slot in overrides or len(found) > 1 or topic not in found or local:
             words += [OPTION[slot], topic]
     if 'odometer_right' in mapping and 'odometer_right' not in overrides:
         extra = ['odometer.left=topic', 'odometer.right=topic', *extra]

@@ -85,21 +85,27 @@ def _look(args: argparse.Namespace) -> tuple[dict[str, Any], list[_Choice]]:
     config = with_settings(Config(), replay.asked_config(args))
     topics = replay.asked_topics(args)
     with open_bag(Path(args.bag)) as bag:
-        choices = _choices(bag, config, topics)
+        found = inspect(bag, args.bag, config, topics)
+        choices = _choices(bag, config, topics, found)
         if choices and sys.stdin and sys.stdin.isatty() and sys.stdout.isatty():
             choices = [_asked(bag, choice) for choice in choices]
-            topics |= {choice.slot: choice.topic for choice in choices}
-        return inspect(bag, args.bag, config, topics), choices
+            found = inspect(bag, args.bag, config, topics | {
+                choice.slot: choice.topic for choice in choices})
+        return found, choices
 
 
-def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str]) -> list[_Choice]:
+def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
+             inspected: dict[str, Any]) -> list[_Choice]:
     """Return the most likely topic of each slot with several candidates."""
+    from odocal_ros.library.topics import candidates
     from odocal_ros.offline.suggest import likely_mapping, others, why_before
-    mapping, config = likely_mapping(bag.topics, config, topics)
+    mapping, still = inspected['mapping'], inspected['still']
+    _, config = likely_mapping(bag.topics, config, topics, still)
     found = []
     for slot in mapping.keys() - topics.keys():
-        if rest := others(bag.topics, slot, config, mapping):
-            why = why_before(bag.topics, slot, mapping[slot], rest[0])
+        rest = others(bag.topics, slot, config, mapping, still)
+        if rest and mapping[slot] in candidates(bag.topics, slot, config, {}):
+            why = why_before(bag.topics, slot, mapping[slot], rest[0], still)
             found.append(_Choice(slot, mapping[slot], rest, why))
     return sorted(found, key=lambda choice: list(LABELS).index(choice.slot))
 

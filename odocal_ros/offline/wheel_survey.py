@@ -19,6 +19,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import MOST_DAYS
 from odocal_ros.messages.odometer_types import JOINTS
 from odocal_ros.messages.tables import columns, tables
+from odocal_ros.offline.fix_path import FixPath
 from odocal_ros.screening.glitches import beyond
 from odocal_ros.settings.config import SIDES
 
@@ -48,22 +49,25 @@ class Values:
             stamp = columns(layout, table, ['header.stamp.sec', 'header.stamp.nanosec'])
             stamps = received[rows] if stamp is None else (
                 stamp[:, 0].astype(np.int64) * 10**9 + stamp[:, 1])
-            self._blocks.setdefault((field, keys), []).append((stamps, np.array(values, float)))
+            self._blocks.setdefault((field, keys), []).append(
+                (stamps, received[rows], np.array(values, float)))
 
-    def facts(self, imu: tuple[Ints, Floats] | None = None) -> list[dict[str, Any]]:
+    def facts(self, imu: tuple[Ints, Floats] | None = None,
+              path: FixPath | None = None) -> list[dict[str, Any]]:
         """
         Return the motion of each value of the most frequent list.
 
         imu : (t_ns, rate), stamps and the turn rate to the left, rad/s; None where there is none.
+        path : of the fixes; None where there is none.
         """
         if not self._blocks:
             return []
         (field, keys), blocks = max(self._blocks.items(),
-                                    key=lambda entry: sum(len(t) for t, _ in entry[1]))
-        stamp_ns = np.concatenate([t for t, _ in blocks])
-        value = np.concatenate([v for _, v in blocks])
+                                    key=lambda entry: sum(len(block[0]) for block in entry[1]))
+        stamp_ns, received_ns, value = (np.concatenate(parts) for parts in zip(
+            *blocks, strict=True))
         keep = np.append(True, np.diff(stamp_ns) > 0) & ~beyond('value', value)
-        stamp_ns, value = stamp_ns[keep], value[keep]
+        stamp_ns, received_ns, value = stamp_ns[keep], received_ns[keep], value[keep]
         if len(stamp_ns) < 3:
             return []
         t = (stamp_ns - stamp_ns[0]) * 1e-9
@@ -72,11 +76,16 @@ class Values:
         turns = 4 * np.pi    # rad, range of an angle from which on it turns without bound
         alike = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
         rolls = (span > (turns if self.msgtype == JOINTS else 0)) & (span > alike * span.max())
-        sides = _sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
+        # a joint that turns without driving, such as a lidar, is no wheel
+        matches = [path.match(received_ns, x) for x in s.T] if path else []
+        if any(match.follows for match in matches):
+            rolls = np.array([match.follows for match in matches])
+        scales = [m.scale if m.follows else None for m in matches] or [None] * len(keys)
+        found = sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
         unit = 'rad' if self.msgtype == JOINTS else 'counts'
         return [{'key': key, 'field': field, 'unit': unit, 'way': float(w), 'span': float(d),
-                 'rolls': bool(r), 'side': side}
-                for key, w, d, r, side in zip(keys, path_length, span, rolls, sides, strict=True)]
+                 'rolls': bool(r), 'side': side, 'scale': scale} for key, w, d, r, side, scale in
+                zip(keys, path_length, span, rolls, found, scales, strict=True)]
 
 
 def _travelled(t: Floats, value: Floats, field: str) -> Floats:
@@ -90,8 +99,8 @@ def _travelled(t: Floats, value: Floats, field: str) -> Floats:
     return value
 
 
-def _sides(t: Floats, s: Floats, rolls: Bools,
-           imu: tuple[Floats, Floats] | None) -> list[str]:
+def sides(t: Floats, s: Floats, rolls: Bools,
+          imu: tuple[Floats, Floats] | None) -> list[str]:
     """Return 'left' or 'right' of each wheel that matches the gyro: the outer travels farther."""
     k = len(rolls)
     none = [''] * k
@@ -117,6 +126,14 @@ def _sides(t: Floats, s: Floats, rolls: Bools,
     return none
 
 
+def alone(facts: list[dict[str, Any]], chosen: Sequence[str]) -> tuple[str, ...]:
+    """Return the setting for one wheel, if the values chosen by name do not grow with distance."""
+    grows = [f for f in facts if f['scale']]
+    if not grows or chosen and {f['key'] for f in grows}.issuperset(chosen):
+        return ()
+    return (f'odometer.field={grows[0]["field"]}[{grows[0]["key"]}]',)
+
+
 def suggested(facts: list[dict[str, Any]]) -> tuple[str, ...]:
     """Return the settings for the wheels found in the data, as many on either side; or none."""
     left, right = ([f['key'] for f in facts if f['side'] == side] for side in SIDES)
@@ -124,16 +141,22 @@ def suggested(facts: list[dict[str, Any]]) -> tuple[str, ...]:
         return ()
     if len(left) > 1:
         axles = chain.from_iterable(zip(left, right, strict=True))
-        return (f'odometer.wheels=[{", ".join(axles)}]',)
+        return (f'odometer.wheels=[{", ".join(map(_quoted, axles))}]',)
     return tuple(f'odometer.{side}={keys[0]}' for side, keys in zip(
         SIDES, (left, right), strict=True))
+
+
+def _quoted(key: str) -> str:
+    """Return a key as an element of a YAML list."""
+    return f'"{key}"' if '[' in key else key
 
 
 def in_words(facts: list[dict[str, Any]]) -> list[str]:
     """Return the motion of each value, for people, one line each."""
     def one(f: dict[str, Any]) -> str:
         side = f'; {f["side"]} side (matches gyro)' if f['side'] else ''
-        kind = f'a wheel{side}' if f['rolls'] else 'no wheel'
+        grows = f', {f["scale"]:.3g} m/{f["unit"].rstrip("s")}' if f['scale'] else ''
+        kind = f'a wheel{grows}{side}' if f['rolls'] else 'no wheel'
         return (f'{f["key"]} travels {f["way"]:.6g} {f["unit"]} within a range of '
                 f'{f["span"]:.6g}: {kind}')
     return [one(f) for f in facts]

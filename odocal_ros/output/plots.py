@@ -16,6 +16,7 @@ import numpy as np
 
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.data.arrays import Floats
+from odocal_ros.output.plots_speed import by_speed
 from odocal_ros.output.plots_svg import (
     BAND,
     BLUE,
@@ -72,10 +73,12 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
         figures.append(_residuals(found, name, before_word))
     if np.isfinite(found.sections.ratio).any():
         figures.append(_sections(found, name, scale_sigma))
+    if len(found.by_speed.bins):
+        figures.append(by_speed(found.by_speed, name))
     figures.append(_motion(found, name))
     if len(found.t_fix) or len(found.t_excluded):
         figures.append(_fixes(found, name))
-    if 'key_biases' in smoothed:
+    if np.any(smoothed.get('key_biases', 0.0)):
         figures.append(_biases(smoothed['key_t'], smoothed['key_biases'], name))
     return figures
 
@@ -120,7 +123,7 @@ def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
     """Mark on the track what is odd: fixes not used, gaps, slips, and where the fit ends."""
     few = found.t_excluded[evenly(len(found.t_excluded))]
     if len(few):
-        ax.plot(*at(few), 'x', color=RED, markersize=5, zorder=4, label='fix not used')
+        ax.plot(*at(few), '.', color=GREY, markersize=3, zorder=4, label='fix not used')
     step = np.diff(found.t_fix)
     gap = 5.0    # median intervals between fixes: more is marked
     gaps = [('no fix used', found.t_fix[k], found.t_fix[k + 1]) for k in np.flatnonzero(
@@ -240,27 +243,29 @@ def _fixes(found: Evidence, name: str) -> tuple[str, str, str]:
                 markeredgewidth=0 if shape != 'x' else 1, label=label)
     rows = evenly(len(found.t_excluded))
     if len(rows):
-        ax.plot(found.t_excluded[rows], np.zeros(len(rows)), 'x', color=RED, markersize=5,
+        ax.plot(found.t_excluded[rows], np.zeros(len(rows)), '.', color=GREY, markersize=3,
                 clip_on=False, zorder=5, label='not used')
     ax.set(xlabel='time since the start mark, s', ylabel='sigma of a fix, m')
     top = float(found.fix_sigma.max(initial=0.0))
     ax.set_ylim(0.0, 1.25 * top if top else 1.0)
     key(figure, ax)
     says = ('Horizontal sigma of each axis as published (or gnss.default_sigma), by status. '
-            'Crosses at the bottom: fixes not used.')
+            'Dots at the bottom: fixes not used.')
     return 'Fix quality', says, svg(figure, f'{name}-fixes', says)
 
 
 def _biases(t: Floats, biases: Floats, name: str) -> tuple[str, str, str]:
-    figure, axes = sheet(3.6, 2)
-    for ax, columns, factor, word in zip(axes, biases, (np.rad2deg(3600.0), 1e3), (
-            'gyro bias, deg/h', 'accelerometer bias, mm/s²'), strict=True):
+    # without an accelerometer its bias is zero throughout
+    shown = [one for one in zip(biases, (np.rad2deg(3600.0), 1e3), (
+        'gyro bias, deg/h', 'accelerometer bias, mm/s²'), strict=True) if np.any(one[0])]
+    figure, axes = sheet(1.8 * len(shown), len(shown))
+    for ax, (columns, factor, word) in zip(axes, shown, strict=True):
         for column, colour, dash, axis in zip(columns.T, (BLUE, RED, GREEN), ('-', '--', ':'),
                                               'xyz', strict=True):
             rows = thinned(column)
             ax.plot(t[rows], factor * column[rows], dash, color=colour, linewidth=1.2, label=axis)
         ax.set_ylabel(word)
-    axes[1].set_xlabel('time since the start mark, s')
+    axes[-1].set_xlabel('time since the start mark, s')
     key(figure, axes[0])
     figure.align_ylabels(axes)
     says = ('IMU biases along the drive, estimated by the smoother. They drift with temperature; '

@@ -96,6 +96,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
         'sentence': sentence(calibration).partition(': ')[2],
         'way': f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
                f'{time_span(duration)}',
+        'headline': tables.headline(calibration),
         'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),
         'why': _why(calibration.reasons), 'rotation': _degrees(calibration),
         'reasons': grouped(calibration.reasons), 'check': check_table(legs),

@@ -30,11 +30,13 @@ from odocal_ros.output.figures import (
     COUNTS,
     inverse,
     known,
+    length,
     share,
     two_digits,
     with_sigma,
 )
 from odocal_ros.output.summary import DEG, DEG_PER_HOUR
+from odocal_ros.output.track_table import before_label, in_pieces
 from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
@@ -89,6 +91,22 @@ def value_rows(calibration: Calibration) -> list[dict[str, Any]]:
         rows.append({'name': label(name), 'value': first, 'other': other, 'relative': relative,
                      'method': label(estimate.method), 'largest': _largest(method, name)})
     return rows
+
+
+def headline(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """Return the four most important values: name, value, a second line."""
+    found = []
+    for name, words in (('scale_factor', 'scale factor'), ('yaw_mounting_angle', 'yaw mounting'),
+                        ('pitch_mounting_angle', 'pitch mounting')):
+        estimate = known(calibration.estimates, name)
+        first, other, relative = in_units(name, estimate)
+        found.append((words, first, f'± {relative}' if relative else other))
+    pieces = in_pieces(calibration.legs)
+    if pieces:
+        last = pieces[-1]
+        found.append((f'track error in {length(last.length)}', length(last.after),
+                      f'{before_label(calibration.legs)}: {length(last.before)}'))
+    return found
 
 
 def undetermined(calibration: Calibration) -> list[str]:

@@ -23,6 +23,7 @@ from odocal_ros.output.file_head import about, head
 from odocal_ros.output.frames import IMU_FRAME
 from odocal_ros.output.geojson import geojson, TRACK
 from odocal_ros.output.leg_table import leg_table, LEGS
+from odocal_ros.output.noise_files import IMU_ERRORS, imu_errors, TWIST, wheel_covariance
 from odocal_ros.outside.names import for_comment, for_launch, for_shell, for_xml_comment
 from odocal_ros.outside.yaml_text import no_date, parameters
 from odocal_ros.reasons import Verdict
@@ -32,7 +33,8 @@ PARAMS = 'calibration.yaml'
 VELOCITY = 'vehicle_velocity_converter.param.yaml'
 IMU = 'imu_corrector.param.yaml'
 LAUNCH, URDF, COMMAND = ('imu_transform.launch.xml', 'imu_transform.urdf', 'imu_transform.txt')
-NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, CONTROLLERS, DEVICES, TRACK, LEGS}
+NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, CONTROLLERS, DEVICES, TRACK, LEGS, TWIST,
+         IMU_ERRORS}
 # declared by the node for every drive; of one wheel they stay unknown
 TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width')
 AXES = 'xyz'
@@ -157,4 +159,5 @@ def _xml(root: Any, note: str) -> str:
 
 
 MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': controllers,
-          'devices': devices, 'track': geojson, 'legs': leg_table}
+          'devices': devices, 'covariance': wheel_covariance, 'imu': imu_errors, 'track': geojson,
+         'legs': leg_table}

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from odocal_ros.settings.setting import setting
 
-FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs',
-           'report')
+FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'covariance', 'imu',
+           'track', 'legs', 'report')
 
 
 @dataclass(frozen=True, kw_only=True)

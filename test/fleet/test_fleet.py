@@ -134,6 +134,15 @@ def test_tables_and_page_hold_the_fleet(fleet, output):
     assert [float(row['scale_factor']) for row in text] == list(whole.scale_factor)
     page = (output / 'fleet.html').read_text()
     assert 'src=' not in page
+    style = page.partition('<style>')[2].partition('</style>')[0]
+    assert '"Helvetica Neue"' in style      # not escaped
+    assert '&' not in style
+    # three vehicles of three models: a mean of one has no sigma
+    population = page.partition('<h2>Population</h2>')[2].partition('</table>')[0]
+    assert 'm/pulse' in population
+    assert '±' not in population
+    assert page.count('<tr class="remarks') == sum(
+        bool(re.search(r'changed|rejected', remark)) for remark in page.split('colspan="10">')[1:])
     assert not [link for link in page.split('href="')[1:]
                 if not link.startswith(('reports/', '#'))]
     for vehicle in fleet.truth:

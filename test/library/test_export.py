@@ -151,3 +151,14 @@ def test_without_pyarrow_the_line_that_installs_it_is_said(calibration, tmp_path
     monkeypatch.setitem(__import__('sys').modules, 'rerun', None)
     with pytest.raises(OdocalError, match=r'pip install rerun-sdk'):
         calibration.export(tmp_path / 'drive.rrd')
+
+
+def test_the_scale_against_speed_is_a_table_and_a_picture(calibration, exported):
+    with (exported / 'scale_by_speed.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    leg = calibration.result.legs[0].evidence.by_speed
+    assert [float(row['ratio']) for row in rows] == leg.bins[:, 1].tolist()
+    assert {(float(row['offset_m_per_s']), float(row['lag_s'])) for row in rows} == {
+        (leg.offset[0], leg.lag[0])}
+    assert (exported / 'scale_by_speed.png').read_bytes().startswith(b'\x89PNG')
+    assert b'<svg' in (exported / 'scale_by_speed.svg').read_bytes()

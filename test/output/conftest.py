@@ -60,6 +60,34 @@ def good():
                        (0.0, 0.0, -0.0087, 0.99996), (0.0, 0.0, -0.0174533))
 
 
+SMOOTHED = {
+    'widened': 1.0, 'noise': {
+        'along': 0.003, 'along_hard': 0.004, 'side': 0.002, 'side_turn': 0.005, 'up': 0.002},
+    'odometer': {'reading': 0.25, 'period': 0.1, 'speed_step': 0.0, 'hard': 0.25, 'speed': 8.0,
+                 'fastest': 14.0, 'turn_rate': 0.06, 'fastest_turn': 0.3, 'square_speed': 80.0},
+    'wheels': {side: {'ratio': 1.0, 'ratio_sigma': 1e-6, 'y': 0.8, 'y_sigma': 3e-4,
+                      'walk': (1e-3, 2e-3, 3e-3)} for side in ('left', 'right')},
+    **{name: {'value': 0.0, 'sigma': 0.0} for name in (
+        'scale_by_speed', 'sideslip', 'speed_offset')},
+    'gyro_scale_z': {'value': 0.002, 'sigma': 1e-4}, 'gyro_scale_x': {'value': 0.0, 'sigma': 1e-2},
+    'posterior_to_prior': {'gyro_scale_z': 0.1, 'gyro_scale_x': 0.99},
+    'accelerometer_bias': {axis: {'value': 0.01, 'sigma': 0.02, 'ratio': ratio}
+                           for axis, ratio in (('x', 0.2), ('y', 0.9), ('z', 1.0))}}
+
+
+@pytest.fixture
+def smoothed(good):
+    """Return an accepted calibration of two wheels by the smoother, 0.05 m/pulse."""
+    method = replace(good.methods['two_point'], name='smoother', details=SMOOTHED)
+    leg = replace(good.legs[0], methods={'smoother': method}, origin=(0.8, 0.2, 100.0))
+    found = good.estimates | {f'scale_factor_{side}': Estimate(0.05, 1e-6, 'm/pulse')
+                              for side in ('left', 'right')} | {
+        'track_width': Estimate(1.6, 1e-3, 'm')} | {
+        f'gyro_bias_{axis}': Estimate(0.1, 1e-5, 'rad/s') for axis in 'xyz'}
+    return replace(good, methods={'smoother': method}, legs=(leg,), estimates={
+        name: replace(e, method='smoother') for name, e in found.items()})
+
+
 @pytest.fixture
 def nothing():
     """Return a rejected calibration that found no number at all."""

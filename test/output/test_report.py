@@ -24,9 +24,11 @@ import pytest
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, Source
 from odocal_ros.calib.sections import Sections
+from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.output import plots_compare, report
 from odocal_ros.output.files import as_json, write_results
-from odocal_ros.output.plots import leg_figures
+from odocal_ros.output.plots import _biases, leg_figures
+from odocal_ros.output.plots_speed import by_speed
 from odocal_ros.output.plots_svg import look
 from odocal_ros.output.report import report_html, report_or_why
 from odocal_ros.settings.config import Config, with_settings
@@ -368,3 +370,38 @@ def test_a_leg_without_tracks_has_its_numbers(good):
     assert parsed.tags['svg'] == 0
     assert 'No figures for this leg' in text
     assert '4 fixes see the reasons' in text
+
+
+def test_the_four_most_important_values_stand_under_the_verdict(good):
+    page = page_of(good)[0]
+    head = page.partition('class="headline"')[2].partition('</dl>')[0]
+    assert re.findall(r'<dt>(.*?)</dt>', head)[:3] == [
+        'scale factor', 'yaw mounting', 'pitch mounting']
+    assert '0.0500000 ± 0.0000012 m/pulse<span class="other">± 24 ppm' in head
+    assert '-1.0000 ± 0.0029 deg' in head
+    assert 'not determined' in head
+    assert page.index('class="headline"') > page.index('class="verdict')
+
+
+def test_no_values_without_a_result(nothing):
+    assert 'class="headline"' not in page_of(nothing)[0]
+
+
+def test_the_scale_against_speed_is_drawn_with_its_fit(good):
+    bins = np.array([[5.0, 1.01, 1e-3, 12], [15.0, 0.99, 1e-3, 12]])
+    found = SpeedScale(bins, (0.98, 1e-3), (0.14, 0.02), (-0.35, 0.03))
+    with look():
+        title, says, drawn = by_speed(found, 'leg1')
+    assert title == 'Scale against speed'
+    assert 'the odometer reads 0.140 ± 0.020 m/s low and is 0.350 ± 0.030 s earlier' in says
+    assert drawn.startswith('<svg')
+    with look():
+        assert 'No fit: the speed varies too little' in by_speed(SpeedScale(bins), 'leg1')[1]
+
+
+def test_a_panel_without_data_is_not_drawn():
+    biases = np.stack([np.full((5, 3), 1e-4), np.zeros((5, 3))])
+    with look():
+        assert 'accelerometer bias' not in _biases(np.arange(5.0), biases, 'leg1')[2]
+        biases[1] += 0.01
+        assert 'accelerometer bias' in _biases(np.arange(5.0), biases, 'leg1')[2]

@@ -23,6 +23,7 @@ from odocal_ros.calib.smoother.as_sent import as_sent
 from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.chain import JointMarginals
 from odocal_ros.calib.smoother.estimate import Fit
+from odocal_ros.calib.smoother.exported import exported
 from odocal_ros.calib.smoother.filtered import filter_reasons, speed_filter
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.left_over import bias_sigmas, correlation, left_over, normalised
@@ -110,6 +111,7 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
                         | left_over(leg, problem, fit) | wheel_details(wheels)
+                        | exported(leg, problem, fit, near, widen)
                         | {'key_bias_sigmas': bias_sigmas(near, widen),
                            'slips': [vars(s) for s in slips],
                            'beside': beside(c, covariance, problem.grade if leg.felt else None)}

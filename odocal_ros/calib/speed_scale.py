@@ -1,0 +1,123 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Scale against speed: the odometer as sent, compared with the fixes, cell by cell of a leg."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.settings.levels import NORMAL_MEDIAN
+
+# judgement: s of a comparison at most, where the speed hardly varies, and at least; cells wanted
+LONGEST_CELL, SHORTEST_CELL, WANTED_CELLS = 5.0, 2.0, 40
+SLOWEST_CELL = 0.2            # judgement: of a high speed; in slower cells fix errors dominate
+FEWEST_CELLS, BINS = 12, 10    # judgement: cells for a result; points of a figure
+# judgement: spread of the speeds over their mean, below which an offset is not separable
+LEAST_SPREAD = 0.1
+NO_BINS = np.empty((0, 4))    # definition: no bins
+
+
+@dataclass(frozen=True, eq=False)
+class SpeedScale:
+    """
+    Ratio of the distances of fixes and odometer by speed, with a fit.
+
+    bins : (b, 4) speed m/s, ratio in m per unit, its sigma, number of cells.
+    factor, offset, lag : (value, sigma) of reference = factor * odometer + offset * time, with
+    the odometer late by the lag: m per unit, m/s, s; None if the speeds do not determine them.
+    """
+
+    bins: Floats
+    factor: tuple[float, float] | None = None
+    offset: tuple[float, float] | None = None
+    lag: tuple[float, float] | None = None
+
+
+def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
+                travel: Travel) -> SpeedScale:
+    """
+    Return the scale against speed of a leg.
+
+    Parameters
+    ----------
+    t_fix : (k,) array
+        Times of fixes, s, rising.
+    fix_n, dead_n : (k, 2 or more) arrays
+        Positions by fixes and by dead reckoning, m.
+    distance : (k,) array
+        Distance driven by dead reckoning, m; with ``dead_n`` it gives path length by chord.
+    travel : Travel
+        Of the odometer as sent.
+
+    """
+    if len(t_fix) < FEWEST_CELLS or len(travel.t) < FEWEST_CELLS:
+        return SpeedScale(NO_BINS)
+    cell = min(LONGEST_CELL, max(SHORTEST_CELL, (t_fix[-1] - t_fix[0]) / WANTED_CELLS))
+    knots = np.unique(np.searchsorted(t_fix, np.arange(t_fix[0], t_fix[-1], cell)))
+    t = t_fix[knots]
+    T, path = np.diff(t), np.diff(distance[knots])
+    chord, dead = (np.hypot(*np.diff(p[knots, :2], axis=0).T) for p in (fix_n, dead_n))
+    rolled = np.diff(travel.at(t))
+    slope = 0.5       # s to either side of a knot, for the speed there
+    speed = (travel.at(t + slope) - travel.at(t - slope)) / (2 * slope)
+    straight = dead > 0.8 * path      # judgement: in tighter turns a chord says little
+    high = 90     # percentile of the speeds, as outliers are among them
+    good = (2 * cell > T) & straight & (rolled != 0) & _moves(travel, t)
+    good &= path / T > SLOWEST_CELL * float(np.percentile(path / T, high))
+    if good.sum() < FEWEST_CELLS:
+        return SpeedScale(NO_BINS)
+    length = chord[good] * path[good] / dead[good]
+    rolled, change, T = np.abs(rolled[good]), np.diff(np.abs(speed))[good], T[good]
+    fit, used = _fit(length, rolled, T, change)
+    return SpeedScale(_bins(length[used], rolled[used], T[used]), *fit)
+
+
+def _moves(travel: Travel, t: Floats) -> Bools:
+    """Return a mask of cells in which the odometer moves in one direction all the time."""
+    fine = np.arange(0.0, 1.0, 0.1)
+    s = travel.at(t[:-1, None] + np.diff(t)[:, None] * fine)
+    step = np.diff(s, axis=1)
+    return np.asarray((step > 0).all(axis=1) | (step < 0).all(axis=1), bool)
+
+
+def _fit(length: Floats, rolled: Floats, T: Floats, change: Floats
+         ) -> tuple[tuple[tuple[float, float], ...], Bools]:
+    """Return factor, offset and lag with sigmas, empty if not determined; and cells in use."""
+    used: Bools = np.ones(len(length), bool)
+    mean_speed = length / T
+    scale = float(length.sum() / rolled.sum())
+    X = np.stack([rolled, T, scale * change], -1)
+    for _ in range(3):      # passes, until outliers are found
+        x, *_ = np.linalg.lstsq(X[used], length[used], rcond=None)
+        off = np.abs(length - X @ x)
+        sigma = float(np.median(off[used])) / NORMAL_MEDIAN
+        used = np.asarray(off <= 4 * max(sigma, 1e-6))     # statistical: one in 16,000
+    spread = float(np.std(mean_speed[used]) / np.mean(mean_speed[used]))
+    if used.sum() < FEWEST_CELLS or spread < LEAST_SPREAD:
+        return (), used
+    variance = float(np.sum((length - X @ x)[used]**2)) / max(int(used.sum()) - 3, 1)
+    root = np.sqrt(np.diag(np.linalg.pinv(X[used].T @ X[used])) * variance)
+    return tuple((float(a), float(s)) for a, s in zip(x, root, strict=True)), used
+
+
+def _bins(length: Floats, rolled: Floats, T: Floats) -> Floats:
+    """Return speed, ratio, its sigma and number of cells, of groups of equally many cells."""
+    # by the odometer: fixes would be sorted by their errors
+    order, scale = np.argsort(rolled / T, kind='stable'), float(length.sum() / rolled.sum())
+    rows = []
+    for part in np.array_split(order, min(BINS, len(order) // 4)):
+        ratio = float(length[part].sum() / rolled[part].sum())
+        left = length[part] - ratio * rolled[part]
+        sigma = float(np.sqrt(np.sum(left**2) * len(part) / (len(part) - 1)) / rolled[part].sum())
+        speed = scale * float(rolled[part].sum() / T[part].sum())
+        rows.append((speed, ratio, sigma, len(part)))
+    return np.array(rows)

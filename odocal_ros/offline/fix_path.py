@@ -1,0 +1,105 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Path of the fixes of a bag, and how well a value of a message follows it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.calib.drive import way_and_chord, white_noise, within_reach
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.samples import FixSamples
+from odocal_ros.screening.fix_screen import origin_amid, usable_fixes
+from odocal_ros.settings.config import GnssConfig
+
+# tuned by benchmarks/odometer_fields.py and 3 real drives: true odometers explain 0.90 or more of
+# the variance of the distances, engine speed, gear and consumed energy 0.98 or less, time and
+# temperature 0.48 or less; where fix errors are most of the variance (always 1 m/s, fixes of
+# 0.8 m), odometers 0.65
+EXPLAINED, EXPLAINED_OF_NOISE = 0.9, 0.5
+FEWEST_STEPS = 10      # judgement: cells of a path that can be compared
+
+
+@dataclass(frozen=True)
+class Match:
+    """
+    Comparison of a travel with the path of the fixes.
+
+    explained : share of the variance of the distances that the travel explains.   scale : m per
+    unit of travel, negative if it decreases with distance.   follows : it is proportional to the
+    distance, within the errors of the fixes.
+    """
+
+    explained: float
+    scale: float
+    follows: bool
+
+
+# definition: of no comparison
+NO_MATCH = Match(0.0, 0.0, False)
+
+
+@dataclass(frozen=True, eq=False)
+class FixPath:
+    """
+    Path of the fixes in cells of equal duration.
+
+    t_ns : (k + 1,) edges, arrival times.   length : (k,) m.   sigma : of a fix, m.
+    """
+
+    t_ns: Ints
+    length: Floats
+    sigma: float
+
+    def match(self, t_ns: Ints, travel: Floats) -> Match:
+        """Return the comparison with a travel, (n,) in any unit at (n,) rising arrival times."""
+        if len(t_ns) < FEWEST_STEPS:
+            return NO_MATCH
+        inside = (self.t_ns[:-1] >= t_ns[0]) & (self.t_ns[1:] <= t_ns[-1])
+        step = np.diff(np.interp(self.t_ns, t_ns, travel))[inside]
+        length, run = self.length[inside], np.abs(step)
+        moved = (run > 0) & (length > length.mean()) if len(length) else inside[:0]
+        if len(length) < FEWEST_STEPS or not moved.any() or not np.isfinite(run).all():
+            return NO_MATCH
+        error = np.abs(length - np.median(length[moved] / run[moved]) * run)
+        outliers = 0.05      # share of cells with a reset of a counter or a jump of the fixes
+        kept = error <= np.quantile(error, 1 - outliers)
+        length, run, step = length[kept], run[kept], step[kept]
+        if not run.any() or not np.ptp(length):
+            return NO_MATCH
+        scale = float(length.sum() / run.sum())
+        left = float(np.mean((length - scale * run)**2))
+        explained = 1 - left / float(np.var(length))
+        follows = explained >= EXPLAINED or (
+            explained >= EXPLAINED_OF_NOISE and left <= self.sigma**2)
+        return Match(explained, scale if step.sum() >= 0 else -scale, follows)
+
+
+def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
+    """Return the path of the usable fixes by arrival time; None if it is too short."""
+    use, covariance_n, _ = usable_fixes(rows, len(rows.stamp_ns), gnss)
+    use &= np.append(True, np.diff(rows.received_ns) > 0)
+    if use.sum() < FEWEST_STEPS:
+        return None
+    t_ns = rows.received_ns[use]
+    t = (t_ns - t_ns[0]) * 1e-9
+    geodetic = np.stack([rows.latitude, rows.longitude, np.nan_to_num(rows.height)], -1)[use]
+    fixes_n = origin_amid(t, geodetic).to_n(geodetic)
+    near = within_reach(t, fixes_n)
+    t, t_ns, fixes_n = t[near], t_ns[near], fixes_n[near, :2]
+    path_length = way_and_chord(t, fixes_n)[0]
+    if path_length == 0:
+        return None
+    # of a usual cell: fix noise of both ends is below 15 % of its length, s and m
+    shortest, longer_than_noise = 4.0, 10.0
+    cell = max(shortest, longer_than_noise * white_noise(fixes_n) * (t[-1] - t[0]) / path_length)
+    knots = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], cell)))
+    return FixPath(t_ns[knots], np.hypot(*np.diff(fixes_n[knots], axis=0).T),
+                   float(np.sqrt(np.median(covariance_n[use][:, 0, 0]))))

@@ -1,0 +1,269 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""odocal inspect finds the odometer in messages of any type, by the path of the fixes."""
+
+from functools import cache
+import json
+import shlex
+
+from drives import changed, drive
+import numpy as np
+import pytest
+import ros_bags
+import ros_messages as make
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+from odocal_ros.bagio.encode import counter, fix, imu, velocity
+from odocal_ros.bagio.write import write_bag
+from odocal_ros.offline.cli import main
+from odocal_ros.offline.field_survey import Fields
+from odocal_ros.offline.odometer_search import only_near_best
+
+pytestmark = pytest.mark.slow
+MOTOR = 'float32 rpm\nfloat64 angle\n'
+ENCODERS = ('std_msgs/Header header\nuint16[4] ticks\nuint32 messages\nfloat32 temperature\n'
+            'float64 speed_kmh\nint16 delta\nfloat64[] east\nmycar_msgs/Motor[] motors\n')
+VELOCITY = ('std_msgs/Header header\nfloat32 longitudinal_velocity\nfloat32 lateral_velocity\n'
+            'float32 heading_rate\n')
+STEERING = 'builtin_interfaces/Time stamp\nfloat32 steering_tire_angle\n'
+
+
+@cache
+def types():
+    """Return a store with the types of a vehicle."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in (('mycar_msgs/msg/Motor', MOTOR), ('mycar_msgs/msg/Encoders', ENCODERS),
+                       ('autoware_vehicle_msgs/msg/VelocityReport', VELOCITY),
+                       ('autoware_vehicle_msgs/msg/SteeringReport', STEERING)):
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def write(path, made, more):
+    """Write IMU and fixes of a drive, and (topic, bag time, message) rows of its vehicle."""
+    rows = [('/imu/data', t, make.imu(t, w, f)) for t, w, f in zip(
+        made.imu.stamp_ns.tolist(), made.imu.w_i, made.imu.f_i, strict=True)]
+    rows += [('/fix', t, make.fix(t, *np.rad2deg([a, b]), h, sigma=0.02)) for t, a, b, h in zip(
+        made.fix.stamp_ns.tolist(), made.fix.latitude, made.fix.longitude, made.fix.height,
+        strict=True)]
+    with Writer(path, version=9, storage_plugin=ros_bags.STORAGES['mcap']) as bag:
+        ends = {}
+        for topic, time_ns, message in sorted(rows + more, key=lambda row: row[1]):
+            kind = message.__msgtype__
+            if topic not in ends:
+                ends[topic] = bag.add_connection(topic, kind, typestore=types())
+            bag.write(ends[topic], time_ns, bytes(types().serialize_cdr(message, kind)))
+    return path
+
+
+def town():
+    return drive(scenario='town', duration=400.0, seed=4, imu_grade='tactical', fix_noise='rtk',
+                 two_wheels=True, odometer_rate=20.0)
+
+
+def encoders(made, keep):
+    """Return the messages of a vehicle; keep: fields that are not left at zero."""
+    kind, motor = (types().types[f'mycar_msgs/msg/{name}'] for name in ('Encoders', 'Motor'))
+    left, right = made.odometer.value, made.odometer_right.value
+    t = (made.odometer.stamp_ns - made.odometer.stamp_ns[0]) * 1e-9
+    speed = np.gradient((left + right) / 2 * made.truth.scale, t)
+    rows = []
+    for i, stamp in enumerate(made.odometer.stamp_ns.tolist()):
+        has = {'ticks': np.array([right[i], left[i], 0, 7 * i], np.int64).astype(np.uint16),
+               'messages': i, 'temperature': 20 + 30 * (1 - np.exp(-i / 3000)),
+               'speed_kmh': 3.6 * speed[i], 'delta': int(left[i] - left[max(i - 1, 0)])}
+        empty = {'ticks': np.zeros(4, np.uint16), 'speed_kmh': 0.0, 'delta': 0}
+        has |= {name: value for name, value in empty.items() if name not in keep}
+        angle = 0.31 * left[i] * made.truth.scale if 'motors' in keep else 0.0
+        engine = 800 + 500 * abs(speed[i]) / np.clip(speed[i] // 6 + 1, 1, 5)
+        rows.append(('/encoders', stamp, kind(
+            header=make.header(stamp), **has, east=np.zeros(2),
+            motors=[motor(rpm=engine, angle=0.0), motor(rpm=0.0, angle=angle)])))
+    return rows
+
+
+def inspected(path, capsys, *options):
+    assert main(['inspect', str(path), *options, '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert main(['inspect', str(path), *options]) == 0
+    return found, capsys.readouterr().out
+
+
+def replayed(command, folder):
+    """Run a suggested command as pasted; return calibration.json."""
+    assert main([*shlex.split(command)[1:], '--output', str(folder), '--set',
+                 'verdict.max_yaw_sigma=0.1']) in (0, 1)
+    return json.loads((folder / 'calibration.json').read_text())
+
+
+def sigmas_off(content, name, truth):
+    found = content['result'][name]
+    return abs(found['value'] - truth) / found['sigma']
+
+
+def test_two_counters_in_an_array_that_roll_over(tmp_path, capsys):
+    made = town()
+    path = write(tmp_path / 'bag', made, encoders(made, ('ticks', 'speed_kmh')))
+    found, text = inspected(path, capsys)
+    assert '/encoders.ticks[1] grows with distance, 0.0' in text
+    fields = next(t for t in found['topics'] if t['name'] == '/encoders')['fields']['found']
+    assert {one['path'] for one in fields} == {'ticks[0]', 'ticks[1]', 'speed_kmh'}
+    assert {'odometer.left=ticks[1]', 'odometer.right=ticks[0]', 'odometer.wrap=65536'} <= set(
+        shlex.split(found['command']))
+    assert found['drive']['scale_unit'] == 'm/pulse'
+    content = replayed(found['command'], tmp_path / 'out')
+    for side, truth in zip(('left', 'right'), made.truth.wheel_scales, strict=True):
+        assert sigmas_off(content, f'scale_factor_{side}', truth) < 4
+
+
+@pytest.mark.parametrize(('field', 'quantity', 'factor'), [
+    ('speed_kmh', 'rate', 1 / 3.6), ('delta', 'increment', None), ('motors', 'cumulative',
+                                                                   1 / 0.31)])
+def test_a_field_of_each_meaning(tmp_path, capsys, field, quantity, factor):
+    made = town()
+    path = write(tmp_path / 'bag', made, encoders(made, (field,)))
+    found, _ = inspected(path, capsys)
+    fields = next(t for t in found['topics'] if t['name'] == '/encoders')['fields']
+    (one,) = fields['found']
+    assert one['path'].startswith(field)
+    assert one['quantity'] == quantity
+    truth = factor or made.truth.wheel_scales[0]
+    assert one['scale'] == pytest.approx(truth, rel=0.02)      # the chords of cells of 4 s
+    content = replayed(found['command'], tmp_path / 'out')
+    assert content['result']['scale_factor']['value'] == pytest.approx(truth, rel=0.005)
+
+
+def test_of_autoware_the_speed_is_the_odometer_and_the_steering_is_not(tmp_path, capsys):
+    made = drive(scenario='town', duration=300.0, seed=4, imu_grade='tactical', fix_noise='rtk',
+                 odometer='speed')
+    velocity, steering = (types().types[f'autoware_vehicle_msgs/msg/{name}Report']
+                          for name in ('Velocity', 'Steering'))
+    time = make.kind('builtin_interfaces/msg/Time')
+    rows = []
+    for stamp, v in zip(made.odometer.stamp_ns.tolist(), made.odometer.value, strict=True):
+        rows.append(('/vehicle/status/velocity_status', stamp, velocity(
+            header=make.header(stamp), longitudinal_velocity=v, lateral_velocity=0.0,
+            heading_rate=0.0)))
+        rows.append(('/vehicle/status/steering_status', stamp, steering(
+            stamp=time(sec=0, nanosec=0), steering_tire_angle=0.1 * np.sin(stamp * 1e-9))))
+    path = write(tmp_path / 'bag', made, rows)
+    found, text = inspected(path, capsys)
+    assert found['mapping']['odometer'] == '/vehicle/status/velocity_status'
+    assert 'no numeric field grows with the distance between the fixes (1 tried)' in text
+    content = replayed(found['command'], tmp_path / 'out')
+    assert sigmas_off(content, 'scale_factor', made.truth.scale) < 4
+
+
+def test_wheels_are_the_joints_that_follow_the_fixes(tmp_path, capsys):
+    """A spinning lidar turns farther than the wheels; the joints with wheel names steer."""
+    made = town()
+    names = ['lidar', 'left_wheel', 'right_wheel', 'b', 'a']
+    t = made.odometer.stamp_ns.tolist()
+    rows = []
+    for i, stamp in enumerate(t):
+        steer = 0.3 * np.sin(i / 50)
+        rows.append(('/arm/joint_states', stamp, make.joints(stamp, ['elbow'], [i * 0.01])))
+        rows.append(('/joint_states', stamp, make.joints(stamp, names, [
+            i * 3.0, steer, steer, made.odometer.value[i] * 0.05,
+            made.odometer_right.value[i] * 0.05])))
+    path = write(tmp_path / 'bag', made, rows)
+    found, text = inspected(path, capsys)
+    assert found['mapping']['odometer'] == '/joint_states'
+    assert found['still'] == ['/arm/joint_states']
+    assert found['command'].endswith('--odometer-topic /joint_states --set odometer.left=b '
+                                     '--set odometer.right=a')
+    assert all(f'  {name} travels' in text for name in names)
+    assert ': a wheel, 0.42' in text
+    content = replayed(found['command'], tmp_path / 'out')
+    for side, truth in zip(('left', 'right'), made.truth.wheel_scales, strict=True):
+        assert sigmas_off(content, f'scale_factor_{side}', truth / 0.05) < 4
+
+
+def test_try_takes_the_field_that_inspect_finds(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = town()
+    write(tmp_path / 'bag', made, encoders(made, ('motors',)))
+    assert main(['try', 'bag', '--no-browser']) in (0, 1)
+    out = ' '.join(capsys.readouterr().out.split())
+    assert 'odometer: /encoders' in out
+    assert "'odometer.field=motors[1].angle' --set odometer.quantity=cumulative" in out
+
+
+def test_the_search_is_bounded():
+    kind = types().types['mycar_msgs/msg/Encoders']
+    motor = types().types['mycar_msgs/msg/Motor']
+    message = kind(header=make.header(0), ticks=np.zeros(4, np.uint16), messages=0,
+                   temperature=0.0, speed_kmh=0.0, delta=0, east=np.zeros(300),
+                   motors=[motor(rpm=0.0, angle=0.0)] * 100)
+    raw = bytes(types().serialize_cdr(message, kind.__msgtype__))
+    asked = []
+
+    def deserialize(raw):
+        asked.append(raw)
+        return message
+    n = 100_000
+    fields = Fields(n)
+    for k in range(10):
+        fields.rows([raw] * (n // 10), range(k * n // 10, (k + 1) * n // 10), deserialize)
+    assert len(fields.paths) == 8 + 16 + 2 * 16
+    assert len(asked) < 400_000 / len(fields.paths) + 1
+    image = Fields(5)
+    image.rows([bytes(2**20)] * 5, range(5), deserialize)
+    assert image.trouble == 'no numeric field'
+
+
+def test_a_limit_that_drops_most_fixes_is_lifted(tmp_path, capsys):
+    made = drive(scenario='town', duration=200.0, seed=4, fix_sigma=1.0)
+    path = tmp_path / 'bag'
+    write_bag(path, [imu('/imu/data', made.imu), fix('/fix', made.fix),
+                     counter('/odometer', made.odometer)])
+    assert 'gnss.max_sigma' not in inspected(path, capsys)[0]['command']
+    found, _ = inspected(path, capsys, '--set', 'gnss.max_sigma=0.5')
+    assert found['command'].endswith('--set gnss.max_sigma=nan')
+
+
+def test_no_axes_are_given_without_an_accelerometer(tmp_path, capsys):
+    made = drive(scenario='town', duration=200.0, seed=4)
+    path = tmp_path / 'bag'
+    write_bag(path, [imu('/imu/data', changed(made.imu, f_i=lambda f: 0 * f)),
+                     fix('/fix', made.fix), counter('/odometer', made.odometer)])
+    found, text = inspected(path, capsys)
+    assert 'gravity' not in text
+    assert 'an upright IMU is assumed' in text
+    assert found['mounting']['rpy'] is None
+
+
+def test_a_component_of_a_velocity_is_not_called_speed(tmp_path, capsys):
+    made = drive(scenario='yard', duration=300.0, seed=4, fix_sigma=0.2, velocity_sigma=0.05)
+    path = tmp_path / 'bag'
+    write_bag(path, [imu('/imu/data', made.imu), fix('/fix', made.fix),
+                     counter('/odometer', made.odometer), velocity('/vel', made.velocity)])
+    found, text = inspected(path, capsys)
+    block = text.partition('\n/vel\n')[2].partition('\n\n')[0]
+    assert block.strip().startswith('one component of a velocity')
+    assert found['still'] == ['/vel']
+
+
+def test_without_messages_nothing_is_said_of_standing(tmp_path, capsys):
+    made = drive(scenario='town', duration=200.0, seed=4)
+    path = tmp_path / 'bag'
+    write_bag(path, [fix('/fix', made.fix)])
+    _, text = inspected(path, capsys)
+    assert 'stand' not in text
+    assert 'all data for a calibration' not in text
+
+
+def test_a_field_that_explains_much_less_than_the_best_is_removed():
+    """Engine speed explains up to 0.93 of the distances; another topic has the true speed."""
+    fields = [{'found': [{'path': 'speed', 'explained': 0.999}]},
+              {'found': [{'path': 'rpm', 'explained': 0.93}, {'path': 'v', 'explained': 0.99}]}]
+    only_near_best(fields)
+    assert [[one['path'] for one in facts['found']] for facts in fields] == [['speed'], ['v']]
