@@ -78,6 +78,7 @@ class OdometryNode(SettledNode):
         self._look_ns = self._silent_ns = 0
         self._begun, self._pause_ns = False, SILENCE_FIRST_NS
         self._said_ns: dict[str, int] = {}      # when, by kind of sentence
+        self._doubled: set[str] = set()         # said
         self.add_on_set_parameters_callback(params.fixed)
         self.create_timer(POSE_TURN_S, self._tick, clock=self._steady)
         self.get_logger().info(f'applies the {kept.words("")}')
@@ -123,6 +124,9 @@ class OdometryNode(SettledNode):
             one.look()
             if not one.flowing():
                 one.find(self.config)
+            if (text := one.doubled()) and text not in self._doubled:
+                self._doubled.add(text)
+                self.get_logger().warning(text)
         missing = [why for why in (one.why() for one in self._inputs.values()) if why]
         apart = self._odometry.apart()
         if not missing and apart:
