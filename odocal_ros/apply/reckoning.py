@@ -228,13 +228,15 @@ class Reckoning:
         if abs(speed) > FASTEST:
             self._notes.append(f'{speed:.0f} m/s is implausible: the calibration belongs to '
                               'another odometer or unit')
-        quantum, doubt = self.wheels.quantum, self.wheels.doubt(self._t - T, self._t)
+        quantum, jitter = self.wheels.quantum, self.wheels.jitter(self._t, T)
+        doubt = self.wheels.doubt(self._t - T, self._t)
         pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
                     quat_from_matrix(C_nb @ C_vb.T), velocity, rate,
                     pose_covariance(v, self.errors, C_nb, arm_n, quantum**2 / 6
-                                    + self.wheels.between(self._t)
+                                    + self.wheels.between(self._t) + jitter / 2
                                     + (speed * self._delay_sigma)**2),
-                    twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt))
+                    twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt
+                                     + jitter))
         self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
         return pose
 
