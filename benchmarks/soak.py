@@ -13,12 +13,13 @@ A long day of the node: hours of simulated time, a leg every quarter of an hour,
     python benchmarks/soak.py [--hours 24] [--speedup 40] [--legs 100] [--log FILE]
 
 The node runs in simulated time (/clock) and receives out-and-back drives, the same ten again and
-again, with stamps that go on; between the drives its sensors are silent. The node ``odometry`` runs
-beside it on the same topics. After each leg are printed: memory, threads and descriptors of the process, memory and descriptors of
-``odometry`` and how many poses it published, the latency of a service call in the leg,
-the time that the answer of ~/stop_leg took, what is in the output folder, and how far the scale
-factor is from the truth. At the end the last quarter of the legs is held against the second one;
-the exit code is 1 if anything grew, or a leg was wrong.
+again, with stamps that go on; between the drives its sensors are silent. The node ``odometry``
+runs beside it on the same topics. After each leg are printed: memory, threads and descriptors of
+the process, memory and descriptors of ``odometry`` and how many poses it published, the latency of
+a service call in the leg, the time that the answer of ~/stop_leg took, what is in the output
+folder, and how far the scale factor is from the truth. At the end the last
+quarter of the legs is held against the second one; the exit code is 1 if anything grew, or a leg
+was wrong.
 """
 
 import argparse

@@ -90,8 +90,13 @@ class Wheel:
 
     def at(self, t: FloatOrFloats) -> FloatOrFloats:
         """Return the travel at times, linear between rows, constant outside."""
-        travel: FloatOrFloats = np.interp(t, self.t, self.s)
-        return travel
+        if isinstance(t, np.ndarray):
+            return np.array([self.at(one) for one in t.tolist()])
+        after = bisect_left(self.t, t)
+        if not 0 < after < len(self.t):
+            return self.s[0] if after == 0 else self.s[-1]
+        t0, t1, s0, s1 = self.t[after - 1], self.t[after], self.s[after - 1], self.s[after]
+        return s0 + (s1 - s0) * (t - t0) / (t1 - t0)
 
     def doubt(self, t_from: float, t_to: float) -> float:
         """Return the variance of the travel between two times, m^2, each uncertainty once."""
