@@ -27,6 +27,7 @@ from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS
 from odocal_ros.live.inputs import IMU, LOOK_AROUND_S
+from odocal_ros.live.losses import LossReport
 from odocal_ros.live.numbers_publisher import NumbersPublisher
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
@@ -81,6 +82,7 @@ class OdometryNode(SettledNode):
         self._begun, self._pause_ns = False, SILENCE_FIRST_NS
         self._said_ns: dict[str, int] = {}      # when, by kind of sentence
         self._doubled: set[str] = set()         # said
+        self._losses = LossReport()
         self.add_on_set_parameters_callback(params.fixed)
         self.create_timer(POSE_TURN_S, self._tick, clock=self._steady)
         self.get_logger().info(f'applies the {kept.words("")}')
@@ -129,6 +131,9 @@ class OdometryNode(SettledNode):
             if (text := one.doubled()) and text not in self._doubled:
                 self._doubled.add(text)
                 self.get_logger().warning(text)
+        for text in self._losses.news({one.topic: one.health.lost
+                                       for one in self._inputs.values()}):
+            self.get_logger().warning(text)
         missing = [why for why in (one.why() for one in self._inputs.values()) if why]
         apart = self._odometry.apart()
         if not missing and apart:
