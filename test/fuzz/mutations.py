@@ -387,6 +387,21 @@ def metadata(rng, bag):
     text_file(rng, bag / 'metadata.yaml')
 
 
+def linked(rng, bag):
+    """Give the file of messages more names, in metadata.yaml or without it."""
+    file = file_of(bag)
+    names = [f'{rng.choice(["a", "z"])}_{k}{file.suffix}' for k in range(rng.choice([1, 30]))]
+    for name in names:
+        getattr(bag / name, rng.choice(['hardlink_to', 'symlink_to']))(file)
+    about = bag / 'metadata.yaml'
+    if rng.random() < 0.5:
+        about.unlink()
+        return
+    tree = yaml.safe_load(about.read_text())
+    tree['rosbag2_bagfile_information']['relative_file_paths'] += names
+    about.write_text(yaml.safe_dump(tree))
+
+
 def text_file(rng, file):
     """Change a value of a tree, or splice its text."""
     text = file.read_text()
@@ -430,9 +445,9 @@ def texts(rng: random.Random, folder):
 
 
 OF = {'mcap': [raw, clump, mcap_records, mcap_inside, mcap_inside, mcap_lies, mcap_overlap,
-               metadata],
+               metadata, linked],
       'sqlite3': [raw, clump, sqlite_rows, sqlite_values, sqlite_values, sqlite_oddities,
-                  sqlite_pages, metadata],
+                  sqlite_pages, metadata, linked],
       'rosbag1': [raw, clump, ros1_inside, ros1_inside],
       'file': [raw, clump, metadata],                   # packed as a whole, and
       'messages': [raw, clump, mcap_records, metadata]}  # each: no value can be reached
