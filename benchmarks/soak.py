@@ -171,6 +171,8 @@ def one_leg(day, client, node, odometry, poses, folder, leg, truth) -> Look:
     wait_for(lambda: client.status['state'] != 'computing', 'the result', LONGEST_S)
     status = client.status
     value, sigma = (float(status[k]) for k in ('scale_factor', 'scale_factor_sigma'))
+    if odometry.process.poll() is not None:
+        sys.exit(f'odometry has ended with {odometry.process.poll()}: {odometry.lines[-15:]}')
     beside = used_by(odometry.process)
     return Look(leg, day.now_s / 3600, *used_by(node.process), beside[0], beside[2], len(poses),
                 statistics.median(calls), stop_s, size_mib(folder), status['verdict'],
