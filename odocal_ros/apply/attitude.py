@@ -19,7 +19,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 
-SMALL = 1e-8      # rad; numerical: a half angle whose sine is the angle to the last digit
+SMALL = 1e-8      # rad; definition: a half angle whose sine is the angle to the last digit
 
 
 def turned(q: Floats, phi: Floats) -> Floats:

@@ -112,7 +112,7 @@ def _folder(path: Path) -> Source:
 
 def _distinct(files: list[Path]) -> list[Path]:
     """Return the files without links to one that is before them: each is read once."""
-    found = {}
+    found: dict[tuple[int, int], Path] = {}
     for file in files:
         about = file.stat()
         found.setdefault((about.st_dev, about.st_ino), file)

@@ -19,7 +19,11 @@ class LossReport:
         self._said: dict[str, int] = {}
 
     def news(self, lost: dict[str, int]) -> list[str]:
-        """Return what is to be said now; lost: topic -> messages so far, 0 after a new count."""
+        """
+        Return the new sentences.
+
+        lost : topic -> messages so far; fewer than before: a new count.
+        """
         found = []
         for topic, count in lost.items():
             said = self._said.get(topic, 0)

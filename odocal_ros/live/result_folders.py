@@ -21,7 +21,7 @@ from odocal_ros.output.worse import replacing, stored_in
 from odocal_ros.outside.whole import locked
 
 LATEST = 'latest'
-LEFT_S = 60.0      # judgement: age of a reserved name, or of a link on its way, that nobody uses
+LEFT_S = 60.0      # judgement: age of an empty folder, or of an unfinished link, that nobody uses
 RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # by its time
 
 
