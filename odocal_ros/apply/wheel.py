@@ -130,7 +130,8 @@ class Wheel:
             return
         before = self._value
         if self.form.quantity != 'rate':
-            step = self._step(value, before, 0.0) * self.scale
+            most = FASTEST * STAMP_BURST + self.quantum
+            step = min(max(self._step(value, before, 0.0) * self.scale, -most), most)
             t = self._rhythm.place(t, self.s[-1] + step, self.speed, self.quantum)
         dt = t - self.t[-1]
         self._rows += 1
