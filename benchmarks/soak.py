@@ -13,11 +13,13 @@ A long day of the node: hours of simulated time, a leg every quarter of an hour,
     python benchmarks/soak.py [--hours 24] [--speedup 40] [--legs 100] [--log FILE]
 
 The node runs in simulated time (/clock) and receives out-and-back drives, the same ten again and
-again, with stamps that go on; between the drives its sensors are silent. After each leg are
-printed: memory, threads and descriptors of the process, the latency of a service call in the leg,
-the time that the answer of ~/stop_leg took, what is in the output folder, and how far the scale
-factor is from the truth. At the end the last quarter of the legs is held against the second one;
-the exit code is 1 if anything grew, or a leg was wrong.
+again, with stamps that go on; between the drives its sensors are silent. The node ``odometry``
+runs beside it on the same topics. After each leg are printed: memory, threads and descriptors of
+the process, memory and descriptors of ``odometry`` and how many poses it published, the latency of
+a service call in the leg, the time that the answer of ~/stop_leg took, what is in the output
+folder, and how far the scale factor is from the truth. At the end the last
+quarter of the legs is held against the second one; the exit code is 1 if anything grew, or a leg
+was wrong.
 """
 
 import argparse
@@ -40,7 +42,8 @@ MOST_AHEAD = 50     # messages of a topic that the node may be behind
 LONGEST_S = 300.0   # an answer
 DRIVES = 10          # of one vehicle, each with noise of its own
 PARKED = 20.0       # times as fast does time go by while nothing is sent
-GROWTH = {'rss_mib': 0.05, 'threads': 0.0, 'descriptors': 0.0, 'call_ms': 0.5}   # of the earlier
+GROWTH = {'rss_mib': 0.05, 'threads': 0.0, 'descriptors': 0.0, 'odometry_mib': 0.05,
+          'odometry_descriptors': 0.0, 'call_ms': 0.5}      # of the earlier
 LEAST = {'call_ms': 20.0}       # ms: less is not looked at, on a machine with others on it
 
 
@@ -53,6 +56,9 @@ class Look:
     rss_mib: float
     threads: int
     descriptors: int
+    odometry_mib: float
+    odometry_descriptors: int
+    poses: int               # so far
     call_ms: float           # median, in the leg
     stop_s: float
     folder_mib: float
@@ -136,8 +142,16 @@ def size_mib(folder: Path) -> float:
     return sum(f.stat().st_size for f in folder.rglob('*') if f.is_file()) / 2**20
 
 
-def one_leg(day, client, node, folder, leg, truth) -> Look:
-    """Drive a leg and look at the node after it."""
+def used_by(process) -> tuple[float, int, int]:
+    """Return memory, MiB, threads and descriptors of a process."""
+    proc = Path(f'/proc/{process.pid}')
+    rss = next(line for line in (proc / 'status').read_text().splitlines() if 'VmRSS' in line)
+    return (int(rss.split()[1]) / 1024, len(list((proc / 'task').iterdir())),
+            len(list((proc / 'fd').iterdir())))
+
+
+def one_leg(day, client, node, odometry, poses, folder, leg, truth) -> Look:
+    """Drive a leg and look at the nodes after it."""
     from bench import wait_for
     day.play(0.0, START_S)
     client.start()
@@ -157,10 +171,10 @@ def one_leg(day, client, node, folder, leg, truth) -> Look:
     wait_for(lambda: client.status['state'] != 'computing', 'the result', LONGEST_S)
     status = client.status
     value, sigma = (float(status[k]) for k in ('scale_factor', 'scale_factor_sigma'))
-    proc = Path(f'/proc/{node.process.pid}')
-    rss = next(line for line in (proc / 'status').read_text().splitlines() if 'VmRSS' in line)
-    return Look(leg, day.now_s / 3600, int(rss.split()[1]) / 1024,
-                len(list((proc / 'task').iterdir())), len(list((proc / 'fd').iterdir())),
+    if odometry.process.poll() is not None:
+        sys.exit(f'odometry has ended with {odometry.process.poll()}: {odometry.lines[-15:]}')
+    beside = used_by(odometry.process)
+    return Look(leg, day.now_s / 3600, *used_by(node.process), beside[0], beside[2], len(poses),
                 statistics.median(calls), stop_s, size_mib(folder), status['verdict'],
                 abs(value - truth) / sigma)
 
@@ -184,6 +198,7 @@ def grown(looks: list[Look]) -> list[str]:
 def main() -> int:
     """Drive all day; return 1 if anything grew or was wrong."""
     from bench import Client, NodeProcess, wait_for
+    from geometry_msgs.msg import TwistWithCovarianceStamped
 
     from odocal_ros.sim.scenarios import SimOptions, simulate
     parser = argparse.ArgumentParser(description=__doc__,
@@ -203,20 +218,28 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix='odocal_soak_') as folder:
         node = NodeProcess('-p', f'output.directory:={folder}', '-p', 'use_sim_time:=true',
                            '-p', 'diagnostic_updater.period:=0.2')
-        client = Client()
+        odometry = NodeProcess('-p', 'use_sim_time:=true', '-p', 'result.valid:=true', '-p',
+                               f'result.scale_factor:={drives[0].truth.scale}', '-p',
+                               'result.scale_factor_sigma:=0.001', module='odometry')
+        client, poses = Client(), []
+        client.node.create_subscription(TwistWithCovarianceStamped, 'odometry/twist',
+                                        lambda _: poses.append(None), 100)
         try:
             every_s = max(DRIVE_S + 10, 3600 * args.hours / args.legs)
             day = Day(client, drives, args.speedup, every_s)
             wait_for(day.received, 'subscriptions')
+            wait_for(lambda: client.node.count_subscribers('/odometer') == 2, 'those of odometry')
             wait_for(day.received, 'the time')
             for leg in range(1, args.legs + 1):
-                looks.append(one_leg(day, client, node, Path(folder), leg, drives[0].truth.scale))
+                looks.append(one_leg(day, client, node, odometry, poses, Path(folder), leg,
+                                     drives[0].truth.scale))
                 print(', '.join(f'{k} {v:.4g}' if isinstance(v, float) else f'{k} {v}'
                                 for k, v in asdict(looks[-1]).items()), flush=True)
                 day.rest()
-            code = node.end()
+            code = node.end() or odometry.end()
         finally:
             node.end()
+            odometry.end()
             client.close()
     if args.log:
         with args.log.open('w') as file:
@@ -224,6 +247,7 @@ def main() -> int:
             rows.writeheader()
             rows.writerows(map(asdict, looks))
     wrong = [look.leg for look in looks if look.verdict == 'accepted' and not look.sigmas < SIGMAS]
+    print('\n'.join(line for line in odometry.lines if 'WARN' in line or 'ERROR' in line))
     print(f'{looks[-1].hour:.1f} h, {len(looks)} legs, exit {code}, '
           f'{sum(look.verdict == "accepted" for look in looks)} accepted, {len(wrong)} wrong')
     return int(bool(grown(looks) or wrong or code))

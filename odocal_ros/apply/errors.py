@@ -17,9 +17,9 @@ scale are considered, never corrected: the pose does not jump, the calibration s
 
 import numpy as np
 
+from odocal_ros.apply.attitude import skewed
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.nav.rotations import skew
 from odocal_ros.settings.grades import Grade
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
@@ -71,7 +71,7 @@ class Errors:
         gaps : (k,) s, parts of the interval without IMU data.
         """
         F = np.eye(N)
-        cross = skew(way_n)
+        cross = skewed(way_n)
         F[P, PHI], F[P, K], F[P, M] = -cross, way_n, -cross @ C_nb[:, 1:]
         F[PHI, BG], F[PHI, G] = -C_nb * T, -turn_n
         F[P, BG], F[P, G] = cross @ C_nb * (T / 2), cross @ turn_n / 2
@@ -151,6 +151,6 @@ class Errors:
         """
         J = np.zeros((6, N))
         J[:3, P], J[3:, PHI], J[3:, M] = np.eye(3), np.eye(3), C_nb[:, 1:]
-        J[:3] -= skew(arm_n) @ J[3:]
+        J[:3] -= skewed(arm_n) @ J[3:]
         cov: Floats = J @ self.cov @ J.T
         return cov

@@ -10,9 +10,11 @@
 """What is sent of odometry: poses and twists, each with its covariance."""
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
+from odocal_ros.apply.attitude import skewed
 from odocal_ros.apply.errors import BG, Errors
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats
@@ -39,9 +41,10 @@ class Pose:
 
     def sound(self) -> bool:
         """Return True if all values are finite and no variance is negative."""
-        return all(bool(np.isfinite(x).all()) for x in (
-            self.position, self.q, self.velocity, self.rate, self.pose_cov, self.twist_cov)) and (
-            bool((np.diag(self.pose_cov) >= 0).all() and (np.diag(self.twist_cov) >= 0).all()))
+        total = sum(float(x.sum()) for x in (self.position, self.q, self.velocity, self.rate,
+                                             self.pose_cov, self.twist_cov))
+        return math.isfinite(total) and bool(
+            min(self.pose_cov.diagonal().min(), self.twist_cov.diagonal().min()) >= 0)
 
 
 def pose_covariance(vehicle: Vehicle, errors: Errors, C_nb: Floats, arm_n: Floats,
@@ -70,7 +73,7 @@ def twist_covariance(vehicle: Vehicle, errors: Errors, speed: float, rate: Float
     turn = C_vb @ errors.cov[BG, BG] @ C_vb.T + np.eye(3) * grade.gyro_noise**2 / T
     turn += np.outer(rate, rate) * grade.gyro_scale_error**2
     # a body that turns too much about an arm moves too much
-    arm = np.cross(np.eye(3), -vehicle.lever_arm).T
+    arm = skewed(vehicle.lever_arm)
     along = np.array([(speed * vehicle.scale_sigma)**2 + variance / T**2, SWAY**2, SWAY**2])
     cov = np.zeros((6, 6))
     cov[:3, :3] = np.diag(along + errors.road(speed * T) / T**2 + [1e-6, 0.0, 0.0])

@@ -19,6 +19,7 @@ gyro bias; the position never jumps.
 
 import numpy as np
 
+from odocal_ros.apply.attitude import cross, matrix_of, product, turned
 from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
 from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
 from odocal_ros.apply.start import Start
@@ -26,14 +27,9 @@ from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.rotations import (
-    matrix_from_quat,
-    quat_from_matrix,
-    quat_from_rotvec,
-    quat_multiply,
-)
+from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply
 from odocal_ros.nav.standstill import REST_TURN
-from odocal_ros.nav.strapdown import prefix_product, rotation_increments
+from odocal_ros.nav.strapdown import rotation_increments
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.levels import FASTEST
 
@@ -44,6 +40,7 @@ HOLE_INTERVALS = 2.5      # judgement: usual intervals of the IMU, a longer one 
 # judgement: corrections in turn that force and motion disagree at, after which the attitude is
 # false; m/s^2 that the force is then as long as gravity to
 MOST_APART, AS_GRAVITY = 10, 1.0
+GROW_PERIOD = 0.05        # s; judgement: in which a covariance hardly grows
 TILT_LOST = 0.5           # rad; judgement: sigma beyond which a straight line levels nothing
 
 
@@ -65,7 +62,9 @@ class Reckoning:
         self._earth_n = start.earth_n
         self._t = self._t_pose = self._t_look = float(self.imu.t[self.imu.at])
         self._s = self._s_pose = float(self.wheels.at(self._t))
+        self._C_nb = matrix_of(self.q)
         self._turn_b, self._felt_n, self._felt = np.zeros(3), np.zeros(3), True
+        self._T_grow, self._way_grow, self._turn_grow = 0.0, np.zeros(3), np.zeros(3)
         self._w_look: list[Floats] = []
         self._rested, self._apart, self._strange_turn = False, 0, np.zeros(3)
         self._v_look = self._velocity_n(self._t)
@@ -109,34 +108,47 @@ class Reckoning:
         phi = rotation_increments(t, imu.w_b[low:last + 2] - self.bias)
         phi = phi[:, at - low:last - low]
         t = imu.t[at:last + 1]
-        q = prefix_product(np.concatenate([self.q[None], quat_from_rotvec(phi.T)]))
-        if self._earth_n.any():
-            turned = np.multiply.outer(self._t - t, self._earth_n)
-            q = quat_multiply(quat_from_rotvec(turned), q)
-        C = matrix_from_quat(q)
-        s = self.wheels.at(t)
+        s, gaps = self.wheels.at(t), np.diff(t)
         lost, self._s = abs(float(s[0]) - self._s), float(s[-1])
-        mid = (C[:-1] + C[1:]) / 2
-        way_n = np.sum(mid @ self.vehicle.forward_b * np.diff(s)[:, None], axis=0)
+        f_b = imu.f_b[at:last + 1] - self.accel_bias
+        way_n = np.zeros(3)
+        f_n = self._C_nb @ f_b[0]
+        for k, (T, step) in enumerate(zip(gaps.tolist(), np.diff(s).tolist(), strict=True)):
+            C_before, f_before = self._C_nb, f_n
+            self._turn(phi[:, k], T)
+            way_n += (C_before + self._C_nb) @ self.vehicle.forward_b * (step / 2)
+            f_n = self._C_nb @ f_b[k + 1]
+            self._felt_n += (f_before + f_n) * (T / 2)
         self.position = self.position + way_n
-        T, turn_b = t[-1] - t[0], phi.sum(axis=1)
-        gaps = np.diff(t)
-        C_mid = C[len(C) // 2]
-        self.errors.grow(T, C_mid, way_n, C_mid @ turn_b, C_mid @ self.vehicle.C_vb.T,
-                         self.wheels.doubt(t[0], t[-1]),
-                         gaps[gaps > HOLE_INTERVALS * imu.usual])
-        self._doubt_turn(imu.strange[at + 1:last + 1], gaps, C_mid)
+        turn_b, strange = phi.sum(axis=1), imu.strange[at + 1:last + 1]
+        self._grow(float(t[-1] - t[0]), way_n, turn_b, gaps[gaps > HOLE_INTERVALS * imu.usual],
+                   self.wheels.doubt(t[0], t[-1]))
+        self._doubt_turn(strange, gaps, self._C_nb)
         if lost > self.wheels.quantum:
             self.errors.lost(lost)
-        f = imu.f_b[at:last + 1] - self.accel_bias
-        self._felt &= bool(np.isfinite(f).all()) and not (gaps > IMU_HOLE).any() and not (
+        self._felt &= bool(np.isfinite(f_b).all()) and gaps.max() <= IMU_HOLE and not (
             self._strange_turn.any())
-        f_n = np.einsum('kij,kj->ki', C, f)
-        self._felt_n = self._felt_n + gaps @ (f_n[:-1] + f_n[1:]) / 2
         self._turn_b = self._turn_b + turn_b
         self._w_look.append(imu.w_b[at + 1:last + 1])
-        self.q, self._t = q[-1] / np.linalg.norm(q[-1]), float(t[-1])
-        imu.at = last
+        self._t, imu.at = float(t[-1]), last
+
+    def _turn(self, phi: Floats, T: float) -> None:
+        """Turn the attitude by a rotation vector of b, rad, over T s."""
+        q = turned(self.q, phi)
+        if self._earth_n.any():
+            q = quat_multiply(quat_from_rotvec(-T * self._earth_n), q)
+        self.q, self._C_nb = q, matrix_of(q)
+
+    def _grow(self, T: float, way_n: Floats, turn_b: Floats, gaps: Floats, doubt: float) -> None:
+        """Carry the errors over T s, at once where data are uncertain, else every GROW_PERIOD."""
+        self._T_grow += T
+        self._way_grow = self._way_grow + way_n
+        self._turn_grow = self._turn_grow + self._C_nb @ turn_b
+        if self._T_grow > GROW_PERIOD - 1e-6 or doubt or len(gaps):
+            C_nb = self._C_nb
+            self.errors.grow(self._T_grow, C_nb, self._way_grow, self._turn_grow,
+                             C_nb @ self.vehicle.C_vb.T, doubt, gaps)
+            self._T_grow, self._way_grow, self._turn_grow = 0.0, np.zeros(3), np.zeros(3)
 
     def _doubt_turn(self, strange: Floats, gaps: Floats, C_nb: Floats) -> None:
         """Add variance for implausible turn rates: (n, 3) rad/s over n gaps of s, in b."""
@@ -154,12 +166,12 @@ class Reckoning:
 
     def _velocity_n(self, t: float) -> Floats:
         """Return the velocity of the IMU in n, by the odometer's last rows."""
-        v, C_nb = self.vehicle, matrix_from_quat(self.q)
+        v, C_nb = self.vehicle, self._C_nb
         now, before = self.wheels.at(np.array([t, t - SPEED_SPAN]))
         arm_b = v.C_vb.T @ (np.asarray(self.config.imu.lever_arm) - v.lever_arm)
         rate = self.imu.w_b[self.imu.at] - self.bias
         velocity: Floats = C_nb @ (
-            v.forward_b * (now - before) / SPEED_SPAN + np.cross(rate, arm_b))
+            v.forward_b * (now - before) / SPEED_SPAN + cross(rate, arm_b))
         return velocity
 
     def _look(self) -> None:
@@ -178,7 +190,7 @@ class Reckoning:
             off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
             noise = 2 * self.wheels.quantum / SPEED_SPAN / T
             by = self.errors.by_gravity(
-                matrix_from_quat(self.q), off_n, T, 0.0 if standing else np.hypot(SHAKING, noise))
+                self._C_nb, off_n, T, 0.0 if standing else np.hypot(SHAKING, noise))
             if by is None:
                 self._take_apart(off_n[:2], velocity, T, w)
             else:
@@ -188,7 +200,7 @@ class Reckoning:
                 self.errors.turned(np.eye(3) * np.sum(by[PHI]**2)**2 / 4)
         if self.config.levelling and standing:
             variance = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
-            earth_b = matrix_from_quat(self.q).T @ self._earth_n
+            earth_b = self._C_nb.T @ self._earth_n
             self._correct(self.errors.by_rest(w.mean(axis=0) - self.bias - earth_b, variance))
         self._rested = resting
         self._t_look, self._v_look = self._t, self._velocity_n(self._t)
@@ -213,28 +225,32 @@ class Reckoning:
 
     def _correct(self, by: Floats) -> None:
         self.q = quat_multiply(quat_from_rotvec(by[PHI]), self.q)
+        self._C_nb = matrix_of(self.q)
         self.bias = self.bias + by[BG]
         self.accel_bias = self.accel_bias + by[BA]
 
     def _pose(self) -> Pose:
         """Return the pose at the row reached."""
         v, T = self.vehicle, self._t - self._t_pose
-        C_nb, C_vb = matrix_from_quat(self.q), v.C_vb
+        C_nb, C_vb = self._C_nb, v.C_vb
         arm_n = -C_nb @ C_vb.T @ v.lever_arm
         earth_b = C_nb.T @ self._earth_n
         rate = C_vb @ (self._turn_b / T - earth_b)
         speed = (self._s - self._s_pose) / T
-        velocity = np.array([speed, 0.0, 0.0]) + np.cross(rate, -v.lever_arm)
+        velocity = cross(v.lever_arm, rate)
+        velocity[0] += speed
         if abs(speed) > FASTEST:
             self._notes.append(f'{speed:.0f} m/s is implausible: the calibration belongs to '
                               'another odometer or unit')
-        quantum, doubt = self.wheels.quantum, self.wheels.doubt(self._t - T, self._t)
+        quantum, jitter = self.wheels.quantum, self.wheels.jitter(self._t, T)
+        doubt = self.wheels.doubt(self._t - T, self._t)
         pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
-                    quat_from_matrix(C_nb @ C_vb.T), velocity, rate,
+                    product(self.q, v.q_bv), velocity, rate,
                     pose_covariance(v, self.errors, C_nb, arm_n, quantum**2 / 6
-                                    + self.wheels.between(self._t)
+                                    + self.wheels.between(self._t) + jitter / 2
                                     + (speed * self._delay_sigma)**2),
-                    twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt))
+                    twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt
+                                     + jitter))
         self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
         return pose
 

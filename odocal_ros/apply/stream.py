@@ -42,6 +42,7 @@ class ImuStream:
         self.zero_ns = 0
         self.at = 0
         self.usual = 0.0
+        self._unmeasured = 0        # rows since ``usual`` was measured
         self.stamp_ns: Ints = np.empty(0, np.int64)
         self.t: Floats = np.empty(0)
         self.w_b: Floats = np.empty((0, 3))
@@ -76,8 +77,10 @@ class ImuStream:
                              ('strange', strange[n:])):
             setattr(self, name, np.concatenate([getattr(self, name), column[rows]]))
         self._drop_single(len(rows))
-        if len(self.t) > 1:
-            self.usual = float(np.median(np.diff(self.t[-INTERVAL_ROWS:])))
+        self._unmeasured += len(rows)
+        few = len(self.t) < INTERVAL_ROWS
+        if len(self.t) > 1 and (few or self._unmeasured > INTERVAL_ROWS // 4):
+            self.usual, self._unmeasured = float(np.median(np.diff(self.t[-INTERVAL_ROWS:]))), 0
 
     def _drop_single(self, new: int) -> None:
         """Drop rows that are off alone; it shows once the next one has come."""

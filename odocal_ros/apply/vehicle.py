@@ -19,7 +19,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
 from odocal_ros.nav.dead_reckoning import forward_b
-from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix
 from odocal_ros.settings.apply_config import ApplyConfig
 
 # rad, 1 sigma of what no calibration determined; judgement: 5 and 3 deg of a mounting by eye
@@ -60,6 +60,11 @@ class Vehicle:
     def C_vb(self) -> Floats:
         """Return the rotation that takes b to the vehicle's axes."""
         return matrix_from_rpy([0.0, self.pitch, self.yaw])
+
+    @cached_property
+    def q_bv(self) -> Floats:
+        """Return the attitude of the vehicle in b, x y z w."""
+        return quat_from_matrix(self.C_vb.T)
 
 
 def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:

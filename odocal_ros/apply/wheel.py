@@ -20,6 +20,7 @@ import math
 
 import numpy as np
 
+from odocal_ros.apply.rhythm import Rhythm
 from odocal_ros.data.arrays import FloatOrFloats, Floats, Values
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.levels import FASTEST
@@ -55,6 +56,8 @@ class Wheel:
         self.t: deque[float] = deque()
         self.s: deque[float] = deque()
         self.doubts: deque[tuple[float, float]] = deque()   # (t, m^2) of uncertain travel
+        self._rhythm = Rhythm()
+        self._arrival = -math.inf      # s, of the last row
         self._value: int | float | None = None
         self._rows = self._refused = 0
         self._refused_since = 0.0
@@ -72,7 +75,8 @@ class Wheel:
     def feed(self, t: Floats, value: Values) -> None:
         """Take rows: times, s, and values as sent; what has no time or value is passed over."""
         for row in zip(t.tolist(), value.tolist(), strict=True):
-            if math.isfinite(row[1]) and (not self.t or row[0] > self.t[-1]):
+            if math.isfinite(row[1]) and row[0] > self._arrival:
+                self._arrival = row[0]
                 self._take(*row)
         if self.t:
             self.forget(self.t[-1] - KEPT_TIME)
@@ -86,12 +90,22 @@ class Wheel:
 
     def at(self, t: FloatOrFloats) -> FloatOrFloats:
         """Return the travel at times, linear between rows, constant outside."""
-        travel: FloatOrFloats = np.interp(t, self.t, self.s)
-        return travel
+        if isinstance(t, np.ndarray):
+            return np.array([self.at(one) for one in t.tolist()])
+        after = bisect_left(self.t, t)
+        if not 0 < after < len(self.t):
+            return self.s[0] if after == 0 else self.s[-1]
+        t0, t1, s0, s1 = self.t[after - 1], self.t[after], self.s[after - 1], self.s[after]
+        return s0 + (s1 - s0) * (t - t0) / (t1 - t0)
 
     def doubt(self, t_from: float, t_to: float) -> float:
         """Return the variance of the travel between two times, m^2, each uncertainty once."""
         return sum((variance for t, variance in self.doubts if t_from < t <= t_to), 0.0)
+
+    def jitter(self, t: float, T: float) -> float:
+        """Return the variance, m^2, of the travel in the T s up to a time by arrival jitter."""
+        off = self._rhythm.error_s * (self.at(t) - self.at(t - T)) / T
+        return 2.0 * off**2 * min(1.0, T / self.usual if self.usual else 1.0)**2
 
     def between(self, t: float) -> float:
         """Return the variance, m^2, of the travel at a time because rows lie only beside it."""
@@ -114,7 +128,12 @@ class Wheel:
             self._value = value
             self._add(t, 0.0)
             return
-        dt, before = t - self.t[-1], self._value
+        before = self._value
+        if self.form.quantity != 'rate':
+            most = FASTEST * STAMP_BURST + self.quantum
+            step = min(max(self._step(value, before, 0.0) * self.scale, -most), most)
+            t = self._rhythm.place(t, self.s[-1] + step, self.speed, self.quantum)
+        dt = t - self.t[-1]
         self._rows += 1
         step = self._step(value, before, dt) * self.scale
         gap = dt > max(MISSING_TIME, GAP_FACTOR * self.usual) and self._rows > SURE_ROWS

@@ -90,6 +90,10 @@ class Wheels:
         """Return the variance of the travel between two times, m^2, beside that of the scale."""
         return sum(w.doubt(t_from, t_to) for w in self._wheels.values()) / len(self._wheels)**2
 
+    def jitter(self, t: float, T: float) -> float:
+        """Return the variance, m^2, of the travel in the T s up to a time by arrival jitter."""
+        return sum(w.jitter(t, T) for w in self._wheels.values()) / len(self._wheels)**2
+
     def between(self, t: float) -> float:
         """Return the variance, m^2, of the travel at a time because rows lie only beside it."""
         return sum(w.between(t) for w in self._wheels.values()) / len(self._wheels)**2

@@ -88,15 +88,15 @@ def _folder(path: Path) -> Source:
     known = _read_metadata(beside) if beside.exists() else None
     wanted = known.names if known else ()
     notes = [known.trouble] if known and known.trouble else []
-    files = [path / file for file in wanted if is_file(path / file)]
+    files = _distinct([path / file for file in wanted if is_file(path / file)])
     lost = [file for file in wanted if not is_file(path / file)]
     if lost and files:
         named = ', '.join(lost[:10]) + ' ...' * (len(lost) > 10)
         notes.append(f'{path}: {len(lost)} of {len(wanted)} files named in metadata.yaml are '
                      f'missing ({named}); the others are read')
     if not files:
-        files = sorted((f for f in path.iterdir() if f.name.endswith(ENDINGS) and is_file(f)),
-                       key=_by_number)
+        files = _distinct(sorted((f for f in path.iterdir()
+                                  if f.name.endswith(ENDINGS) and is_file(f)), key=_by_number))
         if (path / JOURNAL).exists():
             files = without_joined(files)
         if not files:
@@ -108,6 +108,15 @@ def _folder(path: Path) -> Source:
     known = known or Known()
     return Source(path.resolve().name, tuple(files), tuple(notes), known.whole, known.of_file,
                   known.foreign)
+
+
+def _distinct(files: list[Path]) -> list[Path]:
+    """Return the files without links to one that is before them: each is read once."""
+    found: dict[tuple[int, int], Path] = {}
+    for file in files:
+        about = file.stat()
+        found.setdefault((about.st_dev, about.st_ino), file)
+    return list(found.values())
 
 
 def _hint(path: Path) -> str:

@@ -50,10 +50,15 @@ def paths_of(asked: Any) -> list[Path]:
 
 
 def topics_of(asked: Any) -> dict[str, str]:
-    """Return slot -> topic, or raise BadUsage if the argument is not a mapping."""
+    """Return slot -> topic, or raise BadUsage if the argument is no mapping of slots."""
     if asked is not None and not isinstance(asked, Mapping):
         raise BadUsage("topics: required: a mapping of slot to topic such as {'imu': "
                        f"'/imu/data'}}, not {type(asked).__name__}")
+    from odocal_ros.library.topics import OPTION
+    unknown = [one for one in asked or () if one not in OPTION]
+    if unknown:
+        raise BadUsage(f'topics: {brief_line(repr(unknown[0])[:100])} is no slot; required: '
+                       f'{", ".join(OPTION)}')
     return dict(asked or {})
 
 

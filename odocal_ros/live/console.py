@@ -11,6 +11,7 @@
 
 import re
 
+from odocal_ros.live.losses import LossReport
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
@@ -32,6 +33,7 @@ class Console:
         self._log = log
         self._ready = False          # has been said
         self._doubled: set[str] = set()      # said
+        self._losses = LossReport()
         self._silence = False        # has been said
         self._due_ns = 0             # when the next word about what is missing is due
         self._pause_ns = SILENCE_FIRST_NS
@@ -45,6 +47,8 @@ class Console:
         self._faults(now)
         for text in set(now.doubled) - self._doubled:
             self._doubled.add(text)
+            self._log.warning(text)
+        for text in self._losses.news(now.lost_messages):
             self._log.warning(text)
         if now.missing:
             self._missing(now, steady_ns)

@@ -37,6 +37,7 @@ class Health:
         self.count = 0
         self.unusable = 0      # messages that could not be read
         self.lost = 0          # by the middleware's sequence numbers
+        self.lost_before = 0   # of them before the leg
         self.gaps = 0
         self.newest_ns = 0
         self.stampless = False    # no stamp in the last messages

@@ -68,6 +68,16 @@ class Inputs:
         """Return the causes why a leg cannot start, one line per missing topic."""
         return [one.why() for one in self.required(config) if not one.flowing()]
 
+    def begin_leg(self) -> None:
+        """Count lost messages from here on."""
+        for one in self.by_slot.values():
+            one.health.lost_before = one.health.lost
+
+    def lost(self) -> dict[str, int]:
+        """Return topic -> messages lost since the leg began, before the first one in all."""
+        return {one.topic: one.health.lost - one.health.lost_before
+                for one in self.by_slot.values()}
+
     def doubled(self) -> list[str]:
         """Return the warnings on topics with several publishers."""
         return [text for text in (one.doubled() for one in self.by_slot.values()) if text]

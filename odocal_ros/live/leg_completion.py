@@ -192,6 +192,7 @@ class LegCompletion:
         """Open a leg at a mark and return what there is to say."""
         session = self.session
         session.start(mark_ns, self._config(), by_itself)
+        self._recording.inputs.begin_leg()
         self._journal.begin(session, self._recording.inputs.topics)
         if not by_itself:
             self._recording.progress.begin_leg()

@@ -101,7 +101,7 @@ class Publishing:
         config, progress = known['config'], recording.progress
         return SessionView(
             missing=recording.inputs.missing(config), doubled=recording.inputs.doubled(),
-            clocks=progress.clocks.differing(config),
+            lost_messages=recording.inputs.lost(), clocks=progress.clocks.differing(config),
             rates_hz=recording.rates_hz(), results=self.results(),
             max_speed=progress.max_speed(), still_s=progress.still_s(),
             two_wheels=recording.two_wheels(), received=recording.received(),

@@ -9,16 +9,19 @@
 
 """The result folders that a session has written, and what ``latest`` points at."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 import re
 import shutil
+import time
 import uuid
 
 from odocal_ros.output.worse import replacing, stored_in
 from odocal_ros.outside.whole import locked
 
 LATEST = 'latest'
+LEFT_S = 60.0      # judgement: age of an empty folder, or of an unfinished link, that nobody uses
 RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # by its time
 
 
@@ -56,6 +59,7 @@ class ResultFolders:
         """
         link = folder.parent / LATEST
         with locked(folder.parent):         # another node may file there, too
+            _clear(folder.parent)
             before = _target(link)
             worse = '' if force else replacing(stored_in(link), folder)
             if worse:
@@ -110,6 +114,19 @@ def _age(name: str) -> tuple[str, int]:
     """Return the sort key of result names: their time, and the number within that second."""
     when, count = RESULT_NAME.findall(name)[0]
     return when, int(count or 1)
+
+
+def _clear(root: Path) -> None:
+    """Remove what nodes that were killed have left: empty folders of results, and links."""
+    until = time.time() - LEFT_S
+    for one in root.iterdir():
+        with suppress(OSError):
+            if one.lstat().st_mtime > until:
+                continue
+            if RESULT_NAME.fullmatch(one.name):
+                one.rmdir()      # only an empty folder can be
+            elif one.name.startswith(f'.{LATEST}-') and one.is_symlink():
+                one.unlink()
 
 
 def _target(link: Path) -> str:

@@ -29,6 +29,7 @@ class SessionView:
     config: Config
     missing: list[str] = field(default_factory=list)
     doubled: list[str] = field(default_factory=list)     # topics with several publishers
+    lost_messages: dict[str, int] = field(default_factory=dict)      # topic -> since the leg began
     clocks: list[tuple[str, float]] = field(default_factory=list)
     rates_hz: dict[str, float] = field(default_factory=dict)
     results: dict[str, Any] = field(default_factory=dict)  # result.* parameters

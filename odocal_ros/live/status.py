@@ -17,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from odocal_ros.calib.result import wheel_factors
 from odocal_ros.foresee import quantities
 from odocal_ros.foresee.forecast import as_keys
+from odocal_ros.live import losses
 from odocal_ros.live.guidance import (
     hint,
     manoeuvres,
@@ -77,6 +78,7 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
         'manoeuvres': '; '.join(manoeuvres(now)),
         'can_tell': ', '.join(now.ability.can) if now.ability else '',
         'cannot_tell': '; '.join(now.ability.cannot) if now.ability else '',
+        'messages_lost': sum(now.lost_messages.values()),
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
         'save_trouble': now.save_trouble, 'lost': now.lost,
         'automatic': _automatic(now), 'unused': _unused(session),
@@ -151,7 +153,8 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
         ('the result is not saved', now.save_trouble),
         ('the journal cannot be written', now.journal_trouble)) if trouble]
     return '; '.join(filter(None, (seen, *_changes(session), good, now.lost, text,
-                                   _unused(session), *now.doubled, *troubles)))
+                                   _unused(session), *now.doubled, losses.words(now.lost_messages),
+                                   *troubles)))
 
 
 def _computing(now: SessionView) -> dict[str, object]:

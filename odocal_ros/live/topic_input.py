@@ -100,7 +100,7 @@ class Input:
         frames = self.reader.frames if self.reader is not None else None
         if frames is not None and frames.other and not self._frame_id:
             return (f'{self.topic} carries several IMUs (frame_id {one_line(frames.frame)!r} and '
-                    f'{one_line(frames.other)!r}): set imu.frame_id to the one to calibrate')
+                    f'{one_line(frames.other)!r}): set imu.frame_id to the one to use')
         if len(self.publishers) < 2 or self.reader is None:
             return ''
         # a node's name comes after its topics

@@ -100,6 +100,14 @@ def test_random_faults():
     assert wrong == []
 
 
+@pytest.mark.parametrize('number', [41, 311])
+def test_angles_of_1e300_do_not_end_it(number):
+    _, faults, worst, what, _, said = stream(20261126, number)
+    assert 'counter put -1e+300 in 3 rows' in faults
+    assert worst <= SIGMAS, what
+    assert said
+
+
 def test_a_turn_that_no_vehicle_begins_is_doubted():
     drive = drive_of(0)
     topics = columns_of(drive)

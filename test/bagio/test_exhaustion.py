@@ -280,6 +280,25 @@ def test_a_file_named_many_times_is_read_once(tmp_path):
         assert len(bag.files) == 1
 
 
+@pytest.mark.parametrize('link', ['hardlink_to', 'symlink_to'])
+def test_a_file_of_many_names_is_read_once(tmp_path, link):
+    path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5), 'mcap')
+    names = [file.name for file in path.iterdir() if file.suffix == '.mcap']
+    assert len(names) == 1
+    for k in range(50):
+        getattr(path / f'more_{k}.mcap', link)(path / names[0])
+    text = (path / 'metadata.yaml').read_text()
+    line = next(x for x in text.split('\n') if x.strip().startswith('- bag'))
+    more = [line.replace(names[0], f'more_{k}.mcap') for k in range(50)]
+    for content in (text.replace(line, '\n'.join([line, *more]), 1), None):
+        if content is None:
+            (path / 'metadata.yaml').unlink()
+        else:
+            (path / 'metadata.yaml').write_text(content)
+        with open_bag(path) as bag:
+            assert len(bag.files) == 1
+
+
 def test_one_message_of_a_database_is_bounded(tmp_path):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5), 'sqlite3')
     db = sqlite3.connect(path / 'bag.db3')

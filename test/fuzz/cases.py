@@ -31,6 +31,7 @@ import time
 import warnings
 
 import mutations
+import semantic
 
 from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.sim.options import SimOptions
@@ -150,42 +151,56 @@ def case(seed: int, clean: Bases, work: Path, number: int, ran) -> Outcome:
     base = rng.choice(list(BASES))
     bag = place / 'bags' / clean.bag(base).name
     (shutil.copy if clean.bag(base).is_file() else shutil.copytree)(clean.bag(base), bag)
-    done, options = mutated(rng, base, bag)
-    argv = command(rng, bag, clean.options, options)
+    done, options, factors = mutated(rng, base, bag)
+    argv = command(rng, bag, clean.options, options, whole=factors is not None)
     if argv[0] == 'replay':
         argv += ['--output', str(place / 'out')]
     before = tree(place)
     code, seconds, memory = ran(argv, place)
     said = (place / 'stderr').read_text(errors='replace')
     wrong = judged(place, before, code, seconds, memory, said,
-                   clean.truth[base] if not options else None)
+                   ranges(clean.truth[base], factors) if not options else None)
     shutil.rmtree(place)
     method = argv[3] if argv[0] == 'replay' else ''
     return Outcome(number, f'{base} {done} {argv[0]} {method}'.rstrip(), code, seconds, memory,
                    said[-400:], wrong)
 
 
-def command(rng, bag, wide, options) -> list[str]:
-    """Return a command line: mostly of the cheapest method, some of the whole pipeline."""
+def command(rng, bag, wide, options, whole) -> list[str]:
+    """Return a command line: mostly of the cheapest method, ``whole``: of the whole pipeline."""
     if rng.random() < 0.2:
         return ['inspect', str(bag), *(o for o in options if not o.startswith('--leg='))]
     few = [] if rng.random() < 0.005 else ['--set', 'output.formats=[params]']
-    if rng.random() < 0.9:
+    if rng.random() < (0.3 if whole else 0.9):
         return ['replay', str(bag), '--method', 'two_point', *wide, *few, *options]
     return ['replay', str(bag), '--method', rng.choice(['auto', 'smoother', 'patent']), *few,
             *options]
 
 
 def mutated(rng, base, bag):
-    """Change a bag, or say it all by options; return what was done and the options."""
+    """
+    Change a bag, or say it all by options; return what was done, the options, and the factors.
+
+    Factors of the true scale factor, (least, largest): of what changes the meaning; else None.
+    """
     if rng.random() < 0.15:
-        return 'options', mutations.texts(rng, bag.parent)
+        return 'options', mutations.texts(rng, bag.parent), None
     if base == 'journal' and rng.random() < 0.4:
         mutations.text_file(rng, bag / 'journal.yaml')
-        return 'journal_text', []
+        return 'journal_text', [], None
+    if BASES[base][0] == 'sqlite3' and rng.random() < 0.5:
+        change = rng.choice(semantic.ALL)
+        return change.__name__, [], semantic.change_sqlite(rng, mutations.file_of(bag), change)
     change = rng.choice(mutations.OF.get(base) or mutations.OF[BASES[base][0]])
     change(rng, bag)
-    return change.__name__, []
+    return change.__name__, [], None
+
+
+def ranges(truth, factors) -> dict:
+    """Return the least and largest true value of each name."""
+    least, largest = factors or semantic.SAME
+    return {name: (true, true) if name != 'scale_factor' else (least * true, largest * true)
+            for name, true in truth.items()}
 
 
 def tree(place: Path) -> dict:
@@ -261,11 +276,12 @@ def false_value(content, truth) -> str:
     if content['verdict'] != 'accepted':
         return ''
     off = []
-    for name, true in truth.items():
+    for name, (least, largest) in truth.items():
         entry = content['result'].get(name) or {}
         if entry.get('value') is None:
             continue
-        z = (entry['value'] - true) / entry['sigma']
-        if not abs(z) <= SIGMAS:
-            off.append(f'{name} {entry["value"]:.6g} +- {entry["sigma"]:.2g}, {true:.6g} is true')
+        far = max(least - entry['value'], entry['value'] - largest)
+        if not far <= SIGMAS * entry['sigma']:
+            true = f'{least:.6g}' + f' to {largest:.6g}' * (largest > least)
+            off.append(f'{name} {entry["value"]:.6g} +- {entry["sigma"]:.2g}, {true} is true')
     return '; '.join(off)

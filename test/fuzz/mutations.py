@@ -9,7 +9,7 @@
 
 """Seeded mutations of bags, by their structure: each takes a random.Random and a folder."""
 
-import math
+from contextlib import closing
 from pathlib import Path
 import random
 import sqlite3
@@ -18,8 +18,6 @@ import struct
 import yaml
 
 from odocal_ros.bagio.mcap_records import CHUNK, MAGIC
-from odocal_ros.messages.cdr import FRAME_AT, layout_of
-from odocal_ros.messages.sensor_types import IMU
 from odocal_ros.outside.limits import zstd_module
 
 INTEGERS = [0, 1, -1, 2, 127, 255, 256, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62,
@@ -195,6 +193,51 @@ def cdr(rng, message, head=0):
     return bytes(body)
 
 
+INDEX = {         # places and sizes of numbers of a record
+    6: [(0, 8), (8, 8), (16, 8), (24, 4)],                                      # chunk
+    7: [(2, 4), (6, 8), (14, 8), (22, 8), (30, 8)],                             # message index
+    8: [(0, 8), (8, 8), (16, 8), (24, 8), (32, 4), (46, 8)],                    # chunk index
+    11: [(0, 8), (8, 2), (10, 4), (22, 4), (26, 8), (34, 8)], 2: [(0, 8), (8, 8), (16, 4)]}
+
+
+def mcap_lies(rng, bag):
+    """Have indexes, heads of chunks and counts lie: as another record says it, or by a number."""
+    file = file_of(bag)
+    records = records_of(file.read_bytes(), len(MAGIC))
+    for _ in range(rng.choice([1, 1, 3, 30])):
+        op = rng.choice([k for k in INDEX if any(k == one for one, _ in records)])
+        places = [i for i, (one, _) in enumerate(records) if one == op]
+        i, j = rng.choice(places), rng.choice(places)
+        at, size = rng.choice(INDEX[op])
+        body = bytearray(records[i][1])
+        if at + size > len(body):
+            continue
+        number = rng.choice([
+            int.from_bytes(records[j][1][at:at + size], 'little'), rng.choice(INTEGERS),
+            int.from_bytes(body[at:at + size], 'little') + rng.choice([-9, -1, 1, 9, 1000])])
+        body[at:at + size] = (number % 2**(8 * size)).to_bytes(size, 'little')
+        records[i] = op, bytes(body)
+    file.write_bytes(MAGIC + joined(records) + MAGIC)
+
+
+def mcap_overlap(rng, bag):
+    """Repeat or exchange chunks, so that their times overlap; the index is true or is missing."""
+    file = file_of(bag)
+    records = records_of(file.read_bytes(), len(MAGIC))
+    chunks = [i for i, (op, _) in enumerate(records) if op == CHUNK]
+    kind, i, j = rng.randrange(3), rng.choice(chunks), rng.choice(chunks)
+    if kind == 0:
+        records.insert(j, records[i])
+    elif kind == 1:
+        records[i], records[j] = records[j], records[i]
+    else:                      # the same chunk by two entries of the index
+        entries = [k for k, (op, _) in enumerate(records) if op == 8]
+        records.insert(rng.choice(entries), records[rng.choice(entries)])
+    if kind < 2:
+        records = [r for r in records if r[0] not in (2, 7, 8, 11, 14)] + [(2, bytes(20))]
+    file.write_bytes(MAGIC + joined(records) + MAGIC)
+
+
 # ---- sqlite3 -------------------------------------------------------------------------------
 
 def sqlite_rows(rng, bag):
@@ -233,43 +276,57 @@ def sqlite_values(rng, bag):
     db.close()
 
 
-IMU_ROWS = ('SELECT messages.id, data FROM messages JOIN topics ON topic_id = topics.id '
-            f"WHERE type = '{IMU}'")
+COLUMNS = ('id', 'topic_id', 'timestamp', 'data')
+TABLES = [          # that hold the same rows in another way
+    'CREATE TABLE other (data BLOB, timestamp INTEGER, topic_id INTEGER, id INTEGER PRIMARY KEY)',
+    'CREATE TABLE other (id INTEGER, topic_id INTEGER, timestamp INTEGER, data BLOB, '
+    'PRIMARY KEY (timestamp, id)) WITHOUT ROWID',
+    'CREATE TABLE other (id, topic_id, timestamp, data)',
+    'CREATE TABLE other (id TEXT, topic_id TEXT, timestamp TEXT, data TEXT)',
+    'CREATE TABLE other (id INTEGER PRIMARY KEY DESC, more BLOB DEFAULT (zeroblob(70000)), '
+    'topic_id INTEGER, timestamp REAL, data BLOB)',
+    'CREATE TABLE other (id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB, '
+    'twice AS (timestamp * 2) STORED)']
+CHANGES = [
+    'CREATE VIEW messages AS SELECT * FROM other', 'ALTER TABLE other RENAME TO messages',
+    'ALTER TABLE other RENAME TO "Messages"', 'INSERT INTO messages SELECT '
+    f'{", ".join(COLUMNS)} FROM other']
+ROWS = ['id, topic_id, timestamp, data', '-id, topic_id, timestamp, data',
+        'id + 9223372036854770000, topic_id, timestamp, data',
+        "id, topic_id, timestamp, CAST(data || x'00' AS BLOB)"]
 
 
-def sqlite_second_imu(rng, bag):
-    """Send some messages of the IMU as a second one has them, that sits turned about z."""
-    every, angle = rng.choice([2, 2, 3, 10]), rng.uniform(-3.0, 3.0)
-    with sqlite3.connect(file_of(bag)) as db:
-        changed = []
-        for key, data in db.execute(IMU_ROWS).fetchall()[::every]:
-            data = bytearray(data)
-            layout = layout_of(IMU, bytes(data))
-            for name in ('angular_velocity', 'linear_acceleration'):
-                at, _ = layout.find(f'{name}.x')
-                x, y = struct.unpack_from('<2d', data, at)
-                struct.pack_into('<2d', data, at, x * math.cos(angle) - y * math.sin(angle),
-                                 x * math.sin(angle) + y * math.cos(angle))
-            data[FRAME_AT] ^= 1
-            changed.append((bytes(data), key))
-        db.executemany('UPDATE messages SET data = ? WHERE id = ?', changed)
-    db.close()
-
-
-def sqlite_gyro_axes(rng, bag):
-    """Send the axes of the gyro in another order or with other signs, in every message."""
-    order = rng.sample(range(3), 3)
-    signs = [rng.choice([1.0, -1.0]) for _ in order]
-    with sqlite3.connect(file_of(bag)) as db:
-        rows = db.execute(IMU_ROWS).fetchall()
-        at, _ = layout_of(IMU, rows[0][1]).find('angular_velocity.x')
-        changed = []
-        for key, data in rows:
-            rates = struct.unpack_from('<3d', data, at)
-            turned = [sign * rates[k] for sign, k in zip(signs, order, strict=True)]
-            changed.append((data[:at] + struct.pack('<3d', *turned) + data[at + 24:], key))
-        db.executemany('UPDATE messages SET data = ? WHERE id = ?', changed)
-    db.close()
+def sqlite_oddities(rng, bag):
+    """Hold the rows in a table, a view or a file that other writers of sqlite may have."""
+    file = file_of(bag)
+    old = file.with_suffix('.old')
+    file.rename(old)
+    with closing(sqlite3.connect(old)) as read, (
+            closing(sqlite3.connect(file, isolation_level=None))) as db:
+        for pragma in (f'page_size = {rng.choice([512, 1024, 4096, 65536])}',
+                       f'encoding = "{rng.choice(["UTF-8", "UTF-8", "UTF-16le", "UTF-16be"])}"',
+                       f'auto_vacuum = {rng.choice([0, 1, 2])}',
+                       f'journal_mode = {rng.choice(["delete", "wal"])}'):
+            db.execute(f'PRAGMA {pragma}')
+        db.execute('BEGIN')
+        for name, sql in read.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table' "
+                                      "AND name NOT LIKE 'sqlite_%'").fetchall():
+            db.execute(sql)
+            rows = read.execute(f'SELECT * FROM {name}').fetchall()
+            if rows and name != 'messages':
+                db.executemany(f'INSERT INTO {name} VALUES ({", ".join("?" * len(rows[0]))})',
+                               rows)
+        table, change = rng.choice(TABLES), rng.choice(CHANGES)
+        if change.startswith(('ALTER', 'CREATE VIEW messages')):
+            db.execute('DROP TABLE messages')
+        db.execute(table)
+        order = rng.choice(['timestamp', 'timestamp DESC', 'topic_id, id', 'random()'])
+        db.executemany(f'INSERT OR IGNORE INTO other ({", ".join(COLUMNS)}) VALUES (?, ?, ?, ?)',
+                       read.execute(f'SELECT {rng.choice([ROWS[0], *ROWS])} FROM messages ORDER '
+                                    f'BY {order}'))
+        db.execute(change)
+        db.execute('COMMIT')
+    old.unlink()
 
 
 def sqlite_pages(rng, bag):
@@ -330,6 +387,21 @@ def metadata(rng, bag):
     text_file(rng, bag / 'metadata.yaml')
 
 
+def linked(rng, bag):
+    """Give the file of messages more names, in metadata.yaml or without it."""
+    file = file_of(bag)
+    names = [f'{rng.choice(["a", "z"])}_{k}{file.suffix}' for k in range(rng.choice([1, 30]))]
+    for name in names:
+        getattr(bag / name, rng.choice(['hardlink_to', 'symlink_to']))(file)
+    about = bag / 'metadata.yaml'
+    if rng.random() < 0.5:
+        about.unlink()
+        return
+    tree = yaml.safe_load(about.read_text())
+    tree['rosbag2_bagfile_information']['relative_file_paths'] += names
+    about.write_text(yaml.safe_dump(tree))
+
+
 def text_file(rng, file):
     """Change a value of a tree, or splice its text."""
     text = file.read_text()
@@ -372,9 +444,10 @@ def texts(rng: random.Random, folder):
     return [option.replace('\0', ' ') for option in found]
 
 
-OF = {'mcap': [raw, clump, mcap_records, mcap_inside, mcap_inside, metadata],
-      'sqlite3': [raw, clump, sqlite_rows, sqlite_values, sqlite_values, sqlite_gyro_axes,
-                  sqlite_second_imu, sqlite_pages, metadata],
+OF = {'mcap': [raw, clump, mcap_records, mcap_inside, mcap_inside, mcap_lies, mcap_overlap,
+               metadata, linked],
+      'sqlite3': [raw, clump, sqlite_rows, sqlite_values, sqlite_values, sqlite_oddities,
+                  sqlite_pages, metadata, linked],
       'rosbag1': [raw, clump, ros1_inside, ros1_inside],
       'file': [raw, clump, metadata],                   # packed as a whole, and
       'messages': [raw, clump, mcap_records, metadata]}  # each: no value can be reached

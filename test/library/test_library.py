@@ -251,7 +251,8 @@ def test_an_option_that_is_none_is_told():
 
 @pytest.mark.parametrize('odd', [
     (b'\xff',), ('\0',), (3.5,), (None,), ([],), ('x' * 5000,), ('{bag}', 3), ('{bag}', None, 3),
-    ('{bag}', None, '\0'), ('{bag}', None, None, 3)])
+    ('{bag}', None, '\0'), ('{bag}', None, None, 3), ('{bag}', {'imu_2': '/x'}),
+    ('{bag}', {3: '/x'})])
 def test_arguments_that_make_no_sense_are_usage_errors(odd, tmp_path):
     from odocal_ros.errors import BadUsage
     from odocal_ros.library.calibrate_bag import calibrate_bag

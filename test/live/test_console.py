@@ -50,6 +50,12 @@ def test_each_thing_is_said_once_or_seldom():
     two = {'doubled': ['/ticks has 2 publishers (/a, /b)']}
     assert report(305, **two) == [('warning', two['doubled'][0])]
     assert report(306, **two) == []
+    for lost, new in ((0, False), (3, True), (29, False), (31, True), (32, False), (0, False),
+                      (1, True)):       # of the next leg
+        line = report(306, lost_messages={'/ticks': lost, '/imu': 0})
+        assert bool(line) == new, lost
+        assert all(f'{lost} message{"s" * (lost > 1)} of /ticks lost. Likely' in text
+                   for _, text in line)
     gap = {'faults': (Reason(Code.IMU_GAP, 'no IMU data for 3 s'),)}
     for _ in range(2):                                   # of each leg
         session.start(1, Config())

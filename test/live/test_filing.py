@@ -9,7 +9,9 @@
 
 """The answer of ~/save, and what it takes to put a worse result in the place of a good one."""
 
+import os
 import threading
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -60,6 +62,22 @@ def test_a_worse_result_needs_the_second_save(save):
     assert 'latest is unchanged: the new result is rejected (NO_FIX)' in text
     assert 'call ~/save again' in text
     assert save(BAD)[1]
+
+
+def test_what_a_killed_node_has_left_is_removed_by_the_next_save(save, tmp_path):
+    empty, full, new = (tmp_path / f'2026-01-01T00-00-0{k}Z' for k in range(3))
+    other = tmp_path / 'notes'
+    for folder in (empty, full, new, other):
+        folder.mkdir()
+    (full / 'calibration.json').write_text('{}')
+    link, young = (tmp_path / f'.latest-{digit * 32}' for digit in 'ab')
+    for one in (link, young):
+        one.symlink_to(full.name)
+    for old in (empty, full, other, link):
+        os.utime(old, (time.time() - 600.0,) * 2, follow_symlinks=False)
+    save(GOOD)
+    assert {one.name for one in (empty, full, new, other, link, young) if one.is_symlink()
+            or one.exists()} == {full.name, new.name, other.name, young.name}
 
 
 def test_what_cannot_be_saved_is_a_warning_until_it_is(tmp_path):

@@ -1,0 +1,150 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The times of a counter that is stamped at arrival, as its rows come."""
+
+from dataclasses import replace
+
+from faulty_streams import calibration
+import numpy as np
+import pytest
+
+from odocal_ros.apply.odometry import Odometry
+from odocal_ros.apply.rhythm import Rhythm
+from odocal_ros.apply.vehicle import vehicle_of
+from odocal_ros.data.samples import take
+from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.config import with_settings
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+RATE, COUNT = 50.0, 0.02      # Hz, m
+PIECE_NS = 50_000_000
+
+
+def placed(arrivals, travel, speed=10.0, quantum=0.0):
+    """Return the times of rows, s, and the rhythm after them."""
+    rhythm = Rhythm()
+    return np.array([rhythm.place(t, s, speed, quantum) for t, s in zip(
+        arrivals.tolist(), travel.tolist(), strict=True)]), rhythm
+
+
+def in_order(t):
+    """Return arrivals none of which passes another, s."""
+    order = 2e-5 * np.arange(len(t))
+    return np.maximum.accumulate(t - order) + order
+
+
+@pytest.fixture(scope='module')
+def even():
+    """Return times on a rhythm, and arrivals that are late by 5 ms on average."""
+    t = np.arange(3000) / RATE
+    return t, in_order(t + np.random.default_rng(1).exponential(5e-3, len(t)))
+
+
+def test_late_rows_are_put_on_the_rhythm(even):
+    t, arrivals = even
+    times, rhythm = placed(arrivals, 10.0 * t)
+    off = (times - t)[500:]
+    # the line through 300 rows of sigma 5 ms has one of 5 ms * sqrt(4 / 300) = 0.6 ms
+    assert np.std(off) < 1e-3
+    assert np.median(np.abs(np.diff(off))) < 5e-5
+    assert (np.diff(times) > 0).all()
+    assert rhythm.error_s < 1e-3
+
+
+def test_travel_shows_the_rows_that_are_lost_and_those_that_are_late(even):
+    t, arrivals = even
+    kept = np.ones(len(t), bool)
+    kept[[700, 701, 1500, 2200]] = False
+    late = arrivals.copy()
+    late[1000:1006] = np.maximum(late[1000:1006], t[1006])     # a burst, of which none is lost
+    times, _ = placed(in_order(late)[kept], 10.0 * t[kept])
+    assert np.abs(times - t[kept] - np.median(times - t[kept]))[500:].max() < 4e-3
+
+
+def test_rows_lost_at_rest_shift_the_line_within_half_a_second(even):
+    t, arrivals = even
+    kept = np.ones(len(t), bool)
+    kept[1000:1003] = False
+    times, _ = placed(arrivals[kept], 0.0 * t[kept], speed=0.0, quantum=COUNT)
+    off = times - t[kept] - np.median(times - t[kept])
+    assert np.abs(off[1040:]).max() < 0.25 / RATE
+
+
+def test_another_rate_is_another_rhythm(even):
+    t, arrivals = even
+    slow = t[-1] + 1.0 + np.arange(1000) / (RATE / 2)
+    late = in_order(slow + np.random.default_rng(2).exponential(5e-3, len(slow)))
+    times, _ = placed(np.append(arrivals, late), 10.0 * np.append(t, slow))
+    off = (times - np.append(t, slow))[-500:]
+    assert np.std(off) < 2e-3
+
+
+def test_true_times_of_an_uneven_sender_are_kept():
+    rng = np.random.default_rng(3)
+    t = np.sort(np.arange(3000) / RATE + rng.uniform(-5e-3, 5e-3, 3000))
+    times, rhythm = placed(t, 10.0 * t)
+    np.testing.assert_array_equal(times[500:], t[500:])
+    assert rhythm.error_s < 1e-5
+
+
+def test_even_stamps_are_kept_to_the_bit():
+    t = np.arange(1000) / RATE
+    times, _ = placed(t, 10.0 * t)
+    np.testing.assert_array_equal(times, t)
+
+
+def test_what_no_rhythm_explains_is_in_the_error():
+    rng = np.random.default_rng(4)
+    t = np.cumsum(rng.uniform(0.01, 0.03, 3000))            # no rhythm, and late
+    late = in_order(t + rng.exponential(3e-3, len(t)))
+    times, rhythm = placed(late, 10.0 * t)
+    assert np.mean(times == late) > 0.98      # chance may favour a line for some rows
+    # rows 20 ms apart are off their neighbours by somewhat more or less than evenly spaced ones
+    assert rhythm.error_s == pytest.approx(3e-3, rel=0.4)
+
+
+def twists(mean_late_s, seed):
+    """Return error and sigma of the forward speed of a drive whose counter is late, m/s."""
+    drive = simulate(SimOptions(scenario='town', duration=135.0, seed=seed, imu_rate=100.0,
+                                odometer_rate=RATE, imu_grade='industrial'))
+    begin_ns, rows = drive.options.start_ns, drive.odometer
+    late = np.random.default_rng(seed).exponential(mean_late_s, len(rows.stamp_ns))
+    stamps = begin_ns + np.rint(1e9 * in_order((rows.stamp_ns - begin_ns) * 1e-9 + late)).astype(
+        np.int64)
+    counter = replace(rows, stamp_ns=stamps, received_ns=stamps)
+    config = with_settings(ApplyConfig(), {'imu.grade': 'industrial'})
+    odometry = Odometry(vehicle_of(calibration(drive.truth, np.random.default_rng(seed)), config),
+                        config)
+    poses = []
+    for edge in range(begin_ns, int(stamps[-1]), PIECE_NS):
+        for slot, block in (('imu', drive.imu), ('odometer', counter)):
+            a, b = np.searchsorted(block.received_ns, [edge, edge + PIECE_NS])
+            odometry.feed(slot, take(block, slice(a, b)), drive.form)
+        poses += odometry.poses()
+    assert odometry.take_notes() == []
+    t = (np.array([pose.stamp_ns for pose in poses]) - begin_ns) * 1e-9
+    fine = np.arange(0.0, drive.motion.duration, 1e-3)
+    path = np.concatenate([[0.0], np.cumsum(drive.motion.at(fine).speed[1:] * 1e-3)])
+    true = np.diff(np.interp(t, fine, path)) / np.diff(t)
+    error = np.array([pose.velocity[0] for pose in poses])[1:] - true
+    sigma = np.sqrt([pose.twist_cov[0, 0] for pose in poses])[1:]
+    moving = true > 0.3
+    return error[moving], sigma[moving]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('late_s', [0.0, 1e-3, 5e-3, 20e-3])
+def test_the_twist_of_a_late_counter_is_within_its_covariance(late_s):
+    error, sigma = twists(late_s, seed=1)
+    assert len(error) > 500
+    assert np.mean(np.abs(error) < 2 * sigma) >= 0.95
+    # what one count in 50 ms makes, and little more
+    assert np.sqrt(np.mean(error**2)) < 0.2
+    assert np.median(sigma) < 0.25

@@ -1,0 +1,177 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Seeded mutations of what the messages of a bag mean; every message stays well-formed.
+
+Each takes a random.Random and the rows of a bag by topic, and returns by what factors the true
+scale factor is multiplied: (least, largest), of which a mixture may be the mean.
+"""
+
+from contextlib import closing
+import math
+import sqlite3
+import struct
+
+import numpy as np
+
+from odocal_ros.messages.cdr import FRAME_AT, layout_of
+from odocal_ros.messages.sensor_types import FIX, IMU
+
+SAME = (1.0, 1.0)
+COUNTER, JOINTS = 'std_msgs/msg/Int64', 'sensor_msgs/msg/JointState'
+RATES = [f'angular_velocity.{axis}' for axis in 'xyz']
+FORCES = [f'linear_acceleration.{axis}' for axis in 'xyz']
+DEG, G = 180 / math.pi, 9.80665
+
+
+def change_sqlite(rng, file, mutation):
+    """Change the rows of a database; return the factors of the true scale."""
+    with closing(sqlite3.connect(file)) as db, db:
+        topics = dict(db.execute('SELECT id, type FROM topics'))
+        rows = {kind: [] for kind in topics.values()}
+        for topic, time_ns, data in db.execute(
+                'SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id'):
+            rows[topics[topic]].append((time_ns, data))
+        factors = mutation(rng, rows)
+        ids = {kind: topic for topic, kind in topics.items()}
+        db.execute('DELETE FROM messages')
+        db.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)',
+                       sorted(((ids[kind], t, bytes(data)) for kind, one in rows.items()
+                               for t, data in one), key=lambda row: row[1]))
+    return factors
+
+
+def put(kind, data, fields, change):
+    """Return a message with the values of some fields changed."""
+    data, layout = bytearray(data), layout_of(kind, bytes(data))
+    places = [np.ndarray(1, form, data, at) for at, form in map(layout.find, fields)]
+    for place, value in zip(places, change(*(place[0].item() for place in places)), strict=True):
+        place[0] = value
+    return bytes(data)
+
+
+def put_all(rows, kind, fields, change, which=slice(None)):
+    """Change fields of some messages of a type."""
+    rows[kind][which] = [(t, put(kind, data, fields, change)) for t, data in rows[kind][which]]
+
+
+def odometer_of(rows):
+    """Return type and field of the odometer."""
+    kind = COUNTER if COUNTER in rows else JOINTS
+    return kind, ['data'] if kind == COUNTER else ['position[0]']
+
+
+def some_range(rng, n):
+    """Return a part of n rows, up to all that follow."""
+    begin = rng.randrange(n // 10, n - n // 10)
+    return slice(begin, n if rng.random() < 0.3 else rng.randrange(begin, n) + 1)
+
+
+def second_imu(rng, rows):
+    """Send some messages of the IMU as a second one has them, that sits turned about z."""
+    angle = rng.uniform(-3.0, 3.0)
+    c, s = math.cos(angle), math.sin(angle)
+    which = slice(0, None, rng.choice([2, 2, 3, 10]))
+    for fields in (RATES[:2], FORCES[:2]):
+        put_all(rows, IMU, fields, lambda x, y: (c * x - s * y, s * x + c * y), which)
+    rows[IMU][which] = [(t, data[:FRAME_AT] + bytes([data[FRAME_AT] ^ 1]) + data[FRAME_AT + 1:])
+                        for t, data in rows[IMU][which]]
+    return SAME
+
+
+def axes(rng, rows):
+    """Send the axes of gyro or accelerometer in another order or with other signs."""
+    order = rng.sample(range(3), 3)
+    signs = [rng.choice([1.0, -1.0]) for _ in order]
+    put_all(rows, IMU, rng.choice([RATES, RATES, FORCES]),
+            lambda *x: [sign * x[k] for sign, k in zip(signs, order, strict=True)])
+    return SAME
+
+
+def units(rng, rows):
+    """Send a topic in another unit; the true scale factor changes with that of the odometer."""
+    kind, fields = odometer_of(rows)
+    name, fields, factor = rng.choice([
+        (IMU, RATES, DEG), (IMU, RATES, 1 / DEG), (IMU, FORCES, 1 / G), (IMU, FORCES, 1000 / G),
+        (FIX, ['latitude', 'longitude'], 1 / DEG), (FIX, ['altitude'], 1 / 0.3048),
+        (kind, fields, rng.choice([2, 4, 100, -1])), (kind, fields, rng.choice([2, 10, 1000]))])
+    put_all(rows, name, fields, lambda *x: [value * factor for value in x])
+    return (1 / abs(factor),) * 2 if name == kind else SAME
+
+
+def exchanged_fix(rng, rows):
+    """Send latitude and longitude in each other's place, or with the other sign."""
+    sign = rng.choice([1.0, -1.0])
+    put_all(rows, FIX, ['latitude', 'longitude'], lambda x, y: (sign * y, x))
+    return SAME
+
+
+def doubled_range(rng, rows):
+    """Repeat a part of the recording, of one topic or all, in the order of time or behind it."""
+    later_ns = rng.choice([0, 0, 1, 10**9])
+    for kind in rng.choice([[rng.choice(list(rows))], list(rows)]):
+        part = rows[kind][some_range(rng, len(rows[kind]))]
+        rows[kind] += [(t + later_ns, data) for t, data in part]
+    return SAME
+
+
+def spliced(rng, rows):
+    """Go on with the odometer of another vehicle, or with its IMU too, in the midst of a drive."""
+    kind, fields = odometer_of(rows)
+    n, factor = len(rows[kind]), math.exp(rng.choice([-1, 1]) * rng.uniform(0.005, 1.0))
+    begin = rng.randrange(n // 5, n - n // 5)
+    at, form = layout_of(kind, rows[kind][begin][1]).find(fields[0])
+    first = np.frombuffer(rows[kind][begin][1], form, 1, at)[0].item()
+    whole = int if kind == COUNTER else float
+    put_all(rows, kind, fields, lambda x: [whole(first + (x - first) * factor)],
+            slice(begin, None))
+    if rng.random() < 0.3:
+        put_all(rows, IMU, RATES[:2] + FORCES[:2], lambda a, b, c, d: (-b, a, -d, c),
+                slice(begin * len(rows[IMU]) // n, None))
+    return min(1.0, 1 / factor), max(1.0, 1 / factor)
+
+
+def second_publisher(rng, rows):
+    """Have a second sender on the topic of odometer or fixes, that is elsewhere."""
+    every = rng.choice([1, 2, 7])
+    if rng.random() < 0.5:
+        kind, fields = odometer_of(rows)
+        off = rng.choice([1, 50, 3000, 10**6])
+    else:
+        kind, fields = FIX, ['latitude', 'longitude', 'altitude']
+        off = rng.choice([-1, 1]) * 10**rng.uniform(-5.0, 0.0)
+    half_ns = (rows[kind][-1][0] - rows[kind][0][0]) // (2 * len(rows[kind]))
+    rows[kind] += [(t + half_ns, put(kind, stamped(kind, data, half_ns), fields,
+                                     lambda *x: [value + off for value in x]))
+                   for t, data in rows[kind][::every]]
+    return SAME
+
+
+def stamped(kind, data, by_ns):
+    """Return a message with its header stamp moved."""
+    if kind == COUNTER:
+        return data
+    sec, nanosec = struct.unpack_from('<iI', data, 4)
+    return data[:4] + struct.pack('<iI', *divmod(sec * 10**9 + nanosec + by_ns, 10**9)) + data[12:]
+
+
+def clock_step(rng, rows):
+    """Set the clock of a topic, for a while or for good; a drift of it too."""
+    kind = rng.choice(list(rows))
+    which = some_range(rng, len(rows[kind]))
+    by_ns = int(rng.choice([-1, 1]) * 10**rng.uniform(7.0, 11.0))
+    arrivals = kind == COUNTER or rng.random() < 0.3
+    rows[kind][which] = [(t + by_ns * arrivals, stamped(kind, data, by_ns))
+                         for t, data in rows[kind][which]]
+    return SAME
+
+
+ALL = [second_imu, axes, units, exchanged_fix, doubled_range, spliced, second_publisher,
+       clock_step]

@@ -1,0 +1,68 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""A flood of parameters in a leg, and a sender that restarts in it: the node goes on."""
+
+from bench import wait_for
+from player import messages_of, part, Player
+import pytest
+from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
+
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+pytestmark = pytest.mark.slow
+SPEED = 15.0
+REQUESTS = 20
+
+
+def flood(client):
+    """Ask to set all parameters to odd values, again and again; return the futures."""
+    asked = client.send(ListParameters, 'list_parameters', ListParameters.Request())
+    wait_for(asked.done, 'the names of the parameters')
+    names, futures = asked.result().result.names, []
+    for k in range(REQUESTS):
+        wanted = [Parameter(name, value=value).to_parameter_msg()
+                  for name in names for value in (k, 'x' * 50, float('nan'), [True] * 100)]
+        futures += [
+            client.send(SetParameters, 'set_parameters', SetParameters.Request(parameters=wanted)),
+            client.send(SetParametersAtomically, 'set_parameters_atomically',
+                        SetParametersAtomically.Request(parameters=wanted))]
+    return futures
+
+
+def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(start, connect):
+    types, sent = messages_of(simulate(SimOptions(
+        scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
+        fix_noise='rtk', imu_grade='tactical')))
+    node, client = start(), connect()
+    player = Player(client.node, types)
+    wait_for(player.matched, 'subscriptions of the node')
+    player.play(part(sent, 45, 60), SPEED)
+    client.start()
+    with player.playing(part(sent, 60, 95), SPEED):
+        futures = flood(client)
+        wait_for(lambda: all(one.done() for one in futures), 'the answers')
+        wait_for(lambda: float(client.status['duration_s']) > 34.0, 'the rest of the drive')
+    for one in futures:
+        answer = one.result()
+        results = answer.results if hasattr(answer, 'results') else [answer.result]
+        assert not any(result.successful for result in results)
+        assert all(result.reason for result in results)
+    assert len(node.lines) < 20
+    for publisher in player.publishers.values():
+        client.node.destroy_publisher(publisher)
+    player = Player(client.node, types)
+    wait_for(player.matched, 'subscriptions of the node, again')
+    player.play(part(sent, 95, 115), SPEED)
+    stopping = client.ask('stop_leg')
+    player.play(part(sent, 115, 117), SPEED)
+    answer = client.result(stopping)
+    assert 'scale factor 1.0' in answer.message
+    assert node.process.poll() is None

@@ -1,0 +1,81 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Two IMUs alternate on one topic, over DDS: both nodes say so, and the leg is rejected."""
+
+from types import SimpleNamespace
+
+from bench import Client, NodeProcess, wait_for
+from player import messages_of, part, Player, Sent
+import pytest
+
+from odocal_ros.messages.cdr import FRAME_AT
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 15.0
+FIRST_S, MARK_S, STOP_S, END_S = 45, 60, 115, 117     # of the drive: played, and the leg
+WORDS = "carries several IMUs (frame_id 'imu_link' and 'rmu_link'): set imu.frame_id"
+
+
+def alternating(sent):
+    """Return messages, every second one of the IMU with another frame_id."""
+    imu = [one for one in sent if one.slot == 'imu']
+    other = {id(one) for one in imu[1::2]}
+    return [Sent(one.stamp_ns, one.slot, one.raw[:FRAME_AT] + b'r' + one.raw[FRAME_AT + 1:])
+            if id(one) in other else one for one in sent]
+
+
+@pytest.fixture(scope='module')
+def seen(tmp_path_factory):
+    """Drive one leg; keep what the nodes said."""
+    drive = simulate(SimOptions(scenario='straight', duration=180.0, imu_rate=50.0,
+                                odometer_rate=25.0, odometer='speed', fix_noise='rtk'))
+    types, sent = messages_of(drive)
+    sent = alternating(sent)
+    file = tmp_path_factory.mktemp('given') / 'calibration.yaml'
+    file.write_text('/**: {ros__parameters: {result: {scale_factor: 1.0, scale_factor_sigma: '
+                    '0.001, valid: true, stamp: "2026-01-01"}}}')
+    node = NodeProcess('-p', f'output.directory:={tmp_path_factory.mktemp("out")}')
+    odometry = NodeProcess('--params-file', str(file), module='odometry')
+    client, found = Client(), SimpleNamespace(node=node, odometry=odometry)
+    try:
+        player = Player(client.node, types)
+        wait_for(lambda: player.matched() and player.publishers['imu'].get_subscription_count()
+                 == 2, 'subscriptions of the nodes')
+        player.play(part(sent, FIRST_S, MARK_S), SPEED)
+        found.start = client.start()
+        player.play(part(sent, MARK_S, STOP_S), SPEED)
+        found.recording = client.status
+        stopping = client.ask('stop_leg')
+        player.play(part(sent, STOP_S, END_S), SPEED)
+        found.stop = client.result(stopping)
+        found.status = client.until(state='rejected')
+        wait_for(lambda: 'several IMUs' in odometry.text, f'a word: {odometry.text}')
+    finally:
+        node.end()
+        odometry.end()
+        client.close()
+    return found
+
+
+def test_the_calibrator_says_so_while_it_is_driven(seen):
+    assert WORDS in seen.recording['message']
+    assert seen.recording['level'] == b'\1'
+    assert seen.node.text.count(WORDS) == 1
+
+
+def test_the_leg_is_rejected_with_the_setting_that_chooses(seen):
+    assert not seen.stop.success
+    assert 'SEVERAL_IMUS' in seen.stop.message
+    assert "imu.frame_id: 'imu_link'" in seen.stop.message
+    assert 'SEVERAL_IMUS' in seen.status['reasons']
+
+
+def test_the_node_odometry_says_so_once(seen):
+    assert seen.odometry.text.count(WORDS) == 1
