@@ -82,7 +82,7 @@ def test_without_noise_the_whole_signal_counts(road):
             assert off < 0.01, name
 
 
-@pytest.mark.parametrize('seed, kind, grade, effects, more', [
+@pytest.mark.parametrize(('seed', 'kind', 'grade', 'effects', 'more'), [
     (102_000_000, 'oval', 'industrial', (), {
         'fix_noise': 'rtk', 'fix_sigma': 0.02, 'real': {'banking': 0.5}}),
     # kerbs shorter than the wheelbase break the model: the scale is low by a sigma
