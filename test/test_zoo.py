@@ -22,7 +22,7 @@ NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 # a fit ends when a pass moves it by less than 0.03 sigma; versions of numpy differ by some passes
 TOLERANCE = 0.1
 ZOO = [    # kind, grade, verdict, errors of NAMES over their sigmas
-    ('town', 'consumer', 'caution', (-0.75, -0.41, 1.12)),
+    ('town', 'consumer', 'caution', (-0.76, -0.18, 1.02)),
     ('straight', 'industrial', 'caution', (-0.27, 0.18, -0.17)),
     ('out_and_back', 'tactical', 'accepted', (-0.88, 0.29, 0.20)),
     ('motorway', 'consumer', 'caution', (0.98, -0.41, -0.62)),
