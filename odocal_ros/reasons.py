@@ -140,6 +140,8 @@ class Code(Enum):
                                       'switched off. SLAM, AMCL, robot_localization: a source '
                                       'without wheels (scan matching alone, lidar or visual '
                                       'odometry, motion capture). Then drive again.')
+    FIXES_DEAD_RECKONED = CAUTION, ('The other fixes were used. If possible, switch off dead '
+                                    'reckoning in the receiver, or drive a leg without tunnels.')
     # the estimate
     YAW_NOT_SEPARABLE = CAUTION, ('Provide a heading that is independent of the odometer: '
                                   'alignment.heading with alignment.heading_sigma, a '

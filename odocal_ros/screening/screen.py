@@ -31,6 +31,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
 from odocal_ros.screening.clocks import judge_clocks
+from odocal_ros.screening.dead_reckoned import reckoned
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.force import with_force
 from odocal_ros.screening.glitches import frozen, oriented
@@ -160,12 +161,31 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
         velocity_variance=velocity.variance_n[some],
         fixes_rejected=len(leg.fix.stamp_ns) - int(use.sum()),
         scale_unit=leg.form.scale_unit, felt=not unfelt, local=bool(local))
+    if judged and not local:
+        inputs = _without_reckoned(inputs, config, found)
     if unfelt:
         return inputs, tuple(found)
     back = reversed_starts(inputs.travel, t_imu, w_b, f_b, (0.0, t_stop))
     metres = place(inputs, config).rough or None if len(back) else None
     found += said_of(back, inputs.travel, metres, BY_IMU, config.odometer.signed)
     return inputs.mirrored(back), tuple(found)
+
+
+def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
+    """Return inputs without fixes that the receiver has reckoned."""
+    placed = place(inputs, config)
+    if not placed.rough:
+        return inputs
+    up = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
+    rate = inputs.w_b @ up
+    # straights, and turns to both sides: the median is the bias
+    angle = np.cumsum((rate[1:] - np.median(rate)) * np.diff(inputs.t_imu))
+    lost, why = reckoned(inputs.t_fix, placed.fixes_n, inputs.travel.at(inputs.t_fix)
+                         * placed.rough, lambda t: np.interp(t, inputs.t_imu[1:], angle))
+    found += why
+    return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],
+                   covariance_n=inputs.covariance_n[~lost],
+                   fixes_rejected=inputs.fixes_rejected + int(lost.sum())) if why else inputs
 
 
 def _turned(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:

@@ -42,7 +42,7 @@ class Hills:
                 -k**2 * wave + by2 / cosine + by**2 * sine / cosine**3)
 
     def rise(self, travel: Floats) -> Floats:
-        """Return the height above that at 0, m; of hills the slope is taken for its sine."""
+        """Return the height above that at 0, m; hills have small slopes, equal to their sine."""
         k = 2 * np.pi / self.length
         up: Floats = self.slope / k * (1 - np.cos(k * travel))
         for begin, height in self.kerbs:
