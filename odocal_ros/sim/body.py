@@ -43,11 +43,7 @@ def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
     v, s = speed(t), speed.integral()(t)
     here, here_by, _ = hills(s)
-    chord, chord_by = here, here_by
-    if wheelbase:
-        sine = (hills.rise(s + wheelbase) - hills.rise(s)) / wheelbase
-        chord = np.arcsin(sine)
-        chord_by = (np.sin(hills(s + wheelbase)[0]) - np.sin(here)) / wheelbase / np.cos(chord)
+    chord, chord_by = hills.chord(s, wheelbase) if wheelbase else (here, here_by)
     forward, side = speed.derivative().mean(t) + G * here, v * yaw_rate(t)
     # nose up is a negative pitch; in a turn to the left the left side goes up
     roll, roll_rate = sprung(body_roll * side, step)

@@ -30,22 +30,28 @@ class Hills:
         """Return slope and its first and second derivative by distance."""
         k = 2 * np.pi / self.length
         wave, along = self.slope * np.sin(k * travel), self.slope * np.cos(k * travel)
-        sine, by, by2 = np.zeros((3, *np.shape(travel)))    # of the slope of kerbs
-        for begin, height in self.kerbs:
-            x = np.clip((travel - begin) / KERB_LENGTH, 0.0, 1.0)
-            h, y = height / KERB_LENGTH, x * (1 - x)
-            sine += h * 140 * y**3
-            by += h / KERB_LENGTH * 420 * y**2 * (1 - 2 * x)
-            by2 += h / KERB_LENGTH**2 * 840 * y * (1 - 5 * y)
+        _, sine, by, by2 = self._over_kerbs(travel)
         cosine = np.sqrt(1 - sine**2)
         return (wave + np.arcsin(sine), k * along + by / cosine,
                 -k**2 * wave + by2 / cosine + by**2 * sine / cosine**3)
 
-    def rise(self, travel: Floats) -> Floats:
-        """Return the height above that at 0, m; hills have small slopes, equal to their sine."""
-        k = 2 * np.pi / self.length
-        up: Floats = self.slope / k * (1 - np.cos(k * travel))
+    def chord(self, travel: Floats, wheelbase: float) -> tuple[Floats, Floats]:
+        """Return the slope of a line from there to a wheelbase ahead, and its derivative."""
+        k, ahead = 2 * np.pi / self.length, travel + wheelbase
+        mean = self.slope * (np.cos(k * travel) - np.cos(k * ahead)) / (k * wheelbase)
+        mean_by = self.slope * (np.sin(k * ahead) - np.sin(k * travel)) / wheelbase
+        here, there = self._over_kerbs(travel), self._over_kerbs(ahead)
+        sine, by = ((there[i] - here[i]) / wheelbase for i in (0, 1))
+        return mean + np.arcsin(sine), mean_by + by / np.sqrt(1 - sine**2)
+
+    def _over_kerbs(self, travel: Floats) -> Floats:
+        """Return the height by kerbs, m, and its three derivatives by distance: (4, n)."""
+        out = np.zeros((4, *np.shape(travel)))
         for begin, height in self.kerbs:
             x = np.clip((travel - begin) / KERB_LENGTH, 0.0, 1.0)
-            up = up + height * x**4 * (35 + x * (x * (70 - 20 * x) - 84))
-        return up
+            y = x * (1 - x)
+            out += height * np.stack([
+                x**4 * (35 + x * (x * (70 - 20 * x) - 84)), 140 * y**3 / KERB_LENGTH,
+                420 * y**2 * (1 - 2 * x) / KERB_LENGTH**2,
+                840 * y * (1 - 5 * y) / KERB_LENGTH**3])
+        return out
