@@ -84,6 +84,14 @@ BENT = 10 * 0.0027**2 * 0.062 / 12
 SECOND = 0.62**2 * 10.0 / 12
 
 
+def test_the_angles_of_a_constant_turn_scatter_by_their_closed_form():
+    imu = ImuSteps.of(turning(np.arange(0.0, 5.001, 0.01)), 1.0)
+    turn = RATE + BIAS
+    # of an angle that grows evenly over 1 s, of means of steps: 1 / 12 less STEP^2 / 12
+    want = np.outer(turn, turn) * (1 - STEP**2) / 12
+    np.testing.assert_allclose(imu.swings(), np.tile(want, (5, 1, 1)), atol=1e-12)
+
+
 def test_coning_at_the_sample_rate_is_in_the_steps():
     rate, cone, spin = 200.0, 0.02, 2 * np.pi * 8.0
     t = np.arange(0.0, 4.001, 1 / rate)

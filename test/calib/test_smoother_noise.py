@@ -16,6 +16,7 @@ from smoother_legs import made
 from odocal_ros.calib.smoother import smooth
 from odocal_ros.calib.smoother.noise import REST_NOISE, rest_noise
 from odocal_ros.calib.smoother.travel_error import once_a_rest
+from odocal_ros.sim.real import Real
 
 pytestmark = pytest.mark.slow
 SWAY = {'sway': 0.05, 'odometer': 'speed', 'odometer_rate': 10.0, 'speed_noise': 0.05}
@@ -34,6 +35,14 @@ def test_levels_of_a_noisy_speed_and_a_swaying_vehicle_are_found(noise):
         assert found == pytest.approx(0.05 / np.sqrt(10.0), rel=5 / np.sqrt(2 * 150)), name
     # no interval but chance ones is taken for a slip: the edges of stops are none
     assert result.details['residuals']['intervals_slipping'] <= 4
+
+
+@pytest.mark.parametrize(('kerbs', 'least', 'most'), [(0.0, 0.0, 0.05), (0.06, 0.1, 1.0)])
+def test_a_body_that_kerbs_pitch_lifts_its_axle(kerbs, least, most):
+    # within a second by half a wheelbase at most, 0.25 m a rad; without kerbs it is as it begins
+    _, config, leg = made(scenario='yard', duration=300.0, imu_grade='industrial',
+                          fix_noise='rtk', real=Real(kerbs=kerbs, wheelbase=0.5))
+    assert least < smooth(leg, config).details['noise']['pitching'] < most
 
 
 def test_noise_at_rest_is_measured_where_there_is_rest_to_measure():

@@ -94,6 +94,16 @@ class ImuSteps(Steps):
                 for f in fields(Steps)}
         return cls(**sums, t=leg.t_imu[edges], key=np.searchsorted(edges, key))
 
+    def swings(self) -> Floats:
+        """Return the covariances of the angles turned within the intervals: (K, 3, 3) rad^2."""
+        T = np.diff(self.t)
+        turned = np.cumsum(self.turn, axis=0) - self.turn / 2
+        share = (T / np.repeat(self.over_intervals(T), np.diff(self.key)))[:, None]
+        mean = self.over_intervals(turned * share)
+        square = self.over_intervals(turned[:, :, None] * (turned * share)[:, None])
+        out: Floats = square - mean[:, :, None] * mean[:, None]
+        return out
+
     def over_intervals(self, x: Floats) -> Floats:
         """Return the sums over the intervals between keyframes of what each step has: (K, ...)."""
         out: Floats = np.add.reduceat(x, self.key[:-1])

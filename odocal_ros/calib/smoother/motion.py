@@ -90,7 +90,7 @@ class Motion:
                  fitted: bool = False) -> None:
         leg, self.axle = problem.leg, Axle(problem, state)
         self.state, self.sums, self.fitted = state, intervals, fitted
-        self.by_steps = leg.by_steps
+        self.by_steps, self.swings = leg.by_steps, problem.swings
         T = self.T = intervals.T[:, None]
         self.C, self.C_end = state.C_nb[:-1], state.C_nb[1:]
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]

@@ -24,7 +24,13 @@ from odocal_ros.calib.smoother.level_information import LevelSides
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise, Levels
 from odocal_ros.calib.smoother.signals import Signals
-from odocal_ros.calib.smoother.slide import HEAVE, least_slide, SIDEWAYS
+from odocal_ros.calib.smoother.slide import (
+    HEAVE,
+    least_slide,
+    PITCHING,
+    PITCHING_LEAST,
+    SIDEWAYS,
+)
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.state import BG, M, State
 from odocal_ros.data.arrays import Bools, Floats
@@ -38,8 +44,8 @@ ALONG = ('along', 'along_hard')
 NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
          'accel_walk': 'accelerometer_bias_walk', 'along': 'travel_noise',
          'along_hard': 'travel_noise', 'side': 'sideslip', 'side_turn': 'sideslip',
-         'up': 'vertical_motion'}
-ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up',))
+         'up': 'vertical_motion', 'pitching': 'vertical_motion'}
+ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up', 'pitching'))
 
 
 class MotionRows(Factor):
@@ -68,9 +74,9 @@ class MotionRows(Factor):
         imu |= at_rest(problem.imu, problem.leg, problem.still)
         slide, road = least_slide(problem.turned)**2, 0.01**2      # m^2/s, initial
         return (imu | dict.fromkeys(ALONG, road)
-                | dict.fromkeys(SIDEWAYS, max(road, slide)),
+                | dict.fromkeys(SIDEWAYS, max(road, slide)) | {'pitching': PITCHING**2},
                 imu | dict.fromkeys(ALONG, LEAST.road**2) | dict.fromkeys(SIDEWAYS, slide)
-                | {'up': max(slide, HEAVE**2)})
+                | {'up': max(slide, HEAVE**2), 'pitching': PITCHING_LEAST**2})
 
     def weigh(self, levels: Levels) -> None:
         """Whiten the rows by the Cholesky factor of their covariance."""

@@ -30,7 +30,7 @@ from odocal_ros.nav.rotations import skew
 Floats = NDArray[np.float64]
 # level: variance per second of the white noise or walk; of the road also the axis of the vehicle
 IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
-ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2}
+ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
 INTERVAL = (*IMU, *ROAD)
 SLOW_LEVELS = ('slow', 'slow_up')
 # definition: Gauss and Legendre's nodes and weights on 0 to 1
@@ -157,9 +157,11 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # some of it where a wheel hardly turns
     hard, turning = hard_and_turning(motion)
     spread = np.ones((K, 3)) if spread is None else spread
-    acting = ~hard, hard, ~turning, turning, np.ones(K, bool)
-    road = np.stack([share * (where & ~rest) * np.sqrt(spread[:, axis])
-                     for axis, where in zip(ROAD.values(), acting, strict=True)], -1)
+    left = motion.state.C_bv[:, 1]
+    pitching = np.sqrt(np.maximum(left @ motion.swings @ left, 0.0))
+    acting = (share * ~hard, share * hard, share * ~turning, share * turning, share, pitching)
+    road = np.stack([size * ~rest * np.sqrt(spread[:, axis])
+                     for axis, size in zip(ROAD.values(), acting, strict=True)], -1)
     extra = _extra(motion, leg)
     still = rest_noise(speed, rest)
     extra[rest, D] += still

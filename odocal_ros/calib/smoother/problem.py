@@ -72,6 +72,7 @@ class Problem:
     turned: float            # rad, in turns
     fix_time: float          # s, as gnss.correlation_time: 0 white, NaN to be judged
     rate_b: np.ndarray       # (N, 3) rad/s, measured at the keyframes
+    swings: np.ndarray       # (K, 3, 3) rad^2, of the angles within the intervals
     first_levels: Levels = field(default_factory=lambda: Levels({}))
     least: dict[str, float] = field(default_factory=dict)     # levels
     shaken: dict[str, float] = field(default_factory=dict)    # initial levels of the IMU
@@ -90,7 +91,7 @@ class Problem:
         root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
         made = cls(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
                    used(leg, t), turned(leg, imu), config.gnss.correlation_time,
-                   rates_at(leg.t_imu, leg.w_b, t))
+                   rates_at(leg.t_imu, leg.w_b, t), imu.swings())
         for part in FACTORS:
             if part.there(made):
                 first, least = part.first_levels(made)

@@ -35,6 +35,9 @@ TURN_SLIDE = 2e-4
 # m/sqrt(s), least up and down: what springs, tyres and road do in a second that no unknown holds.
 # Tuned: with a tenth the pitch of yards was 3 sigmas off (docs/decisions/0005)
 HEAVE = 2e-3
+# m/rad, by which the pitch of a body within a second lifts its axle beyond the model, as kerbs
+# shorter than a wheelbase do: initial level and lower limit, judgement; each drive has its own
+PITCHING, PITCHING_LEAST = 0.03, 1e-4
 # m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
 ORDINARY_ROAD = SWAY / np.sqrt(10.0)
 # rad turned in all: less than one crossroads tests nothing, two do. Judgement
