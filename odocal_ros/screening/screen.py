@@ -174,7 +174,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
 def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
     """Return inputs without fixes that the receiver has reckoned."""
     placed = place(inputs, config)
-    if not placed.rough:
+    if not placed.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs
     up = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
     rate = inputs.w_b @ up
