@@ -24,18 +24,15 @@ what else is said of the fault's drives, but for what is never false (zoo_table.
 
 import argparse
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-import json
 import os
 from pathlib import Path
-import sys
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
-from resumed import read_rows
+from resumed import read_rows, run_missing
 from zoo import configured, GRADES, KINDS
 from zoo_table import BY_KIND, NEVER_FALSE
 
@@ -190,16 +187,7 @@ def main():
     seeds = [FIRST_SEED + SEEDS_A_RUN * RUNS.index(code) + k for j in range(args.drives)
              for code in args.only or RUNS
              for k in (range(4 * j, 4 * j + 4) if code == 'clean' else (j,))]
-    missing = [seed for seed in seeds if seed not in have]
-    with ProcessPoolExecutor(args.jobs) as pool, args.file.open('a') as out:
-        done = pool.map(run_drive, missing, [args.duration] * len(missing))
-        for n, row in enumerate(done, 1):
-            out.write(json.dumps(row) + '\n')
-            out.flush()
-            have[row['seed']] = row
-            print(f'\r{n} of {len(missing)}', end='', file=sys.stderr, flush=True)
-    print(file=sys.stderr)
-    table([have[seed] for seed in seeds])
+    table(run_missing(run_drive, seeds, have, args.file, args.jobs, args.duration))
 
 
 if __name__ == '__main__':

@@ -25,18 +25,15 @@ that name the effect: of drives whose scale is off by more than its stated sigma
 
 import argparse
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
-import json
 import os
 from pathlib import Path
-import sys
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from alarms import RTK
 import numpy as np
-from resumed import read_rows
+from resumed import read_rows, run_missing
 from zoo import configured, outcome
 from zoo_table import FIGURES, WITHIN
 
@@ -120,15 +117,7 @@ def main():
     # by turns, so that what is there after an interruption is of all runs
     seeds = [FIRST_SEED + SEEDS_A_RUN * list(RUNS).index(run) + k for k in range(args.drives)
              for run in args.only or RUNS]
-    missing = [seed for seed in seeds if seed not in have]
-    with ProcessPoolExecutor(args.jobs) as pool, args.file.open('a') as out:
-        for n, row in enumerate(pool.map(run_drive, missing), 1):
-            out.write(json.dumps(row) + '\n')
-            out.flush()
-            have[row['seed']] = row
-            print(f'\r{n} of {len(missing)}', end='', file=sys.stderr, flush=True)
-    print(file=sys.stderr)
-    table([have[seed] for seed in seeds])
+    table(run_missing(run_drive, seeds, have, args.file, args.jobs))
 
 
 if __name__ == '__main__':

@@ -9,7 +9,9 @@
 
 """Rows of a benchmark that continues after an interruption: one JSON object per line."""
 
+from concurrent.futures import ProcessPoolExecutor
 import json
+import sys
 
 
 def read_rows(path) -> dict[int, dict]:
@@ -22,3 +24,21 @@ def read_rows(path) -> dict[int, dict]:
             path.write_text(text)
         rows = {row['seed']: row for row in map(json.loads, text.splitlines())}
     return rows
+
+
+def run_missing(run, seeds, have, file, jobs, *more):
+    """
+    Return the rows of all seeds; those that are missing are run, and written as they come.
+
+    run : called with a seed and ``more``, in ``jobs`` processes.   have : rows by seed.
+    """
+    missing, have = [seed for seed in seeds if seed not in have], dict(have)
+    with ProcessPoolExecutor(jobs) as pool, file.open('a') as out:
+        done = pool.map(run, missing, *([one] * len(missing) for one in more))
+        for n, row in enumerate(done, 1):
+            out.write(json.dumps(row) + '\n')
+            out.flush()
+            have[row['seed']] = row
+            print(f'\r{n} of {len(missing)}', end='', file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    return [have[seed] for seed in seeds]

@@ -29,7 +29,8 @@ from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.offline import survey
 from odocal_ros.offline.fix_path import fix_path, FixPath, Match
-from odocal_ros.offline.inspection_drive import closed, look
+from odocal_ros.offline.inspection_drive import look
+from odocal_ros.offline.lacking import lacking
 from odocal_ros.offline.odometer_search import (
     best_topic,
     configured,
@@ -123,7 +124,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         _read_again(bag, taps, mapping['odometer'], config, topics)
     if {'imu', 'odometer'} <= mapping.keys():
         extra += look(bag, _together(taps, mapping), config, found, findings)
-    findings += _lacking(found, mapping, config)
+    findings += lacking(found, mapping, config)
     wheels = config.odometer.keys or any(
         option.startswith(('odometer.left=', 'odometer.wheels=')) for option in extra)
     ends = ENDS - {Code.NO_STANDSTILL} if wheels else ENDS
@@ -265,53 +266,3 @@ def _together(taps: dict[str, _Tap], mapping: dict[str, str]) -> LegRecorder:
         if own == slot or slot == 'odometer_right':
             recorder.adopt(slot, rows, own)
     return recorder
-
-
-def _lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
-    """Return the reasons for data that a calibration would miss."""
-    lacking = [Reason(code, f'no topic for the {word}') for slot, code, word in (
-        ('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER, 'odometer'),
-        ('fix', Code.NO_FIX, 'fixes')) if slot not in mapping]
-    drive = found['drive']
-    if not drive:
-        return lacking
-    legs = found['legs']
-    if not found['standstills']:
-        slowest = (f': its lowest speed (mean over 1 s) is {drive["slowest"]:.2f} '
-                   'm/s') * (drive['slowest'] > 0)
-        lacking.append(Reason(Code.NO_STANDSTILL, f'the vehicle is never at rest{slowest}'))
-    elif legs and not any(abs(leg['start'] - stop) < 1.0
-                          for leg in legs for _, stop in found['standstills']):
-        lacking.append(Reason(Code.NO_STANDSTILL, 'no standstill before the drive: the first is '
-                              f'at {found["standstills"][0][0]:.1f} s'))
-    short = [leg for leg in legs if leg['way'] < config.leg.min_distance]
-    loops = [leg for leg in legs if leg not in short and closed(leg)]
-    for some, code, said in ((short, Code.LEG_TOO_SHORT, 'path length {way:.0f} m'), (
-            loops, Code.CHORD_TOO_SHORT, 'a loop: path length {way:.0f} m, {chord:.0f} m from '
-            'start to end')):
-        if some:
-            many = '' if len(some) == 1 else f'{len(some)} of {len(legs)} legs, as '
-            lacking.append(Reason(code, many + 'the leg {start:.1f}:{stop:.1f} s is '.format(
-                **some[0]) + said.format(**some[0])))
-    if 0 < drive['fastest'] < config.leg.min_speed:
-        lacking.append(Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
-                              f'{drive["fastest"]:.1f} m/s; the limit is '
-                              f'{config.leg.min_speed:g} m/s'))
-    return lacking + _heading(found, mapping, config)
-
-
-def _heading(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
-    """Return the reason for a missing or poor heading, with possible sources."""
-    if 'heading' in mapping or math.isfinite(config.alignment.heading):
-        return []
-    facts = next(t for t in found['topics'] if t['name'] == mapping['imu'])['imu']
-    if not facts['orientation']:
-        why = 'no heading topic, and the IMU publishes no orientation'
-    elif facts['yaw_sigma'] is None:
-        why = 'no heading topic, and the IMU orientation has no covariance'
-    elif facts['yaw_sigma'] > config.verdict.max_yaw_sigma:
-        why = ('the only heading is the IMU orientation with an uncertainty of '
-               f'{math.degrees(facts["yaw_sigma"]):.1f} deg')
-    else:
-        return []
-    return [Reason(Code.YAW_NOT_SEPARABLE, why)]

@@ -6,7 +6,7 @@
 # is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
-"""Fixes that a receiver reckons in a tunnel, told from measured ones."""
+"""Fixes that a receiver reckons in a tunnel are found, and no measured ones."""
 
 from drives import configured
 import numpy as np
