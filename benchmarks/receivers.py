@@ -46,7 +46,7 @@ RUNS = {        # effects, kinds of drive, figures of Real, reasons that name it
     'fused_fixes': (('fused_fixes',), ROADS, {}, ('FIXES_FOLLOW_ODOMETER',)),
     'tracked_fixes': (('tracked_fixes',), ROADS, {}, ('FIXES_SMOOTHED', 'DELAY_SEEN')),
     'held_speed': (('held_speed',), ROADS, {}, ('SPEED_ON_CHANGE',)),
-    'filtered_speed': (('filtered_speed',), ROADS, {}, ('SPEED_FILTERED', 'DELAY_SEEN')),
+    'filtered_speed': (('filtered_speed',), ROADS, {}, ('SPEED_FILTERED',)),
     'late_fixes': (('late_fixes',), ROADS, {}, ('FIXES_LATE', 'DELAY_SEEN')),
     'tunnels': (('tunnels',), ROADS, {}, ('FIXES_DEAD_RECKONED',)),
     'reflections': (('reflections',), ROADS, {}, ('FIXES_NOISIER_THAN_SAID',)),

@@ -72,8 +72,8 @@ class Code(Enum):
                           'bus. The smoother needs neither: it uses the step transitions.')
     SPEED_ON_CHANGE = NOTE, ('If available, use wheel pulses or a speed that is published at a '
                              'fixed rate.')
-    SPEED_FILTERED = CAUTION, ('Use wheel pulses or an unfiltered speed signal of the same bus. '
-                               'The smoother models a delay, but no low-pass filter.')
+    SPEED_FILTERED = NOTE, ('No action needed. For dead reckoning, wheel pulses or an unfiltered '
+                            'speed signal of the same bus are better.')
     COUNTER_COARSE = NOTE, ('If available, use a counter with more pulses per metre. Otherwise '
                             'drive farther: quantisation averages out with distance.')
     REVERSING_UNSIGNED = CAUTION, ('Do not reverse during a leg, or use an odometer that counts '

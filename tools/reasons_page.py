@@ -93,10 +93,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'lags while the vehicle accelerates and brakes. Limits: at least 30 % of the moving '
         'messages repeat the one before, and the smallest change exceeds 0.6 of the tenth '
         'percentile of all changes.',
-        Code.SPEED_FILTERED: 'Over intervals of a second the odometer deviates from the vehicle '
-        'whenever the acceleration changes. A low-pass filter of the speed does this, wheel slip '
-        'does not. Many speed signals of cars are filtered over 0.2 to 0.5 s. Only the remaining '
-        'deviation is reported as slip.',
+        Code.SPEED_FILTERED: 'The odometer deviates from the vehicle whenever the acceleration '
+        'changes, as a low-pass filter of the speed does. Many speed signals of cars are filtered '
+        'over 0.2 to 0.5 s. Delay and filter are constants of the fit.',
         Code.COUNTER_COARSE: 'There are few counts per metre, so the distance has the resolution '
         'of one count at each time. Over a long drive this error is small and part of the sigma. '
         'Events within a few metres, such as a short slip, cannot be detected.',

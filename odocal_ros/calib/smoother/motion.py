@@ -34,6 +34,7 @@ from odocal_ros.calib.smoother.state import (
     M,
     ODO_ARM,
     ODO_DELAY,
+    ODO_LAG2,
     P,
     PHI,
     PITCH,
@@ -57,7 +58,7 @@ D = slice(E, E + 3)     # definition: rows of the odometer, after those of the o
 ROWS = D.stop
 # of Motion, what each interval has
 EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'rolled', 'heaved', 'faster',
-        'unsaid', 'pushed', 'pitched', 'from_mean', 'varied', 'travelled', 'residual')
+        'eased', 'unsaid', 'pushed', 'pitched', 'from_mean', 'varied', 'travelled', 'residual')
 
 
 def rotvec(C: Floats) -> Floats:
@@ -103,7 +104,7 @@ class Motion:
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
         self._vary()
         way = turn(intervals.S, self.f + self.leaned) * self.varied
-        self.faster = self._by_odometer_delay()
+        self.faster, self.eased = self._by_odometer_filter()
         self.rolled = turn(half @ self.C, way)
         self.heaved = turn(self.C, self.pitched * state.constants[PITCH_CENTRE])
         self.way = self.rolled + self.heaved
@@ -162,10 +163,12 @@ class Motion:
         ahead: Floats = (self.f_n + self.f_n_end) / 2 * (np.sign(said) * moves)[:, None]
         return np.asarray(ahead * self.T)
 
-    def _by_odometer_delay(self) -> Floats:
-        """Return the derivative of the way by a delay of the odometer: (K, 3)."""
-        faster = np.diff(self.axle.wheel / self.state.scale)
-        return (self.f_n + self.f_n_end) / 2 * faster[:, None]
+    def _by_odometer_filter(self) -> tuple[Floats, Floats]:
+        """Return the derivatives of the way by delay and filter of the odometer: (K, 3) each."""
+        ahead, wheel = (self.f_n + self.f_n_end) / 2, self.axle.wheel / self.state.scale
+        # by the fit, whose accelerometer knows it better than readings do
+        push = np.gradient(wheel, self.state.t)
+        return ahead * np.diff(wheel)[:, None], -ahead * np.diff(push)[:, None] / 2
 
     def jacobians(self, n: int) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by begin, end and constants: (K, 18, n), (K, 18, n), (K, 18, M)."""
@@ -216,9 +219,9 @@ class Motion:
         if self.unsaid is not None:
             c[:, D, SPEED_OFFSET] = -self.unsaid
         # stamps late by d: the reading at a time is the travel d before it
-        c[:, D, ODO_DELAY] = -self.faster
+        c[:, D, ODO_DELAY], c[:, D, ODO_LAG2] = -self.faster, -self.eased
         if self.by_steps:       # of such a way the direction counts, which these do not change
-            c[:, D, [LN_K, ODO_DELAY, SPEED_OFFSET]] = 0.0
+            c[:, D, [LN_K, ODO_DELAY, ODO_LAG2, SPEED_OFFSET]] = 0.0
             c[:, D, TYRES] = 0.0
         c[:, :, GYRO] = gyro[:, :, 3:]
         c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF

@@ -24,7 +24,7 @@ from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.chain import JointMarginals
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.exported import exported
-from odocal_ros.calib.smoother.filtered import filter_reasons, speed_filter
+from odocal_ros.calib.smoother.filters import filter_reasons
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.left_over import bias_sigmas, correlation, left_over, normalised
 from odocal_ros.calib.smoother.leg import SmootherLeg
@@ -52,6 +52,7 @@ from odocal_ros.calib.smoother.state import (
     LN_K,
     M,
     ODO_ARM,
+    ODO_LAG2,
     PITCH,
     VELOCITY,
     YAW,
@@ -74,11 +75,12 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     near = fit.marginals()
     widen, reasons = mismatch(problem, fit, config)
     count = leg.travel.quantum * fit.state.scale
-    slips, along_reasons = _odometer(leg, fit, near, count)
-    reasons += along_reasons
     state, c = fit.state, fit.state.constants
     covariance = floored(fit.covariance * widen**2)
     sigma = np.sqrt(np.diag(covariance))
+    filtered = filter_reasons(c[ODO_LAG2], sigma[ODO_LAG2])
+    slips, slip_said = _slips(leg, fit, near, count, filtered=bool(filtered))
+    reasons += [*filtered, *slip_said]
     reasons += remarks(problem, fit, sigma, config)
     after = np.sqrt(np.diag(fit.covariance)) / fit.first.constants
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
@@ -120,19 +122,16 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
                         border_of(fit, configured(leg)).widened(widen))
 
 
-def _odometer(leg: SmootherLeg, fit: Fit, near: JointMarginals,
-              count: float) -> tuple[tuple[Slip, ...], list[Reason]]:
-    """Return the slips, and what is said of the odometer: a filter of its speed before slip."""
+def _slips(leg: SmootherLeg, fit: Fit, near: JointMarginals, count: float, *,
+           filtered: bool) -> tuple[tuple[Slip, ...], list[Reason]]:
+    """Return the slips, and the reasons that report them."""
     if leg.by_steps:    # of a coarse speed only its steps are used: its way along shows no slip
         return (), []
     turned = along(fit, near)
-    low_pass = speed_filter(fit, turned)
-    if low_pass is None:
-        slips = find_slips(fit, turned, count)
-        return slips, slip_reasons(slips, level_when_changing(fit, near, count))
+    slips = find_slips(fit, turned, count)
     # the shape of a filter is not known: what it leaves when speeds change is no slip
-    slips = find_slips(fit, low_pass.taken_from(turned), count, filtered=True)
-    return slips, [*filter_reasons(low_pass), *slip_reasons(slips)]
+    level = '' if filtered else level_when_changing(fit, near, count)
+    return slips, slip_reasons(slips, level)
 
 
 def floored(covariance: Floats) -> Floats:

@@ -20,6 +20,7 @@ from odocal_ros.calib.smoother.imu_noise import at_rest, shaken, unfelt
 from odocal_ros.calib.smoother.imu_steps import ImuSteps
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.odometer_filter import as_rolled
 from odocal_ros.calib.smoother.outside import Heading, Velocity, velocity_sigmas
 from odocal_ros.calib.smoother.outside_rows import used
 from odocal_ros.calib.smoother.point_rows import alike, PointRows
@@ -115,14 +116,13 @@ class Problem:
     def sums(self, state: State) -> tuple[Intervals, dict[str, Points]]:
         """Return the sums over all intervals, and to the times of rows by their part."""
         leg, c = self.leg, state.constants
-        delay = c[ODO_DELAY]
         times = {part.name: part.times(self, c) for part in FACTORS
                  if issubclass(part, PointRows) and part.there(self)}
         all_t = np.concatenate(list(times.values()))
         order = np.argsort(all_t, kind='stable')
         intervals, points = preintegrate(
             self.imu, state.gyro_bias[:-1], state.accel_bias[:-1],
-            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order], c)
+            as_rolled(leg.travel, c), state.scale * state.forward, all_t[order], c)
         place = np.split(np.argsort(order, kind='stable'),
                          np.cumsum([len(t) for t in times.values()])[:-1])
         return intervals, {name: points.take(own) for name, own in zip(
@@ -147,6 +147,7 @@ def imperfect_sigmas(grade: Grade) -> Floats:
         'accelerometer_scale': grade.accel_scale_error, 'accelerometer_axis': axes,
         'fix_lag_square': 1.0,                      # s^2
         'fix_error_by_motion': 1.4e-3,
+        'odometer_lag_square': 0.1,                 # s^2
         'scale_by_speed': 1e-4,                     # s/m at FAST_SPEED
         'scale_by_time': 2.5e-3 / WARM_TIME,        # 1 / s
         'scale_by_force': 4e-3,                     # 1 / (m/s^2)

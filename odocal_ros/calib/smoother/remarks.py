@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.receiver import lag_reasons, odometer_reasons
 from odocal_ros.calib.smoother.chain import JointMarginals
 from odocal_ros.calib.smoother.estimate import Fit
+from odocal_ros.calib.smoother.filters import lag_reasons, odometer_reasons
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.problem import imperfect_sigmas, Problem

@@ -16,8 +16,7 @@ import numpy as np
 from odocal_ros.calib.smoother.chain import JointMarginals
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.motion_rows import MotionRows
-from odocal_ros.calib.smoother.noise import ROAD
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
@@ -47,34 +46,24 @@ def along(fit: Fit, marginals: JointMarginals) -> Floats:
     return out
 
 
-def find_slips(fit: Fit, turned: Floats, count: float = 0.0,
-               filtered: bool = False) -> tuple[Slip, ...]:
+def find_slips(fit: Fit, turned: Floats, count: float = 0.0) -> tuple[Slip, ...]:
     """
     Return the runs that lie far out along, by more than a count, m; largest first.
 
-    turned : (K,) m, as ``along`` has it, without what a filter of the speed does.
-    filtered : whether there is one; what happens whenever the speed changes is then no slip.
+    turned : (K,) m, as ``along`` has it.
     """
-    t, variance = fit.state.t, np.full(len(turned), fit.levels['along'])
+    t = fit.state.t
     least = max(4 * float(np.sqrt(fit.levels['along'])), LEAST_SLIP, count)    # sigmas of a second
     far = np.flatnonzero((fit.spread[:, 0] > SLIP_VARIANCE) | (np.abs(turned) > least))
     if not len(far):
         return ()
-    if filtered:
-        variance += np.where(_speed_changes(fit), fit.levels['along_hard'], 0.0)
-    total = np.append(0.0, np.cumsum(variance * np.diff(t)))
     slips = []
     for run in np.split(far, np.flatnonzero(np.diff(far) > 2) + 1):    # a second between
         begin, end, metres = run[0], run[-1] + 1, float(turned[run].sum())
-        if abs(metres) >= max(LEAST_SLIP, 4 * np.sqrt(total[end] - total[begin]), count):
+        if abs(metres) >= max(4 * np.sqrt(fit.levels['along'] * (t[end] - t[begin])), LEAST_SLIP,
+                              count):
             slips.append(Slip(float(t[begin]), float(t[end] - t[begin]), metres))
     return tuple(sorted(slips, key=lambda s: -abs(s.metres)))
-
-
-def _speed_changes(fit: Fit) -> Bools:
-    """Return a mask of the intervals with the noise of acceleration and braking, (K,)."""
-    out: Bools = fit.weighted[MotionRows].noise.road[:, tuple(ROAD).index('along_hard')] > 0
-    return out
 
 
 def level_when_changing(fit: Fit, marginals: JointMarginals, count: float = 0.0) -> str:

@@ -23,11 +23,11 @@ from odocal_ros.calib.smoother.factor import SPREAD
 from odocal_ros.calib.smoother.imu_steps import ImuSteps
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
+from odocal_ros.calib.smoother.odometer_filter import as_rolled
 from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import SPEED_WINDOW
-from odocal_ros.calib.smoother.state import ODO_DELAY, State
-from odocal_ros.data.arrays import Floats
+from odocal_ros.calib.smoother.state import State
 
 
 def steps_of(view: SmootherLeg, spacing: float) -> ImuSteps:
@@ -78,8 +78,7 @@ def _reckoned(state: State, problem: Problem) -> State:
     on['travel_error'][n:] = 0.0
     f = state.scale * state.forward
 
-    def travel(t: Floats) -> Floats:
-        return leg.travel.at(t + c[ODO_DELAY])
+    travel = as_rolled(leg.travel, c)
     sums, _ = preintegrate(rows, on['gyro_bias'][n:], on['accel_bias'][n:], travel,
                            f, np.empty(0), c)
     for k in range(K):

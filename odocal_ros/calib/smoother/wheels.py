@@ -33,6 +33,7 @@ from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import rotvec
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import hard_and_turning
+from odocal_ros.calib.smoother.odometer_filter import as_rolled
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import (
     GYRO,
@@ -108,7 +109,7 @@ def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
                             & (t <= min(w.t[-1] for w in wheels)))
     if len(inside) < FEWEST:
         return {}
-    s = np.stack([w.at(t[inside]) for w in wheels]) * state.scale
+    s = np.stack([as_rolled(w, state.constants)(state.t[inside]) for w in wheels]) * state.scale
     at = _nodes(s, state.scale * max(w.quantum for w in wheels))
     if len(at) < FEWEST:
         return {}
@@ -185,7 +186,7 @@ class _Common:
         turn = integral_at(t, leg.t_imu, by_row(
             lambda w_b: (w_b - state.gyro_bias.mean(axis=0)) @ up, leg.w_b))
         wheels = [wheel for wheel in leg.wheels if not wheel.ahead]
-        s = np.mean([wheel.at(t + state.constants[ODO_DELAY]) for wheel in wheels], axis=0)
+        s = np.mean([as_rolled(wheel, state.constants)(t) for wheel in wheels], axis=0)
         path = steering_path(t, turn, scale * s, scale * leg.wheels[i].ahead, self._left(i, 0.0))
         return np.diff(np.interp(self.t, t, path))
 

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Reasons about what a receiver does to its fixes: a filter, an odometer of its own."""
+"""Reasons about filters in receiver and odometer, and an odometer in the receiver."""
 
 import numpy as np
 
@@ -35,3 +35,12 @@ def odometer_reasons(share: float, sigma: float, log_time: float) -> tuple[Reaso
                    f'of {100 * share:+.2f} % +- {100 * sigma:.2f} % (time constant '
                    f'{np.exp(log_time):.0f} s), as positions fused with a wheel speed do; '
                    'accounted for'),)
+
+
+def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
+    """Return SPEED_FILTERED, where so; of the odometer's filter and its sigma, s^2."""
+    worth = 0.1     # s: a filter over less moves an interval by a centimetre, at 2 m/s^2
+    if square <= max(REMARK_SIGMAS * sigma, worth**2):
+        return ()
+    return (Reason(Code.SPEED_FILTERED, 'the odometer speed is low-pass filtered with a time '
+                   f'constant of about {np.sqrt(square):.2f} s; accounted for'),)

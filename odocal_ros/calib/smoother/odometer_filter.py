@@ -1,0 +1,39 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The odometer's readings as the wheel turned: without their delay and the filter of a speed."""
+
+from collections.abc import Callable
+
+from odocal_ros.calib.smoother.state import ODO_DELAY, ODO_LAG2
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.odometer import Travel
+
+# s to each side of a time, for the acceleration at it. Judgement: with a filter of 0.4 s the
+# rounding of a counter then adds a quarter of what the reading has
+REACH = 0.5
+
+
+def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
+    """
+    Return the travel of the wheel as a function of time, scale units.
+
+    A reading behind a filter is the mean of past ones with some weights. Of these count the mean
+    delay D and the variance T^2, for a first-order filter the square of its time constant: the
+    wheel has travelled x(t + D) - T^2 x''(t + D) / 2, but for the third moment.
+
+    travel : of the readings.   constants : (M,), with D, s, and T^2, s^2.
+    """
+    delay, half = float(constants[ODO_DELAY]), float(constants[ODO_LAG2]) / 2
+
+    def rolled(t: Floats) -> Floats:
+        x, ahead, behind = (travel.at(t + delay + step) for step in (0.0, REACH, -REACH))
+        out: Floats = x - half * (ahead - 2 * x + behind) / REACH**2
+        return out
+    return rolled
