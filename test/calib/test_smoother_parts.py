@@ -51,6 +51,7 @@ from odocal_ros.calib.smoother.state import (
     YAW,
 )
 from odocal_ros.nav.coarse_speed import CoarseSpeed
+from odocal_ros.nav.earth import rate_without_north
 from odocal_ros.nav.odometer import Travel
 
 pytestmark = pytest.mark.slow
@@ -297,3 +298,18 @@ def test_what_the_drive_hardly_knows_has_no_say_in_its_size(shaken):
     # (7e-6 / 1e-3)^2 of that slope, 5e-5: it stays at its median, within half a step of the grid
     assert np.log(weighted[PriorRows].sizes(solved.marginals())[name] / SIZE) == pytest.approx(
         0.0, abs=0.03)
+
+
+def test_the_bias_turns_with_a_robot_in_a_local_frame(shaken):
+    problem, state = shaken
+    origin = replace(problem.leg.origin, local=rate_without_north(0.7))
+    problem = replace(problem, leg=replace(problem.leg, origin=origin))
+    part, h = part_at(problem, state, 'fixes'), 1e-4
+    even = np.arange(len(state.t)) % 2 == 0
+    for i in range(BA.start, BA.stop):
+        step = np.zeros((len(state.t), N))
+        step[even, i] = h
+        a, b = (part_at(problem, state.moved(x, np.zeros(M)), 'fixes').raw for x in (step, -step))
+        expected = np.where(even[part.k][:, None], part.jacobians(N)[0][:, :, i], 0.0)
+        # of a bias under constant attitude: 0.1
+        assert (a - b) / (2 * h) == pytest.approx(expected, abs=LOOSE['fixes'])

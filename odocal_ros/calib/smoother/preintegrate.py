@@ -86,6 +86,7 @@ class Points:
     dv: Floats       # (m, 3)
     dp: Floats       # (m, 3)
     R: Floats        # (m, 3, 3)
+    AA: Floats       # (m, 3, 3)
     F: Floats        # (m, 3, a)
     FF: Floats       # (m, 3, a)
     force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
@@ -266,5 +267,15 @@ class _Chunk:
         after, share = h[:, None], (h / dt)[:, None]
         F = self.F_before[j] + self.step_F[j] * share
         FF = self.FF_before[j] + self.F_before[j] * after + self.step_FF[j] * share**2
-        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, F, FF,
+        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R,
+                      self._twice_turned(j, after, share), F, FF,
                       force + rise * h, rate + spin * h, spin)
+
+    def _twice_turned(self, j: Ints, after: Floats, share: Floats) -> Floats:
+        """Return the double integral of R up to a share of steps j: (m, 3, 3)."""
+        dt = self.dt[:, None, None]
+        A, _ = self._running(self.R @ self.G * dt)
+        step = self.R @ self.GG * dt**2
+        AA, _ = self._running(A * dt + step)
+        out: Floats = AA[j] + A[j] * after + step[j] * share**2
+        return out
