@@ -204,15 +204,40 @@ def fix(name: str, samples: FixSamples, frame: str = 'gnss') -> Topic:
                  layout.packer(fill, len(samples.stamp_ns)))
 
 
-def pose(name: str, samples: FixSamples, position: Floats, frame: str = 'map') -> Topic:
-    """Return geometry_msgs/PoseStamped of positions, (n, 3) m, at the times of FixSamples."""
-    layout = _Layout().header(frame).add('place', VECTOR).add('q', ('<f8', 4))
+def point(name: str, samples: FixSamples, position: Floats, frame: str = 'map') -> Topic:
+    """Return geometry_msgs/PointStamped of positions, (n, 3) m, at the times of FixSamples."""
+    return _positions(name, 'PointStamped', samples, position,
+                      _Layout().header(frame).add('place', VECTOR))
 
+
+def pose(name: str, samples: FixSamples, position: Floats, frame: str = 'map') -> Topic:
+    """Return geometry_msgs/PoseStamped of such positions, without a rotation."""
+    return _positions(name, 'PoseStamped', samples, position,
+                      _Layout().header(frame).add('place', VECTOR).add('q', ('<f8', 4)))
+
+
+def pose_with_covariance(name: str, samples: FixSamples, position: Floats,
+                         frame: str = 'map') -> Topic:
+    """Return geometry_msgs/PoseWithCovarianceStamped of such positions."""
+    return _positions(name, 'PoseWithCovarianceStamped', samples, position,
+                      _Layout().header(frame).add('place', VECTOR).add('q', ('<f8', 4)).add(
+                          'cov', ('<f8', 36)))
+
+
+def _positions(name: str, kind: str, samples: FixSamples, position: Floats,
+               layout: _Layout) -> Topic:
+    """Return a topic of positions, with what else the layout has: a rotation, a covariance."""
     def fill(out: NDArray[Any], rows: slice) -> None:
+        fields = out.dtype.names or ()
         _stamp(out, samples.stamp_ns[rows])
         out['place'] = position[rows]
-        out['q'][:, 3] = 1.0
-    return Topic(name, 'geometry_msgs/msg/PoseStamped', samples.received_ns,
+        if 'q' in fields:
+            out['q'][:, 3] = 1.0
+        if 'cov' in fields:
+            square = out['cov'].reshape(-1, 6, 6)
+            square[:, :3, :3] = samples.covariance_n[rows]
+            out['cov'] = square.reshape(-1, 36)
+    return Topic(name, f'geometry_msgs/msg/{kind}', samples.received_ns,
                  layout.packer(fill, len(samples.stamp_ns)))
 
 

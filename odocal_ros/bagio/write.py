@@ -30,9 +30,10 @@ BLOCK = 20_000         # judgement: messages packed at a time, to bound memory
 
 def drive_topics(drive: Any) -> list[Topic]:
     """Return a simulated drive's topics under the names that the node listens to."""
+    reference = drive.reference
+    position = () if reference.encoder == 'fix' else (drive.positions(),)
     topics = [encode.imu('/imu/data', drive.imu),
-              encode.pose('/pose', drive.fix, drive.positions())
-              if drive.options.reference == 'pose' else encode.fix('/fix', drive.fix)]
+              getattr(encode, reference.encoder)(reference.topic, drive.fix, *position)]
     kind, left, right = drive.options.odometer, drive.odometer, drive.odometer_right
     if kind == 'angle':
         topics.append(encode.joints('/joint_states', dict(zip(

@@ -13,6 +13,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import Track
+from odocal_ros.nav.local_frame import GNSS_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import yaw_from_quat
 from odocal_ros.reasons import Code, Reason
@@ -97,8 +98,12 @@ def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
 
 
 def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
-               t_stop: float) -> tuple[Reason, ...]:
-    """Return why there is no leg where wheels or fixes show no motion, empty where both do."""
+               t_stop: float, least: float = GNSS_MOVES) -> tuple[Reason, ...]:
+    """
+    Return why there is no leg where wheels or fixes show no motion, empty where both do.
+
+    least : distance over which fixes surely move, m.
+    """
     rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
     t_here, here = t_fix[rows], fixes_n[rows, :2]
     if len(here) < 2:
@@ -107,8 +112,8 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
     if len(here) > 4:       # a single outlier is no motion: running median of three
         here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
         t_here = t_here[1:-1]
-    # m over which a receiver at rest wanders, 10 sigmas: judgement, less is no leg either
-    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(20.0, 10 * fix_sigma)
+    # 10 sigmas: judgement, less is no leg either
+    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(least, 10 * fix_sigma)
     pick = (travel.t >= 0) & (travel.t <= t_stop)
     if pick.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
@@ -155,17 +160,19 @@ def _gone(fixes: Floats, least: float) -> float:
     return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(middle[-1] - middle[0]))))
 
 
-def way_and_chord(t_fix: Floats, fixes_n: Floats) -> tuple[float, float]:
+def way_and_chord(t_fix: Floats, fixes_n: Floats,
+                  least: float = GNSS_MOVES) -> tuple[float, float]:
     """
     Return the way driven and the distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 
     The way goes from fix to fix at least ten times their white noise apart: nearer ones would
-    add it up. Those that no vehicle gets to are none of it.
+    add it up. Those that no vehicle gets to are none of it.   least : distance over which fixes
+    surely move, m.
     """
     p = fixes_n[within_reach(t_fix, fixes_n), :2]
     if len(p) < 2:
         return 0.0, 0.0
-    knots = [*knots_of(p, max(2.0, 10 * white_noise(p))), len(p) - 1]
+    knots = [*knots_of(p, max(min(2.0, least), 10 * white_noise(p))), len(p) - 1]
     way = float(np.hypot(*np.diff(p[knots], axis=0).T).sum())
     return way, float(np.hypot(*(p[-1] - p[0])))
 

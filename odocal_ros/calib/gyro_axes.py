@@ -98,7 +98,7 @@ def by_course(inputs: 'Inputs', placed: Placed, w_i: Floats, axes: Floats,
     """Return a level axis of the gyro that measures the yaw rate instead of the upright one."""
     def ratio(axis: Floats) -> float | None:
         return turn_ratio(inputs.t_imu, by_row(lambda w: w @ axis, w_i), inputs.t_fix,
-                          placed.fixes_n, placed.fix_sigma)
+                          placed.fixes_n, placed.fix_sigma, inputs.least_motion)
 
     def one_motion(ratio: float | None) -> bool:
         return ratio is not None and ONE_MOTION_RATIO[0] < abs(ratio) < ONE_MOTION_RATIO[1]

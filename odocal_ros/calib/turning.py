@@ -13,9 +13,10 @@ import numpy as np
 
 from odocal_ros.calib.check import ONE_MOTION_RATIO
 from odocal_ros.calib.drive import knots_of
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.angles import arctan2
-from odocal_ros.nav.integral import twice_integral_at
+from odocal_ros.nav.integral import integral_at, twice_integral_at
+from odocal_ros.nav.local_frame import GNSS_MOVES
 from odocal_ros.reasons import Code, Reason
 
 # statistical: correlation of turns by gyro and by course from which they are the same turns, and
@@ -24,7 +25,7 @@ SAME_TURNS, SLOPE_SIGMAS = 0.9, 8.0
 
 
 def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
-               sigma: float) -> float | None:
+               sigma: float, least: float = GNSS_MOVES) -> float | None:
     """
     Return turns by the gyro over turns of the course by fixes: 1 if units and sign are right.
 
@@ -36,17 +37,21 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
         s, and turn rate about the upward axis.
     t_fix, fixes_n, sigma : (k,), (k, 2 or more), float
         s, m, and m horizontally.
+    least : float
+        Distance over which fixes surely move, m.
 
     """
-    knots = knots_of(fixes_n, max(5.0, 10 * sigma))     # m: a course is then good to 0.14 rad
+    # m: a course is then good to 0.14 rad
+    knots = knots_of(fixes_n, max(min(5.0, least), 10 * sigma))
     if len(knots) < 5:
         return None
-    step = np.diff(fixes_n[knots, :2], axis=0)
-    t = (t_fix[knots][:-1] + t_fix[knots][1:]) / 2
+    ends = t_fix[knots]
+    keep = ~_pivots(ends, integral_at(ends, t_imu, w_up))
+    step = np.diff(fixes_n[knots, :2], axis=0)[keep]
+    t = ((ends[:-1] + ends[1:]) / 2)[keep]
     course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     # the mean angle over each chord; what a bias adds goes with the time
-    ends = t_fix[knots]
-    gyro = np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends)
+    gyro = (np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends))[keep]
     # where the course turns about at once a vehicle may have backed up: by how much is left open
     about = np.flatnonzero(np.abs(np.diff(course)) > 2.0)
     drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > about])
@@ -58,6 +63,14 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     alike = slope**2 * power / (course @ course)
     certain = alike * (len(t) - 1 - drift.shape[1]) > SLOPE_SIGMAS**2 * (1 - alike)
     return 1 / slope if alike > SAME_TURNS**2 and certain else None
+
+
+def _pivots(ends: Floats, angle: Floats) -> Bools:
+    """Return a mask of the chords in which a vehicle stops and turns: (n,), angle in rad."""
+    lasts, turns = np.diff(ends), np.abs(np.diff(angle))
+    # judgement: times the usual, and rad: there the mean angle by time is not that of the path
+    pivots: Bools = (lasts > 3.0 * np.median(lasts)) & (turns > 0.5)
+    return pivots
 
 
 def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:

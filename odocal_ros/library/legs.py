@@ -24,6 +24,7 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.outside.limits import LATEST_NS
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.local_frame import settings_by_frame
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import Inputs, screen
 from odocal_ros.settings.config import Config
@@ -195,7 +196,7 @@ def find_legs(recorder: LegRecorder, bag: 'Bag | Recording', asked: Sequence[Leg
                                         judged=False)[0], first, config)
     legs = [_placed(a, bag, first, last) for a in asked if isinstance(a, LegSpan)]
     if EACH_STOP in asked:
-        legs += _each_stop(stops_known(), config)
+        legs += _each_stop(stops_known(), settings_by_frame(recorder.rows('fix'), config))
     if legs:
         return legs
     if marks:

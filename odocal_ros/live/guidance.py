@@ -77,7 +77,7 @@ def metres_to_go(now: SessionView) -> float:
     """Return the metres that the leg still lacks to leg.min_distance, 0 outside of one."""
     if now.session.state is not State.RECORDING:
         return 0.0
-    return max(0.0, now.session.config.leg.min_distance - now.distance_m)
+    return max(0.0, now.leg.min_distance - now.distance_m)
 
 
 def seconds_to_stand(now: SessionView) -> float:
@@ -91,7 +91,7 @@ def manoeuvres(now: SessionView) -> list[str]:
     """Return the missing manoeuvres of the leg, besides metres and standstill."""
     if now.session.state is not State.RECORDING:
         return []
-    wants, least = [], now.session.config.leg.min_speed
+    wants, least = [], now.leg.min_speed
     if now.max_speed < least:
         wants.append(f'{DRIVE}faster than {least:.3g} m/s ({KMH * least:.0f} km/h)')
     if now.two_wheels and 'smoother' in deciding(now.session.config.method):
@@ -122,7 +122,7 @@ def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
     """Return the hint: what to do, then what is known."""
     metres, wants = metres_to_go(now), manoeuvres(now)
     facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution, or a gap
-    slow = now.max_speed < now.session.config.leg.min_speed
+    slow = now.max_speed < now.leg.min_speed
     if metres > 0 or slow:
         if metres > 0:
             wants = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in wants)]

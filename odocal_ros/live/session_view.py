@@ -18,7 +18,8 @@ from odocal_ros.foresee.forecast import Forecast
 from odocal_ros.live.session import Session, State
 from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Reason, Verdict
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, LegConfig
+from odocal_ros.settings.frame import in_local_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,7 @@ class SessionView:
     journal: str = ''                            # folder of the newest leg's journal
     journal_trouble: str = ''                    # why it cannot be written
     received: bool = True                           # any message on any topic so far
+    local: bool = False                          # positions are in a local frame
 
     @property
     def state(self) -> str:
@@ -57,6 +59,12 @@ class SessionView:
         if self.session.state is State.IDLE and self.missing:
             return 'waiting'
         return self.session.state.value
+
+    @property
+    def leg(self) -> LegConfig:
+        """Return the limits of the leg."""
+        config = self.session.config
+        return (in_local_frame(config) if self.local else config).leg
 
     @property
     def lost_cause(self) -> bool:

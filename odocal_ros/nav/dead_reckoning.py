@@ -31,6 +31,7 @@ from odocal_ros.nav.earth import (
     geodetic_from_ecef,
     PartlyKnownRate,
 )
+from odocal_ros.nav.local_frame import GNSS_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 
@@ -146,11 +147,12 @@ def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
     return np.arctan2(-y, side * np.hypot(x, z)), np.arctan2(side * z, side * x)
 
 
-def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float) -> float | None:
+def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
+                least: float = GNSS_MOVES) -> float | None:
     """
     Return metres per unit of travel from distances between fixes, None where nothing moves.
 
-    The path is cut into equal sections, as short as possible with fixes 20 m and eight
+    The path is cut into equal sections, as short as possible with fixes ``least`` m and eight
     sigmas apart, and the median of the pieces taken: good to a few per cent despite outliers,
     for thresholds and for scales that have no nominal value.
     """
@@ -164,7 +166,7 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float) ->
         k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], pieces + 1)))
         chord, run = np.hypot(*np.diff(p[k], axis=0).T), np.abs(np.diff(s[k]))
         onward = run > 0
-        if onward.any() and np.median(chord[onward]) >= max(20.0, 8 * sigma):
+        if onward.any() and np.median(chord[onward]) >= max(least, 8 * sigma):
             return float(np.median(chord[onward] / run[onward]))
         pieces //= 2
     return None

@@ -28,13 +28,17 @@ USUAL_LATITUDE_DEG = 45.0
 # m from the origin along an axis: there the vertical differs by 0.18 deg from the z axis.
 # Judgement: larger values are map coordinates (UTM), which are not in a tangent plane
 LARGEST_FRAME = 20_000.0
+# m over which positions surely move, of GNSS and in a local frame. Judgement: a receiver at rest
+# drifts by many metres, SLAM and motion capture by centimetres
+GNSS_MOVES, LOCAL_MOVES = 20.0, 0.5
 
 
 def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, Floats]:
     """
     Return latitude, longitude, rad, and height, m, of (n, 3) m in a local frame: (n,) each.
 
-    NaN for positions beyond LARGEST_FRAME.   latitude_deg : NaN for USUAL_LATITUDE_DEG.
+    NaN for positions beyond LARGEST_FRAME, and for the height where z is 0: the positions of 2D
+    SLAM and AMCL have none.   latitude_deg : NaN for USUAL_LATITUDE_DEG.
     """
     latitude = math.radians(USUAL_LATITUDE_DEG if math.isnan(latitude_deg) else latitude_deg)
     with np.errstate(invalid='ignore'):      # a NaN that signals
@@ -44,4 +48,5 @@ def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, 
     # no matrix product: its last bits depend on the number of rows, so replay would differ
     r_e = np.stack([own + a * x + b * y + c * z for own, (a, b, c) in zip(
         own_e, C_en(latitude, FRAME_LONGITUDE), strict=True)])
-    return geodetic_from_ecef(r_e.T)
+    place = geodetic_from_ecef(r_e.T)
+    return place

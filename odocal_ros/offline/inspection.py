@@ -49,6 +49,7 @@ from odocal_ros.offline.wheel_survey import (
 )
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond
+from odocal_ros.screening.local_frame import settings_by_frame
 from odocal_ros.settings.config import Config, SIDES
 
 # what only a method that begins with an alignment, or sees the ends alone, minds
@@ -124,6 +125,8 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         _read_again(bag, taps, mapping['odometer'], config, topics)
     if {'imu', 'odometer'} <= mapping.keys():
         extra += look(bag, _together(taps, mapping), config, found, findings)
+    if 'fix' in mapping:
+        config = settings_by_frame(taps[mapping['fix']].recorder.rows('fix'), config)
     findings += lacking(found, mapping, config)
     wheels = config.odometer.keys or any(
         option.startswith(('odometer.left=', 'odometer.wheels=')) for option in extra)

@@ -32,6 +32,7 @@ from odocal_ros.offline.stretches import (
 )
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import usable_fixes
+from odocal_ros.screening.local_frame import settings_by_frame
 from odocal_ros.screening.sanity import imu_sanity, MAX_RATE
 from odocal_ros.screening.screen import Inputs, screen
 from odocal_ros.settings.config import Config
@@ -58,6 +59,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     except BadData as error:
         findings.append(Reason(Code.CLOCKS_DIFFER, str(error)))
         return []
+    config = settings_by_frame(leg.fix, config)
     inputs, reasons = screen(leg, config)
     findings += [r for r in reasons if r.code is not Code.NO_FIX or 'fix' in found['mapping']]
     if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:
@@ -67,9 +69,10 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
     drive = survey_drive(inputs, config)
-    path_length, chord = way_and_chord(drive.t_fix, drive.fixes_n)
+    path_length, chord = way_and_chord(drive.t_fix, drive.fixes_n, inputs.least_motion)
     driven = _driven(inputs, drive)
-    scale = path_length / driven if path_length > 50 and driven else drive.scale
+    long = path_length > 2.5 * inputs.least_motion      # judgement: then it is good to a per cent
+    scale = path_length / driven if long and driven else drive.scale
     # speeds by the scale that is shown
     truer = scale / drive.scale if scale and drive.scale else 1.0
     found['drive'] = {
@@ -138,7 +141,8 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: Drive, config: Config
         'needed': m.rpy is not None and not agrees and not set_already}
     up_i = medians(f_i)
     up_i = up_i / max(float(np.linalg.norm(up_i)), 1e-9)
-    ratio = turn_ratio(inputs.t_imu, w_i @ up_i, drive.t_fix, drive.fixes_n, drive.sigma)
+    ratio = turn_ratio(inputs.t_imu, w_i @ up_i, drive.t_fix, drive.fixes_n, drive.sigma,
+                       inputs.least_motion)
     found['drive']['gyro_over_course'] = ratio
     findings += gyro_reasons(ratio, config.imu.gyro_scale)
     if m.rpy is None or not found['mounting']['needed']:
@@ -156,7 +160,8 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: Drive, first: 
     def described(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
         here = (drive.t_fix >= start) & (drive.t_fix <= stop)
-        path_length, chord = way_and_chord(drive.t_fix[here], drive.fixes_n[here])
+        path_length, chord = way_and_chord(drive.t_fix[here], drive.fixes_n[here],
+                                           inputs.least_motion)
         return {'start': base + start, 'stop': base + stop, 'way': path_length,
                 'chord': chord} | more
 

@@ -29,7 +29,7 @@ NUMBERS = {
     'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
     'imu_rate': ('HZ', 'rate of /imu/data (default 100)'),
     'odometer_rate': ('HZ', 'rate of the odometer (default 50)'),
-    'fix_rate': ('HZ', 'rate of /fix (default 5)'),
+    'fix_rate': ('HZ', 'rate of the fixes or other positions (default 5)'),
     'heading_rate': ('HZ', 'rate of /heading (default 10)'),
     'gyro_scale_error': ('X', 'gyro scale error, relative (default 0)'),
     'accel_scale_error': ('X', 'accelerometer scale error, relative (default 0)'),
@@ -39,15 +39,20 @@ NUMBERS = {
     'odometer_delay': ('S', 'delay of odometer stamps, s'),
     'wheel_difference': ('X', 'right scale divided by left scale, minus 1 (default 0.004); of '
                          'more than 2 wheels 1 sigma of each'),
-    'track_width': ('M', 'distance between left and right wheels (default 1.6)'),
+    'track_width': ('M', 'distance between left and right wheels (default 1.6; indoor 0.3)'),
     'wheelbase': ('M', 'distance of the front wheels from the odometer point (default 2.7)'),
     'slip_events': ('N', 'wheel spins per hour of motion'),
     'slip_size': ('M', 'metres lost in each spin (default 0.1)'),
     'start_slip': ('SHARE', 'wheel spin after each start, as a fraction of travel'),
     'start_slip_time': ('S', 'duration of this spin, s (default 5)'),
     'sway': ('M/S', 'sideways and vertical velocity while moving, 1 sigma, white at 10 Hz'),
-    'fix_sigma': ('M', 'horizontal error of fixes, 1 sigma; up: twice (default 1.5, rtk 0.02)'),
+    'fix_sigma': ('M', 'horizontal error of fixes, 1 sigma; up: twice (default 1.5, rtk 0.02, '
+                  'mocap 0.001, total_station 0.002, slam 0.02, amcl 0.01)'),
     'fix_correlation_time': ('S', 'correlation time of --fix-noise correlated (default 60)'),
+    'reference_drift': ('X', 'drift of the reference, m per square root of a metre (slam '
+                        '0.01, amcl 0.05)'),
+    'drift_length': ('M', 'path in which this drift is forgotten (amcl 2; 0: never)'),
+    'closure_time': ('S', 'mean time between loop closures of the reference (slam 30; 0: none)'),
     'fix_delay': ('S', 'delay of fix stamps, s'),
     'outliers': ('SHARE', 'fraction of outliers among the fixes, 0 to 0.5'),
     'outlier_size': ('M', 'size of outliers (default 20)'),
@@ -78,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; the simulator checks their values."""
     add = parser.add_argument
     add('--scenario', required=True, metavar='NAME',
-        help='paper, straight, out_and_back, town, motorway, oval or yard')
+        help='paper, straight, out_and_back, town, motorway, oval, yard or indoor')
     add('--out', required=True, metavar='BAG', help='bag to write; truth.yaml and '
         'calibrator.yaml are written to the same folder')
     add('--seed', type=int, metavar='N', help='seed of all random numbers (default 1); each seed '
@@ -88,12 +93,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--odometer', metavar='KIND', help='counts (Int64, default), speed (TwistStamped) or '
         'angle (JointState)')
     add('--two-wheels', action='store_true', default=None, help='left and right odometer')
-    add('--wheels', type=int, metavar='N', help='number of wheels, 1 to 8 (default 1); more than '
-        '2 are joints of one JointState')
+    add('--wheels', type=int, metavar='N', help='number of wheels, 1 to 8 (default 1; indoor '
+        '2); more than 2 are joints of one JointState')
     add('--front-fixed', action='store_const', const=False, dest='front_steers',
         help='the front ones of more than 2 wheels do not steer')
-    add('--reference', metavar='KIND', help='fix (NavSatFix on /fix, default) or pose '
-        '(PoseStamped on /pose in a local frame, with the errors of the fixes)')
+    add('--reference', metavar='KIND', help='fix (NavSatFix on /fix, default), or positions in a '
+        'local frame with the usual errors of their kind: mocap, total_station, slam (indoor: '
+        'default) or amcl; pose: PoseStamped with the errors of fixes')
     add('--fix-noise', metavar='KIND', help='white (default), correlated or rtk')
     add('--slip', type=float, metavar='M', dest='slip_walk',
         help='random slip while moving, m per square root of a second')

@@ -31,6 +31,7 @@ from odocal_ros.pipeline.leg_run import leg_result, run_leg
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.local_frame import settings_by_frame
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
 from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
 from odocal_ros.screening.screen import Inputs, screen
@@ -75,7 +76,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     LegResult; a leg that cannot be calibrated says why in its reasons.
 
     """
-    progress = progress or (lambda stage: None)
+    progress, config = progress or (lambda stage: None), settings_by_frame(leg.fix, config)
     seen = screened(leg, config, notes)
     inputs = seen.inputs
 
@@ -102,13 +103,14 @@ def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
     """
     reasons = seen.reasons
     if seen.usable:
-        _, reasons = prepare(leg, seen.inputs, config, reasons)
+        _, reasons = prepare(leg, seen.inputs, settings_by_frame(leg.fix, config), reasons)
     return tuple(r for r in reasons
                  if r.code.gravity is not Verdict.ACCEPTED and r.code not in NOT_YET)
 
 
 def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
     """Return the inputs of a leg, z up."""
+    config = settings_by_frame(leg.fix, config)
     inputs, found = screen(leg, config)
     reasons = (*notes, *found)
     missing = _missing(leg, inputs)

@@ -41,7 +41,8 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
     """Return the result of a leg: its counts, findings and what more there is."""
     between = (inputs.t_fix >= -0.5) & (inputs.t_fix <= inputs.t_stop + 0.5)
     if 'distance' not in more:
-        more['distance'] = _path_of(inputs.t_fix[between], inputs.geodetic[between])
+        more['distance'] = _path_of(inputs.t_fix[between], inputs.geodetic[between],
+                                    inputs.least_motion)
     return LegResult(
         start_ns=leg.start_ns, stop_ns=leg.stop_ns, duration=inputs.t_stop,
         imu_samples=len(inputs.t_imu),
@@ -50,12 +51,12 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
         C_bi=inputs.C_bi, **more)
 
 
-def _path_of(t_fix: Floats, geodetic: Floats) -> float:
+def _path_of(t_fix: Floats, geodetic: Floats, least: float) -> float:
     """Return the path length by the fixes, m, for a leg that is refused."""
     if not len(t_fix):
         return 0.0
     fixes_n = origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic))
-    return way_and_chord(t_fix, fixes_n)[0]
+    return way_and_chord(t_fix, fixes_n, least)[0]
 
 
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:

@@ -118,7 +118,7 @@ def judged_by(prepared: PreparedLeg, scale: float) -> PreparedLeg:
 def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
     """Return the explanation why there is no usable drive, None if there is one."""
     still = not_moving(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
-                       inputs.t_stop)
+                       inputs.t_stop, inputs.least_motion)
     if still or not placed.rough:
         return still or (Reason(Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a '
                                 'scale'),)
@@ -133,7 +133,7 @@ def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ..
     """Return the reason for a gyro that does not turn with the fixes or with gravity."""
     up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ up_b, inputs.w_b),
-                       inputs.t_fix, placed.fixes_n, placed.fix_sigma)
+                       inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)
     scale_or_sign = gyro_reasons(ratio, config.imu.gyro_scale)
     if any(r.code is Code.GYRO_SIGN for r in scale_or_sign):
         return scale_or_sign

@@ -15,11 +15,22 @@ import math
 import numpy as np
 
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.samples import LOCAL, no_heading, no_velocity
+from odocal_ros.data.samples import FixSamples, LOCAL, no_heading, no_velocity
 from odocal_ros.nav.earth import OMEGA
 from odocal_ros.nav.local_frame import LARGEST_FRAME
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.frame import in_local_frame
+
+
+def settings_by_frame(fix: FixSamples, config: Config) -> Config:
+    """Return the settings that apply to positions, by their frame."""
+    return in_local_frame(config) if is_local(fix) else config
+
+
+def is_local(fix: FixSamples) -> bool:
+    """Return True if positions are in a local frame."""
+    return bool((fix.status == LOCAL).any())
 
 
 def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
@@ -29,7 +40,7 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     The leg is without GNSS velocities, which are east and north, and without a heading topic
     unless the settings ask for it: that is a heading in the local frame then.
     """
-    if not (leg.fix.status == LOCAL).any():
+    if not is_local(leg.fix):
         return leg, ()
     left_out = ['GNSS velocities'] * bool(len(leg.fix_velocity.stamp_ns))
     leg = replace(leg, fix_velocity=no_velocity())

@@ -61,5 +61,6 @@ def place(inputs: 'Inputs', config: Config) -> Placed:
     fixes_n = origin.to_n(geodetic)
     fixes_n[lost, 2] = np.nan
     sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
-    rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma) or nominal
+    rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma,
+                        inputs.least_motion) or nominal
     return Placed(origin, fixes_n, sigma, nominal, rough)

@@ -26,6 +26,7 @@ from odocal_ros.data.leg import Leg, WHEELS
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_step, medians
 from odocal_ros.nav.gaps import gaps_in_rhythm
+from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
@@ -79,6 +80,11 @@ class Inputs:
     def usual_f_b(self) -> Floats:
         """Return the median of the specific force, which shows what is up: (3,) m/s^2."""
         return medians(self.f_b)
+
+    @property
+    def least_motion(self) -> float:
+        """Return the distance over which positions surely move, m."""
+        return LOCAL_MOVES if self.local else GNSS_MOVES
 
     def mirrored(self, spans: Floats) -> 'Inputs':
         """Return them with the counts in spans, (m, 2) s, reversed."""

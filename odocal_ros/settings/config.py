@@ -203,6 +203,13 @@ class ReferenceConfig:
         'Latitude of the site, for positions in a local frame (poses instead of GNSS fixes). It '
         'gives gravity and the vertical Earth rate. NaN: gravity of 45 deg; the Earth rate, up to '
         '15 deg/h, is estimated as gyro bias.'))
+    default_sigma: float = setting(0.05, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of '
+                                   'positions in a local frame without a covariance: the first '
+                                   'value of the estimate.')
+    min_distance: float = setting(2.0, 'm', 0.1, 1e5, about='leg.min_distance with positions in a '
+                                  'local frame; the smaller of both applies.')
+    min_speed: float = setting(0.1, 'm/s', 0.01, 50.0, about='leg.min_speed with positions in a '
+                               'local frame; the smaller of both applies.')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,11 +17,11 @@ from typing import Any
 from odocal_ros.errors import BadUsage
 from odocal_ros.settings.grades import Grade, GRADES
 from odocal_ros.sim.real import NONE3, Real, Vector
+from odocal_ros.sim.references import REFERENCES
 
 SIM_GRADES = {**GRADES, 'perfect': Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 FIX_NOISES = ('white', 'correlated', 'rtk')
 ODOMETERS = ('counts', 'speed', 'angle')
-REFERENCES = ('fix', 'pose')
 MOST_OWN_TOPICS, MOST_WHEELS = 2, 8    # definition: as in odometer.wheels
 BY_SCENARIO: Any = None   # filled in by ``resolved``
 
@@ -65,11 +65,11 @@ class SimOptions:
     nominal_scale: float = BY_SCENARIO   # K0, configured by the operator
     speed_noise: float = 0.0               # m/s, white, of kind speed
     two_wheels: bool = False               # as wheels = 2
-    wheels: int = 1                        # more than 2: joints of one JointState
+    wheels: int = BY_SCENARIO              # more than 2: joints of one JointState
     wheel_difference: float = 0.004        # K_right / K_left - 1; of more wheels 1 sigma each
     wheelbase: float = 2.7                 # m, from the odometer's point to the front axle
     front_steers: bool = True              # of more than 2 wheels the front ones steer
-    track_width: float = 1.6               # m
+    track_width: float = BY_SCENARIO       # m
     slip_walk: float = 0.0                 # m/sqrt(s) while moving
     slip_events: float = 0.0               # per hour of motion
     slip_size: float = 0.1                 # m spun in each event
@@ -77,11 +77,15 @@ class SimOptions:
     start_slip_time: float = 5.0           # s from each start on
     sway: float = 0.0                      # m/s of side and up while moving, white at 10 Hz
 
-    reference: str = 'fix'                 # what the bag has: fix (NavSatFix) or pose
-    fix_rate: float = 5.0                  # Hz
-    fix_noise: str = 'white'               # white, correlated or rtk
+    # fix (NavSatFix) or a position in a local frame; the next seven have its usual values
+    reference: str = BY_SCENARIO
+    fix_rate: float = BY_SCENARIO          # Hz
+    fix_noise: str = BY_SCENARIO           # white, correlated or rtk
     fix_sigma: float = BY_SCENARIO   # m, horizontal, each axis; up: twice
-    fix_correlation_time: float = 60.0     # s, of kind correlated
+    fix_correlation_time: float = BY_SCENARIO    # s, of kind correlated
+    reference_drift: float = BY_SCENARIO   # m/sqrt(m) of path
+    drift_length: float = BY_SCENARIO      # m of path in which it is forgotten; 0: never
+    closure_time: float = BY_SCENARIO      # s, mean, between loop closures; 0: none
     fix_delay: float = 0.0                 # s, delay of the stamps
     antenna_lever_arm: Vector = NONE3
     outliers: float = 0.0                  # share of the fixes
@@ -116,14 +120,22 @@ DEFAULTS = {
     'motorway': {'duration': 600.0, 'imu_grade': 'industrial'},
     'oval': {'duration': 600.0, 'imu_grade': 'industrial'},
     'yard': {'duration': 600.0, 'imu_grade': 'consumer'},
+    'indoor': {'duration': 150.0, 'imu_grade': 'consumer', 'reference': 'slam', 'wheels': 2,
+               'track_width': 0.3},
 }
+COMMON = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4), 'reference': 'fix', 'wheels': 1,
+          'track_width': 1.6, 'fix_rate': 5.0, 'fix_noise': 'white', 'fix_correlation_time': 60.0,
+          'reference_drift': 0.0, 'drift_length': 0.0, 'closure_time': 0.0}
+# of a robot: 70 mm wheels, encoders with 2500 counts
+INDOOR_SCALES = {'counts': (8.9e-5, 8.8e-5), 'speed': (1.02, 1.0), 'angle': (0.0354, 0.035)}
 SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0
 POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'velocity_rate', 'scale',
             'nominal_scale', 'track_width', 'wheelbase', 'fix_correlation_time', 'duration')
 NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise', 'slip_walk',
                 'slip_events', 'slip_size', 'start_slip', 'start_slip_time', 'sway', 'outliers',
                 'outlier_size', 'seed', 'velocity_sigma', 'velocity_correlation_time',
-                'velocity_lag', 'velocity_outliers')
+                'velocity_lag', 'velocity_outliers', 'reference_drift', 'drift_length',
+                'closure_time')
 # largest size, and how a person gives it: rad inside, degrees on the command line
 LIMITS = {'outliers': 0.5, 'start_slip': 0.5, 'sway': 1.0, 'wheel_difference': 0.5,
           'gyro_scale_error': 0.5, 'accel_scale_error': 0.5, 'odometer_delay': 10.0,
@@ -146,28 +158,33 @@ def resolved(options: SimOptions) -> SimOptions:
 
     """
     _choice('--scenario', options.scenario, DEFAULTS)
-    _choice('--fix-noise', options.fix_noise, FIX_NOISES)
     _choice('--odometer', options.odometer, ODOMETERS)
-    _choice('--reference', options.reference, REFERENCES)
+    defaults: dict[str, Any] = COMMON | DEFAULTS[options.scenario]
+    _choice('--reference', options.reference or defaults['reference'], REFERENCES)
+    defaults |= REFERENCES[options.reference or defaults['reference']].usual
+    options = _filled(options, defaults)
+    _choice('--fix-noise', options.fix_noise, FIX_NOISES)
     if options.wheel_count > MOST_OWN_TOPICS and options.odometer == 'counts':
         options = replace(options, odometer='angle')
-    defaults: dict[str, Any] = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4),
-                                **DEFAULTS[options.scenario]}
-    scale, nominal = SCALES[options.odometer]
+    scale, nominal = (INDOOR_SCALES if options.scenario == 'indoor' else SCALES)[options.odometer]
     if options.scenario == 'paper':
         # fine pulses: a coarser one would hide 1e-6 of 11 200 m
         scale = 0.001 if options.odometer == 'counts' else scale
         nominal = 1.2 * (options.scale or scale)
     elif options.scale is not None:
         nominal = options.scale * nominal / scale
-    defaults |= {'scale': scale, 'nominal_scale': nominal,
-                 'fix_sigma': 0.02 if options.fix_noise == 'rtk' else 1.5}
-    filled = replace(options, **{name: value for name, value in defaults.items()
-                                 if getattr(options, name) is None})
+    filled = _filled(options, {'scale': scale, 'nominal_scale': nominal,
+                               'fix_sigma': 0.02 if options.fix_noise == 'rtk' else 1.5})
     if isinstance(options.real, dict):      # as truth.yaml holds it
         filled = replace(filled, real=Real(**options.real))
     _check(filled)
     return filled
+
+
+def _filled(options: SimOptions, values: dict[str, Any]) -> SimOptions:
+    """Return options with values for those that are BY_SCENARIO."""
+    return replace(options, **{name: value for name, value in values.items()
+                               if getattr(options, name) is BY_SCENARIO})
 
 
 def _check(options: SimOptions) -> None:

@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.sim import indoor as small
 from odocal_ros.sim.profile import chain, hold, Piece, Profile, ramp, turn
 
 
@@ -143,6 +144,12 @@ def yard(duration: float, rng: np.random.Generator) -> Route:
     return _route(stretches)
 
 
+def indoor(duration: float, rng: np.random.Generator) -> Route:
+    """Return the moves and turns on the spot of a small robot, 5 s still before and after."""
+    _rest('indoor', duration, 2 * small.STILL, least=math.ceil(small.LONGEST))
+    return _route(small.stretches(duration, rng))
+
+
 def _town_cycle(rng: np.random.Generator,
                 off: float) -> tuple[list[Piece], list[Piece], float]:
     up, top, down = _tenth(rng.uniform(5, 12)), rng.uniform(9, 14), _tenth(rng.uniform(6, 12))
@@ -191,4 +198,5 @@ def _clean(speed: Profile) -> Profile:
 
 
 ROUTES = {'paper': paper, 'straight': straight, 'out_and_back': out_and_back, 'town': town,
-          'motorway': motorway, 'oval': oval, 'yard': yard}
+          'motorway': motorway, 'oval': oval, 'yard': yard,
+          'indoor': indoor}

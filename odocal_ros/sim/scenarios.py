@@ -35,6 +35,7 @@ from odocal_ros.sim.motion import attitude, Motion, Start
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Profile
+from odocal_ros.sim.references import local_fixes, Reference, REFERENCES
 from odocal_ros.sim.road import Hills
 from odocal_ros.sim.routes import Route, ROUTES
 from odocal_ros.sim.vehicle_wheels import wheels_of
@@ -103,11 +104,18 @@ class Drive:
         """Return the samples of the right wheel, no rows without one."""
         return self.wheels[1] if len(self.wheels) > 1 else no_odometer()
 
+    @property
+    def reference(self) -> Reference:
+        """Return the kind of the position reference."""
+        return REFERENCES[self.options.reference]
+
     def leg(self) -> Leg:
         """Return the drive as one leg between its marks, with all that came before."""
+        fix = (self.fix if self.options.reference == 'fix'
+               else local_fixes(self.fix, self.positions(), self.reference))
         wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
         return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
-                   fix=self.fix, heading=self.heading, fix_velocity=self.velocity,
+                   fix=fix, heading=self.heading, fix_velocity=self.velocity,
                    form=self.form, **wheels)
 
     def positions(self) -> Floats:
@@ -115,7 +123,11 @@ class Drive:
         start = self.options
         position_n = Origin(start.latitude, start.longitude, start.height).to_n(
             np.stack([self.fix.latitude, self.fix.longitude, self.fix.height], -1))
-        return position_n @ matrix_from_rpy([0.0, 0.0, float(yaw_from_heading(start.heading))])
+        position = position_n @ matrix_from_rpy(
+            [0.0, 0.0, float(yaw_from_heading(start.heading))])
+        if self.reference.planar:
+            position[:, 2] = 0.0
+        return position
 
 
 def motion_of(options: SimOptions) -> Motion:

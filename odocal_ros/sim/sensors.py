@@ -34,6 +34,7 @@ from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motio
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
 from odocal_ros.sim.options import SIM_GRADES, SimOptions
 from odocal_ros.sim.real import NONE3
+from odocal_ros.sim.references import drift, REFERENCES, stationary_sigma
 from odocal_ros.sim.vehicle_wheels import SimWheel, steered_path, wheels_of
 
 # s from the first IMU sample, so that no two topics sample together
@@ -42,7 +43,7 @@ TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measuring
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
 WHITE_SHARE = 0.2        # judgement: of the correlated sigma: receiver noise on top
 SIGMA_FLOOR = 0.001      # m, judgement: no receiver reports zero
-AT_REST = 1e-9           # m/s, judgement
+AT_REST = 1e-9           # m/s and rad/s, judgement
 
 
 def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floats]:
@@ -172,7 +173,7 @@ def _reading(state: State, options: SimOptions, wheel: SimWheel,
 def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
     """Return the metres a wheel has spun beyond the ground by each time: (n,)."""
     spun = np.zeros(len(state.t))
-    moving = np.abs(state.speed) > AT_REST
+    moving = (np.abs(state.speed) > AT_REST) | (np.abs(state.yaw_rate) > AT_REST)
     steps = np.diff(state.t, prepend=state.t[:1]) * moving
     if options.slip_walk:
         walk = stream(options.seed, f'slip walk {side}')
@@ -203,7 +204,9 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     ns, t = stamps(motion.duration, options.fix_rate, PHASE['fix'])
     real = options.real
     latitude, longitude, height = real_fixes.places(motion, t, options)
-    error = real_fixes.fused(t, fix_errors(t, options) + real_fixes.errors(t, options), options)
+    error = fix_errors(t, options) + real_fixes.errors(t, options)
+    error = error + drift(t, motion.at(t).travel, options)
+    error = real_fixes.fused(t, error, options)
     meridian, normal = radii(latitude)
     by_rad = np.stack([(normal + height) * np.cos(latitude), meridian + height], -1)
     # from the first fix: metres per radian change along the path
@@ -212,8 +215,11 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     error = real_fixes.reckoned(t, error, place, options)
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
-    variance = real_fixes.true_variance(_axes(options) ** 2 * _power(options), options)
+    variance = real_fixes.true_variance(
+        _axes(options) ** 2 * _power(options) + stationary_sigma(options)**2, options)
     variance = np.maximum(variance * real.stated_factor**2, SIGMA_FLOOR**2)
+    if REFERENCES[options.reference].planar:
+        variance[2] = 0.0
     n = len(t)
     stamp = options.start_ns + _late(ns, options, 'fix')
     samples = FixSamples(

@@ -63,7 +63,7 @@ def _topics(drive: Drive) -> dict[str, Any]:
     elif len(drive.wheels) > 1:
         odometer = {'left': '/odometer/left', 'right': '/odometer/right'}
     topics = {'imu_topic': '/imu/data', 'odometer_topic': odometer,
-              'fix_topic': f'/{drive.options.reference}'}
+              'fix_topic': drive.reference.topic}
     return topics | ({'heading_topic': '/heading'} if len(drive.heading.stamp_ns) else {})
 
 

@@ -16,6 +16,7 @@ from drives import changed, drive, everything_said, settings
 import numpy as np
 import pytest
 
+from odocal_ros.calib.smoother import problem
 from odocal_ros.calib.smoother.leg import smoother_leg
 from odocal_ros.calib.smoother.problem import _priors
 from odocal_ros.data.samples import LOCAL
@@ -75,13 +76,14 @@ def test_poses_give_the_values_of_fixes(options):
 
 
 def test_with_the_earth_rate_of_the_frame_they_are_those_of_fixes(monkeypatch):
-    """So the direction of the Earth rate is all that poses lack."""
+    """So poses differ by the Earth rate, the first sigma, and errors that change with the path."""
     made = drive(**CAR | {'fix_noise': 'white'})
     latitude, turned = made.options.latitude, math.pi / 2 - made.options.heading
     rate = earth_rate_n(latitude) @ matrix_from_rpy([0.0, 0.0, turned])
     monkeypatch.setattr(placed, 'rate_without_north', lambda latitude: PartlyKnownRate(
         tuple(rate.tolist()), (0.0, 0.0, 0.0)))
-    config = settings(made, **SMOOTHER)
+    monkeypatch.setattr(problem, 'drift_time', lambda leg, t: np.diff(t))
+    config = settings(made, **SMOOTHER, reference__default_sigma=2.5)
     by_fix = estimates(without_covariance(made), config)
     by_pose = estimates(posed(made, math.degrees(latitude)), config)
     for name in NAMES:

@@ -75,6 +75,22 @@ class SmootherLeg:
         return coarse is not None and coarse.step * self.rough_scale > 0.05
 
 
+def drift_time(leg: SmootherLeg, t: Floats) -> Floats:
+    """
+    Return the time in which the correlated error of fixes changes between keyframes: (N - 1,) s.
+
+    That of GNSS changes with time. That of positions in a local frame (drift of SLAM, cells and
+    particles of AMCL) changes with the path of the wheels: time is shared out by path.
+    """
+    T = np.diff(t)
+    if not leg.origin.local:
+        return T
+    path = np.max([np.abs(np.diff(one.at(t))) for one in leg.wheels or (leg.travel,)], axis=0)
+    at_rest = 0.01      # of the time, judgement: a pose may change without motion
+    out: Floats = np.maximum(T.sum() * path / max(path.sum(), 1e-12), at_rest * T)
+    return out
+
+
 def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats, spans: Floats,
                  rough_scale: float, t_stop: float | None = None) -> SmootherLeg:
     """

@@ -18,7 +18,7 @@ from odocal_ros.calib.smoother.equations import FACTORS, Weighted
 from odocal_ros.calib.smoother.fixes import whitener
 from odocal_ros.calib.smoother.imu_noise import at_rest, shaken, unfelt
 from odocal_ros.calib.smoother.imu_steps import ImuSteps
-from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.leg import drift_time, SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.odometer_filter import as_rolled
 from odocal_ros.calib.smoother.outside import Heading, Velocity, velocity_sigmas
@@ -74,6 +74,7 @@ class Problem:
     fix_time: float          # s, as gnss.correlation_time: 0 white, NaN to be judged
     rate_b: np.ndarray       # (N, 3) rad/s, measured at the keyframes
     swings: np.ndarray       # (K, 3, 3) rad^2, of the angles within the intervals
+    drift_time: np.ndarray   # (K,) s, in which the correlated fix error changes
     first_levels: Levels = field(default_factory=lambda: Levels({}))
     least: dict[str, float] = field(default_factory=dict)     # levels
     shaken: dict[str, float] = field(default_factory=dict)    # initial levels of the IMU
@@ -92,7 +93,8 @@ class Problem:
         root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
         made = cls(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
                    used(leg, t), turned(leg, imu), config.gnss.correlation_time,
-                   rates_at(leg.t_imu, leg.w_b, t), imu.swings())
+                   rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
+                   drift_time(leg, t))
         for part in FACTORS:
             if part.there(made):
                 first, least = part.first_levels(made)

@@ -50,7 +50,7 @@ class SlowError(Factor):
     name = 'slow'
 
     def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
-        self.state, self.T = point.state, point.intervals.T
+        self.state, self.T = point.state, problem.drift_time
         self.jump = 1.0 if point.spread is None else point.spread[:, JUMP:]
         self.time_given = not np.isnan(problem.fix_time)
         # where runs of intervals without fixes begin: a fix ends a run

@@ -1,0 +1,137 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Small robots indoors, without GNSS: does the sigma hold for each kind of position reference.
+
+    python benchmarks/indoor.py [--drives 24] [--only KIND] [--jobs 1] [--file F]
+
+Differential robots with two counters on a level floor, 30 s to 3 min at 0.2 to 1.2 m/s with turns
+on the spot (odocal_ros/sim/indoor.py), references with their usual errors (sim/references.py).
+IMUs are those of the zoo (docs/zoo.md) with their effects, by turns consumer and industrial; each
+wheel has a random slip of 1 mm/sqrt(s). Settings are the defaults, but for the grade of the IMU
+and the nominal scale. Drive k of kind e has seed 93_000_000 + 1_000_000 e + k, fixed before the
+first run. Rows go to the file line by line: an interrupted run continues where it stopped.
+
+Printed by kind for the scale of the mean (wheel radius), the ratio of right to left, the track
+width, yaw and pitch of the IMU: in how many drives that are not rejected it is given, the share
+within 1.96 sigma, the rms and the largest of error over sigma, the largest of accepted drives, and
+the median sigma; verdicts; in how many drives each reason was given.
+"""
+
+import argparse
+from collections import Counter
+import math
+import os
+from pathlib import Path
+
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+from resumed import read_rows, run_missing
+from zoo import configured
+from zoo_table import WITHIN
+
+FIRST_SEED, SEEDS_A_KIND = 93_000_000, 1_000_000
+KINDS = ('mocap', 'total_station', 'slam', 'amcl')
+GRADES = ('consumer', 'industrial')
+IMU_EFFECTS = ('triads', 'g_sensitivity', 'bias', 'temperature', 'vibration', 'imu_stamps')
+SLIP = 1e-3     # m/sqrt(s) of each wheel
+FIGURES = (('scale', 'ppm', 1e6), ('ratio', 'ppm', 1e6), ('width', 'ppm', 1e6),
+           ('yaw', 'mdeg', 1e3 * 180 / math.pi), ('pitch', 'mdeg', 1e3 * 180 / math.pi))
+
+
+def options_of(seed):
+    """Return the SimOptions of a drive."""
+    from odocal_ros.sim.draw import drawn
+    from odocal_ros.sim.noise import stream
+    e, k = divmod(seed - FIRST_SEED, SEEDS_A_KIND)
+    rng = stream(seed, 'robot')
+    own = {'duration': round(float(rng.uniform(30, 180)), 1),
+           'track_width': float(rng.uniform(0.15, 0.6)),
+           'wheel_difference': float(rng.normal(0, 0.01)),
+           'imu_lever_arm': tuple(map(float, rng.normal(0, 0.05, 3))),
+           'scale': 8.9e-5 * (1 + 0.03 * float(rng.standard_normal()))}
+    return drawn(seed, 'indoor', GRADES[k % 2], IMU_EFFECTS, **own, nominal_scale=8.9e-5,
+                 slope=0.0, odometer_lever_arm=(0.0, 0.0, 0.0), antenna_lever_arm=(0.0, 0.0, 0.0),
+                 slip_walk=SLIP, reference=KINDS[e],
+                 **dict.fromkeys(('fix_rate', 'fix_noise', 'fix_sigma')))[0]
+
+
+def run_drive(seed):
+    """Draw, drive, calibrate; return a row."""
+    from odocal_ros.pipeline.calibrate import calibrate, combine
+    from odocal_ros.settings.config import with_settings
+    from odocal_ros.sim.scenarios import simulate
+    drive = simulate(options_of(seed))
+    config = with_settings(configured(drive), {'odometer.track_width': 0.0})
+    calibration = combine([calibrate(drive.leg(), config)], config)
+    row = {'seed': seed, 'kind': drive.options.reference, 'grade': drive.options.imu_grade,
+           'duration': drive.options.duration, 'distance': drive.truth.distance,
+           'verdict': calibration.verdict.value,
+           'codes': sorted({r.code.name for r in calibration.reasons})}
+    truth, found = drive.truth, calibration.estimates
+    for key, name, true, size in (
+            ('scale', 'scale_factor', truth.scale, truth.scale),
+            ('width', 'track_width', drive.options.track_width, drive.options.track_width),
+            ('yaw', 'yaw_mounting_angle', truth.yaw, 1.0),
+            ('pitch', 'pitch_mounting_angle', truth.pitch, 1.0)):
+        if name in found and found[name].value is not None:
+            row |= {f'{key}_error': (found[name].value - true) / size,
+                    f'{key}_sigma': found[name].sigma / size}
+    left, right = (found.get(f'scale_factor_{side}') for side in ('left', 'right'))
+    if left is not None and left.value is not None:
+        true = truth.wheel_scales[1] / truth.wheel_scales[0]
+        wheels = calibration.legs[0].methods['smoother'].details['wheels']
+        row |= {'ratio_error': right.value / left.value / true - 1,
+                'ratio_sigma': 2 * wheels['left']['ratio_sigma']}
+    return row
+
+
+def table(rows):
+    """Print by kind how far values are off, and what is said."""
+    for kind in KINDS:
+        own = [row for row in rows if row['kind'] == kind]
+        if not own:
+            continue
+        print(f'{kind}: {len(own)} drives, {dict(Counter(row["verdict"] for row in own))}')
+        for key, unit, size in FIGURES:
+            _print_figure(key, unit, size, own)
+        print(f'    {dict(Counter(code for row in own for code in row["codes"]))}')
+
+
+def _print_figure(key, unit, size, rows):
+    rows = [row for row in rows if f'{key}_sigma' in row and row['verdict'] != 'rejected']
+    if not rows:
+        return
+    z = np.array([abs(row[f'{key}_error']) / row[f'{key}_sigma'] for row in rows])
+    accepted = [x for x, row in zip(z, rows, strict=True) if row['verdict'] == 'accepted']
+    sigma = np.median([row[f'{key}_sigma'] for row in rows]) * size
+    print(f'    {key:6} given {len(rows):3}  share {100 * (z <= WITHIN).mean():4.0f} %  '
+          f'rms {np.sqrt((z**2).mean()):5.2f}  worst {z.max():5.1f}  accepted {len(accepted):3}, '
+          f'worst {max(accepted, default=np.nan):5.1f}  sigma {sigma:.0f} {unit}')
+
+
+def main():
+    """Run what the file does not hold yet, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--drives', type=int, default=24, help='of each kind')
+    parser.add_argument('--only', choices=KINDS, action='append', default=[], metavar='KIND')
+    parser.add_argument('--jobs', type=int, default=1, help='processes')
+    parser.add_argument('--file', type=Path, default=Path('/tmp/indoor.jsonl'))
+    args = parser.parse_args()
+    have = read_rows(args.file)
+    seeds = [FIRST_SEED + SEEDS_A_KIND * KINDS.index(kind) + k for k in range(args.drives)
+             for kind in args.only or KINDS]
+    table(run_missing(run_drive, seeds, have, args.file, args.jobs))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,55 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Speed and turn rate of a small robot in a room: straights, arcs, turns on the spot."""
+
+import math
+
+import numpy as np
+
+from odocal_ros.sim.profile import hold, Piece, ramp, turn
+
+# judgement: of a run of a minute with a small robot
+STILL = 5.0         # s at standstill, at the start and at the end
+LONGEST = 19.0      # s of a cycle with the shortest straight
+BLEND = 0.4         # s in which an acceleration or a turn rate sets in
+
+Stretch = tuple[list[Piece], list[Piece]]     # accelerations and turn rates of equal duration
+
+
+def stretches(duration: float, rng: np.random.Generator) -> list[Stretch]:
+    """
+    Return cycles of a move and a turn on the spot, 5 s still before and after.
+
+    A move of 2 to 8 s at 0.2 to 1.2 m/s is straight or an arc of up to 90 deg by turns. Turns on
+    the spot are of 45 to 200 deg at 0.5 to 1.2 rad/s, to the left and to the right by turns.
+    """
+    found, left, side = [(hold(STILL), hold(STILL))], duration - 2 * STILL, rng.choice([-1.0, 1.0])
+    k = 0
+    while left >= LONGEST:
+        speed, rate, length = _cycle(rng, side, bool(k % 2), left)
+        found.append((speed, rate))
+        left, side, k = round(left - length, 9), -side, k + 1
+    found.append((hold(STILL + left), hold(STILL + left)))
+    return found
+
+
+def _cycle(rng: np.random.Generator, side: float, arc: bool,
+           left: float) -> tuple[list[Piece], list[Piece], float]:
+    """Return accelerations, turn rates and duration of a move and a turn to a side."""
+    up, down, wait, pause = (round(float(rng.uniform(*r)), 1) for r in (
+        (1.0, 1.5), (1.0, 1.5), (0.5, 2.0), (0.5, 2.0)))
+    top, cruise = rng.uniform(0.2, 1.2), round(min(rng.uniform(2.0, 8.0), left - 15.0), 1)
+    bend = arc * rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 90))
+    angle = side * math.radians(rng.uniform(45, 200))
+    spot = round(abs(angle) / rng.uniform(0.5, 1.2) + BLEND, 1)
+    speed = ramp(up, top, BLEND) + hold(cruise) + ramp(down, -top, BLEND)
+    rate = hold(up) + turn(cruise, bend, BLEND) + hold(down)
+    return (speed + hold(wait + spot + pause), rate + hold(wait) + turn(spot, angle, BLEND)
+            + hold(pause), round(up + cruise + down + wait + spot + pause, 9))

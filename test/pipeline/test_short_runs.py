@@ -1,0 +1,110 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Short runs of small robots: limits made for cars do not refuse them."""
+
+from dataclasses import replace
+
+from drives import configured
+import numpy as np
+import pytest
+
+from odocal_ros.calib.drive import not_moving
+from odocal_ros.calib.smoother.leg import drift_time, SmootherLeg
+from odocal_ros.calib.turning import turn_ratio
+from odocal_ros.nav.dead_reckoning import rough_scale
+from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code, Verdict
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.frame import in_local_frame
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize(('reference', 'limit'), [
+    ('mocap', 1e-3), ('total_station', 1e-3), ('slam', 5e-3), ('amcl', 1e-2)])
+def test_two_minutes_give_radius_ratio_width_and_yaw(reference, limit):
+    """An IMU mounted nose down: with it a wrong derivative made the yaw 5 sigma off."""
+    made = simulate(SimOptions(scenario='indoor', duration=120.0, seed=3, imu_rate=50.0,
+                               reference=reference, pitch=-0.04, roll=0.01))
+    config = with_settings(configured(made), {'odometer.track_width': 0.0,
+                                              'verdict.max_scale_sigma': 0.02})
+    result = calibrate(made.leg(), config)
+    assert not {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW} & {r.code for r in result.reasons}
+    assert all(r.code.gravity is Verdict.ACCEPTED for r in result.reasons), result.reasons
+    smoother = result.methods['smoother']
+    assert smoother.details['iterations'] < 20
+    found, truth = smoother.estimates, made.truth
+    assert found['scale_factor'].sigma < limit * truth.scale
+    for name, true in (('scale_factor', truth.scale), ('yaw_mounting_angle', truth.yaw),
+                       ('track_width', made.options.track_width),
+                       ('scale_factor_left', truth.wheel_scales[0]),
+                       ('scale_factor_right', truth.wheel_scales[1])):
+        assert abs(found[name].value - true) < 3 * found[name].sigma, name
+
+
+def test_limits_are_those_of_the_frame_the_smaller_of_both():
+    config = with_settings(Config(), {'leg.min_distance': 50.0, 'reference.min_speed': 5.0})
+    local = in_local_frame(config)
+    assert (local.leg.min_distance, local.leg.min_speed) == (2.0, 2.78)
+    assert local.gnss.default_sigma == 0.05
+    assert config.gnss.default_sigma == 2.5
+
+
+def room(rng):
+    """Return times, fixes and travel of a robot that drives sides of 2 m and turns between."""
+    t = np.arange(0.0, 200.0, 0.1)
+    moves = t % 10.0 < 5.0                      # 0.4 m/s, then 5 s on the spot
+    faces = np.cumsum(np.where(moves, 0.0, 2.0 / 5.0 * (-1.0) ** (t // 30.0))) * 0.1
+    step = 0.04 * moves[:, None] * np.stack([np.cos(faces), np.sin(faces)], -1)
+    fixes = np.cumsum(step, axis=0) + 0.01 * rng.standard_normal((len(t), 2))
+    return t, fixes, np.cumsum(0.04 * moves), faces
+
+
+def test_the_rough_scale_of_a_room_is_that_of_its_straights():
+    t, fixes, way, _ = room(np.random.default_rng(1))
+    travel = Travel(t, way / 1e-4, 1.0)
+    assert rough_scale(travel, t, fixes, 0.01, LOCAL_MOVES) == pytest.approx(1e-4, rel=0.05)
+    assert not not_moving(travel, t, fixes, 0.01, 200.0, LOCAL_MOVES)
+    assert not_moving(travel, t, fixes, 0.01, 200.0, GNSS_MOVES)
+
+
+def test_turns_on_the_spot_are_no_turns_of_the_course():
+    t, fixes, _, faces = room(np.random.default_rng(2))
+    rate = np.gradient(faces, t)
+    for unit in (1.0, 57.3):
+        ratio = turn_ratio(t, unit * rate, t, fixes, 0.01, LOCAL_MOVES)
+        assert ratio == pytest.approx(unit, rel=0.1)
+
+
+def test_errors_in_a_local_frame_change_with_the_path_of_the_wheels():
+    t = np.arange(0.0, 11.0)
+    way = np.interp(t, [0.0, 4.0, 6.0, 10.0], [0.0, 0.0, 3.0, 3.0])
+    leg = object.__new__(SmootherLeg)
+    turning = Travel(t, np.interp(t, [0.0, 6.0, 8.0, 10.0], [0.0, 0.0, 1.0, 1.0]), 0.0)
+    for name, value in {'travel': Travel(t, way, 0.0), 'wheels': (Travel(t, way, 0.0), turning),
+                        'origin': replace_origin(True)}.items():
+        object.__setattr__(leg, name, value)
+    # 3 m, then 1 m of one wheel; at rest a hundredth
+    expected = np.where((t[:-1] >= 4) & (t[:-1] < 6), 10 * 1.5 / 4, np.where(
+        (t[:-1] >= 6) & (t[:-1] < 8), 10 * 0.5 / 4, 0.01))
+    assert drift_time(leg, t) == pytest.approx(expected)
+    object.__setattr__(leg, 'origin', replace_origin(False))
+    assert (drift_time(leg, t) == 1.0).all()
+
+
+def replace_origin(local):
+    """Return an origin on the equator, of a local frame or not."""
+    from odocal_ros.nav.dead_reckoning import Origin
+    from odocal_ros.nav.earth import rate_without_north
+    origin = Origin(0.0, 0.0, 0.0)
+    return replace(origin, local=rate_without_north(0.7)) if local else origin
