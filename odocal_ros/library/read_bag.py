@@ -21,6 +21,7 @@ from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, Settings
 from odocal_ros.library.journal import journal_notes, JournalNotes
 from odocal_ros.library.listener import Listener
+from odocal_ros.library.marks import mark_positions, with_marks
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.outside.names import one_line
 from odocal_ros.reasons import Reason
@@ -115,7 +116,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
     hearer = hearer or Listener()
     path = Path(path)
     journal = journal_notes(path)
-    settings = config_of(config, journal.settings if journal else None)
+    settings = with_marks(config_of(config, journal.settings if journal else None))
     # the hash costs as long as reading the file: beside the decoding, which holds one core
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
         name = one_line(bag.name)
@@ -130,6 +131,8 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
         recorder.form = readers[chosen['odometer']].form or recorder.form
         if 'odometer_right' in chosen:
             recorder.form_right = readers[chosen['odometer_right']].form
+        if settings.reference.marks:
+            recorder.feed('fix', mark_positions(settings, recorder, bag.start_ns))
         marks = marked_legs(bag)
         for note in bag.notes:
             if isinstance(note, str):

@@ -35,7 +35,8 @@ def simulate(scenario: str | SimOptions = 'town', out: Path | str | None = None,
     Parameters
     ----------
     scenario : str or SimOptions
-        paper, straight, out_and_back, town, motorway, oval, yard or indoor; or all options.
+        paper, straight, out_and_back, town, motorway, oval, yard, indoor or square; or all
+        options.
     out : path, optional
         Bag to write; truth.yaml and calibrator.yaml, what an operator would know, go beside it.
     storage, compression, force, progress

@@ -60,6 +60,9 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
     """
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     _check_reference(chosen)
+    if config.reference.marks and 'fix' in chosen:
+        raise BadUsage(f'--fix-topic {chosen["fix"]}: marks (reference.marks) replace fixes; omit '
+                       'one of them')
     troubles: list[str] = []
     for slot in wanted(config):
         if slot in chosen:
@@ -78,7 +81,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
 
 def wanted(config: Config) -> tuple[str, ...]:
     """Return the slots to fill; odometers and heading first, for what they leave to others."""
-    surveyed = config.reference.start and config.reference.end
+    surveyed = config.reference.start and config.reference.end or config.reference.marks
     return (*(('odometer_right',) if config.odometer.own_topics else ()), 'odometer',
             *(('heading',) if config.alignment.heading_source in ('auto', 'heading_topic')
               else ()),

@@ -39,6 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_calibration_arguments(parser)
     add('--holdout', action='store_true', help='exclude the last fifth of each leg from the fit '
         'and check the correction on it')
+    add('--mark', action='append', type=float, default=[], metavar='T', dest='marks',
+        help='the robot stands on a point of reference.points at T seconds from the first '
+        'message; repeatable, in the order of the points')
     add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
     add('--export', metavar='FILES', default='', help='time series files, separated by commas: '
         'trajectory.tum, states.csv, residuals.parquet, track.kml, scale_by_speed.png, '
@@ -73,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
     """Replay bags; return 0 accepted or caution (of --accept: pass), else 1."""
     from odocal_ros.library.asked import legs_of
     config = asked_config(args)
+    if args.marks:
+        config['reference.marks'] = tuple(args.marks)
     legs_of(args.leg)
     series = [name.strip() for name in args.export.split(',') if name.strip()]
     if series:

@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; the simulator checks their values."""
     add = parser.add_argument
     add('--scenario', required=True, metavar='NAME',
-        help='paper, straight, out_and_back, town, motorway, oval, yard or indoor')
+        help='paper, straight, out_and_back, town, motorway, oval, yard, indoor or square')
     add('--out', required=True, metavar='BAG', help='bag to write; truth.yaml and '
         'calibrator.yaml are written to the same folder')
     add('--seed', type=int, metavar='N', help='seed of all random numbers (default 1); each seed '
@@ -98,8 +98,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--front-fixed', action='store_const', const=False, dest='front_steers',
         help='the front ones of more than 2 wheels do not steer')
     add('--reference', metavar='KIND', help='fix (NavSatFix on /fix, default), or positions in a '
-        'local frame with the usual errors of their kind: mocap, total_station, slam (indoor: '
-        'default) or amcl; pose: PoseStamped with the errors of fixes')
+        'local frame with the usual errors of their kind: mocap, total_station, slam (indoor, '
+        'square: default) or amcl; pose: PoseStamped with the errors of fixes')
     add('--fix-noise', metavar='KIND', help='white (default), correlated or rtk')
     add('--slip', type=float, metavar='M', dest='slip_walk',
         help='random slip while moving, m per square root of a second')

@@ -93,8 +93,12 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     drift = bias_of_top * float(np.percentile(np.abs(y), 95)) / FAULT_GRID
     fits = [robust_fit(A, y, floor, (np.inf, np.inf, drift), start)
             for start in (None, (usual, 0.0, 0.0))]
-    scale = TUKEY * min(sigma for _, _, sigma in fits)
-    left_over = [np.minimum(1.0, ((y - A @ x) / scale)**2).sum() for x, _, _ in fits]
+    least = min(sigma for _, _, sigma in fits)
+    # rad in a cell, of a consumer gyro that vibrates: judgement. With it a fit by the turns may
+    # differ more in straights than one without turns
+    gyro_noise = 2e-4
+    left_over = [np.minimum(1.0, ((y - A @ x) / (
+        TUKEY * np.hypot(least, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
     return fits[int(np.argmin(left_over))][:2]
 
 

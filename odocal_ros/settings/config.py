@@ -26,6 +26,7 @@ from odocal_ros.settings.output_config import (
     PublishConfig,
     UpdaterConfig,
 )
+from odocal_ros.settings.reference_config import ReferenceConfig
 from odocal_ros.settings.setting import (
     setting,
     settings_of as settings_of,  # for others too: they are its other half
@@ -191,25 +192,6 @@ class AlignmentConfig:
                                    'and of sources that do not state theirs, 1 sigma.')
     heading_offset: float = setting(0.0, 'rad', -6.3, 6.3, about='Added to the ENU yaw of the '
                                     'heading topic.')
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReferenceConfig:
-    start: tuple[float, ...] = setting((), 'deg, deg, m, m', about='Surveyed antenna position at '
-                                       'the start mark: latitude, longitude, ellipsoidal height, '
-                                       'sigma; empty: from fixes.')
-    end: tuple[float, ...] = setting((), 'deg, deg, m, m', about='The same at the end mark.')
-    latitude_deg: float = setting(NAN, 'deg', -85.0, 85.0, ro=True, about=(
-        'Latitude of the site, for positions in a local frame (poses instead of GNSS fixes). It '
-        'gives gravity and the vertical Earth rate. NaN: gravity of 45 deg; the Earth rate, up to '
-        '15 deg/h, is estimated as gyro bias.'))
-    default_sigma: float = setting(0.05, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of '
-                                   'positions in a local frame without a covariance: the first '
-                                   'value of the estimate.')
-    min_distance: float = setting(2.0, 'm', 0.1, 1e5, about='leg.min_distance with positions in a '
-                                  'local frame; the smaller of both applies.')
-    min_speed: float = setting(0.1, 'm/s', 0.01, 50.0, about='leg.min_speed with positions in a '
-                               'local frame; the smaller of both applies.')
 
 
 @dataclass(frozen=True, kw_only=True)

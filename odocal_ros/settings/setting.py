@@ -33,16 +33,16 @@ AnyConfig = TypeVar('AnyConfig', bound=Settings)
 
 def setting(default: object, unit: str = '', low: float | None = None, high: float | None = None,
             about: str = '', choices: Sequence[str] = (), ro: bool = False,
-            frame: bool = False, item: type = float) -> Any:
+            frame: bool = False, item: type = float, many: bool = False) -> Any:
     """
     Declare a setting; NaN passes where the default is NaN.
 
     ro : fixed at start-up.   frame : the name of a coordinate frame.   item : type of the values
-    of a list.
+    of a list.   many : a list of any length.
     """
     return field(default=default, metadata={
         'unit': unit, 'low': low, 'high': high, 'about': about, 'choices': choices, 'ro': ro,
-        'frame': frame, 'item': item})
+        'frame': frame, 'item': item, 'many': many})
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ class Setting:
     read_only: bool
     frame: bool
     item: type
+    many: bool
 
     @property
     def kind(self) -> str:
@@ -76,7 +77,7 @@ class Setting:
                 return tuple(self._one(str(v) if type(v) is int else v, str) for v in value)
             items = tuple(self._one(v, float) for v in value)
             lengths = (3,) if self.default else (0, 4)
-            if len(items) not in lengths:
+            if len(items) not in lengths and not self.many:
                 raise BadConfig(f'{self.name}: {len(items)} values; required: {lengths[-1]}')
             return items
         return self._one(value, type(self.default))
@@ -124,7 +125,7 @@ def _settings(owner: Settings, prefix: str = '') -> Iterator[Setting]:
         else:
             m = f.metadata
             yield Setting(prefix + f.name, f.default, m['unit'], m['low'], m['high'],
-                          m['choices'], m['about'], m['ro'], m['frame'], m['item'])
+                          m['choices'], m['about'], m['ro'], m['frame'], m['item'], m['many'])
 
 
 @cache

@@ -40,6 +40,21 @@ def stretches(duration: float, rng: np.random.Generator) -> list[Stretch]:
     return found
 
 
+def square() -> list[Stretch]:
+    """
+    Return a square of 4 m to the left, and one to the right, with stops at the corners.
+
+    10 s still; then eight times: 9 s of motion, 3 s still, a turn of 90 deg in 2 s, 3 s still.
+    """
+    found = [(hold(10.0), hold(10.0))]
+    for side in [1.0] * 4 + [-1.0] * 4:
+        # 4 m: a ramp of 1 s with such flanks is half a second of the speed
+        speed = ramp(1.0, 0.5, BLEND) + hold(7.0) + ramp(1.0, -0.5, BLEND)
+        found.append((speed + hold(8.0), hold(12.0) + turn(2.0, side * math.pi / 2, BLEND)
+                      + hold(3.0)))
+    return found
+
+
 def _cycle(rng: np.random.Generator, side: float, arc: bool,
            left: float) -> tuple[list[Piece], list[Piece], float]:
     """Return accelerations, turn rates and duration of a move and a turn to a side."""

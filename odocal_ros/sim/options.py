@@ -122,11 +122,15 @@ DEFAULTS = {
     'yard': {'duration': 600.0, 'imu_grade': 'consumer'},
     'indoor': {'duration': 150.0, 'imu_grade': 'consumer', 'reference': 'slam', 'wheels': 2,
                'track_width': 0.3},
+    'square': {'duration': 151.0, 'imu_grade': 'consumer', 'reference': 'slam', 'wheels': 2,
+               'track_width': 0.3},
 }
 COMMON = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4), 'reference': 'fix', 'wheels': 1,
           'track_width': 1.6, 'fix_rate': 5.0, 'fix_noise': 'white', 'fix_correlation_time': 60.0,
           'reference_drift': 0.0, 'drift_length': 0.0, 'closure_time': 0.0}
 # of a robot: 70 mm wheels, encoders with 2500 counts
+# definition: scenarios
+ROBOTS = ('indoor', 'square')
 INDOOR_SCALES = {'counts': (8.9e-5, 8.8e-5), 'speed': (1.02, 1.0), 'angle': (0.0354, 0.035)}
 SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0
 POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'velocity_rate', 'scale',
@@ -166,7 +170,7 @@ def resolved(options: SimOptions) -> SimOptions:
     _choice('--fix-noise', options.fix_noise, FIX_NOISES)
     if options.wheel_count > MOST_OWN_TOPICS and options.odometer == 'counts':
         options = replace(options, odometer='angle')
-    scale, nominal = (INDOOR_SCALES if options.scenario == 'indoor' else SCALES)[options.odometer]
+    scale, nominal = (INDOOR_SCALES if options.scenario in ROBOTS else SCALES)[options.odometer]
     if options.scenario == 'paper':
         # fine pulses: a coarser one would hide 1e-6 of 11 200 m
         scale = 0.001 if options.odometer == 'counts' else scale

@@ -150,6 +150,12 @@ def indoor(duration: float, rng: np.random.Generator) -> Route:
     return _route(small.stretches(duration, rng))
 
 
+def square(duration: float, rng: np.random.Generator) -> Route:
+    """Return a square of 4 m in both directions, as of UMBmark, with turns on the spot."""
+    rest = _rest('square', duration, 10 + 8 * 17, least=5.0)
+    return _route([*small.square(), (hold(rest), hold(rest))])
+
+
 def _town_cycle(rng: np.random.Generator,
                 off: float) -> tuple[list[Piece], list[Piece], float]:
     up, top, down = _tenth(rng.uniform(5, 12)), rng.uniform(9, 14), _tenth(rng.uniform(6, 12))
@@ -199,4 +205,4 @@ def _clean(speed: Profile) -> Profile:
 
 ROUTES = {'paper': paper, 'straight': straight, 'out_and_back': out_and_back, 'town': town,
           'motorway': motorway, 'oval': oval, 'yard': yard,
-          'indoor': indoor}
+          'indoor': indoor, 'square': square}

@@ -1,0 +1,44 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Settings of position references other than GNSS fixes."""
+
+from dataclasses import dataclass
+import math
+
+from odocal_ros.settings.setting import setting
+
+NAN = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceConfig:
+    start: tuple[float, ...] = setting((), 'deg, deg, m, m', about='Surveyed antenna position at '
+                                       'the start mark: latitude, longitude, ellipsoidal height, '
+                                       'sigma; empty: from fixes.')
+    end: tuple[float, ...] = setting((), 'deg, deg, m, m', about='The same at the end mark.')
+    latitude_deg: float = setting(NAN, 'deg', -85.0, 85.0, ro=True, about=(
+        'Latitude of the site, for positions in a local frame (poses instead of GNSS fixes). It '
+        'gives gravity and the vertical Earth rate. NaN: gravity of 45 deg; the Earth rate, up to '
+        '15 deg/h, is estimated as gyro bias.'))
+    default_sigma: float = setting(0.05, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of '
+                                   'positions in a local frame without a covariance: the first '
+                                   'value of the estimate.')
+    points: tuple[float, ...] = setting((), 'm', -1e4, 1e4, many=True, about=(
+        'Points on the floor where the robot stands at the marks: x and y of each, in the order '
+        'of the marks; after the last point the list starts again.'))
+    points_sigma: float = setting(0.005, 'm', 1e-4, 1.0, about='Uncertainty of points and of '
+                                  'the robot on them, each axis.')
+    marks: tuple[float, ...] = setting((), 's', 0.0, 1e6, many=True, about=(
+        'Times at which the robot stands on the points, from the first message of the bag; they '
+        'replace fixes and poses. The same as --mark.'))
+    min_distance: float = setting(2.0, 'm', 0.1, 1e5, about='leg.min_distance with positions in a '
+                                  'local frame; the smaller of both applies.')
+    min_speed: float = setting(0.1, 'm/s', 0.01, 50.0, about='leg.min_speed with positions in a '
+                               'local frame; the smaller of both applies.')
