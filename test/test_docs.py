@@ -38,7 +38,8 @@ ELSEWHERE = {
     'export': 'the TLS of a Dask cluster: test/fleet',
     '.venv/bin/python': 'test_comma2k19.py runs that module',
 }
-FLEET = 'docs/first_fleet.md'      # whose commands go on from each other
+# pages whose commands go on from each other
+FLEET, INDOOR = 'docs/first_fleet.md', 'docs/indoor.md'
 RESULTS = ('ACCEPTED: ', 'CAUTION: ', 'REJECTED: ')     # a block that shows what is printed
 KNOWN = {'odocal', 'ros2', *ELSEWHERE}
 STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'fix_noise': 'rtk'}
@@ -93,7 +94,7 @@ def meant_to_be_typed(line):
 
 @pytest.mark.parametrize(('page', 'line'), [
     (page, line) for page, line in all_commands('odocal')
-    if meant_to_be_typed(line) and page != FLEET],
+    if meant_to_be_typed(line) and page not in (FLEET, INDOOR)],
     ids=lambda text: text[:60])
 def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch, capfd, results):
     words = shlex.split(line)[1:]
@@ -157,6 +158,24 @@ def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch
     decided = {row['vehicle']: row['decision'] for row in map(
         json.loads, re.findall(r'^\{.*$', out, re.MULTILINE)) if row['decision'] != 'PASS'}
     assert decided == {'shuttle_004': 'FAIL', 'van_005': 'UNDECIDED'}
+
+
+def test_the_walk_through_a_room_prints_what_the_page_says(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    lines = [shlex.split(line)[1:] for page, line in all_commands('odocal') if page == INDOOR]
+    assert [words[0] for words in lines] == ['simulate', 'inspect', 'replay', 'simulate', 'replay']
+    shown = [text for language, text in fenced(page_of(INDOOR)) if language == 'text']
+    for words in lines:
+        capfd.readouterr()
+        assert cli.main(words) == 0
+        out, _ = capfd.readouterr()
+        if words[0] == 'replay':
+            of_run = shown[:2] if words[1] == 'robot' else shown[2:]
+            assert all('\n'.join(text) in out for text in of_run), out
+    made = yaml.safe_load((tmp_path / 'truth.yaml').read_text())
+    told = f'{made["scale"]["value"]:g} m/pulse, ' + ', '.join(
+        f'{x:.8f}' for x in made['scale']['wheels'])
+    assert f'True values: {told.replace("8.9e-05", "0.000089")}, 0.3 m' in page_of(INDOOR)
 
 
 def test_the_figures_of_the_page_are_those_that_are_drawn():

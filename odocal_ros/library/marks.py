@@ -21,7 +21,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.messages.local_types import local_fixes
 from odocal_ros.settings.config import Config
 
-# s before and after a mark, and positions in between: a fit needs ten, and one error for each mark
+# s before and after a mark, and positions in between. Judgement: a fit needs ten positions
 WITHIN, ROWS = 0.5, 5
 # s at the mean motion of the wheels, in which a time-correlated error is forgotten: the errors of
 # two marks are independent, those of the positions of one mark are equal. Judgement

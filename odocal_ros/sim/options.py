@@ -128,9 +128,8 @@ DEFAULTS = {
 COMMON = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4), 'reference': 'fix', 'wheels': 1,
           'track_width': 1.6, 'fix_rate': 5.0, 'fix_noise': 'white', 'fix_correlation_time': 60.0,
           'reference_drift': 0.0, 'drift_length': 0.0, 'closure_time': 0.0}
+ROBOTS = ('indoor', 'square')     # scenarios
 # of a robot: 70 mm wheels, encoders with 2500 counts
-# definition: scenarios
-ROBOTS = ('indoor', 'square')
 INDOOR_SCALES = {'counts': (8.9e-5, 8.8e-5), 'speed': (1.02, 1.0), 'angle': (0.0354, 0.035)}
 SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0
 POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'velocity_rate', 'scale',
