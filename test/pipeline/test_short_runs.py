@@ -92,12 +92,15 @@ def test_errors_in_a_local_frame_change_with_the_path_of_the_wheels():
     leg = object.__new__(SmootherLeg)
     turning = Travel(t, np.interp(t, [0.0, 6.0, 8.0, 10.0], [0.0, 0.0, 1.0, 1.0]), 0.0)
     for name, value in {'travel': Travel(t, way, 0.0), 'wheels': (Travel(t, way, 0.0), turning),
-                        'origin': replace_origin(True)}.items():
+                        'origin': replace_origin(True), 'rough_scale': 1.0}.items():
         object.__setattr__(leg, name, value)
     # 3 m, then 1 m of one wheel; at rest a hundredth
     expected = np.where((t[:-1] >= 4) & (t[:-1] < 6), 10 * 1.5 / 4, np.where(
         (t[:-1] >= 6) & (t[:-1] < 8), 10 * 0.5 / 4, 0.01))
     assert drift_time(leg, t) == pytest.approx(expected)
+    object.__setattr__(leg, 'rough_scale', 4.0)      # 6 m/s: a car
+    assert (drift_time(leg, t) == 1.0).all()
+    object.__setattr__(leg, 'rough_scale', 1.0)
     object.__setattr__(leg, 'origin', replace_origin(False))
     assert (drift_time(leg, t) == 1.0).all()
 

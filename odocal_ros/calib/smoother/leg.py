@@ -83,7 +83,9 @@ def drift_time(leg: SmootherLeg, t: Floats) -> Floats:
     particles of AMCL) changes with the path of the wheels: time is shared out by path.
     """
     T = np.diff(t)
-    if not leg.origin.local:
+    fastest = 5.0       # m/s, judgement: no robot indoors; the positions of a car are from GNSS
+    far = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
+    if not leg.origin.local or (far > fastest * T).any():
         return T
     path = np.max([np.abs(np.diff(one.at(t))) for one in leg.wheels or (leg.travel,)], axis=0)
     at_rest = 0.01      # of the time, judgement: a pose may change without motion
