@@ -79,8 +79,8 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.foresee.smoother_so_far import SmootherSoFar
     from odocal_ros.foresee.thinned_leg import ThinnedLeg
     from odocal_ros.live.jobs import compute
-    from odocal_ros.live.memory import give_back, hold_little
     import odocal_ros.live.node  # noqa: F401 all that a node holds
+    from odocal_ros.live.worker import give_back, hold_little
     from odocal_ros.messages.decode import make_reader
     from odocal_ros.settings.config import Config
     hold_little()

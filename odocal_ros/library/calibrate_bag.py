@@ -21,7 +21,7 @@ from odocal_ros.library.asked import config_of, Leg, legs_of, paths_of, Settings
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.listener import Listener, Notes
 from odocal_ros.library.read_bag import read_bag, readers_of, Recording
-from odocal_ros.pipeline.stage import Stage
+from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
@@ -67,7 +67,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
 
     """
     from odocal_ros.library.bags import look_at_all, unique_names, unique_paths
-    from odocal_ros.output.frames import framed
+    from odocal_ros.output.ros_files import framed
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
     received = Notes(hearer or Listener())
@@ -98,7 +98,7 @@ class _Asked:
 def _look(path: Path, asked: _Asked) -> None:
     """Open a bag and check that it has the required data."""
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.library.journal import journal_notes
+    from odocal_ros.library.read_bag import journal_notes
     journal = journal_notes(path)
     settings = config_of(asked.config, journal.settings if journal else None)
     with open_bag(path) as bag:

@@ -15,9 +15,8 @@ import re
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
-from odocal_ros.messages.local_types import LOCAL_TYPES
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import FIX, IMU, VELOCITY
+from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, VELOCITY
 from odocal_ros.settings.config import Config
 
 OPTION = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic',

@@ -11,10 +11,10 @@
 
 import re
 
-from odocal_ros.live.losses import LossReport
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.waiting_messages import LossReport
 from odocal_ros.reasons import Code
 
 # judgement: of waiting, until it is said, and said again

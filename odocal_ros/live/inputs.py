@@ -14,7 +14,7 @@ from rclpy.node import Node
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.errors import BadUsage
 from odocal_ros.live.topic_input import Input
-from odocal_ros.messages.local_types import LOCAL_TYPES
+from odocal_ros.messages.sensor_types import LOCAL_TYPES
 from odocal_ros.settings.config import Config
 
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'

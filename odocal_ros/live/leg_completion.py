@@ -30,8 +30,7 @@ from odocal_ros.live.computing import Computing
 from odocal_ros.live.console import Console
 from odocal_ros.live.filing import Filing
 from odocal_ros.live.guidance import after_result, hint, quantities_ok
-from odocal_ros.live.journal import Journal
-from odocal_ros.live.journal_text import replay_command
+from odocal_ros.live.journal import Journal, replay_command
 from odocal_ros.live.params import restored_from
 from odocal_ros.live.process import SettledNode
 from odocal_ros.live.publishing import Publishing

@@ -10,6 +10,7 @@
 """The node that applies a calibration: counter and IMU in, odometry and twist out."""
 
 import re
+import struct
 import sys
 from typing import Any
 
@@ -18,19 +19,23 @@ from nav_msgs.msg import Odometry as OdometryMessage
 import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from odocal_ros.apply.odometry import BEGINS_ANEW, Odometry
 from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.vehicle import vehicle_of
+from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS
 from odocal_ros.live.inputs import IMU, LOOK_AROUND_S
-from odocal_ros.live.losses import LossReport
-from odocal_ros.live.numbers_publisher import NumbersPublisher
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
+from odocal_ros.live.waiting_messages import LossReport
+from odocal_ros.messages.cdr import layout_of
 from odocal_ros.settings.apply_config import ApplyConfig
 
 # judgement: what a controller lets pose and twist be late; half of it costs 1.5 % of a core more
@@ -47,6 +52,35 @@ subscribes   imu/data, odometer; if configured odometer_right
 publishes    odometry (nav_msgs/Odometry), odometry/twist
              (geometry_msgs/TwistWithCovarianceStamped)
 settings     parameters, all described in config/odometry.yaml"""
+
+
+class NumbersPublisher:
+    """
+    Publishes copies of one message with another stamp and other numbers.
+
+    To set the fields of a message object and to serialise it costs many times as much.
+    """
+
+    def __init__(self, node: Node, topic: str, message: Any) -> None:
+        """
+        Create the publisher.
+
+        message : its header holds the frame; after its last string are only 64-bit floats.
+        """
+        raw = serialize_message(message)      # what follows the message is no part of it
+        package, name = type(message).__module__.split('.')[0], type(message).__name__
+        layout = layout_of(f'{package}/msg/{name}', raw)
+        assert layout is not None
+        self._raw = raw[:layout.size]
+        self._publisher = node.create_publisher(
+            type(message), topic, 10,
+            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False))
+
+    def send(self, stamp_ns: int, numbers: Floats) -> None:
+        """Publish with a stamp, ns, and all its floats in order: (n,)."""
+        values = numbers.tobytes()
+        stamp = struct.pack('<iI', *divmod(stamp_ns, 10**9))
+        self._publisher.publish(self._raw[:4] + stamp + self._raw[12:-len(values)] + values)
 
 
 class OdometryNode(SettledNode):

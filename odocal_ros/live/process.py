@@ -27,8 +27,8 @@ from rclpy.utilities import remove_ros_args
 
 from odocal_ros import __version__
 from odocal_ros.errors import BadConfig, OdocalError
-from odocal_ros.live.memory import hold_little
 from odocal_ros.live.plain_log import PlainLog
+from odocal_ros.live.worker import hold_little
 from odocal_ros.outside.names import brief_line, said_by
 
 LOOK_FOR_NAMESAKE_S = 5.0      # judgement: s between looks for another node of the same name

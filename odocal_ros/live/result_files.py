@@ -79,7 +79,7 @@ def save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
 
     """
     from odocal_ros.output.files import Results
-    from odocal_ros.output.frames import framed
+    from odocal_ros.output.ros_files import framed
     calibration, config = framed(calibration, config, imu_frame)
     root = output_root(config, inputs[0]['node'])
     name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'

@@ -35,9 +35,9 @@ from odocal_ros.output.figures import (
     two_digits,
     with_sigma,
 )
+from odocal_ros.output.leg_table import shown_verdict
 from odocal_ros.output.summary import DEG, DEG_PER_HOUR
 from odocal_ros.output.track_table import before_label, in_pieces
-from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 

@@ -34,10 +34,9 @@ from odocal_ros.output.figures import (
     with_sigma,
     with_unit,
 )
+from odocal_ros.output.leg_table import leg_verdicts, search_lines, shown_verdict
 from odocal_ros.output.reason_lines import bag_lines, reason_lines
-from odocal_ros.output.search_table import search_lines
 from odocal_ros.output.track_table import track_lines
-from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Verdict
 
 WIDTH = 98    # judgement: columns

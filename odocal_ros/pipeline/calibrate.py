@@ -28,8 +28,8 @@ from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.pipeline.leg_run import leg_result, run_leg
+from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.pipeline.prepare import prepare
-from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
 from odocal_ros.screening.sanity import imu_sanity, UNUSABLE

@@ -21,11 +21,10 @@ from odocal_ros.calib.drive import way_and_chord
 from odocal_ros.calib.result import LegResult, MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
-from odocal_ros.pipeline.method_run import Passed
+from odocal_ros.pipeline.method_run import Passed, Stage
 from odocal_ros.pipeline.methods import found_by, METHODS, run_methods
 from odocal_ros.pipeline.prepare import judged_by
 from odocal_ros.pipeline.prepared import PreparedLeg
-from odocal_ros.pipeline.stage import Stage
 from odocal_ros.pipeline.tracks import check_of, tracks
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid

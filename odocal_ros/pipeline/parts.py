@@ -19,7 +19,7 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import Leg, part_of
 from odocal_ros.data.pieces import by_step
 from odocal_ros.pipeline.calibrate import calibrate
-from odocal_ros.pipeline.stage import Stage
+from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 

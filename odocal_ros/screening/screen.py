@@ -32,7 +32,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
 from odocal_ros.screening.clocks import judge_clocks
 from odocal_ros.screening.dead_reckoned import reckoned
-from odocal_ros.screening.fix_screen import usable_fixes
+from odocal_ros.screening.fix_screen import contradicted, usable_fixes
 from odocal_ros.screening.force import with_force
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
@@ -41,7 +41,6 @@ from odocal_ros.screening.other_imus import other_imus
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import LABEL, usable_rows
-from odocal_ros.screening.velocity_screen import contradicted
 from odocal_ros.screening.wheel_travel import wheels
 from odocal_ros.settings.config import Config, SIDES
 

@@ -19,7 +19,7 @@ import pytest
 
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.library.legs import parse_leg
-from odocal_ros.live.journal_text import replay_command
+from odocal_ros.live.journal import replay_command
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 30.0

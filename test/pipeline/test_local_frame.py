@@ -19,7 +19,7 @@ import pytest
 from odocal_ros.calib.smoother.leg import smoother_leg
 from odocal_ros.calib.smoother.problem import _priors
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.messages.local_types import local_fixes
+from odocal_ros.messages.sensor_types import local_fixes
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, OMEGA, PartlyKnownRate, rate_without_north
 from odocal_ros.nav.rotations import matrix_from_rpy

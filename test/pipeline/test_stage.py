@@ -11,7 +11,7 @@
 
 import pytest
 
-from odocal_ros.pipeline.stage import Stage
+from odocal_ros.pipeline.method_run import Stage
 
 pytestmark = pytest.mark.core
 
