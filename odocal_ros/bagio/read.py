@@ -110,14 +110,8 @@ class Bag:
         """
         Read topics in one pass.
 
-        Parameters
-        ----------
-        readers : dict
-            Topic -> reader of its messages.
-        feed : callable
-            Called with (slot, block) of samples, in order of bag time.
-        progress : callable, optional
-            Called with the fraction done.
+        readers : topic -> reader of its messages.   feed : called with (slot, block) of samples,
+        in order of bag time.   progress : called with the fraction done.
 
         Raises
         ------

@@ -96,14 +96,8 @@ def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Fl
     """
     Return the number of rows in each bin, and the mean of each vector there.
 
-    Parameters
-    ----------
-    t : (n,) array
-        Times of the rows, rising.
-    edges : (m + 1,) array
-        Of the bins, in the same unit; a bin holds its upper edge.
-    vectors : (n, k) arrays
-        Values of the rows.
+    t : (n,) times of the rows, rising.   edges : (m + 1,) of the bins, in the same unit; a bin
+    holds its upper edge.   vectors : (n, k) values of the rows.
 
     Returns
     -------

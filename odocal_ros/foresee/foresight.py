@@ -88,18 +88,9 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
     """
     Return the forecast of a leg that ends here, and the reasons of its methods so far.
 
-    Parameters
-    ----------
-    leg : Leg
-        The data so far; its last row is the current position.
-    fix_rate : float
-        Hz.
-    config : Config
-        As frozen into the leg.
-    wanted : callable
-        Asked now and then; Abandoned is raised when it says no.
-    smoother : SmootherSoFar, optional
-        That of this leg; looks go from the one before to the next.
+    leg : the data so far; its last row is the current position.   fix_rate : Hz.   config : as
+    frozen into the leg.   wanted : asked now and then; Abandoned is raised when it says no.
+    smoother : that of this leg; looks go from the one before to the next.
 
     Raises
     ------

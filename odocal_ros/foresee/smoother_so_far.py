@@ -73,14 +73,8 @@ class SmootherSoFar:
         """
         Return the running estimate.
 
-        Parameters
-        ----------
-        leg : Leg
-            The data so far: the earlier data, and more.
-        config : Config
-            As frozen into the leg.
-        wanted : callable
-            Asked between passes; Abandoned is raised when it says no.
+        leg : the data so far: the earlier data, and more.   config : as frozen into the leg.
+        wanted : asked between passes; Abandoned is raised when it says no.
 
         Raises
         ------

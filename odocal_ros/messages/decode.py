@@ -87,14 +87,9 @@ class Reader:
         """
         Decode messages.
 
-        Parameters
-        ----------
-        raws : sequence of bytes
-            Messages as serialised (CDR), in order of arrival.
-        received_ns : sequence or array of int
-            Their arrival; the stamp of messages that have none.
-        deserialize : callable
-            Turns one of them into an object with its fields; asked only where needed.
+        raws : messages as serialised (CDR), in order of arrival.   received_ns : their arrival;
+        the stamp of messages that have none.   deserialize : turns one of them into an object with
+        its fields; asked only where needed.
 
         Returns
         -------

@@ -105,12 +105,8 @@ def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
     """
     Sum attitude over travel: docs/method.md (T1).
 
-    Parameters
-    ----------
-    t, q_nb : (m,), (m, 4) arrays
-        Epochs, s, and attitude at them.
-    travel : Travel
-        Odometer travel, interpolated to the epochs.
+    t, q_nb : (m,), (m, 4) epochs, s, and attitude at them.   travel : odometer travel,
+    interpolated to the epochs.
 
     Returns
     -------

@@ -66,18 +66,9 @@ def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool =
     """
     Sum an odometer's rows up to travel.
 
-    Parameters
-    ----------
-    t : (n,) array
-        Times, s, rising.
-    value : (n,) array
-        As sent: int64 counters or float64.
-    form : OdometerForm
-        What the value means.
-    reversed_counts : bool
-        Positive values mean backwards.
-    name : str
-        What findings call it.
+    t : (n,) times, s, rising.   value : (n,) as sent: int64 counters or float64.   form : what the
+    value means.   reversed_counts : positive values mean backwards.   name : what findings call
+    it.
 
     Returns
     -------

@@ -30,16 +30,9 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     """
     Find when the vehicle stands.
 
-    Parameters
-    ----------
-    t_imu, w_b : (n,), (n, 3) arrays
-        IMU times, s, and turn rates, rad/s, bias and all.
-    travel : Travel
-        Odometer travel.
-    metres_per_unit : float
-        Rough scale of it, above 0.
-    shortest : float
-        Least duration, s.
+    t_imu, w_b : (n,), (n, 3) IMU times, s, and turn rates, rad/s, bias and all.   travel :
+    odometer travel.   metres_per_unit : rough scale of it, above 0.   shortest : least duration,
+    s.
 
     Returns
     -------

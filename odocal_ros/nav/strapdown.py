@@ -171,20 +171,10 @@ def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every:
     """
     Propagate attitude through gyro samples.
 
-    Parameters
-    ----------
-    t : (n,) array
-        Sample times, s, rising; the attitude ``q_nb0`` holds at ``t[0]``.
-    w_b : (n, 3) array
-        Turn rate of b against inertial space, rad/s.
-    q_nb0 : (4,) array
-        Attitude at t[0], x y z w.
-    earth_rate_n : (3,) array
-        Earth rate in n, rad/s (n is fixed to the Earth).
-    every : int
-        Keep one epoch in this many.
-    bias : (3,) array, optional
-        Of the gyro, taken out, rad/s.
+    t : (n,) sample times, s, rising; the attitude ``q_nb0`` holds at ``t[0]``.   w_b : (n, 3) turn
+    rate of b against inertial space, rad/s.   q_nb0 : (4,) attitude at t[0], x y z w.
+    earth_rate_n : (3,) Earth rate in n, rad/s (n is fixed to the Earth).   every : keep one epoch
+    in this many.   bias : (3,) of the gyro, taken out, rad/s.
 
     Returns
     -------

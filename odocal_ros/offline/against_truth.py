@@ -61,14 +61,9 @@ def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[
     """
     Return each figure whose truth is known.
 
-    Parameters
-    ----------
-    calibration : dict
-        Content of calibration.json.
-    truth : dict
-        Content of a truth.yaml: of odocal simulate, where ``scale`` holds the scale factor and
-        its ratio, or of a real drive, where its value is the ratio to the nominal scale.
-
+    calibration : content of calibration.json.   truth : content of a truth.yaml: of odocal
+    simulate, where ``scale`` holds the scale factor and its ratio, or of a real drive, where its
+    value is the ratio to the nominal scale.
     """
     result, found = calibration['result'], []
     if 'scale' in truth:

@@ -21,13 +21,8 @@ class Phase:
     """
     A phase of the work, as a context; called with the fraction done, if known.
 
-    Parameters
-    ----------
-    title : str
-        What is being done.
-    quiet : bool
-        Show nothing. Nothing is shown either where the error stream is no terminal.
-
+    title : what is being done.   quiet : show nothing. Nothing is shown either where the error
+    stream is no terminal.
     """
 
     def __init__(self, title: str, quiet: bool = False) -> None:

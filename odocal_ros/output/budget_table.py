@@ -44,21 +44,10 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
     """
     Return the lines of a budget, none without one.
 
-    Parameters
-    ----------
-    table : dict
-        Source to one-sigma share of each parameter, as calibration.json has it.
-    scale : float
-        Scale factor that its scale column belongs to.
-    shown : float
-        Share of the variance below which a source is but named.
-    hidden : collection of str
-        Parameters that are not determined: their column stays empty.
-    width : int
-        Columns of the screen.
-    small_too : bool
-        Name the small ones.
-
+    table : source to one-sigma share of each parameter, as calibration.json has it.   scale :
+    scale factor that its scale column belongs to.   shown : share of the variance below which a
+    source is but named.   hidden : parameters that are not determined: their column stays empty.
+    width : columns of the screen.   small_too : name the small ones.
     """
     if not table:
         return []

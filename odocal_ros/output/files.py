@@ -40,16 +40,8 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
     """
     Return the content of calibration.json.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The combination of all legs.
-    config : Config
-        Settings it was made with.
-    inputs : list of dict
-        One a bag: its name, sha256 and topics.
-    created : str
-        ISO 8601 date and time.
+    calibration : the combination of all legs.   config : settings it was made with.   inputs : one
+    a bag: its name, sha256 and topics.   created : ISO 8601 date and time.
 
     Returns
     -------

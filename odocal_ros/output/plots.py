@@ -47,18 +47,10 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
     """
     Draw a leg.
 
-    Parameters
-    ----------
-    found : Evidence
-        Of the leg.
-    name : str
-        Put before the ids of each figure.
-    scale_sigma : float, optional
-        Relative sigma of the leg's scale: the band about zero of the sections.
-    before_word : str
-        What the track before the correction rests on.
-    smoothed : dict, optional
-        Details of the smoother: slips, and biases at its keyframes.
+    found : of the leg.   name : put before the ids of each figure.   scale_sigma : relative sigma
+    of the leg's scale: the band about zero of the sections.   before_word : what the track before
+    the correction rests on.   smoothed : details of the smoother: slips, and biases at its
+    keyframes.
 
     Returns
     -------

@@ -73,15 +73,8 @@ def svg(figure: Any, name: str, says: str) -> str:
     """
     Return a figure as an svg element.
 
-    Parameters
-    ----------
-    figure : Figure
-        Made under ``look``.
-    name : str
-        Put before each id in it: a page holds many figures.
-    says : str
-        For those who cannot see it.
-
+    figure : made under ``look``.   name : put before each id in it: a page holds many figures.
+    says : for those who cannot see it.
     """
     from html import escape
 

@@ -36,14 +36,8 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
     """
     Return the page of a calibration.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The combination of all legs; what a leg lacks (track, evidence) is left out.
-    config : Config
-        Settings it was made with.
-    content : dict
-        Of calibration.json, for bags and software.
+    calibration : the combination of all legs; what a leg lacks (track, evidence) is left out.
+    config : settings it was made with.   content : of calibration.json, for bags and software.
 
     Raises
     ------

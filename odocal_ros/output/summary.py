@@ -56,18 +56,10 @@ def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
     """
     Return everything a person needs to judge a calibration, as plain text.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Of all legs.
-    styled : bool
-        The verdict in bold and in colour, for a terminal.
-    width : int
-        Columns; below 98 what is said twice or is of less use is left out.
-    rows : int, optional
-        Lines there are. Where they do not do, small errors, notes and the whole budget, in this
-        order, are left to the report: verdict, values and what to do are not.
-
+    calibration : of all legs.   styled : the verdict in bold and in colour, for a terminal.
+    width : columns; below 98 what is said twice or is of less use is left out.   rows : lines
+    there are. Where they do not do, small errors, notes and the whole budget, in this order, are
+    left to the report: verdict, values and what to do are not.
     """
     for small, notes, budget in ((True, True, True), (False, True, True), (False, False, True),
                                  (False, False, False)):

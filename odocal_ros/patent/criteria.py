@@ -58,17 +58,9 @@ def score(leg: PlanarLeg, sets: Floats, robust: bool = False, course: bool = Tru
     """
     Return the criteria of parameter sets.
 
-    Parameters
-    ----------
-    leg : PlanarLeg
-        What was driven.
-    sets : (m, 3) array
-        Left and right scale, m per unit, and heading, rad.
-    robust : bool
-        Weight fixes by their sigma and bound the pull of outliers in ``loss``.
-    course : bool
-        Compare with the course over ground too.
-
+    leg : what was driven.   sets : (m, 3) left and right scale, m per unit, and heading, rad.
+    robust : weight fixes by their sigma and bound the pull of outliers in ``loss``.   course :
+    compare with the course over ground too.
     """
     sets = np.atleast_2d(np.asarray(sets, dtype=float))
     m = len(sets)

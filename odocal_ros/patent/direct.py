@@ -66,17 +66,8 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
     """
     Return the parameters that lower the (robust) mean square, by Gauss-Newton from x.
 
-    Parameters
-    ----------
-    leg : PlanarLeg
-        What was driven.
-    x : (3,) array
-        Where to begin: left, right (relative), heading (rad).
-    space : Space
-        Which parameters there are.
-    robust : bool
-        As in ``criteria.score``.
-
+    leg : what was driven.   x : (3,) where to begin: left, right (relative), heading (rad).
+    space : which parameters there are.   robust : as in ``criteria.score``.
     """
     q = space.q_of(x)
     iterations, settled = 0, False

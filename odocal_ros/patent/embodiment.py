@@ -107,15 +107,9 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
     """
     Run the embodiment on a leg.
 
-    Parameters
-    ----------
-    leg : PlanarLeg
-        Its start values belong to wheels of the nominal radius.
-    radius : float
-        Nominal radius of both wheels, m.
-    truth : (left, right, heading), optional
-        True errors, m and deg, for a line of their own.
-
+    leg : its start values belong to wheels of the nominal radius.   radius : nominal radius of
+    both wheels, m.   truth : (left, right, heading) true errors, m and deg, for a line of their
+    own.
     """
     heading_step = np.deg2rad(0.25)
     half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * heading_step])

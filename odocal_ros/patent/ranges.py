@@ -48,13 +48,8 @@ def ranges_of(wheels: WheelsConfig, heading_sigma: float | None = None) -> Range
     """
     Return the ranges that the settings ask for.
 
-    Parameters
-    ----------
-    wheels : WheelsConfig
-        ``radius_range``, ``heading_range``, ``levels``.
-    heading_sigma : float, optional
-        Of heading and mounting angle together, rad, where both are known that well.
-
+    wheels : ``radius_range``, ``heading_range``, ``levels``.   heading_sigma : of heading and
+    mounting angle together, rad, where both are known that well.
     """
     if wheels.radius_range > 0:
         scale, why = wheels.radius_range, 'wheels.radius_range'

@@ -122,16 +122,9 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
     """
     Search left scale, right scale and heading.
 
-    Parameters
-    ----------
-    leg : PlanarLeg
-        What was driven; its start values are the middle of the ranges.
-    ranges : Ranges
-        What is searched.
-    robust : bool
-        Weight fixes by their sigma and bound the pull of outliers.
-    accuracy : (maximum, mean), optional
-        Distances asked for, m.
+    leg : what was driven; its start values are the middle of the ranges.   ranges : what is
+    searched.   robust : weight fixes by their sigma and bound the pull of outliers.   accuracy :
+    (maximum, mean) distances asked for, m.
 
     Returns
     -------

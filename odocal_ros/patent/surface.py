@@ -107,21 +107,10 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
     """
     Lower a criterion by surfaces.
 
-    Parameters
-    ----------
-    value : callable
-        (m, 3) parameters x to the criterion, (m,).
-    x : (3,) array
-        Where to begin: the best row of an array.
-    width : (3,) array
-        Half width of the first box in x: a step between levels.
-    half : (3,) array
-        Half of the range about zero that is searched.
-    space : Space
-        Which parameters there are.
-    widen : bool
-        Double the range where the minimum lies on its edge.
-
+    value : (m, 3) parameters x to the criterion, (m,).   x : (3,) where to begin: the best row of
+    an array.   width : (3,) half width of the first box in x: a step between levels.   half : (3,)
+    half of the range about zero that is searched.   space : which parameters there are.   widen :
+    double the range where the minimum lies on its edge.
     """
     walk = _Walk(value, space, np.asarray(half, dtype=float), np.asarray(width, dtype=float), x)
     first = last = walk.surface()

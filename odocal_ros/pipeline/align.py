@@ -51,20 +51,8 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     """
     Align a leg.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        Screened leg.
-    spans : (k, 2) array
-        Standstills, s.
-    metres_per_unit : float
-        Rough scale.
-    fixes_n : (n, 3) array
-        Fixes in n, m.
-    origin : Origin
-        Where n is fixed.
-    config : Config
-        Heading source, grade.
+    inputs : screened leg.   spans : (k, 2) standstills, s.   metres_per_unit : rough scale.
+    fixes_n : (n, 3) fixes in n, m.   origin : where n is fixed.   config : heading source, grade.
 
     Returns
     -------

@@ -55,20 +55,11 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     """
     Take one leg from samples to result.
 
-    Parameters
-    ----------
-    leg : Leg
-        Raw samples between two marks, with pre-roll.
-    config : Config
-        Settings in force.
-    alignment : Alignment, optional
-        Used instead of the leg's own (a simulation puts errors in it).
-    notes : tuple of Reason
-        What the door knows of the data already (a truncated bag).
-    holdout : bool
-        Keep the last fifth of the distance back from the fit and check the correction on it.
-    progress : callable, optional
-        Called with each stage of the work, and with each pass of a fit.
+    leg : raw samples between two marks, with pre-roll.   config : settings in force.   alignment :
+    used instead of the leg's own (a simulation puts errors in it).   notes : what the door knows
+    of the data already (a truncated bag).   holdout : keep the last fifth of the distance back
+    from the fit and check the correction on it.   progress : called with each stage of the work,
+    and with each pass of a fit.
 
     Returns
     -------

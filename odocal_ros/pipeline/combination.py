@@ -40,16 +40,9 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     """
     Combine legs of one vehicle.
 
-    Parameters
-    ----------
-    legs : sequence of LegResult
-        At least one. Rejected legs are left out while any other is left, and named.
-    config : Config
-        Limits, frames.
-    carried : Carried, optional
-        Information of earlier legs on the vehicle.
-    imu : Carried, optional
-        Information of other legs on its IMU, if nothing is carried.
+    legs : at least one. Rejected legs are left out while any other is left, and named.   config :
+    limits, frames.   carried : information of earlier legs on the vehicle.   imu : information of
+    other legs on its IMU, if nothing is carried.
 
     Returns
     -------

@@ -25,15 +25,8 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
     """
     Return DELAY_SEEN for each delay that is there for certain and matters at the speed driven.
 
-    Parameters
-    ----------
-    prepared : PreparedLeg
-        The leg.
-    seen : dict
-        'gnss' or 'odometer' -> by how many s its stamps are late, with what is set, and sigma.
-    scale : float
-        As the method that saw them found it.
-
+    prepared : the leg.   seen : 'gnss' or 'odometer' -> by how many s its stamps are late, with
+    what is set, and sigma.   scale : as the method that saw them found it.
     """
     speed = _speed(prepared) * scale
     notes = []

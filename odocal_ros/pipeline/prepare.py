@@ -45,16 +45,9 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     """
     Prepare a leg for the methods.
 
-    Parameters
-    ----------
-    leg, inputs, config : Leg, Inputs, Config
-        The leg, screened, and the settings in force.
-    reasons : sequence of Reason
-        What was found of it so far.
-    alignment : Alignment, optional
-        Used instead of the leg's own.
-    holdout : bool
-        Keep the last fifth of the distance back from the fit.
+    leg, inputs, config : the leg, screened, and the settings in force.   reasons : what was found
+    of it so far.   alignment : used instead of the leg's own.   holdout : keep the last fifth of
+    the distance back from the fit.
 
     Returns
     -------

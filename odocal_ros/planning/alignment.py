@@ -39,17 +39,8 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
     """
     Return the alignment a drive will have, and what is to be said of it.
 
-    Parameters
-    ----------
-    drive : PlannedDrive
-        As planned.
-    config : Config
-        Grade, heading source and its sigma.
-    fix_sigma : float
-        Of one fix, m, for a course.
-    spans : list of (begin, end)
-        Standstills, s.
-
+    drive : as planned.   config : grade, heading source and its sigma.   fix_sigma : of one fix,
+    m, for a course.   spans : list of (begin, end) standstills, s.
     """
     grade = grade_of(config.imu)
     before = [span for span in spans if span[0] <= 0.5]

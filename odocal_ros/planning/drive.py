@@ -131,15 +131,9 @@ def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.p
     """
     Return the drive of a speed and a turn rate by time; marked where it first moves and ends.
 
-    Parameters
-    ----------
-    t, speed, yaw_rate : (m,) arrays
-        s, m/s, rad/s (left positive).
-    heading : float
-        Of the vehicle at the start, clockwise from north, rad.
-    more :
-        Further fields of PlannedDrive; slope is 0 where it is not given.
-
+    t, speed, yaw_rate : (m,) s, m/s, rad/s (left positive).   heading : of the vehicle at the
+    start, clockwise from north, rad.   more : further fields of PlannedDrive; slope is 0 where
+    it is not given.
     """
     t, speed, yaw_rate = (np.asarray(x, dtype=float) for x in (t, speed, yaw_rate))
     turned = np.concatenate([[0.0], np.cumsum((yaw_rate[:-1] + yaw_rate[1:]) / 2 * np.diff(t))])

@@ -74,15 +74,8 @@ def inserted(drive: PlannedDrive, k: int, t: Floats, speed: Floats,
     """
     Return the drive with a piece after row k; what follows comes later and turned.
 
-    Parameters
-    ----------
-    drive : PlannedDrive
-        As planned.
-    k : int
-        Row between the marks.
-    t, speed, turned : (m,) arrays
-        s since row k, above 0 and rising; m/s; rad turned to the left since row k.
-
+    drive : as planned.   k : row between the marks.   t, speed, turned : (m,) s since row k, above
+    0 and rising; m/s; rad turned to the left since row k.
     """
     return replace(
         drive, t=np.concatenate([drive.t[:k + 1], drive.t[k] + t, drive.t[k + 1:] + t[-1]]),

@@ -90,12 +90,7 @@ def plan_methods(drive: PlannedDrive, sigmas: Sigmas, spacing: float | None = No
     """
     Return the predictions of the configured methods for a drive.
 
-    Parameters
-    ----------
-    drive, sigmas : PlannedDrive, Sigmas
-        As for ``predict``.
-    spacing : float, optional
-        As for ``predict_smoother``.
+    drive, sigmas : as for ``predict``.   spacing : as for ``predict_smoother``.
 
     Raises
     ------

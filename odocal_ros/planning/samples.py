@@ -64,15 +64,9 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
     """
     Return the samples that a drive would give were nothing in error.
 
-    Parameters
-    ----------
-    drive : PlannedDrive
-        As planned. Mounting angles are zero, the scale is 1: a sigma does not hang on them.
-    sigmas : Sigmas
-        Lever arms, fix rate and sigma, size of a count, heading from outside.
-    spacing : float
-        s between keyframes.
-
+    drive : as planned. Mounting angles are zero, the scale is 1: a sigma does not hang on them.
+    sigmas : lever arms, fix rate and sigma, size of a count, heading from outside.   spacing : s
+    between keyframes.
     """
     config = sigmas.config
     spans = np.array(drive.standstills(config.leg.standstill)).reshape(-1, 2)

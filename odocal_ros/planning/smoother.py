@@ -42,12 +42,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     The rows are those of ``smooth`` at the true states of ideal samples, the levels those of
     ``planned_levels``, and what is said of the outcome is said by the code that says it of a fit.
 
-    Parameters
-    ----------
-    drive, sigmas : PlannedDrive, Sigmas
-        As for ``predict``.
-    spacing : float, optional
-        s between keyframes; as ``spacing_for`` has it.
+    drive, sigmas : as for ``predict``.   spacing : s between keyframes; as ``spacing_for`` has it.
 
     Returns
     -------

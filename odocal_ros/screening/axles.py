@@ -131,15 +131,8 @@ def steering_path(t: Floats, turn: Floats, s: Floats, ahead: float = 0.0,
     """
     Return the path of a steered wheel beyond that of a fixed one, by its squared distance: (n,).
 
-    Parameters
-    ----------
-    t : (n,) array
-        Equal steps, s.
-    turn, s : (n,) arrays
-        Turn of the vehicle, rad, and travel of its unsteered axle.
-    ahead, left : float
-        Place of the wheel from the middle of that axle, in the unit of s.
-
+    t : (n,) equal steps, s.   turn, s : (n,) turn of the vehicle, rad, and travel of its unsteered
+    axle.   ahead, left : place of the wheel from the middle of that axle, in the unit of s.
     """
     rate, speed = np.gradient(turn, t), np.gradient(s, t)
     speed = np.convolve(np.pad(speed, len(SMOOTH) // 2, mode='edge'), SMOOTH, mode='valid')

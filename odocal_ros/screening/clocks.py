@@ -35,13 +35,8 @@ def judge_clocks(leg: Leg, offsets: Mapping[str, float],
     """
     Compare each topic's clock with the IMU's, at equal times of arrival.
 
-    Parameters
-    ----------
-    leg : Leg
-        As it came.
-    offsets, labels : dict
-        Of each slot: s to be added to its stamps, and what people call it.
-
+    leg : as it came.   offsets, labels : of each slot: s to be added to its stamps, and what
+    people call it.
     """
     found = [r for slot in ('imu', *TOPICS) for r in _was_set(getattr(leg, slot), labels[slot],
                                                               leg.start_ns)]

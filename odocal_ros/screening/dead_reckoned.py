@@ -40,17 +40,8 @@ def reckoned(t_fix: Floats, fixes_n: Floats, path: Floats, turned: Callable[[Flo
     """
     Return a mask of fixes that a receiver has reckoned, and FIXES_DEAD_RECKONED.
 
-    Parameters
-    ----------
-    t_fix : (k,) array
-        s.
-    fixes_n : (k, 3) array
-        m.
-    path : (k,) array
-        Path length by the odometer, m, its scale good to 30 %.
-    turned : callable
-        Angle turned about the vertical by (m,) times, rad: (m,).
-
+    t_fix : (k,) s.   fixes_n : (k, 3) m.   path : (k,) path length by the odometer, m, its scale
+    good to 30 %.   turned : angle turned about the vertical by (m,) times, rad: (m,).
     """
     spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], path, turned)
     found = np.zeros(len(t_fix), bool)

@@ -66,17 +66,9 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
     """
     Return the pushes of a drive, None where it is too short.
 
-    Parameters
-    ----------
-    t, w, f : (n,), (n, 3), (n, 3) arrays
-        Times, s, turn rate, rad/s, and specific force, in any one frame fixed to the IMU.
-    up : (3,)
-        Unit vector, as gravity shows.
-    travel : Travel
-        Odometer; positive is taken as forward.
-    metres_per_unit : float
-        Its rough scale.
-
+    t, w, f : (n,), (n, 3), (n, 3) times, s, turn rate, rad/s, and specific force, in any one frame
+    fixed to the IMU.   up : (3,) unit vector, as gravity shows.   travel : odometer; positive is
+    taken as forward.   metres_per_unit : its rough scale.
     """
     t0, t1 = max(t[0], travel.t[0]) + BIN_S, min(t[-1], travel.t[-1]) - BIN_S
     if t1 - t0 < FEWEST_BINS_FACING * BIN_S:
@@ -103,13 +95,7 @@ def facing(inputs: 'Inputs', metres_per_unit: float) -> Facing | None:
     Changes from bin to bin are compared, so that a slope, which changes slowly, is no push. The
     turns have a factor of their own: a gyro of the wrong sign does not turn the answer.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        In the configured body frame.
-    metres_per_unit : float
-        As for ``pushes``.
-
+    inputs : in the configured body frame.   metres_per_unit : as for ``pushes``.
     """
     mean = inputs.usual_f_b
     size = float(np.linalg.norm(mean))

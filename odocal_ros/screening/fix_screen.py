@@ -35,14 +35,7 @@ def usable_fixes(fix: FixSamples, sent: int,
     """
     Judge the fixes of a leg.
 
-    Parameters
-    ----------
-    fix : FixSamples
-        With stamps in order.
-    sent : int
-        How many there were before.
-    gnss : GnssConfig
-        Limits.
+    fix : with stamps in order.   sent : how many there were before.   gnss : limits.
 
     Returns
     -------

@@ -102,14 +102,8 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
     """
     Return a mask of rows that jump away from their neighbours and back.
 
-    Parameters
-    ----------
-    t : (n,) array
-        Times, s, rising.
-    x : (n, k) array
-        Values.
-    least : float
-        Smallest bound, from one row to the next, that may be a glitch.
+    t : (n,) times, s, rising.   x : (n, k) values.   least : smallest bound, from one row to the
+    next, that may be a glitch.
 
     Returns
     -------

@@ -39,14 +39,9 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     """
     Return the intervals of reversing in which the counter counts up: (m, 2) s.
 
-    Parameters
-    ----------
-    travel : Travel
-        Of the odometer, any unit.
-    t_imu, w_b, f_b : (n,), (n, 3), (n, 3) arrays
-        s, turn rate, rad/s, bias and all, specific force, m/s^2.
-    between : (2,)
-        The marks, s; earlier travel gives the usual values.
+    travel : of the odometer, any unit.   t_imu, w_b, f_b : (n,), (n, 3), (n, 3) s, turn rate,
+    rad/s, bias and all, specific force, m/s^2.   between : (2,) the marks, s; earlier travel gives
+    the usual values.
 
     Returns
     -------

@@ -29,16 +29,9 @@ def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
     """
     Judge units and axes of an IMU.
 
-    Parameters
-    ----------
-    mean : (3,)
-        Specific force as it usually is (its median), m/s^2, in the configured body frame.
-    w_b : (n, 3) array
-        Turn rate there, rad/s.
-    C_bi : (3, 3)
-        Nominal rotation configured.
-    imu : ImuConfig
-        Its scales are in the figures already.
+    mean : (3,) specific force as it usually is (its median), m/s^2, in the configured body
+    frame.   w_b : (n, 3) turn rate there, rad/s.   C_bi : (3, 3) nominal rotation configured.
+    imu : its scales are in the figures already.
 
     Returns
     -------

@@ -104,14 +104,8 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
     """
     Return rows with hidden rollovers corrected, the reasons, and the remaining uncertainty.
 
-    Parameters
-    ----------
-    t, samples : (n,) s, OdometerSamples
-        Usable rows of a running count.
-    step : (n - 1,)
-        Its steps, rollovers of the type's span undone.
-    side : str
-        Whose counter it is, for people.
+    t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its
+    steps, rollovers of the type's span undone.   side : whose counter it is, for people.
 
     Returns
     -------

@@ -36,14 +36,8 @@ def broken_wheels(axle: Sequence[Travel], imu: Imu,
     """
     Return WHEEL_DEAD and WHEEL_REVERSED where one wheel fails, empty where both count.
 
-    Parameters
-    ----------
-    axle : (2,) sequence of Travel
-        The left and the right wheel, scale units.
-    imu : (t, w_b, f_b)
-        (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.
-    between : (2,)
-        The marks, s.
+    axle : (2,) Travel of the left and the right wheel, scale units.   imu : (t, w_b, f_b)
+    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.   between : (2,) the marks, s.
 
     Returns
     -------

@@ -88,16 +88,9 @@ def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floa
     """
     Return the coefficients of y = A x by least squares, rows far off left out by Tukey's weights.
 
-    Parameters
-    ----------
-    A, y : (n, k), (n,) arrays
-        Design and values.
-    floor : float
-        Least sigma of a value.
-    prior : (k,) array, optional
-        Sigmas of the coefficients about zero, inf: free.
-    start : (k,) array, optional
-        Coefficients that many rows are known to follow; default: least squares.
+    A, y : (n, k), (n,) design and values.   floor : least sigma of a value.   prior : (k,) sigmas
+    of the coefficients about zero, inf: free.   start : (k,) coefficients that many rows are known
+    to follow; default: least squares.
 
     Returns
     -------
