@@ -122,7 +122,7 @@ class _Screen(Listener):
 
 def asked_config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings asked for: --config < --set < --accept and --method, each checked."""
-    from odocal_ros.settings.accept_option import parse_accept
+    from odocal_ros.settings.accept_config import parse_accept
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.settings.config_file import parse_set, read_config_file
     asked = read_config_file(Path(args.config)) if args.config else {}

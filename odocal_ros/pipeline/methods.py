@@ -21,9 +21,8 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.coarse_odometer import held_steps
 from odocal_ros.pipeline.delay_note import delay_notes
 from odocal_ros.pipeline.method_run import MethodRun, Passed
-from odocal_ros.pipeline.no_force import upright
 from odocal_ros.pipeline.prepared import PreparedLeg
-from odocal_ros.pipeline.slow_slip import held
+from odocal_ros.pipeline.scale_error import held, upright
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.screen import Inputs

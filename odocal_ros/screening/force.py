@@ -12,7 +12,7 @@ An IMU that sends turn rates only: a car's yaw rate on the bus, the gyro of a ro
 
 The ground is then taken as level and the IMU as upright: gravity stands where an accelerometer
 would show it, so that all that follows needs no other case; what that may be wrong by goes into
-the level (``pipeline/align.py``) and the scale (``pipeline/no_force.py``).
+the level (``pipeline/align.py``) and the scale (``pipeline/scale_error.py``).
 """
 
 from dataclasses import replace

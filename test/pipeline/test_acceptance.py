@@ -19,7 +19,7 @@ from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.pipeline.acceptance import accept, decide, Decision
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.accept_option import parse_accept
+from odocal_ros.settings.accept_config import parse_accept
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
