@@ -81,6 +81,11 @@ def wait_for(condition, what: str, patience: float = PATIENCE):
     raise AssertionError(f'{what} did not come within {patience:g} s')
 
 
+def given(settings: dict[str, object]) -> list[str]:
+    """Return settings as ROS arguments."""
+    return [x for name, value in settings.items() for x in ('-p', f'{name}:={value}')]
+
+
 class Client:
     """A node in the test's process that talks to the calibrator and keeps what it publishes."""
 

@@ -16,8 +16,8 @@ import json
 from pathlib import Path
 import time
 
-from bench import Client, NodeProcess, wait_for
-from player import messages_of, part, Player
+from bench import wait_for
+from player import messages_of, part, playing_to
 
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.library.legs import marked_legs
@@ -57,10 +57,7 @@ def drive():
 def killed(driven, moment_s: float, folder: Path, *args: str) -> Remains:
     """Kill a node that records a leg of a drive ``moment_s`` after its start mark."""
     types, sent = driven
-    node, client = NodeProcess('-p', f'output.directory:={folder}', *args), Client()
-    try:
-        player = Player(client.node, types)
-        wait_for(player.matched, 'subscriptions')
+    with playing_to(types, '-p', f'output.directory:={folder}', *args) as (node, client, player):
         player.play(part(sent, BEFORE_S, START_S), 3 * SPEED)
         client.until(state='idle')
         answer = client.call('start_leg')
@@ -75,9 +72,6 @@ def killed(driven, moment_s: float, folder: Path, *args: str) -> Remains:
             node.process.kill()
             node.wait()
             moment_s = time.monotonic() - marked
-    finally:
-        node.end()
-        client.close()
     journal, = (folder / 'journal').iterdir()
     return remains(journal, moment_s, end_ns, int(status['leg_start_ns']), told_s)
 
@@ -122,10 +116,7 @@ class Files:
 def killed_at_files(driven, stage: str, moment_s: float, folder: Path, *args: str) -> Files:
     """Kill a node ``moment_s`` after ~/stop_leg was asked, or ~/save after that (stage)."""
     types, sent = driven
-    node, client = NodeProcess('-p', f'output.directory:={folder}', *args), Client()
-    try:
-        player = Player(client.node, types)
-        wait_for(player.matched, 'subscriptions')
+    with playing_to(types, '-p', f'output.directory:={folder}', *args) as (node, client, player):
         player.play(part(sent, BEFORE_S, START_S), 3 * SPEED)
         client.until(state='idle')
         client.start()
@@ -139,9 +130,6 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path, *args: st
         time.sleep(max(0.0, moment_s - (time.monotonic() - begin)))
         node.process.kill()
         node.wait()
-    finally:
-        node.end()
-        client.close()
     journal, = (folder / 'journal').iterdir()
     results = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()
                and path.name != 'journal' and not path.name.startswith('.')]
@@ -151,6 +139,12 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path, *args: st
                  [path for path, c in contents.items() if c is None and any(path.iterdir())],
                  not latest.is_symlink() or bool(whole_content(latest)),
                  replayed(journal, *NUMBERS))
+
+
+def same_result(live: dict, offline: dict, *more: str) -> None:
+    """Assert that two results are the same in every digit, and more of their parts."""
+    for key in ('result', 'verdict', 'reasons', 'methods', 'check', *more):
+        assert live[key] == offline[key], key
 
 
 def wrong(left: Files | Remains) -> list[float]:

@@ -128,8 +128,7 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
     drive = simulate(SimOptions(duration=180.0, imu_rate=20.0, odometer_rate=10.0,
                                 odometer='speed', fix_noise='rtk'))
     types, messages = messages_of(drive)
-    player = Player(client.node, types, {'fix': 'gps/fix'})
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, types, {'fix': 'gps/fix'})
     player.play(part(messages, 45, 60), 30)
     client.until(state='idle')
     assert client.call('start_leg').success

@@ -42,8 +42,7 @@ def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(start,
         scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
         fix_noise='rtk', imu_grade='tactical')))
     node, client = start(), connect()
-    player = Player(client.node, types)
-    wait_for(player.matched, 'subscriptions of the node')
+    player = Player.connected(client, types)
     player.play(part(sent, 45, 60), SPEED)
     client.start()
     with player.playing(part(sent, 60, 95), SPEED):
@@ -58,8 +57,7 @@ def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(start,
     assert len(node.lines) < 20
     for publisher in player.publishers.values():
         client.node.destroy_publisher(publisher)
-    player = Player(client.node, types)
-    wait_for(player.matched, 'subscriptions of the node, again')
+    player = Player.connected(client, types)
     player.play(part(sent, 95, 115), SPEED)
     stopping = client.ask('stop_leg')
     player.play(part(sent, 115, 117), SPEED)

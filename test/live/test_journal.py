@@ -16,9 +16,9 @@ import resource
 import time
 from types import SimpleNamespace
 
-from bench import Client, NodeProcess, wait_for
-from kills import drive, killed, remains, replayed, wrong
-from player import by_now, messages_of, part, Player, sent_of
+from bench import given, wait_for
+from kills import drive, killed, remains, replayed, same_result, wrong
+from player import by_now, messages_of, part, Player, playing_to, sent_of
 import pytest
 
 from odocal_ros.bagio import encode
@@ -32,8 +32,7 @@ NAMES = {'imu': '/front/imu', 'fix': '/gps/fix'}
 
 def same(live, offline, journal):
     """Assert that a result written live is the one of its journal, in every digit."""
-    for key in ('result', 'verdict', 'reasons', 'methods', 'check', 'config'):
-        assert live[key] == offline[key], key
+    same_result(live, offline, 'config')
     for here, there in zip(live['legs'], offline['legs'], strict=True):
         assert here | {'bag': Path(journal).name} == there
 
@@ -47,15 +46,10 @@ def session(tmp_path_factory):
     types, sent = messages_of(simulated)
     folder = tmp_path_factory.mktemp('journal')
     remaps = [x for slot, name in NAMES.items() for x in ('-r', f'{slot_name(slot)}:={name}')]
-    node = NodeProcess('-p', f'output.directory:={folder}',
-                       '-p', 'alignment.heading_source:=fixed',
-                       '-p', f'alignment.heading:={simulated.truth.heading!r}',
-                       '-p', 'leg.preroll:=20.0', *remaps)
-    client = Client()
+    settings = {'output.directory': folder, 'alignment.heading_source': 'fixed',
+                'alignment.heading': simulated.truth.heading, 'leg.preroll': 20.0}
     seen = SimpleNamespace(folder=folder)
-    try:
-        player = Player(client.node, types, NAMES)
-        wait_for(player.matched, 'subscriptions')
+    with playing_to(types, *given(settings), *remaps, names=NAMES) as (_, client, player):
         player.play(part(sent, 30, 60), SPEED)
         client.until(state='idle')
         client.call('start_leg')
@@ -86,9 +80,6 @@ def session(tmp_path_factory):
         wait_for((seen.undone / 'metadata.yaml').exists, 'its end')
         client.call('undo_leg')
         wait_for((seen.undone / f'{seen.undone.name}_1.mcap').exists, 'the mark')
-    finally:
-        node.end()
-        client.close()
     return seen
 
 
@@ -202,8 +193,7 @@ def slow():
 
 def recording(client, slow):
     """Start a leg and return the player."""
-    player = Player(client.node, slow[0])
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, slow[0])
     player.play(part(slow[1], 0, 10), SPEED)
     client.until(state='idle')
     assert client.call('start_leg').success

@@ -22,8 +22,8 @@ def driven():
 
 
 @pytest.mark.parametrize(('stage', 'moment_s'), [
-    *(('stop', m) for m in np.random.default_rng(12).uniform(0.0, 4.0, 3).round(3)),
-    *(('save', m) for m in np.random.default_rng(13).uniform(0.0, 0.4, 3).round(3))])
+    *(('stop', m) for m in np.random.default_rng(12).uniform(0.0, 4.0, 2).round(3)),
+    *(('save', m) for m in np.random.default_rng(13).uniform(0.0, 0.4, 2).round(3))])
 def test_a_node_killed_at_its_files_leaves_whole_ones(driven, tmp_path, stage, moment_s):
     # the quick method: the files are the same
     left = killed_at_files(driven, stage, moment_s, tmp_path, '-p', 'method:=two_point')

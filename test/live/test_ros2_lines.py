@@ -52,8 +52,7 @@ def driven(tmp_path_factory):
                                    odometer_rate=25.0, odometer='speed', fix_noise='rtk'))
         types, sent = messages_of(made)
         seen.truth = made.truth.scale
-        player = Player(client.node, types, TOPICS)
-        wait_for(player.matched, 'subscriptions to the topics of the page')
+        player = Player.connected(client, types, TOPICS)
         calls = list(dict.fromkeys(map(tuple, of('service', 'call'))))
         # standing; driving to the next stop, and a little on: a leg ends with its last message
         stretches = [(45, 60, 60), (60, 117, 119)]

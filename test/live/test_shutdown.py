@@ -36,14 +36,13 @@ def sent():
 
 
 @pytest.mark.parametrize(('how', 'before'), [
-    (signal.SIGINT, ''), (signal.SIGTERM, ''), (signal.SIGINT, SLOW), (signal.SIGTERM, SLOW)])
+    (signal.SIGINT, ''), (signal.SIGTERM, SLOW)])
 def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
         start, connect, sent, tmp_path, how, before):
     node = start('-p', 'alignment.heading_source:=fixed', '-p', 'alignment.heading:=0.7',
                  '-p', 'method:=two_point', before=before)
     client = connect()
-    player = Player(client.node, sent[0])
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, sent[0])
     player.play(part(sent[1], 40, 60), 30)
     client.until(state='idle')
     client.start()

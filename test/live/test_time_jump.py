@@ -36,8 +36,7 @@ def test_a_leg_lost_to_a_jump_of_time_is_said_and_computed_from_its_journal(
                  f'alignment.heading:={drive.truth.heading!r}', '-p',
                  f'journal.max_bytes:={10**9 * journal}')
     client = connect()
-    player = Player(client.node, types)
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, types)
     player.play(part(sent, 30, 60), SPEED)
     client.until(state='idle')
     started = int(client.until(leg_event='')['leg_start_ns']), client.start()
