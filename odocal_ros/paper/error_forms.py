@@ -53,33 +53,6 @@ def chord_error(x: Floats | float, y: Floats | float, dx: Floats | float, dy: Fl
     return -K0 * S1 / S2**3 * (x * dx + y * dy), (y * dx - x * dy) / S2**2
 
 
-@dataclass(frozen=True)
-class StraightLeg:
-    """What a straight leg ends with: phi_U, dL, dlam, dalpha in rad, dK relative to K."""
-
-    phi_U: float
-    dL: float
-    dlam: float
-    dalpha: float
-    dK: float
-
-
-def straight_leg(phi_U0: float, eps_z: float, duration: float, velocity_E: float,
-                 velocity_N: float, latitude: float, radius: float) -> StraightLeg:
-    """
-    Return eq. (29)-(33) in closed form: constant velocity, m/s, for ``duration``, s.
-
-    phi_U0 : rad at the start.   eps_z : drift up, rad/s.   latitude : rad.   radius : m.
-    """
-    turned = phi_U0 * duration - eps_z * duration**2 / 2
-    return StraightLeg(
-        phi_U=phi_U0 - eps_z * duration,                                     # (29)
-        dL=-velocity_E / radius * turned,                                    # (30)
-        dlam=velocity_N / np.cos(latitude) / radius * turned,                # (31)
-        dalpha=-turned / duration,                                           # (33)
-        dK=eps_z**2 * duration**2 / 24)                                      # in place of (32)
-
-
 @dataclass(frozen=True, eq=False)
 class SpeedProfile:
     """

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.dead_reckoning import Origin, Track
-from odocal_ros.nav.earth import C_en, radii
-from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy, transpose
+from odocal_ros.nav.earth import radii
+from odocal_ros.nav.rotations import matrix_from_rpy
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,43 +43,13 @@ class Path:
         return np.concatenate([[0.0], np.cumsum(step)])
 
 
-def path_of_track(track: Track, forward: Floats, origin: Origin,
-                  start_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Path:
-    """
-    Return the path of a dead-reckoned leg.
-
-    Parameters
-    ----------
-    track : Track
-        Attitude and travel in the n of ``origin``.
-    forward : (3,) array
-        Scale times forward axis in b, m per unit of travel.
-    origin : Origin
-        Where n is fixed.
-    start_n : (3,) array
-        Position of the track's first epoch in n, m.
-
-    """
-    position_n = track.P @ np.asarray(forward, dtype=float) + start_n
-    latitude, longitude, height = origin.to_geodetic(position_n).T
-    C_ln = transpose(C_en(latitude, longitude)) @ C_en(origin.latitude, origin.longitude)
-    step_n = np.diff(position_n, axis=0) / np.diff(track.t)[:, None]
-    velocity = np.einsum('mij,mj->mi', (C_ln[:-1] + C_ln[1:]) / 2, step_n)
-    C_nb = C_ln @ matrix_from_quat(track.q_nb)
-    return Path(track.t, latitude, longitude, height, velocity, C_nb)
-
-
 def planned_path(t: Floats, speed: Floats, yaw: Floats | float, latitude: float,
                  longitude: float = 0.0, height: float = 0.0) -> Path:
     """
     Return the path of a level drive that is not driven yet.
 
-    Parameters
-    ----------
-    t, speed, yaw : (m,) arrays
-        Epochs, s; speed, m/s, and ENU yaw of the vehicle, rad, there (straight in between).
-    latitude, longitude, height : float
-        Start, rad, rad, m (WGS 84).
+    t, speed, yaw : (m,) epochs, s; speed, m/s, and ENU yaw of the vehicle, rad, there (straight in
+    between).   latitude, longitude, height : start, rad, rad, m (WGS 84).
 
     Returns
     -------
