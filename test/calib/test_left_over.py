@@ -140,7 +140,7 @@ def test_where_no_odometer_was_there_is_nothing():
 def test_sigmas_of_the_biases_are_honest_all_along():
     apart = []
     for seed in range(1, 9):
-        drive, config, leg, _, fit = fitted(seed=seed)
+        drive, config, leg, _, fit = fitted(seed=seed, duration=120.0)
         true = truth(drive, config, leg)
         sigma = bias_sigmas(fit.marginals(), 1.0)
         off = np.stack([fit.state.gyro_bias - true.gyro_bias,

@@ -53,9 +53,8 @@ def test_at_the_truth_noise_says_nothing_of_the_imus_errors():
     assert both[0] - both[1] < -3.0
 
 
-@pytest.mark.parametrize('sway', [0.0, 0.05])
-def test_a_road_that_shakes_makes_no_scale_error(sway):
-    _, config, leg = made(duration=1200.0, imu_grade='consumer', sway=sway, odometer='speed',
+def test_a_road_that_shakes_makes_no_scale_error():
+    _, config, leg = made(duration=1200.0, imu_grade='consumer', sway=0.05, odometer='speed',
                           odometer_rate=10.0, speed_noise=0.05)
     graded = with_settings(config, {f'imu.{name}_sigma': np.nan for name in (
         'accel_scale', 'misalignment', 'gyro_by_force')})

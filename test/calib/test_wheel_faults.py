@@ -322,14 +322,14 @@ def test_a_gyro_that_does_not_turn_is_no_ground_for_factors():
 
 def test_a_gyro_of_noise_ends_in_reasons_too():
     """Heights left out in the last round: what was solved with them has another length."""
-    made = drive(**TOWN, seed=3, imu_grade='industrial')
+    made = drive(**TOWN | {'duration': 200.0}, seed=3, imu_grade='industrial')
     noise = np.random.default_rng(0).normal(0.0, 0.3, made.imu.w_i.shape)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
     assert calibrate(leg, settings(made, method='smoother')).methods['smoother'].reasons
 
 
 def test_a_gyro_of_less_noise_widens_the_track_width():
-    made = drive(**TOWN, seed=3, imu_grade='consumer')
+    made = drive(**TOWN | {'duration': 200.0}, seed=3, imu_grade='consumer')
     noise = np.random.default_rng(0).normal(0.0, 0.1, made.imu.w_i.shape)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
     noisy, clean = (calibrate(x, settings(made, method='smoother')).methods['smoother']

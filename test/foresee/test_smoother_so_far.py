@@ -186,7 +186,8 @@ def test_the_size_of_an_imperfection_is_carried_on(config):
 
     offs = []
     for seed in range(3, 11):
-        drive = drive_of(accel_scale_error=3e-3, seed=seed)       # as large as is usual
+        # as large as is usual
+        drive = drive_of(accel_scale_error=3e-3, seed=seed, duration=130.0)
         first, later = looked(drive, graded, (40.0, 60.0))
         assert (first.once_s, later.once_s) == (0.0, 0.0)     # not grown by half: no cold start
         leg = SmootherSoFar().look(later.leg, graded)

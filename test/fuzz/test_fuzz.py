@@ -13,7 +13,7 @@ import cases
 import pytest
 
 pytestmark = pytest.mark.slow
-CASES = 120      # the same on any machine: what one of two busy cores did in 20 s
+CASES = 80       # the same on any machine: what one of two busy cores did in 15 s
 
 
 @pytest.fixture(scope='module')

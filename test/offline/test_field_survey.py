@@ -64,8 +64,8 @@ def write(path, made, more):
     return path
 
 
-def town():
-    return drive(scenario='town', duration=400.0, seed=4, imu_grade='tactical', fix_noise='rtk',
+def town(duration=240.0):
+    return drive(scenario='town', duration=duration, seed=4, imu_grade='tactical', fix_noise='rtk',
                  two_wheels=True, odometer_rate=20.0)
 
 
@@ -110,7 +110,7 @@ def sigmas_off(content, name, truth):
 
 
 def test_two_counters_in_an_array_that_roll_over(tmp_path, capsys):
-    made = town()
+    made = town(400.0)
     path = write(tmp_path / 'bag', made, encoders(made, ('ticks', 'speed_kmh')))
     found, text = inspected(path, capsys)
     assert '/encoders.ticks[1] grows with distance, 0.0' in text

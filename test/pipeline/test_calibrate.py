@@ -250,9 +250,9 @@ class Corruption:
 
 
 @pytest.mark.filterwarnings('error')
-@pytest.mark.parametrize(('which', 'runs'), [('straight', 80), ('town', 40)])
+@pytest.mark.parametrize(('which', 'runs'), [('straight', 50), ('town', 30)])
 def test_nothing_raises_and_nothing_wrong_is_accepted(made, town, which, runs):
-    """120 corrupted legs: an accepted one is within six sigmas, a rejected one says why."""
+    """80 corrupted legs: an accepted one is within six sigmas, a rejected one says why."""
     it = made if which == 'straight' else town
     config, verdicts = settings(it), []
     for seed in range(runs):

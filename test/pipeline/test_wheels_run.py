@@ -49,18 +49,6 @@ def off(estimate, truth):
     return abs(estimate.value - truth) / estimate.sigma
 
 
-def test_both_factors_the_angle_and_the_width_come_out(made, result):
-    found = result.methods['smoother'].estimates
-    truth = dict(zip(WHEELS, (made.options.scale, *made.truth.wheel_scales), strict=True))
-    for name, true in truth.items():
-        assert off(found[name], true) < SIGMAS
-        # the leg tells each wheel better than the two differ by: 4 permille
-        assert found[name].sigma < 1e-3 * true
-    assert off(found['yaw_mounting_angle'], made.truth.yaw) < SIGMAS
-    assert off(found['track_width'], made.options.track_width) < SIGMAS
-    assert off(found['pitch_mounting_angle'], made.truth.pitch) < SIGMAS
-
-
 def test_the_mean_of_both_wheels_is_the_scale_factor(result):
     """Its harmonic one; both sigmas hold the scale's."""
     scale, left, right = (result.methods['smoother'].estimates[name] for name in WHEELS)
