@@ -154,11 +154,11 @@ def run(*command, **more):
 @pytest.mark.parametrize('editable', [False, True], ids=['plain', 'editable'])
 def test_pip_puts_both_commands_on_the_path(tmp_path, editable):
     source = copy_of_the_package(tmp_path / 'source')
-    run(sys.executable, '-m', 'venv', tmp_path / 'venv', env=clean_environment())
+    run(sys.executable, '-m', 'venv', '--without-pip', tmp_path / 'venv', env=clean_environment())
     bin_ = tmp_path / 'venv' / 'bin'
     install = subprocess.run(
-        [bin_ / 'python', '-m', 'pip', 'install', '--no-deps', '--disable-pip-version-check',
-         *(['--editable'] if editable else []), str(source)],
+        [sys.executable, '-m', 'pip', '--python', bin_ / 'python', 'install', '--no-deps',
+         '--disable-pip-version-check', *(['--editable'] if editable else []), str(source)],
         capture_output=True, text=True, env=clean_environment(), cwd=tmp_path)
     if 'No matching distribution found for setuptools' in install.stderr:
         pytest.skip('NO PACKAGE INDEX HERE: pip could not fetch setuptools to build with')
