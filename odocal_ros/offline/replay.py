@@ -42,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
 
 
-def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
+def add_input_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options for settings and topics."""
     add = parser.add_argument
     add('--config', metavar='FILE', help='ROS parameter file, the same YAML as for the node')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
@@ -52,6 +52,12 @@ def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
         add(f'--{slot.replace("_", "-")}-topic', metavar='TOPIC', dest=f'{slot}_topic',
             help=f'topic of the {slot.replace("_", " ")}; default: the only topic of a fitting '
             'type')
+
+
+def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
+    add_input_arguments(parser)
+    add = parser.add_argument
     add('--leg', action='append', default=[], metavar='A:B',
         help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
         'each-stop; repeatable')
@@ -118,9 +124,7 @@ def asked_config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings asked for: --config < --set < --accept and --method, each checked."""
     from odocal_ros.settings.accept_config import parse_accept
     from odocal_ros.settings.config import Config, with_settings
-    from odocal_ros.settings.config_file import parse_set, read_config_file
-    asked = read_config_file(Path(args.config)) if args.config else {}
-    asked |= dict(parse_set(text) for text in args.settings)
+    asked = asked_settings(args)
     for text in args.accept:
         asked |= parse_accept(text)
     if args.strict:
@@ -129,6 +133,13 @@ def asked_config(args: argparse.Namespace) -> dict[str, Any]:
         asked['method'] = args.method
     with_settings(Config(), asked)
     return asked
+
+
+def asked_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings of --config < --set."""
+    from odocal_ros.settings.config_file import parse_set, read_config_file
+    asked = read_config_file(Path(args.config)) if args.config else {}
+    return asked | dict(parse_set(text) for text in args.settings)
 
 
 def asked_topics(args: argparse.Namespace) -> dict[str, str]:
