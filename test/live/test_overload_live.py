@@ -12,7 +12,7 @@ import sys
 from types import SimpleNamespace
 
 from bench import given, wait_for
-from kills import replayed, same_result
+from kills import NUMBERS, replayed, same_result
 from player import messages_of, part, playing_to, stopped
 import pytest
 
@@ -79,7 +79,7 @@ def test_what_the_queue_lost_is_counted_and_said(leg):
 
 
 def test_the_result_is_that_of_a_replay(leg):
-    offline = replayed(leg.journal)[1]
+    offline = replayed(leg.journal, *NUMBERS)[1]
     same_result(leg.live, offline)
     assert [(one['start_ns'], one['stop_ns']) for one in leg.live['legs']] == [
         (one['start_ns'], one['stop_ns']) for one in offline['legs']]

@@ -17,6 +17,7 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from odocal_ros.bagio.encode import counter, fix, imu, velocity
 from odocal_ros.bagio.write import write_bag
+from odocal_ros.offline import inspection_text
 from odocal_ros.offline.cli import main
 from odocal_ros.offline.field_survey import Fields
 from odocal_ros.offline.odometer_search import only_near_best
@@ -87,14 +88,13 @@ def encoders(made, keep):
 def inspected(path, capsys, *options):
     assert main(['inspect', str(path), *options, '--json']) == 0
     found = json.loads(capsys.readouterr().out)
-    assert main(['inspect', str(path), *options]) == 0
-    return found, capsys.readouterr().out
+    return found, inspection_text.text(found)
 
 
 def replayed(command, folder):
     """Run a suggested command as pasted; return calibration.json."""
     assert main([*shlex.split(command)[1:], '--output', str(folder), '--set',
-                 'verdict.max_yaw_sigma=0.1']) in (0, 1)
+                 'verdict.max_yaw_sigma=0.1', '--set', 'output.formats=[params]']) in (0, 1)
     return json.loads((folder / 'calibration.json').read_text())
 
 

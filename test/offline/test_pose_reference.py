@@ -18,6 +18,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import cli
 
 pytestmark = pytest.mark.slow
+NUMBERS = ('--set', 'output.formats=[params]')      # no report is drawn
 
 
 @pytest.fixture(scope='module')
@@ -42,7 +43,7 @@ def test_inspect_shows_the_reference_and_suggests_the_command(bag, capsys):
 
 def test_replay_calibrates_and_says_what_the_reference_is(bag, tmp_path, capsys):
     assert cli.main(['replay', str(bag), '--config', str(bag.parent / 'calibrator.yaml'),
-                     '--output', str(tmp_path / 'out')]) == 0
+                     '--output', str(tmp_path / 'out'), *NUMBERS]) == 0
     said = capsys.readouterr()
     assert said.err.count('no NavSatFix with messages in the bag; position reference: /pose '
                           '(geometry_msgs/msg/PoseStamped); another one: --fix-topic') == 1
@@ -58,7 +59,7 @@ def test_replay_calibrates_and_says_what_the_reference_is(bag, tmp_path, capsys)
 def test_what_is_exported_has_no_place_on_a_map(bag, tmp_path, capsys, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     code = cli.main(['replay', str(bag), '--config', str(bag.parent / 'calibrator.yaml'),
-                     '--output', str(tmp_path / 'out'), '--export', name, '--quiet'])
+                     '--output', str(tmp_path / 'out'), '--export', name, '--quiet', *NUMBERS])
     if name == 'track.kml':
         assert code == 2
         assert 'the positions are in a local frame' in capsys.readouterr().err

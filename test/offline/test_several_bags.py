@@ -36,7 +36,7 @@ def bags(tmp_path_factory):
 
 def replay(bags, names, out, *options):
     return main(['replay', *(str(bags / name) for name in names), '--output', str(out), '--method',
-                 'two_point', *options])
+                 'two_point', '--set', 'output.formats=[params]', *options])
 
 
 def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path, capsys):
