@@ -44,18 +44,18 @@ def types():
 
 def write(path, made, more):
     """Write IMU and fixes of a drive, and (topic, bag time, message) rows of its vehicle."""
-    rows = [('/imu/data', t, make.imu(t, w, f)) for t, w, f in zip(
-        made.imu.stamp_ns.tolist(), made.imu.w_i, made.imu.f_i, strict=True)]
-    rows += [('/fix', t, make.fix(t, *np.rad2deg([a, b]), h, sigma=0.02)) for t, a, b, h in zip(
-        made.fix.stamp_ns.tolist(), made.fix.latitude, made.fix.longitude, made.fix.height,
-        strict=True)]
+    topics = imu('/imu/data', made.imu), fix('/fix', made.fix)
+    rows = [(topic.name, topic.msgtype, int(t), row.tobytes()) for topic in topics
+            for t, row in zip(topic.time_ns, topic.pack(slice(0, len(topic.time_ns))),
+                              strict=True)]
+    rows += [(name, message.__msgtype__, t, bytes(types().serialize_cdr(
+        message, message.__msgtype__))) for name, t, message in more]
     with Writer(path, version=9, storage_plugin=ros_bags.STORAGES['mcap']) as bag:
         ends = {}
-        for topic, time_ns, message in sorted(rows + more, key=lambda row: row[1]):
-            kind = message.__msgtype__
-            if topic not in ends:
-                ends[topic] = bag.add_connection(topic, kind, typestore=types())
-            bag.write(ends[topic], time_ns, bytes(types().serialize_cdr(message, kind)))
+        for name, kind, time_ns, raw in sorted(rows, key=lambda row: row[2]):
+            if name not in ends:
+                ends[name] = bag.add_connection(name, kind, typestore=types())
+            bag.write(ends[name], time_ns, raw)
     return path
 
 
