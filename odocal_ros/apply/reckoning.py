@@ -23,7 +23,7 @@ from odocal_ros.apply.attitude import cross, matrix_of, product, turned
 from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
 from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
 from odocal_ros.apply.start import Start
-from odocal_ros.apply.stream import ImuStream
+from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
@@ -36,7 +36,6 @@ from odocal_ros.settings.levels import FASTEST
 # judgement, all in s: between corrections; that a speed is taken over; without odometer, after
 # which attitude continues alone; without IMU, that hide motion
 CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
-HOLE_INTERVALS = 2.5      # judgement: usual intervals of the IMU, a longer one hides a turn
 # judgement: corrections in turn that force and motion disagree at, after which the attitude is
 # false; m/s^2 that the force is then as long as gravity to
 MOST_APART, AS_GRAVITY = 10, 1.0
