@@ -67,11 +67,22 @@ class Reckoning:
         self._w_look: list[Floats] = []
         self._rested, self._apart, self._strange_turn = False, 0, np.zeros(3)
         self._v_look = self._velocity_n(self._t)
+        self._swung = self._v_look           # m/s in n, at the start, and what turns added
+        self._moved = self._stays = 0.0      # s, by which a clock moved, and for good
         self._arm0_n = matrix_from_quat(self.q) @ self.vehicle.C_vb.T @ self.vehicle.lever_arm
 
-    def poses(self) -> list[Pose]:
-        """Return the poses that what has come since the last call allows."""
+    def poses(self, moved: float = 0.0, stays: float = 0.0) -> list[Pose]:
+        """
+        Return the poses that what has come since the last call allows.
+
+        moved, stays : s, by which a clock moved, as the last rows show it, and for good.
+        """
         out: list[Pose] = []
+        if stays and not self._stays:
+            self._notes.append(f'stamps moved by {stays:.2g} s against their arrival times: a '
+                               'clock was set, or messages are late; sigma increased')
+        self._stays = max(self._stays, stays)
+        self._moved = max(self._stays, moved)
         while not self.failed and (last := self._next()) is not None:
             received = self.imu.t[last] <= self.wheels.newest()
             self._advance(last)
@@ -122,6 +133,7 @@ class Reckoning:
         turn_b, strange = phi.sum(axis=1), imu.strange[at + 1:last + 1]
         self._grow(float(t[-1] - t[0]), way_n, turn_b, gaps[gaps > HOLE_INTERVALS * imu.usual],
                    self.wheels.doubt(t[0], t[-1]))
+        self._swung = self._swung + cross(self._C_nb @ turn_b, way_n) / float(t[-1] - t[0])
         self._doubt_turn(strange, gaps, self._C_nb)
         if lost > self.wheels.quantum:
             self.errors.lost(lost)
@@ -155,8 +167,8 @@ class Reckoning:
             self._strange_turn = np.zeros(3)
             return
         if not self._strange_turn.any():
-            self._notes.append(f'the gyro jumps by {strange.max():.2g} rad/s, more than a vehicle '
-                              'can turn: the gyro is down-weighted')
+            self._notes.append(f'the gyro jumps in one sample by {strange.max():.2g} rad/s, more '
+                              'than a vehicle can turn: the gyro is down-weighted')
         turn = self._strange_turn + gaps @ strange
         self.errors.turned(C_nb @ np.diag(turn**2 - self._strange_turn**2) @ C_nb.T)
         self._strange_turn = turn
@@ -245,13 +257,25 @@ class Reckoning:
         doubt = self.wheels.doubt(self._t - T, self._t)
         pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
                     product(self.q, v.q_bv), velocity, rate,
-                    pose_covariance(v, self.errors, C_nb, arm_n, quantum**2 / 6
-                                    + self.wheels.between(self._t) + jitter / 2
-                                    + (speed * self._delay_sigma)**2),
+                    self._late(speed, C_nb @ (self._turn_b / T - earth_b)) + pose_covariance(
+                        v, self.errors, C_nb, arm_n,
+                        quantum**2 / 6 + self.wheels.between(self._t) + jitter / 2),
                     twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt
                                      + jitter))
         self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
         return pose
+
+    def _late(self, speed: float, rate_n: Floats) -> Floats:
+        """
+        Return the covariance of a pose, (6, 6), by the times of odometer and IMU.
+
+        speed : m/s.   rate_n : (3,) rad/s.   A delay shifts travel by what accelerations along
+        the path changed of the velocity; a clock that moved shifts the time of the pose too.
+        """
+        way_n = self._C_nb @ self.vehicle.forward_b * speed - self._swung
+        off = np.concatenate([way_n * np.hypot(self._delay_sigma, self._moved),
+                              rate_n * self._moved])
+        return np.outer(off, off)
 
     def _leave_behind(self, last: int) -> None:
         """Forget what lies behind."""

@@ -141,7 +141,7 @@ class Wheel:
             step += self._bridged(dt, step)
         shown = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s
         off = abs(shown - self.speed) * dt
-        if self._is_false(t, dt, step, off):
+        if self._is_false(t, dt, step, shown, off):
             self.notes.append(f'the counter jumps by {step:+.1f} m in {dt:.2f} s: a reset or an '
                              f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
             step = self.speed * dt
@@ -156,13 +156,14 @@ class Wheel:
         self.usual += (dt - self.usual) * (0.1 if self.usual and not gap else not gap)
         self._add(t, self.s[-1] + step)
 
-    def _is_false(self, t: float, dt: float, step: float, off: float) -> bool:
+    def _is_false(self, t: float, dt: float, step: float, shown: float, off: float) -> bool:
         """
         Return True if a row is not motion: a step, m, with this deviation, m, from the speed.
 
-        What stays for a while and is possible at all is accepted.
+        shown : m/s, of the row.   What stays for a while and is possible at all is accepted.
         """
-        possible = abs(step) <= FASTEST * max(dt, STAMP_BURST) + self.quantum
+        possible = abs(step) <= FASTEST * max(dt, STAMP_BURST) + self.quantum and (
+            self.form.quantity != 'rate' or abs(shown) <= FASTEST)
         usual = off <= self._limit(dt) or self._rows <= SURE_ROWS
         if possible and usual:
             return False

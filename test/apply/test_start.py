@@ -11,7 +11,6 @@
 
 from functools import cache
 
-import numpy as np
 import pytest
 from streams import odometry_of, PIECE_NS, samples_of
 
