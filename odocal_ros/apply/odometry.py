@@ -99,6 +99,10 @@ class Odometry:
             self.imu.feed(block)
         self.wheels.zero_ns = self.imu.zero_ns
 
+    def due(self) -> bool:
+        """Return True if the odometer has reached the next pose of the path."""
+        return self._path is not None and self._path.due()
+
     def poses(self) -> list[Pose]:
         """Return the poses that what was fed since the last call allows."""
         apart = self.apart()
