@@ -32,6 +32,7 @@ SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
 # judgement: s that a burst of stamps may hide; usual jitters of stamps that a row may be off by;
 # rows that determine them
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
+HUNG_JITTERS = 2.0    # judgement: of a counter that stops at once; one that is held shows 3
 # judgement: rows before any is tested; rows in turn, and s, that are refused at least before one
 # is accepted
 SURE_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
@@ -172,10 +173,15 @@ class Wheel:
         return not possible or self._refused <= MOST_REFUSED or (
             t - self._refused_since < REFUSED_TIME)
 
-    def _limit(self, dt: float, change: float = WHEEL_CHANGE) -> float:
+    def _hangs(self, dt: float, step: float) -> bool:
+        """Return True if a counter stops at once: it hangs, or the wheel locks."""
+        return not step and not self._strange and self.form.quantity != 'rate' and (
+            abs(self.speed) * dt > self._limit(dt, SPEED_CHANGE, HUNG_JITTERS))
+
+    def _limit(self, dt: float, change: float = WHEEL_CHANGE, jitters: float = JITTERS) -> float:
         """Return the limit for the deviation of a row from the previous speed, m."""
         return (change * (dt + self._lag()) * dt + 3 * self.quantum
-                + JITTERS * self._jitter * abs(self.speed))
+                + jitters * self._jitter * abs(self.speed))
 
     def _lag(self) -> float:
         """Return the time, s, that the speed is taken over: coarse counts want more."""
@@ -190,6 +196,11 @@ class Wheel:
             self._strange = 0.0 if back else abs(shown - self.speed)
             self._sure_speed, self._strange_travel, self._strange_time = self.speed, 0.0, 0.0
             self.speed = shown if off > self._limit(dt) else self.speed
+        elif self._hangs(dt, step):
+            self.notes.append(f'the counter stops at once from {self.speed:.1f} m/s: it hangs, or '
+                              'the wheel locks; sigma increased')
+            self._strange, self._sure_speed = abs(self.speed), self.speed
+            self._strange_travel = self._strange_time = 0.0
         elif off > self._limit(dt, SPEED_CHANGE):
             self._doubt(off**2)
         self._refused = 0
