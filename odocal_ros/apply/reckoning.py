@@ -203,9 +203,11 @@ class Reckoning:
         standing = resting and self._rested
         if self.config.levelling and received and self._felt:
             off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
-            noise = 2 * self.wheels.quantum / SPEED_SPAN / T
+            doubt = self.wheels.doubt(self._t_look, self._t)      # changes the speed in T
+            noise = 2 * np.hypot(self.wheels.quantum / SPEED_SPAN / T, np.sqrt(doubt) / T**2)
             by = self.errors.by_gravity(
-                self._C_nb, off_n, T, 0.0 if standing else np.hypot(SHAKING, noise))
+                self._C_nb, off_n, T,
+                0.0 if standing and not doubt else np.hypot(SHAKING, noise))
             if by is None:
                 self._take_apart(off_n[:2], velocity, T, w)
             else:

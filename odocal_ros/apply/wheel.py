@@ -53,6 +53,7 @@ class Wheel:
         self.scale = -scale if reversed_counts else scale      # m per unit, signed
         self.speed = 0.0               # m/s, over the last rows
         self.usual = 0.0               # s between rows
+        self.hung = False              # it stopped at once, and has not moved since
         self.notes: list[str] = []
         self.t: deque[float] = deque()
         self.s: deque[float] = deque()
@@ -191,12 +192,15 @@ class Wheel:
 
     def _follow(self, dt: float, step: float, shown: float, off: float) -> None:
         """Use the speed of an accepted row; add variance after a jump of speed."""
+        hangs = self._hangs(dt, step)
+        self.hung = not step and (self.hung or hangs or (
+            self._refused > 0 and off > self._limit(dt)))
         if self._refused:
             back = abs(shown - self._sure_speed) * dt <= self._limit(dt) and self._strange > 0
             self._strange = 0.0 if back else abs(shown - self.speed)
             self._sure_speed, self._strange_travel, self._strange_time = self.speed, 0.0, 0.0
             self.speed = shown if off > self._limit(dt) else self.speed
-        elif self._hangs(dt, step):
+        elif hangs:
             self.notes.append(f'the counter stops at once from {self.speed:.1f} m/s: it hangs, or '
                               'the wheel locks; sigma increased')
             self._strange, self._sure_speed = abs(self.speed), self.speed

@@ -113,7 +113,7 @@ WITHIN = {143: 'imu clock set back by 0.117 s', 168: 'turn of 0.155 rad/s in 5 r
           184: 'heading off by 0.12 rad', 196: 'turn of 0.167 rad/s for 1.5 s',
           308: 'a gap of a counter at rest', 310: 'speeds of 548 m/s',
           353: 'restart while it brakes', 371: 'imu clock ahead by 0.32 s',
-          828: 'a counter that hangs for 0.4 s'}
+          828: 'a counter that hangs for 0.4 s', 905: 'a counter that hangs for 4.3 s'}
 
 
 @pytest.mark.parametrize('number', WITHIN, ids=WITHIN.get)
