@@ -202,7 +202,7 @@ class OdometryNode(SettledNode):
             self._tf(transform_of(pose, self.config.frames))
 
     def _transforms(self) -> Callable[[TransformStamped], None]:
-        """Return what sends a transform, or raise BadConfig if its message is missing."""
+        """Return a function that sends a transform, or raise BadConfig without its message."""
         try:
             kind = message_class('tf2_msgs/msg/TFMessage')
         except BadConfig:
