@@ -46,8 +46,8 @@ def pose_covariance(vehicle: Vehicle, errors: Errors, C_nb: Floats, arm_n: Float
     """
     Return the covariance of position and rotation: (6, 6).
 
-    C_nb, arm_n : as ``Errors.pose`` takes them.   along : m^2, what a count and the odometer's
-    delay along the path, at this time.
+    C_nb, arm_n : as ``Errors.pose`` takes them.   along : m^2, of a count along the path, at this
+    time.
     """
     cov = errors.pose(C_nb, arm_n)
     forward_n = C_nb @ vehicle.forward_b

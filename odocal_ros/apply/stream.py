@@ -13,6 +13,7 @@ from odocal_ros.screening.glitches import ROWS_BESIDE
 from odocal_ros.settings.apply_config import ApplyConfig
 
 INTERVAL_ROWS = 64      # judgement: rows that determine the usual interval
+HOLE_INTERVALS = 2.5      # judgement: usual intervals of the IMU, a longer one hides a turn
 COLUMNS = ('stamp_ns', 't', 'w_b', 'f_b', 'strange')
 
 

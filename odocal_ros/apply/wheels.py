@@ -99,9 +99,9 @@ class Wheels:
                      / len(self._wheels))
 
     def still(self, t_from: float, t_to: float) -> bool:
-        """Return True if no wheel turned between two times."""
-        return all(abs(w.at(t_to) - w.at(t_from)) <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum
-                   for w in self._wheels.values())
+        """Return True if no wheel turned between two times, and none hangs."""
+        return all(not w.hung and abs(w.at(t_to) - w.at(t_from))
+                   <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum for w in self._wheels.values())
 
     def forget(self, t: float) -> None:
         """Drop rows before a time."""

@@ -14,7 +14,7 @@ import rclpy
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.utilities import remove_ros_args
@@ -47,6 +47,10 @@ class SettledNode(Node):
     def _build(self) -> None:
         raise NotImplementedError
 
+    def spin(self, executor: Executor) -> None:
+        """Handle what comes until the context ends."""
+        executor.spin()
+
     def _look_for_namesake(self) -> None:
         """Log once if another node has the same name."""
         own = self.get_name(), self.get_namespace()
@@ -61,7 +65,7 @@ class SettledNode(Node):
         return PlainLog(super().get_logger())  # type: ignore[no-untyped-call]
 
 
-def run(name: str, about: str, make: Callable[[], Node],
+def run(name: str, about: str, make: Callable[[], SettledNode],
         args: list[str] | None = None) -> int:
     """
     Run a node until it must stop.
@@ -94,7 +98,7 @@ def run(name: str, about: str, make: Callable[[], Node],
     try:
         node = make()
         executor.add_node(node)
-        executor.spin()
+        node.spin(executor)
     except ExternalShutdownException:
         pass
     except OdocalError as error:
@@ -105,7 +109,7 @@ def run(name: str, about: str, make: Callable[[], Node],
     finally:
         executor.shutdown()
         if node is not None:
-            node.destroy_node()
+            node.destroy_node()  # type: ignore[no-untyped-call]
         rclpy.try_shutdown()
     if getattr(node, 'at_work', False):
         # an interpreter that ends under a thread in C++ aborts; what is on the disk is whole

@@ -7,6 +7,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints, Values
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
+from odocal_ros.screening.glitches import beyond
 
 # counts, rad, m: less is not called motion
 STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
@@ -25,12 +26,17 @@ class Steps:
         return STILL_TRAVEL.get(self.form.scale_unit, 0.02)
 
     def of(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
-        """Return the step of each row since the row before, its stamp, ns, and its duration, s."""
-        stamps, values = block.stamp_ns, block.value
+        """
+        Return the step of each row since the row before, its stamp, ns, and its duration, s.
+
+        Rows without a possible value are passed over.
+        """
+        good = ~beyond('value', block.value)
+        stamps, values = block.stamp_ns[good], block.value[good]
         if self._last is not None:
             stamps = np.r_[self._last[0], stamps]
             values = np.r_[self._last[1], values]
-        self._last = (block.stamp_ns[-1:], block.value[-1:])
+        self._last = (stamps[-1:], values[-1:])
         seconds = np.diff(stamps) * 1e-9
         if self.form.quantity == 'increment':
             steps = values[1:]

@@ -43,6 +43,8 @@ class ApplyConfig:
                            'vehicle is refused.')
     levelling: bool = setting(True, ro=True, about='Use the accelerometer for tilt and stops for '
                               'the gyro bias; false: gyros only, as in replay.')
+    publish_tf: bool = setting(False, ro=True, about='Publish the pose as TF too: frames.odom -> '
+                               'frames.base. Only one node may send this transform.')
     odometer: OdometerConfig = OdometerConfig()
     imu: ImuConfig = ImuConfig()
     start: StartConfig = StartConfig()

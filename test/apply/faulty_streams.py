@@ -186,7 +186,8 @@ def worst_of(drive, poses, topics, path=0):
     """Return the largest error over sigma of the poses, and what it is of."""
     set_ns, by_ns = topics.get('set', (0, 0))
     stamp_ns = np.array([p.stamp_ns for p in poses])
-    anew = path > 0 and stamp_ns[0] >= set_ns + by_ns
+    # a pose is on the clock of its IMU row: after a step of it on the new one
+    anew = (stamp_ns >= set_ns + max(by_ns, 0)) | (path > 0 and stamp_ns[0] >= set_ns + by_ns)
     t = (stamp_ns - by_ns * anew - drive.options.start_ns) * 1e-9
     inside = (t > 0) & (t < drive.motion.duration)
     if not inside.all():
