@@ -30,10 +30,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
     """
     Compare what the methods say of one leg.
 
-    Parameters
-    ----------
-    methods : dict of MethodResult
-        By name; rejected ones are left out.
+    methods : by name; rejected ones are left out.
 
     Returns
     -------

@@ -45,12 +45,7 @@ def choose(methods: Mapping[str, MethodResult],
     """
     Take each parameter from the first method that has it and is not rejected.
 
-    Parameters
-    ----------
-    methods : dict of MethodResult
-        By name.
-    asked : str or tuple of str
-        The setting ``method``, or the methods that may give.
+    methods : by name.   asked : the setting ``method``, or the methods that may give.
 
     Returns
     -------

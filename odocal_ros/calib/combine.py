@@ -28,14 +28,8 @@ def combine_method(name: str, results: Sequence[MethodResult],
     """
     Combine what one method says of several legs.
 
-    Parameters
-    ----------
-    name : str
-        The method.
-    results : list of MethodResult
-        One a leg, at least one.
-    walked : (J,) array, optional
-        Variance of the random walk of ln K from each leg to the last; None: it stays.
+    name : the method.   results : one a leg, at least one.   walked : (J,) variance of the random
+    walk of ln K from each leg to the last; None: it stays.
 
     Returns
     -------

@@ -36,16 +36,8 @@ def judge_way(track: Track, t_stop: float, metres_per_unit: float,
     """
     Judge how far and how fast was driven between the marks.
 
-    Parameters
-    ----------
-    track : Track
-        Dead reckoned.
-    t_stop : float
-        The stop mark, s.
-    metres_per_unit : float
-        Rough scale.
-    leg : LegConfig
-        Limits.
+    track : dead reckoned.   t_stop : the stop mark, s.   metres_per_unit : rough scale.   leg :
+    limits.
 
     Returns
     -------

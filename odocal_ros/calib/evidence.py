@@ -62,27 +62,12 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
     """
     Collect what the report draws of a leg.
 
-    Parameters
-    ----------
-    leg : Leg
-        For the fixes as sent.
-    inputs : Inputs
-        The screened leg.
-    track : Track
-        Epochs and attitude.
-    fixes_n : (k, 3) array
-        Usable fixes, m, at inputs.t_fix.
-    kept : (k,) bool
-        Those that are not absurdly far off; of these, the ones within the track are shown.
-    pin : MarkFix
-        Where the paths are pinned.
-    paths : (before, after)
-        Callables t (n,) to the antenna's path, (n, 3) m but for a constant, as configured and as
-        calibrated.
-    config : Config
-        Settings in force.
-    t_fit : float
-        End of what was fitted, s.
+    leg : for the fixes as sent.   inputs : the screened leg.   track : epochs and attitude.
+    fixes_n : (k, 3) usable fixes, m, at inputs.t_fix.   kept : (k,) bool those that are not
+    absurdly far off; of these, the ones within the track are shown.   pin : where the paths are
+    pinned.   paths : (before, after) callables t (n,) to the antenna's path, (n, 3) m but for a
+    constant, as configured and as calibrated.   config : settings in force.   t_fit : end of what
+    was fitted, s.
 
     Returns
     -------

@@ -34,10 +34,7 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
     """
     Return the axes of a sensor, levelled, and their names.
 
-    Parameters
-    ----------
-    up : (3,)
-        Unit vector in the sensor's frame.
+    up : (3,) Unit vector in the sensor's frame.
 
     Returns
     -------
@@ -56,12 +53,7 @@ def gyro_axes(inputs: 'Inputs', placed: Placed) -> tuple[Reason, ...]:
     """
     Return GYRO_AXES where an axis of the gyro is mirrored, or two are swapped.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        A screened leg.
-    placed : Placed
-        Its fixes in metres and approximate scale.
+    inputs : a screened leg.   placed : its fixes in metres and approximate scale.
 
     Returns
     -------

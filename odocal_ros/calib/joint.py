@@ -57,19 +57,10 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
     """
     Combine legs of one vehicle.
 
-    Parameters
-    ----------
-    borders : sequence of Border
-        By time, at least one.
-    steps : (J - 1,) array
-        Sigma by which ``drifting`` may have changed from leg to leg.
-    drifting : str
-        The constant that walks.
-    angles : sequence of str
-        Constants that are the same after a whole turn.
-    curved : sequence of str
-        Those in which a leg's equations are not linear: 1 - cos of their change is an error of
-        that leg's own.
+    borders : by time, at least one.   steps : (J - 1,) sigma by which ``drifting`` may have
+    changed from leg to leg.   drifting : the constant that walks.   angles : constants that are
+    the same after a whole turn.   curved : those in which a leg's equations are not linear: 1 -
+    cos of their change is an error of that leg's own.
 
     Returns
     -------

@@ -75,15 +75,9 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
     """
     Tell how an IMU sits.
 
-    Parameters
-    ----------
-    t, w_i, f_i : (n,), (n, 3), (n, 3) arrays
-        Times, s, turn rate, rad/s, and specific force, m/s^2 or g, in the sensor's frame.
-    travel : Travel
-        Odometer; positive is taken as forward.
-    metres_per_unit : float
-        Its rough scale.
-
+    t, w_i, f_i : (n,), (n, 3), (n, 3) times, s, turn rate, rad/s, and specific force, m/s^2 or g,
+    in the sensor's frame.   travel : odometer; positive is taken as forward.   metres_per_unit :
+    its rough scale.
     """
     mean = medians(f_i)
     size = float(np.linalg.norm(mean))

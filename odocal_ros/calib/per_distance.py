@@ -20,12 +20,7 @@ def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistanc
     """
     Return the relative error of two tracks, pinned anew to a fix for each piece.
 
-    Parameters
-    ----------
-    way : (k,) array
-        m driven at each fix.
-    before, after : (k, 3) arrays
-        Track less fixes, m, pinned anywhere.
+    way : (k,) m driven at each fix.   before, after : (k, 3) track less fixes, m, pinned anywhere.
 
     Returns
     -------

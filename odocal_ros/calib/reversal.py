@@ -59,13 +59,8 @@ def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Piece
     """
     Cut the drive into pieces long enough for a direction.
 
-    Parameters
-    ----------
-    track_2d, fixes_2d, t : (n, 2), (n, 2), (n,) arrays
-        At the fixes, any unit, m and s.
-    sigma : float
-        White noise of a fix, m.
-
+    track_2d, fixes_2d, t : (n, 2), (n, 2), (n,) at the fixes, any unit, m and s.   sigma : white
+    noise of a fix, m.
     """
     # a direction is then good to sqrt(2) / 20 rad
     knots = np.array(knots_of(fixes_2d, max(10.0, 20 * sigma)), int)

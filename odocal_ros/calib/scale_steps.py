@@ -31,14 +31,8 @@ def scale_steps(borders: Sequence[Border], steps: Sequence[float] | Floats, drif
     """
     Hold each leg's scale against what those before foretell.
 
-    Parameters
-    ----------
-    borders : sequence of Border
-        By time.
-    steps : (J - 1,) array
-        Sigma by which ``drifting`` walks from leg to leg.
-    drifting, angles : str, sequence of str
-        As for ``joint``.
+    borders : by time.   steps : (J - 1,) sigma by which ``drifting`` walks from leg to leg.
+    drifting, angles : as for ``joint``.
 
     Returns
     -------

@@ -44,15 +44,9 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
     all sections together, their power and correlation as they are after such a fit.
     Errors that change more slowly than over a section are not in it.
 
-    Parameters
-    ----------
-    way : (k,) array
-        m driven at each fix, rising.
-    reckoned_n, fix_n : (k, 3) arrays
-        Dead-reckoned and fixed positions, m.
-    sigma : (k,) array
-        Of a fix as stated, m per horizontal axis; a hundredth of it is the least taken.
-
+    way : (k,) m driven at each fix, rising.   reckoned_n, fix_n : (k, 3) dead-reckoned and fixed
+    positions, m.   sigma : (k,) of a fix as stated, m per horizontal axis; a hundredth of it is
+    the least taken.
     """
     whole = way[-1] - way[0] if len(way) else 0.0
     fewest = 8      # fixes of a section, twice the parameters of its fit

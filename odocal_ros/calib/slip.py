@@ -66,19 +66,8 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     """
     Return when and how far the odometer ran ahead of the IMU, its lateness taken out.
 
-    Parameters
-    ----------
-    t_imu, f_b : (n,), (n, 3) arrays
-        Specific force, s, m/s^2.
-    track : Track
-        Attitude and travel.
-    f : (3,)
-        Scale times forward axis.
-    latitude : float
-        rad.
-    quantum : float
-        Size of an odometer count, scale units.
-
+    t_imu, f_b : (n,), (n, 3) specific force, s, m/s^2.   track : attitude and travel.   f : (3,)
+    scale times forward axis.   latitude : rad.   quantum : size of an odometer count, scale units.
     """
     K = float(np.linalg.norm(f))
     grid = np.arange(max(track.t[0] - LATE[0], t_imu[0]), min(track.t[-1] - LATE[-1], t_imu[-1]),

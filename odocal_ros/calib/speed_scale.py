@@ -41,17 +41,9 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     """
     Return the scale against speed of a leg.
 
-    Parameters
-    ----------
-    t_fix : (k,) array
-        Times of fixes, s, rising.
-    fix_n, dead_n : (k, 2 or more) arrays
-        Positions by fixes and by dead reckoning, m.
-    distance : (k,) array
-        Distance driven by dead reckoning, m; with ``dead_n`` it gives path length by chord.
-    travel : Travel
-        Of the odometer as sent.
-
+    t_fix : (k,) times of fixes, s, rising.   fix_n, dead_n : (k, 2 or more) positions by fixes and
+    by dead reckoning, m.   distance : (k,) distance driven by dead reckoning, m; with ``dead_n``
+    it gives path length by chord.   travel : of the odometer as sent.
     """
     if len(t_fix) < FEWEST_CELLS or len(travel.t) < FEWEST_CELLS:
         return SpeedScale(NO_BINS)

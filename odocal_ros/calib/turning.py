@@ -24,13 +24,8 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
 
     None where the drive hardly turns or the two have little to do with each other.
 
-    Parameters
-    ----------
-    t_imu, w_up : (n,) arrays
-        s, and turn rate about the upward axis.
-    t_fix, fixes_n, sigma : (k,), (k, 2 or more), float
-        s, m, and m horizontally.
-
+    t_imu, w_up : (n,) s, and turn rate about the upward axis.   t_fix, fixes_n, sigma : (k,), (k,
+    2 or more), float s, m, and m horizontally.
     """
     knots = knots_of(fixes_n, max(5.0, 10 * sigma))     # m: a course is then good to 0.14 rad
     if len(knots) < 5:

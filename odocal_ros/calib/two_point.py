@@ -133,21 +133,9 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
     """
     Return scale, yaw and pitch of one leg with their sigmas and the error budget.
 
-    Parameters
-    ----------
-    chord : Chord
-        Track, marks and alignment of the leg.
-    nominal_scale : float
-        K0, 0 where unknown.
-    scale_unit : str
-        Unit of the scale factor.
-    quantum : float
-        Size of a count in scale units, 0 for speeds.
-    fix_scale : (3,) array
-        Factor on the stated fix sigmas, east, north, up.
-    config : Config
-        Limits.
-
+    chord : track, marks and alignment of the leg.   nominal_scale : k0, 0 where unknown.
+    scale_unit : Unit of the scale factor.   quantum : size of a count in scale units, 0 for
+    speeds.   fix_scale : (3,) factor on the stated fix sigmas, east, north, up.   config : limits.
     """
     f, vertical_known = solve(chord, fix_scale[2])
     sources = (*_sources(chord, f, vertical_known, quantum, fix_scale, config),

@@ -113,19 +113,9 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     """
     Iterate from a state to the restricted maximum of the likelihood.
 
-    Parameters
-    ----------
-    problem, state, levels : Problem, State, Levels
-        The leg and the initial values.
-    most : int
-        Iterations.
-    frozen : bool
-        Keep the noise levels constant.
-    about : WarmStart, optional
-        From an earlier fit, whose slips and priors are used.
-    trace : callable, optional
-        Called after each pass, for progress and benchmarks.
-
+    problem, state, levels : the leg and the initial values.   most : iterations.   frozen : keep
+    the noise levels constant.   about : from an earlier fit, whose slips and priors are used.
+    trace : called after each pass, for progress and benchmarks.
     """
     before, still, settled, fitted = np.ones(3), 0.0, False, about is not None
     was_fitted = fitted

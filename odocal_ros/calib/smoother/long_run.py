@@ -29,15 +29,8 @@ def long_run(fixes: Fixes, levels: Levels,
     The largest ratio, for spans of 1, 2, 4, ... s, of the mean square of the error differences to
     its expectation, less REMARK_SIGMAS of its standard deviations.
 
-    Parameters
-    ----------
-    fixes : Fixes
-        With white and correlated errors.
-    levels : Levels
-        Of the pass.
-    found : dict
-        Quadratic sum and expectation of each level.
-
+    fixes : with white and correlated errors.   levels : of the pass.   found : quadratic sum and
+    expectation of each level.
     """
     t, error = fixes.state.t[fixes.k] + fixes.points.tau, fixes.errors()
     stated = 1 / np.diagonal(fixes.root, axis1=1, axis2=2)**2

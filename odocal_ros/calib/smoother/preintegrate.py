@@ -106,20 +106,10 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
     """
     Sum up all intervals.
 
-    Parameters
-    ----------
-    imu : ImuSteps
-        Steps.
-    gyro_bias, accel_bias : (K, 3) arrays
-        Taken out, one for each interval.
-    travel : callable
-        (m,) times, s, to travel, scale units.
-    forward : (3,) array
-        Scale times forward axis, for S_by.
-    t_points : (m,) array
-        Times of fixes, rising, within the keyframes.
-    constants : (M,) array, optional
-        Of which GYRO and ACCEL are taken out.
+    imu : steps.   gyro_bias, accel_bias : (K, 3) taken out, one for each interval.   travel : (m,)
+    times, s, to travel, scale units.   forward : (3,) scale times forward axis, for S_by.
+    t_points : (m,) times of fixes, rising, within the keyframes.   constants : (M,) of which GYRO
+    and ACCEL are taken out.
 
     Returns
     -------

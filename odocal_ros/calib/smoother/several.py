@@ -40,16 +40,9 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     """
     Combine what the smoother says of several legs of one vehicle.
 
-    Parameters
-    ----------
-    results : sequence of MethodResult
-        Those with a border, at least one.
-    times_ns : sequence of int
-        When each leg was driven.
-    config : Config
-        Limits, ``verdict.scale_drift_per_day``.
-    numbers : sequence of int, optional
-        What the legs are called; 1, 2, ...; 0: legs of an earlier result, carried on.
+    results : those with a border, at least one.   times_ns : when each leg was driven.   config :
+    limits, ``verdict.scale_drift_per_day``.   numbers : what the legs are called; 1, 2, ...; 0:
+    legs of an earlier result, carried on.
 
     Returns
     -------

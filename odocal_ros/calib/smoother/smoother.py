@@ -39,14 +39,8 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
     """
     Estimate scale, yaw and pitch mounting of a leg from all its samples.
 
-    Parameters
-    ----------
-    leg : SmootherLeg
-        Screened samples.
-    config : Config
-        Grade, lever arms' and delays' sigmas, limits.
-    trace : callable, optional
-        Called with each pass of the iteration, for benchmarks.
+    leg : screened samples.   config : grade, lever arms' and delays' sigmas, limits.   trace :
+    called with each pass of the iteration, for benchmarks.
 
     Returns
     -------
@@ -136,16 +130,9 @@ def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
     """
     Return the covariance of the constants at a given state, covariance only.
 
-    Parameters
-    ----------
-    leg, config : SmootherLeg, Config
-        As for ``smooth``.
-    truth : State
-        Values of all unknowns, at the times of ``keyframe_times``.
-    levels : Levels
-        Noise levels.
-    imperfect : (k,) array, optional
-        Sigmas of what is imperfect, as IMPERFECT; None: as usual.
+    leg, config : as for ``smooth``.   truth : values of all unknowns, at the times of
+    ``keyframe_times``.   levels : noise levels.   imperfect : (k,) sigmas of what is imperfect, as
+    IMPERFECT; None: as usual.
 
     Returns
     -------

@@ -66,17 +66,8 @@ def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
     """
     Return a state to start from.
 
-    Parameters
-    ----------
-    leg : SmootherLeg
-        The leg.
-    imu : ImuSteps
-        Its IMU steps with the keyframes.
-    priors : Priors
-        Turn-on bias.
-    yaw : float, optional
-        Yaw mounting to start from, rad, in place of that found from accelerations.
-
+    leg : the leg.   imu : its IMU steps with the keyframes.   priors : turn-on bias.   yaw : yaw
+    mounting to start from, rad, in place of that found from accelerations.
     """
     bias, rest = rest_bias(leg, imu)
     sigma = np.full(3, 2e-4) if rest else np.maximum(priors.gyro_bias, 1e-3)

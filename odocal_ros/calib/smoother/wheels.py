@@ -83,17 +83,9 @@ def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
     """
     Return each wheel of a leg by name, none where there are no two or too little motion.
 
-    Parameters
-    ----------
-    problem, fit : Problem, Fit
-        The leg and its fit.
-    covariance : (M, M) array
-        Of the constants.
-    drift : float
-        Sigma of the gyro's bias about up, rad/s: of how the attitudes of the fit drift.
-    width : float
-        Track width as set, m, 0: unknown.
-
+    problem, fit : the leg and its fit.   covariance : (M, M) of the constants.   drift : sigma of
+    the gyro's bias about up, rad/s: of how the attitudes of the fit drift.   width : track width
+    as set, m, 0: unknown.
     """
     wheels, state = problem.leg.wheels, fit.state
     if len(wheels) < 2:

@@ -55,28 +55,12 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     """
     Return what the gyro finds wrong with wheels that both count, and the slips of one of them.
 
-    Parameters
-    ----------
-    axle : (2,) sequence of Travel
-        The left and the right wheel, scale units.
-    imu : (t, w_b, f_b)
-        (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.
-    between : (2,)
-        The marks, s.
-    track : Track
-        Dead reckoned with their mean: attitude.
-    latitude : float
-        rad.
-    metres_per_unit : float
-        Rough scale of the mean of both.
-    track_width : float
-        m, 0 unknown.
-    doubt_t : (d,) array, optional
-        s, where travel is in doubt for other reasons (gaps, resets).
-    max_deviation : float
-        Ratio of the counts less one, from which on it is said.
-    count : int
-        Of the wheels in the mean.
+    axle : (2,) sequence of Travel the left and the right wheel, scale units.   imu : (t, w_b, f_b)
+    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.   between : (2,) the marks, s.   track : dead
+    reckoned with their mean: attitude.   latitude : rad.   metres_per_unit : rough scale of the
+    mean of both.   track_width : m, 0 unknown.   doubt_t : (d,) s, where travel is in doubt for
+    other reasons (gaps, resets).   max_deviation : ratio of the counts less one, from which on it
+    is said.   count : of the wheels in the mean.
 
     Returns
     -------
