@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What a long leg takes of memory: peak RSS beside its goal, for replay and for the node.
@@ -79,8 +73,8 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.foresee.smoother_so_far import SmootherSoFar
     from odocal_ros.foresee.thinned_leg import ThinnedLeg
     from odocal_ros.live.jobs import compute
-    from odocal_ros.live.memory import give_back, hold_little
     import odocal_ros.live.node  # noqa: F401 all that a node holds
+    from odocal_ros.live.worker import give_back, hold_little
     from odocal_ros.messages.decode import make_reader
     from odocal_ros.settings.config import Config
     hold_little()

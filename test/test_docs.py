@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Every command in README and docs is run, here or where the table of the others says."""
 
@@ -138,7 +132,8 @@ def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch
         shlex.split(line)[1:] for page, line in all_commands('odocal') if page == FLEET)
     assert cli.main(made) == 0
     assert '\n'.join((tmp_path / 'fleet' / 'manifest.csv').read_text().splitlines()[:2]) in page
-    assert cli.main(calibrated) == 1
+    # test/fleet looks at the reports: drawing them is most of the time
+    assert cli.main([*calibrated, '--reports', 'none']) == 1
     out, _ = capfd.readouterr()
     worth = r'^  (\w+): (accepted|rejected); (.*) ([-\d]+)$'
     told = re.findall(worth, page, re.MULTILINE)
@@ -152,7 +147,6 @@ def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch
     assert re.findall(r'^(\w+_\d{3}) ', out, re.MULTILINE) == [
         name for name, verdict, *_ in told if verdict == 'accepted']
     assert cli.main(replayed) == 0
-    # the reports are drawn: they would be again, as they were
     assert cli.main([*accepted, '--reports', 'none']) == 1
     out, _ = capfd.readouterr()
     decided = {row['vehicle']: row['decision'] for row in map(

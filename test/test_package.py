@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The package as pip and colcon install it: what is declared, and what starts."""
 
@@ -24,6 +18,7 @@ import pytest
 import yaml
 
 import odocal_ros
+from odocal_ros.outside.licence import Licence, SPDX
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
@@ -68,11 +63,12 @@ def test_one_version_everywhere():
 
 
 def test_each_source_file_says_whose_it_is_and_under_what_licence():
-    """The words by which ament_copyright knows Apache-2.0; it reads them by single blanks."""
-    head = (ROOT / 'setup.py').read_text().split('\n\n')[0]
-    words = ' '.join(head.replace('#', '').split())
-    assert words.startswith('Copyright 2026 odocal_ros maintainers Licensed under the Apache ')
-    assert words.endswith('limitations under the License.')
+    """Two lines, which ament_copyright knows by an entry point of this package."""
+    own, = SPDX.file_headers
+    words = own.format(copyright='Copyright 2026 odocal_ros maintainers')
+    head = '\n'.join(f'# {line}' for line in words.splitlines())
+    assert (ROOT / 'setup.py').read_text().startswith(f'{head}\n\n')
+    assert f'{Licence.__module__}:SPDX' in (ROOT / 'setup.py').read_text()
     rooms = ('odocal_ros', 'test', 'tools', 'benchmarks', 'examples', 'launch', 'docs')
     files = [path for room in rooms for path in (ROOT / room).rglob('*.py')]
     assert len(files) > 500
@@ -154,11 +150,11 @@ def run(*command, **more):
 @pytest.mark.parametrize('editable', [False, True], ids=['plain', 'editable'])
 def test_pip_puts_both_commands_on_the_path(tmp_path, editable):
     source = copy_of_the_package(tmp_path / 'source')
-    run(sys.executable, '-m', 'venv', tmp_path / 'venv', env=clean_environment())
+    run(sys.executable, '-m', 'venv', '--without-pip', tmp_path / 'venv', env=clean_environment())
     bin_ = tmp_path / 'venv' / 'bin'
     install = subprocess.run(
-        [bin_ / 'python', '-m', 'pip', 'install', '--no-deps', '--disable-pip-version-check',
-         *(['--editable'] if editable else []), str(source)],
+        [sys.executable, '-m', 'pip', '--python', bin_ / 'python', 'install', '--no-deps',
+         '--disable-pip-version-check', *(['--editable'] if editable else []), str(source)],
         capture_output=True, text=True, env=clean_environment(), cwd=tmp_path)
     if 'No matching distribution found for setuptools' in install.stderr:
         pytest.skip('NO PACKAGE INDEX HERE: pip could not fetch setuptools to build with')

@@ -1,13 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Accepted stamps of one topic in odometry: increasing and close to their arrival."""
+
+from collections import deque
 
 import numpy as np
 
@@ -16,9 +12,13 @@ from odocal_ros.data.arrays import Bools, Ints
 # judgement: ns that a stamp may be ahead of what the arrivals before allow, and behind the newest:
 # no driver is as odd; rows in turn beyond it, after which the clock was set
 ODD_NS, ODD_ROWS = 200_000_000, 10
-LATEST_NS = 2**62    # format: in the year 2116; sums of two such times still fit 64 bits
+LATEST_NS = (2**31 - 5) * 10**9    # format: s of a header's stamp, with an imu.time_offset
 FAST_PLAY = 1.5      # judgement: times real time, from which a bag is played, without its clock
 LAG_ROWS = 1000      # judgement: accepted rows over which the least lag is forgotten
+# judgement: rows in turn, all off by so many s or more, that show a clock that moved; rows that
+# show that it stays so; ns per row that the usual lag follows; how far from real time a bag is
+# played whose arrivals show nothing
+MOVED_ROWS, MOVED_S, STAYS_ROWS, FOLLOW_NS, PLAYED = 3, 0.03, 50, 1e4, 0.05
 
 
 class Arrivals:
@@ -40,6 +40,17 @@ class Arrivals:
         self._first: tuple[int, int] | None = None      # stamp and arrival, ns
         self.rate = 1.0               # times real time that the stamps go by, 1 if about real time
         self.lag_ns: float | None = None      # the least, arrival less stamp
+        self._real_time = True
+        self._usual_ns = 0.0                  # of the lags, their median
+        self._lags: deque[int] = deque(maxlen=STAYS_ROWS)
+
+    def moved_s(self, rows: int) -> float:
+        """Return by how many s the last rows are off the usual lag, 0 if one of them is not."""
+        last = list(self._lags)[-rows:]
+        if len(last) < rows or not self._real_time:
+            return 0.0
+        least = max(min(last) - self._usual_ns, self._usual_ns - max(last)) * 1e-9
+        return abs(sum(last) / rows - self._usual_ns) * 1e-9 if least > MOVED_S else 0.0
 
     def believed(self, stamp_ns: Ints, received_ns: Ints) -> Bools:
         """Return a mask of rows of the next block with a usable stamp: (n,)."""
@@ -65,8 +76,16 @@ class Arrivals:
                 else:
                     self.lag_ns -= ahead / LAG_ROWS
             self.dropped += not good[k] and behind != 0
+            if not self._odd:
+                self._follow(lag)
         self._take_rate(int(received_ns[-1]) if len(received_ns) else 0)
         return good
+
+    def _follow(self, lag: int) -> None:
+        """Take a lag, ns, and let the usual one follow slowly, as two clocks drift."""
+        self._usual_ns = self._usual_ns if self._lags else float(lag)
+        self._usual_ns += min(max(lag - self._usual_ns, -FOLLOW_NS), FOLLOW_NS)
+        self._lags.append(lag)
 
     def _take_rate(self, received_ns: int) -> None:
         """Take the rate of the stamps since the first block; of a bag played fast it is not 1."""
@@ -74,4 +93,5 @@ class Arrivals:
             self._first = (self._newest_ns, received_ns) if self._newest_ns else None
         elif received_ns > self._first[1]:
             rate = (self._newest_ns - self._first[0]) / (received_ns - self._first[1])
+            self._real_time = abs(rate - 1) < PLAYED
             self.rate = rate if rate > FAST_PLAY else 1.0

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 How dead reckoning errs: covariance of position, attitude, sensors and calibration.
@@ -37,6 +31,9 @@ SHAKING = 0.4
 # physical: rad/sqrt(s) of tilt where the Earth's turn, left in the gyro bias, turns with the
 # vehicle: 11 deg/h constant for about half a minute
 EARTH_LEFT = 6e-4
+# definition: m that a straight line is too long by, per m and rad^2: rms of a normal angle's
+# square over 2; per m: no more, of a direction that is not known
+BEND, MOST_BENT = 3**0.5 / 2, 2.0
 GRAVITY = 9.81    # m/s^2; physical: its last digits tilt nothing
 
 
@@ -57,6 +54,7 @@ class Errors:
             np.full(3, grade.accel_bias), [vehicle.scale_sigma, vehicle.pitch_sigma,
                                            vehicle.yaw_sigma, grade.gyro_scale_error]])
         self.cov[range(N), range(N)] = sigma**2
+        self._bent = np.zeros(3)      # m in n, what attitude errors do to travel in second order
         # x of odom is where the vehicle heads: what the yaw errs by is in the attitude, reversed
         self.cov[5, 5] = vehicle.yaw_sigma**2
         self.cov[5, 14] = self.cov[14, 5] = -vehicle.yaw_sigma**2
@@ -75,6 +73,8 @@ class Errors:
         F[P, PHI], F[P, K], F[P, M] = -cross, way_n, -cross @ C_nb[:, 1:]
         F[PHI, BG], F[PHI, G] = -C_nb * T, -turn_n
         F[P, BG], F[P, G] = cross @ C_nb * (T / 2), cross @ turn_n / 2
+        self._bent = self._bent + way_n * min(
+            BEND * float(np.trace(self.cov[PHI, PHI])), MOST_BENT)
         cov = F @ self.cov @ F.T
         road = self.road(float(np.linalg.norm(way_n))) + [doubt, 0.0, 0.0]
         hidden = 0.0 if gaps is None else float(np.sum(
@@ -153,4 +153,8 @@ class Errors:
         J[:3, P], J[3:, PHI], J[3:, M] = np.eye(3), np.eye(3), C_nb[:, 1:]
         J[:3] -= skewed(arm_n) @ J[3:]
         cov: Floats = J @ self.cov @ J.T
+        cov[:3, :3] += np.outer(self._bent, self._bent)
+        # two rotations leave half their product about the third axis
+        a, b, c = np.diag(self.cov)[PHI].tolist()
+        cov[range(3, 6), range(3, 6)] += [b * c / 4, a * c / 4, a * b / 4]
         return cov

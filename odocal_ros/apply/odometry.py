@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Odometry as the samples come: screened streams, a start, and the path from it on.
@@ -15,7 +9,7 @@ If the path cannot be continued, it restarts at its origin, with a note.
 
 import numpy as np
 
-from odocal_ros.apply.arrivals import Arrivals
+from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
 from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.reckoning import ODOMETER_SILENCE, Reckoning
 from odocal_ros.apply.start import begin
@@ -67,8 +61,8 @@ class Odometry:
         ahead = [imu_ns - lag for lag in lags.values()] if imu_ns is not None else []
         return max(ahead, key=abs, default=0.0) * 1e-9
 
-    def _begin_anew(self, why: str) -> None:
-        """Begin where a first message would."""
+    def begin_anew(self, why: str) -> None:
+        """Begin where a first message would, and say why."""
         self.restarts += 1
         self._notes.append(f'{BEGINS_ANEW}, from the origin: {why}')
         self._anew()
@@ -85,7 +79,7 @@ class Odometry:
         arrivals = self._arrivals.setdefault(slot, Arrivals())
         believed = arrivals.believed(block.stamp_ns, block.received_ns)
         if arrivals.anew:
-            self._begin_anew(f'the stamps of the {slot} jump by {arrivals.off_s:+.3g} s')
+            self.begin_anew(f'the stamps of the {slot} jump by {arrivals.off_s:+.3g} s')
             block = take(block, slice(arrivals.odd_from, None))
             arrivals = self._arrivals[slot] = Arrivals()
             believed = arrivals.believed(block.stamp_ns, block.received_ns)
@@ -99,19 +93,25 @@ class Odometry:
             self.imu.feed(block)
         self.wheels.zero_ns = self.imu.zero_ns
 
+    def due(self) -> bool:
+        """Return True if the odometer has reached the next pose of the path."""
+        return self._path is not None and self._path.due()
+
     def poses(self) -> list[Pose]:
         """Return the poses that what was fed since the last call allows."""
         apart = self.apart()
         if apart and self._path is not None:
-            self._begin_anew(f'odometer stamps differ from IMU stamps by {apart:+.3g} s')
+            self.begin_anew(f'odometer stamps differ from IMU stamps by {apart:+.3g} s')
         if self._path is None and not apart:
             self._path = self._begin()
         if self._path is None:
             self.imu.forget(ODOMETER_SILENCE)
             return []
-        out = self._path.poses()
+        moved = (max(one.moved_s(rows) for one in self._arrivals.values())
+                 for rows in (MOVED_ROWS, STAYS_ROWS))
+        out = self._path.poses(*moved)
         if self._path.failed:
-            self._begin_anew(self._path.failed)
+            self.begin_anew(self._path.failed)
         return out
 
     def _begin(self) -> Reckoning | None:

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What is sent of odometry: poses and twists, each with its covariance."""
 
@@ -52,8 +46,8 @@ def pose_covariance(vehicle: Vehicle, errors: Errors, C_nb: Floats, arm_n: Float
     """
     Return the covariance of position and rotation: (6, 6).
 
-    C_nb, arm_n : as ``Errors.pose`` takes them.   along : m^2, what a count and the odometer's
-    delay along the path, at this time.
+    C_nb, arm_n : as ``Errors.pose`` takes them.   along : m^2, of a count along the path, at this
+    time.
     """
     cov = errors.pose(C_nb, arm_n)
     forward_n = C_nb @ vehicle.forward_b

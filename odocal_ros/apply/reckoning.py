@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Dead reckoning from a start on: the calibration's own strapdown and sum, corrected at stops.
@@ -23,7 +17,7 @@ from odocal_ros.apply.attitude import cross, matrix_of, product, turned
 from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
 from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
 from odocal_ros.apply.start import Start
-from odocal_ros.apply.stream import ImuStream
+from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
@@ -36,7 +30,6 @@ from odocal_ros.settings.levels import FASTEST
 # judgement, all in s: between corrections; that a speed is taken over; without odometer, after
 # which attitude continues alone; without IMU, that hide motion
 CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
-HOLE_INTERVALS = 2.5      # judgement: usual intervals of the IMU, a longer one hides a turn
 # judgement: corrections in turn that force and motion disagree at, after which the attitude is
 # false; m/s^2 that the force is then as long as gravity to
 MOST_APART, AS_GRAVITY = 10, 1.0
@@ -68,11 +61,22 @@ class Reckoning:
         self._w_look: list[Floats] = []
         self._rested, self._apart, self._strange_turn = False, 0, np.zeros(3)
         self._v_look = self._velocity_n(self._t)
+        self._swung = self._v_look           # m/s in n, at the start, and what turns added
+        self._moved = self._stays = 0.0      # s, by which a clock moved, and for good
         self._arm0_n = matrix_from_quat(self.q) @ self.vehicle.C_vb.T @ self.vehicle.lever_arm
 
-    def poses(self) -> list[Pose]:
-        """Return the poses that what has come since the last call allows."""
+    def poses(self, moved: float = 0.0, stays: float = 0.0) -> list[Pose]:
+        """
+        Return the poses that what has come since the last call allows.
+
+        moved, stays : s, by which a clock moved, as the last rows show it, and for good.
+        """
         out: list[Pose] = []
+        if stays and not self._stays:
+            self._notes.append(f'stamps moved by {stays:.2g} s against their arrival times: a '
+                               'clock was set, or messages are late; sigma increased')
+        self._stays = max(self._stays, stays)
+        self._moved = max(self._stays, moved)
         while not self.failed and (last := self._next()) is not None:
             received = self.imu.t[last] <= self.wheels.newest()
             self._advance(last)
@@ -87,6 +91,10 @@ class Reckoning:
             self._look()
             self._leave_behind(last)
         return out
+
+    def due(self) -> bool:
+        """Return True if the odometer has reached the next pose."""
+        return self.wheels.newest() > self._t_pose + 1 / self.config.publish.rate - 1e-6
 
     def _next(self) -> int | None:
         """Return the row to advance to: a pose is due and all it needs has come; else None."""
@@ -123,6 +131,7 @@ class Reckoning:
         turn_b, strange = phi.sum(axis=1), imu.strange[at + 1:last + 1]
         self._grow(float(t[-1] - t[0]), way_n, turn_b, gaps[gaps > HOLE_INTERVALS * imu.usual],
                    self.wheels.doubt(t[0], t[-1]))
+        self._swung = self._swung + cross(self._C_nb @ turn_b, way_n) / float(t[-1] - t[0])
         self._doubt_turn(strange, gaps, self._C_nb)
         if lost > self.wheels.quantum:
             self.errors.lost(lost)
@@ -156,8 +165,8 @@ class Reckoning:
             self._strange_turn = np.zeros(3)
             return
         if not self._strange_turn.any():
-            self._notes.append(f'the gyro jumps by {strange.max():.2g} rad/s, more than a vehicle '
-                              'can turn: the gyro is down-weighted')
+            self._notes.append(f'the gyro jumps in one sample by {strange.max():.2g} rad/s, more '
+                              'than a vehicle can turn: the gyro is down-weighted')
         turn = self._strange_turn + gaps @ strange
         self.errors.turned(C_nb @ np.diag(turn**2 - self._strange_turn**2) @ C_nb.T)
         self._strange_turn = turn
@@ -188,9 +197,11 @@ class Reckoning:
         standing = resting and self._rested
         if self.config.levelling and received and self._felt:
             off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
-            noise = 2 * self.wheels.quantum / SPEED_SPAN / T
+            doubt = self.wheels.doubt(self._t_look, self._t)      # changes the speed in T
+            noise = 2 * np.hypot(self.wheels.quantum / SPEED_SPAN / T, np.sqrt(doubt) / T**2)
             by = self.errors.by_gravity(
-                self._C_nb, off_n, T, 0.0 if standing else np.hypot(SHAKING, noise))
+                self._C_nb, off_n, T,
+                0.0 if standing and not doubt else np.hypot(SHAKING, noise))
             if by is None:
                 self._take_apart(off_n[:2], velocity, T, w)
             else:
@@ -246,13 +257,25 @@ class Reckoning:
         doubt = self.wheels.doubt(self._t - T, self._t)
         pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
                     product(self.q, v.q_bv), velocity, rate,
-                    pose_covariance(v, self.errors, C_nb, arm_n, quantum**2 / 6
-                                    + self.wheels.between(self._t) + jitter / 2
-                                    + (speed * self._delay_sigma)**2),
+                    self._late(speed, C_nb @ (self._turn_b / T - earth_b)) + pose_covariance(
+                        v, self.errors, C_nb, arm_n,
+                        quantum**2 / 6 + self.wheels.between(self._t) + jitter / 2),
                     twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt
                                      + jitter))
         self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
         return pose
+
+    def _late(self, speed: float, rate_n: Floats) -> Floats:
+        """
+        Return the covariance of a pose, (6, 6), by the times of odometer and IMU.
+
+        speed : m/s.   rate_n : (3,) rad/s.   A delay shifts travel by what accelerations along
+        the path changed of the velocity; a clock that moved shifts the time of the pose too.
+        """
+        way_n = self._C_nb @ self.vehicle.forward_b * speed - self._swung
+        off = np.concatenate([way_n * np.hypot(self._delay_sigma, self._moved),
+                              rate_n * self._moved])
+        return np.outer(off, off)
 
     def _leave_behind(self, last: int) -> None:
         """Forget what lies behind."""

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Arrival jitter of a counter, as its rows come: times on the sender's rhythm, and what is left.
@@ -34,6 +28,7 @@ LATE_ROWS = 50             # judgement: rows of the mean deviation
 SURE_STEP = 4.0            # judgement: counts in an interval from which travel shows lost rows
 FAR = 0.5                  # judgement: intervals off the line from which rows may have been lost
 FAR_ROWS = 25              # judgement: rows all of which are off so: it is no jitter
+LONG_GAP = 1.0             # s; judgement: between rows of a slow wheel, lost rows
 MOST_LOST = 5              # judgement: rows lost at once after which another line is determined
 
 
@@ -67,8 +62,11 @@ class Rhythm:
         t : s, its arrival.   travel : m, so far.   speed : m/s, before it.   quantum : m.
         """
         expected = abs(speed) * self._interval
-        self._follow(t, abs(travel - self._rows[-1][2]) if self._rows else 0.0,
-                     expected if expected > SURE_STEP * quantum else 0.0)
+        step = abs(travel - self._rows[-1][2]) if self._rows else 0.0
+        sure = expected > SURE_STEP * quantum
+        if not sure and t - self._line > LONG_GAP and not 0 < step <= 2 * SURE_STEP * quantum:
+            self._restart()      # lost rows, as far as travel shows it: late ones come in turn
+        self._follow(t, step, expected if sure else 0.0)
         self._rows.append((t, self._line if self._count else t, travel))
         if len(self._rows) == 3:
             self._test(abs(speed), quantum)

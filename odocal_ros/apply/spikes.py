@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Rows of the IMU that no vehicle makes, found as they come.
@@ -37,6 +31,7 @@ USUAL_ROWS = 50           # judgement: rows over which the usual step is taken
 STUCK_TIME = 0.1          # s; judgement: of rows equal in every bit, after which the sensor hangs
 TURN_CHANGE = 10.0        # rad/s^2; physical: no vehicle starts to turn faster, but over a stone
 STRANGE_TURN_TIME = 1.0        # s; judgement: after which a turn that began so is one
+ALONE_CHANGE = 2.5        # rad/s^2; judgement: of a step that stands alone: turns begin slower
 STEPS = np.repeat([TURN_STEP, FORCE_STEP], 3)
 SINGLES = np.repeat([SINGLE_TURN, SINGLE_FORCE], 3)
 
@@ -59,6 +54,7 @@ class SpikeScreen:
     def __init__(self) -> None:
         self._usual = np.zeros(2)           # of steps from row to row, in STEPS: gyro, force
         self._since = 0.0                   # s, since when the rows are equal
+        self._w: Floats = np.empty((0, 3))       # rad/s, of the rows before the last one
         self._strange = np.zeros(3)         # rad/s, step of the gyro that no vehicle makes
         self._before = np.zeros(3)          # rad/s, rate before it
         self._until = 0.0                   # s
@@ -71,8 +67,14 @@ class SpikeScreen:
         Returns (n,) bool, (n, 3) rad/s, 0 where the rate is plausible, and the
         index of the first row to hold, n for none.
         """
+        alone = self._alone(t, x[:, :3])
+        keep, strange, hold = self._sifted(t, x, alone)
+        self._w = np.concatenate([self._w, x[:hold, :3][keep[:hold]]])[-ROWS_BESIDE - 1:-1]
+        return keep, strange, hold
+
+    def _sifted(self, t: Floats, x: Floats, alone: Bools) -> tuple[Bools, Floats, int]:
         keep, strange = np.ones(len(t), bool), np.zeros((len(t), 3))
-        if self._calm(t, x):
+        if not alone.any() and self._calm(t, x):
             return keep, strange, len(t)
         last, j = 0, 1
         while j < len(t):
@@ -83,6 +85,8 @@ class SpikeScreen:
                 back = self._back(x[j + 1:within] - x[last], step)
                 if back is None and within == len(t):
                     return keep, strange, j
+            if alone[j].any() and j + 1 == len(t) and back is None:
+                return keep, strange, j        # the next row shows whether it is alone
             self._learn(step[None])
             if back is not None:
                 keep[j:j + 1 + back] = False
@@ -91,7 +95,8 @@ class SpikeScreen:
             if step.any() or not x[j, :3].any():      # a gyro may have a dead band
                 self._since = t[j]
             keep[j] = t[j] - self._since <= STUCK_TIME
-            strange[j] = self._strange_of(t[j], x[j, :3], t[last], x[last, :3])
+            strange[j] = self._strange_of(t[j], x[j, :3], t[last], x[last, :3],
+                                          alone[j] & (last == j - 1))
             last, j = (j, j + 1) if keep[j] else (last, j + 1)
         return keep, strange, len(t)
 
@@ -101,15 +106,42 @@ class SpikeScreen:
             (np.abs(w - self._before) <= BACK_SHARE * np.abs(self._strange)).all(
                 where=self._strange != 0)))
 
-    def _strange_of(self, t: float, w: Floats, t_last: float, w_last: Floats) -> Floats:
-        """Return the implausible part of a rate, (3,) rad/s, from the step where it started."""
+    def _alone(self, t: Floats, w: Floats) -> Bools:
+        """
+        Return a mask of rates after a step that stands alone: (n, 3) rad/s to (n, 3) bool.
+
+        A vehicle starts to turn over several rows; a sensor fault may start with one step.
+        """
+        rows = np.concatenate([self._w, w])
+        size = np.abs(rows[1:] - rows[:-1])
+        out = np.zeros(w.shape, bool)
+        if len(size) <= ROWS_BESIDE or size.max() <= SINGLE_TURN:
+            return out
+        beside = np.zeros(size.shape)
+        beside[:-1] = size[1:]
+        for k in range(1, ROWS_BESIDE + 1):
+            np.maximum(beside[k:], size[:-k], out=beside[k:])
+        least = np.maximum(SINGLE_TURN, ALONE_CHANGE * np.diff(t)[:, None])
+        new = slice(len(self._w), None)
+        out[1:] = size[new] > np.maximum(least, SINGLE_TIMES * beside[new])
+        out[:max(0, ROWS_BESIDE + 1 - len(self._w))] = False      # too few rows before
+        return out
+
+    def _strange_of(self, t: float, w: Floats, t_last: float, w_last: Floats,
+                    alone: Bools) -> Floats:
+        """
+        Return the implausible part of a rate, (3,) rad/s, from the step where it started.
+
+        alone : (3,) bool, the axes whose step stands alone.
+        """
         if self._is_over(t, w):
             self._strange = np.zeros(3)
             return self._strange
         step = np.abs(w - w_last)
         most = max(TURN_CHANGE * (t - t_last), USUAL_STEPS * TURN_STEP * self._usual[0])
-        if not self._strange.any() and (step > most).any():
-            self._strange, self._before = np.where(step > most, step, 0.0), w_last
+        odd = (step > most) | alone
+        if not self._strange.any() and odd.any():
+            self._strange, self._before = np.where(odd, step, 0.0), w_last
             self._until = t + STRANGE_TURN_TIME
         return self._strange
 

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Where odometry begins: attitude, gyro bias and what is certain of them."""
 
@@ -14,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.apply.errors import Errors, GRAVITY
-from odocal_ros.apply.stream import ImuStream
+from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
@@ -29,6 +23,7 @@ MOST_TILTING = 0.5         # rad/s; physical: no vehicle rolls or pitches so for
 START_SPAN = 2.0           # s; judgement: of samples that a start is taken from
 GIVEN_TILT_SIGMA = 0.01    # rad; judgement: of an attitude from outside
 ROAD_TILT_SIGMA = 0.1      # rad; physical: a road of 10 %
+START_HOLE = 0.5           # s; judgement: without IMU data, in the samples of a start
 MOST_FORCE_OFF = 5.0       # m/s^2; physical: half of g, that driving may add over START_SPAN
 BRAKING_SIGMA = 2.0        # m/s^2; physical: that a mean over START_SPAN may hold of braking
 
@@ -56,8 +51,13 @@ def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
     row = int(np.searchsorted(imu.t, wheels.oldest()))
     if config.start.attitude:
         return _given(row, vehicle, config, grade) if len(imu.t) > row else None
-    end = int(np.searchsorted(imu.t, max(wheels.oldest(), imu.t[0]) + START_SPAN))
+    end = int(np.searchsorted(imu.t, imu.t[row] + START_SPAN)) if row < len(imu.t) else row
     if end >= len(imu.t) or wheels.newest() < imu.t[end]:
+        return None
+    holes = np.flatnonzero(np.diff(imu.t[row:end + 1]) > max(
+        START_HOLE, HOLE_INTERVALS * imu.usual))
+    if len(holes):
+        imu.drop(row + int(holes[-1]) + 1)      # start from the rows after the gap
         return None
     t, w, f = imu.t[row:end + 1], imu.w_b[row:end + 1], imu.f_b[row:end + 1]
     resting = wheels.still(t[0], t[-1]) and bool(

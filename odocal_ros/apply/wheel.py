@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Travel of one wheel: rollovers corrected, resets interpolated, lost travel with its variance.
@@ -32,6 +26,7 @@ SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
 # judgement: s that a burst of stamps may hide; usual jitters of stamps that a row may be off by;
 # rows that determine them
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
+HUNG_JITTERS = 2.0    # judgement: of a counter that stops at once; one that is held shows 3
 # judgement: rows before any is tested; rows in turn, and s, that are refused at least before one
 # is accepted
 SURE_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
@@ -52,6 +47,7 @@ class Wheel:
         self.scale = -scale if reversed_counts else scale      # m per unit, signed
         self.speed = 0.0               # m/s, over the last rows
         self.usual = 0.0               # s between rows
+        self.hung = False              # it stopped at once, and has not moved since
         self.notes: list[str] = []
         self.t: deque[float] = deque()
         self.s: deque[float] = deque()
@@ -141,7 +137,7 @@ class Wheel:
             step += self._bridged(dt, step)
         shown = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s
         off = abs(shown - self.speed) * dt
-        if self._is_false(t, dt, step, off):
+        if self._is_false(t, dt, step, shown, off):
             self.notes.append(f'the counter jumps by {step:+.1f} m in {dt:.2f} s: a reset or an '
                              f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
             step = self.speed * dt
@@ -156,13 +152,14 @@ class Wheel:
         self.usual += (dt - self.usual) * (0.1 if self.usual and not gap else not gap)
         self._add(t, self.s[-1] + step)
 
-    def _is_false(self, t: float, dt: float, step: float, off: float) -> bool:
+    def _is_false(self, t: float, dt: float, step: float, shown: float, off: float) -> bool:
         """
         Return True if a row is not motion: a step, m, with this deviation, m, from the speed.
 
-        What stays for a while and is possible at all is accepted.
+        shown : m/s, of the row.   What stays for a while and is possible at all is accepted.
         """
-        possible = abs(step) <= FASTEST * max(dt, STAMP_BURST) + self.quantum
+        possible = abs(step) <= FASTEST * max(dt, STAMP_BURST) + self.quantum and (
+            self.form.quantity != 'rate' or abs(shown) <= FASTEST)
         usual = off <= self._limit(dt) or self._rows <= SURE_ROWS
         if possible and usual:
             return False
@@ -171,10 +168,15 @@ class Wheel:
         return not possible or self._refused <= MOST_REFUSED or (
             t - self._refused_since < REFUSED_TIME)
 
-    def _limit(self, dt: float, change: float = WHEEL_CHANGE) -> float:
+    def _hangs(self, dt: float, step: float) -> bool:
+        """Return True if a counter stops at once: it hangs, or the wheel locks."""
+        return not step and not self._strange and self.form.quantity != 'rate' and (
+            abs(self.speed) * dt > self._limit(dt, SPEED_CHANGE, HUNG_JITTERS))
+
+    def _limit(self, dt: float, change: float = WHEEL_CHANGE, jitters: float = JITTERS) -> float:
         """Return the limit for the deviation of a row from the previous speed, m."""
         return (change * (dt + self._lag()) * dt + 3 * self.quantum
-                + JITTERS * self._jitter * abs(self.speed))
+                + jitters * self._jitter * abs(self.speed))
 
     def _lag(self) -> float:
         """Return the time, s, that the speed is taken over: coarse counts want more."""
@@ -184,11 +186,19 @@ class Wheel:
 
     def _follow(self, dt: float, step: float, shown: float, off: float) -> None:
         """Use the speed of an accepted row; add variance after a jump of speed."""
+        hangs = self._hangs(dt, step)
+        self.hung = not step and (self.hung or hangs or (
+            self._refused > 0 and off > self._limit(dt)))
         if self._refused:
             back = abs(shown - self._sure_speed) * dt <= self._limit(dt) and self._strange > 0
             self._strange = 0.0 if back else abs(shown - self.speed)
             self._sure_speed, self._strange_travel, self._strange_time = self.speed, 0.0, 0.0
             self.speed = shown if off > self._limit(dt) else self.speed
+        elif hangs:
+            self.notes.append(f'the counter stops at once from {self.speed:.1f} m/s: it hangs, or '
+                              'the wheel locks; sigma increased')
+            self._strange, self._sure_speed = abs(self.speed), self.speed
+            self._strange_travel = self._strange_time = 0.0
         elif off > self._limit(dt, SPEED_CHANGE):
             self._doubt(off**2)
         self._refused = 0

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The travel of a vehicle by one counter or by those of its two wheels."""
 
@@ -105,9 +99,9 @@ class Wheels:
                      / len(self._wheels))
 
     def still(self, t_from: float, t_to: float) -> bool:
-        """Return True if no wheel turned between two times."""
-        return all(abs(w.at(t_to) - w.at(t_from)) <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum
-                   for w in self._wheels.values())
+        """Return True if no wheel turned between two times, and none hangs."""
+        return all(not w.hung and abs(w.at(t_to) - w.at(t_from))
+                   <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum for w in self._wheels.values())
 
     def forget(self, t: float) -> None:
         """Drop rows before a time."""

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The error budget of the two-point method: every source as one-sigma effects on the parameters.
@@ -53,16 +47,8 @@ def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> d
     """
     Return the gyro sources as chord errors, (3, k) m for one sigma: docs/method.md (T10).
 
-    Parameters
-    ----------
-    t : (m,) array
-        Epochs from the start of the leg to its end, s.
-    D : (m, 3) array
-        Dead-reckoned displacement from the start, n, m.
-    q_nb : (m, 4) array
-        Attitude, x y z w.
-    alignment : Alignment
-        Sigmas.
+    t : (m,) epochs from the start of the leg to its end, s.   D : (m, 3) dead-reckoned
+    displacement from the start, n, m.   q_nb : (m, 4) attitude, x y z w.   alignment : sigmas.
 
     Returns
     -------
@@ -145,31 +131,14 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     both ends share, which makes the Earth, and so the chord, larger. ``projection`` is there to
     be seen to be zero: the chord is taken in space, not in a plane.
 
-    Parameters
-    ----------
-    f : (3,)
-        Solution, m per unit of travel, in b.
-    M : (3, 3) array
-        Attitude summed over travel.
-    start, end : MarkFix
-        Reference positions.
-    t, D, q_nb : arrays
-        The track, as in drift_sources, from the alignment or the start mark to the end mark.
-    alignment : Alignment
-        Level, heading and gyro sigmas.
-    quantum : float
-        Size of an odometer count, m.
-    fix_scale : (3,) array
-        Factor on the stated fix sigmas that the residuals ask for, east, north, up.
-    time_sigma : float
-        Unknown latency of fixes, s.
-    velocity_change : (3,)
-        Velocity at the end mark less that at the start, m/s; zero between standing marks.
-    lever_arm_sigma : float
-        m, each axis.
-    odometer_time_sigma : float
-        Unknown latency of the odometer, s.
-
+    f : (3,) solution, m per unit of travel, in b.   M : (3, 3) attitude summed over travel.
+    start, end : reference positions.   t, D, q_nb : the track, as in drift_sources, from the
+    alignment or the start mark to the end mark.   alignment : level, heading and gyro sigmas.
+    quantum : size of an odometer count, m.   fix_scale : (3,) factor on the stated fix sigmas that
+    the residuals ask for, east, north, up.   time_sigma : unknown latency of fixes, s.
+    velocity_change : (3,) velocity at the end mark less that at the start, m/s; zero between
+    standing marks.   lever_arm_sigma : m, each axis.   odometer_time_sigma : unknown latency of
+    the odometer, s.
     """
     forward = D[-1] / np.linalg.norm(D[-1])
     at_start = int(np.searchsorted(t, start.t - 1e-9))

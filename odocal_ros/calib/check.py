@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The check: dead reckoning against every fix, before and after the correction; and sanity."""
 
@@ -32,15 +26,8 @@ def stray(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.
 
-    Parameters
-    ----------
-    path : callable
-        t (n,) to the antenna's path, (n, 3) m, but for a constant.
-    pin : MarkFix
-        Where the path is pinned.
-    fixes : (t, position_n)
-        Within the leg.
-
+    path : t (n,) to the antenna's path, (n, 3) m, but for a constant.   pin : where the path is
+    pinned.   fixes : (t, position_n) within the leg.
     """
     t, position_n = fixes
     return pin.position_n + path(t) - path(np.array(pin.t)) - position_n
@@ -58,20 +45,12 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     """
     Return the factors on stated fix sigmas that residuals ask for, east, north, up: (3,).
 
-    Parameters
-    ----------
-    residual : (n, 3) array
-        Corrected track less fixes, m; NaN up where no height is known.
-    covariance_n : (n, 3, 3) array
-        As stated, m^2.
-    drift : float
-        What the gyros may have bent the track by, m: taken out of the residuals. What is left may
-        still hold errors of the track, so this errs on the wide side; below NOISIER_WORTH the
-        stated sigmas stand.
-    marks : sequence of MarkFix
-        The two that the track is pinned to: it has their errors, in proportion to the way a third
-        of the variance of each, and the factor is theirs too.
-
+    residual : (n, 3) corrected track less fixes, m; NaN up where no height is known.
+    covariance_n : (n, 3, 3) as stated, m^2.   drift : what the gyros may have bent the track by,
+    m: taken out of the residuals. What is left may still hold errors of the track, so this errs on
+    the wide side; below NOISIER_WORTH the stated sigmas stand.   marks : the two that the track is
+    pinned to: it has their errors, in proportion to the way a third of the variance of each, and
+    the factor is theirs too.
     """
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
     level2 = np.median((residual[:, :2]**2).sum(axis=1)) / np.log(2)     # mean of an exponential
@@ -113,17 +92,9 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
     Means over windows show it, across the chord; how far slow errors of the fixes may take them
     is what they do along it.
 
-    Parameters
-    ----------
-    t, residual : (n,), (n, 3) arrays
-        Times, s, and corrected track less fixes, m.
-    chord_n : (3,) array
-        From mark to mark, m.
-    fix_sigma, drift : float
-        Of a fix, and what the gyros may have bent the track by, m.
-    distance : float
-        Of the leg, m.
-
+    t, residual : (n,), (n, 3) times, s, and corrected track less fixes, m.   chord_n : (3,) from
+    mark to mark, m.   fix_sigma, drift : of a fix, and what the gyros may have bent the track by,
+    m.   distance : of the leg, m.
     """
     x, y = chord_n[:2] / np.hypot(*chord_n[:2])
     count, _, (along, across) = window_means(t, *(residual[:, :2] @ axis

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What a person looks at to trust a leg: tracks, residuals, speed, scale by section, fixes."""
 
@@ -68,27 +62,12 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
     """
     Collect what the report draws of a leg.
 
-    Parameters
-    ----------
-    leg : Leg
-        For the fixes as sent.
-    inputs : Inputs
-        The screened leg.
-    track : Track
-        Epochs and attitude.
-    fixes_n : (k, 3) array
-        Usable fixes, m, at inputs.t_fix.
-    kept : (k,) bool
-        Those that are not absurdly far off; of these, the ones within the track are shown.
-    pin : MarkFix
-        Where the paths are pinned.
-    paths : (before, after)
-        Callables t (n,) to the antenna's path, (n, 3) m but for a constant, as configured and as
-        calibrated.
-    config : Config
-        Settings in force.
-    t_fit : float
-        End of what was fitted, s.
+    leg : for the fixes as sent.   inputs : the screened leg.   track : epochs and attitude.
+    fixes_n : (k, 3) usable fixes, m, at inputs.t_fix.   kept : (k,) bool those that are not
+    absurdly far off; of these, the ones within the track are shown.   pin : where the paths are
+    pinned.   paths : (before, after) callables t (n,) to the antenna's path, (n, 3) m but for a
+    constant, as configured and as calibrated.   config : settings in force.   t_fit : end of what
+    was fitted, s.
 
     Returns
     -------

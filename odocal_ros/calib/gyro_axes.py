@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Gyro axes against the accelerometer and against the course of the fixes.
@@ -40,10 +34,7 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
     """
     Return the axes of a sensor, levelled, and their names.
 
-    Parameters
-    ----------
-    up : (3,)
-        Unit vector in the sensor's frame.
+    up : (3,) Unit vector in the sensor's frame.
 
     Returns
     -------
@@ -62,12 +53,7 @@ def gyro_axes(inputs: 'Inputs', placed: Placed) -> tuple[Reason, ...]:
     """
     Return GYRO_AXES where an axis of the gyro is mirrored, or two are swapped.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        A screened leg.
-    placed : Placed
-        Its fixes in metres and approximate scale.
+    inputs : a screened leg.   placed : its fixes in metres and approximate scale.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Several legs of a vehicle to one estimate of its constants: that of one fit of all their rows.
@@ -63,19 +57,10 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
     """
     Combine legs of one vehicle.
 
-    Parameters
-    ----------
-    borders : sequence of Border
-        By time, at least one.
-    steps : (J - 1,) array
-        Sigma by which ``drifting`` may have changed from leg to leg.
-    drifting : str
-        The constant that walks.
-    angles : sequence of str
-        Constants that are the same after a whole turn.
-    curved : sequence of str
-        Those in which a leg's equations are not linear: 1 - cos of their change is an error of
-        that leg's own.
+    borders : by time, at least one.   steps : (J - 1,) sigma by which ``drifting`` may have
+    changed from leg to leg.   drifting : the constant that walks.   angles : constants that are
+    the same after a whole turn.   curved : those in which a leg's equations are not linear: 1 -
+    cos of their change is an error of that leg's own.
 
     Returns
     -------

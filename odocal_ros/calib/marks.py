@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Reference positions at the marks: fixes averaged over a standstill, or fitted around a mark.
@@ -66,16 +60,8 @@ def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
     """
     Average fixes of one place: docs/method.md (T6), (T7).
 
-    Parameters
-    ----------
-    t : (n,) array
-        Times, s.
-    position_n : (n, 3) array
-        Fixes, m, motion taken out.
-    covariance_n : (n, 3, 3) array
-        As stated, m^2.
-    correlation_time : float
-        s; 0: white; NaN: estimated from the data.
+    t : (n,) times, s.   position_n : (n, 3) fixes, m, motion taken out.   covariance_n : (n, 3, 3)
+    as stated, m^2.   correlation_time : s; 0: white; NaN: estimated from the data.
 
     Returns
     -------
@@ -163,21 +149,10 @@ def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats,
     """
     Return the antenna position at a mark.
 
-    Parameters
-    ----------
-    t_mark : float
-        s.
-    span : (begin, end) or None
-        The standstill at the mark, s; None in motion.
-    fixes : (t, position_n, covariance_n)
-        Fixes of the leg.
-    displacement_n : callable
-        (n,) times to the (n, 3) motion of the antenna from the mark, m, dead reckoned.
-    correlation_time : float
-        As in mean_fix.
-    window : float
-        Seconds each side of a mark in motion.
-
+    t_mark : s.   span : (begin, end) or None the standstill at the mark, s; None in motion.
+    fixes : (t, position_n, covariance_n) fixes of the leg.   displacement_n : (n,) times to the
+    (n, 3) motion of the antenna from the mark, m, dead reckoned.   correlation_time : as in
+    mean_fix.   window : seconds each side of a mark in motion.
     """
     t, position_n, covariance_n = fixes
     low, high = span if span else (t_mark - window, t_mark + window)

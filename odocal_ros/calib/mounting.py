@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """How an IMU sits in the vehicle: up from gravity, forward from what driving does to it."""
 
@@ -81,15 +75,9 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
     """
     Tell how an IMU sits.
 
-    Parameters
-    ----------
-    t, w_i, f_i : (n,), (n, 3), (n, 3) arrays
-        Times, s, turn rate, rad/s, and specific force, m/s^2 or g, in the sensor's frame.
-    travel : Travel
-        Odometer; positive is taken as forward.
-    metres_per_unit : float
-        Its rough scale.
-
+    t, w_i, f_i : (n,), (n, 3), (n, 3) times, s, turn rate, rad/s, and specific force, m/s^2 or g,
+    in the sensor's frame.   travel : odometer; positive is taken as forward.   metres_per_unit :
+    its rough scale.
     """
     mean = medians(f_i)
     size = float(np.linalg.norm(mean))

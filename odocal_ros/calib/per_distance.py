@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Error of dead reckoning per distance driven, before and after: what scale and yaw make of it."""
 
@@ -26,12 +20,7 @@ def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistanc
     """
     Return the relative error of two tracks, pinned anew to a fix for each piece.
 
-    Parameters
-    ----------
-    way : (k,) array
-        m driven at each fix.
-    before, after : (k, 3) arrays
-        Track less fixes, m, pinned anywhere.
+    way : (k,) m driven at each fix.   before, after : (k, 3) track less fixes, m, pinned anywhere.
 
     Returns
     -------

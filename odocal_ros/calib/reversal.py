@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Reversing that the odometer counts upwards: the direction of travel flips against the fixes.
@@ -65,13 +59,8 @@ def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Piece
     """
     Cut the drive into pieces long enough for a direction.
 
-    Parameters
-    ----------
-    track_2d, fixes_2d, t : (n, 2), (n, 2), (n,) arrays
-        At the fixes, any unit, m and s.
-    sigma : float
-        White noise of a fix, m.
-
+    track_2d, fixes_2d, t : (n, 2), (n, 2), (n,) at the fixes, any unit, m and s.   sigma : white
+    noise of a fix, m.
     """
     # a direction is then good to sqrt(2) / 20 rad
     knots = np.array(knots_of(fixes_2d, max(10.0, 20 * sigma)), int)

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Where, between legs of a vehicle, the scale changed by more than a walk: new tyres, a load."""
 
@@ -37,14 +31,8 @@ def scale_steps(borders: Sequence[Border], steps: Sequence[float] | Floats, drif
     """
     Hold each leg's scale against what those before foretell.
 
-    Parameters
-    ----------
-    borders : sequence of Border
-        By time.
-    steps : (J - 1,) array
-        Sigma by which ``drifting`` walks from leg to leg.
-    drifting, angles : str, sequence of str
-        As for ``joint``.
+    borders : by time.   steps : (J - 1,) sigma by which ``drifting`` walks from leg to leg.
+    drifting, angles : as for ``joint``.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Scale by section of the way, each with the sigma that its own fixes leave."""
 
@@ -50,15 +44,9 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
     all sections together, their power and correlation as they are after such a fit.
     Errors that change more slowly than over a section are not in it.
 
-    Parameters
-    ----------
-    way : (k,) array
-        m driven at each fix, rising.
-    reckoned_n, fix_n : (k, 3) arrays
-        Dead-reckoned and fixed positions, m.
-    sigma : (k,) array
-        Of a fix as stated, m per horizontal axis; a hundredth of it is the least taken.
-
+    way : (k,) m driven at each fix, rising.   reckoned_n, fix_n : (k, 3) dead-reckoned and fixed
+    positions, m.   sigma : (k,) of a fix as stated, m per horizontal axis; a hundredth of it is
+    the least taken.
     """
     whole = way[-1] - way[0] if len(way) else 0.0
     fewest = 8      # fixes of a section, twice the parameters of its fit

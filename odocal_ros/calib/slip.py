@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Wheel slip: where the odometer runs farther than the IMU's acceleration allows.
@@ -72,19 +66,8 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     """
     Return when and how far the odometer ran ahead of the IMU, its lateness taken out.
 
-    Parameters
-    ----------
-    t_imu, f_b : (n,), (n, 3) arrays
-        Specific force, s, m/s^2.
-    track : Track
-        Attitude and travel.
-    f : (3,)
-        Scale times forward axis.
-    latitude : float
-        rad.
-    quantum : float
-        Size of an odometer count, scale units.
-
+    t_imu, f_b : (n,), (n, 3) specific force, s, m/s^2.   track : attitude and travel.   f : (3,)
+    scale times forward axis.   latitude : rad.   quantum : size of an odometer count, scale units.
     """
     K = float(np.linalg.norm(f))
     grid = np.arange(max(track.t[0] - LATE[0], t_imu[0]), min(track.t[-1] - LATE[-1], t_imu[-1]),

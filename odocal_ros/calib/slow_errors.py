@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Fix errors that stay alike over a mark: seen along the leg, where a mark cannot see them."""
 
@@ -42,15 +36,9 @@ def slow_variance(t: Floats, along: Floats, way: Floats, variance: Floats,
     chord, since gyros bend a track across it; less a straight line over the way, which is what
     the errors of the two marks themselves make.
 
-    Parameters
-    ----------
-    t, along, way : (n,) arrays
-        Times, s, corrected track less fixes along the chord, m, and how far along it, m.
-    variance : (n,) array
-        As stated, m^2.
-    drift : float
-        What the gyros may have done along it, m: no error of the fixes.
-
+    t, along, way : (n,) times, s, corrected track less fixes along the chord, m, and how far along
+    it, m.   variance : (n,) as stated, m^2.   drift : what the gyros may have done along it, m: no
+    error of the fixes.
     """
     count, number, (means, places) = window_means(t, along, way)
     if len(count) < 5:      # with a mean and a slope taken out, a variance by five is good to 80 %
@@ -92,19 +80,9 @@ def no_better(mark: MarkFix, slow: float, tau: float, span: tuple[float, float] 
     A mark that has seen slow errors itself knows them as well as the leg does: it is widened only
     where it took them for white, or where the leg clearly says more.
 
-    Parameters
-    ----------
-    mark : MarkFix
-        With the variance of its own fixes.
-    slow, tau : float
-        As slow_variance returns them.
-    span : (begin, end) or None
-        The standstill at the mark, s; None in motion.
-    stated : float
-        Variance of one fix, m^2.
-    up_ratio : float
-        Variance up against that in the level.
-
+    mark : with the variance of its own fixes.   slow, tau : as slow_variance returns them.   span
+    : (begin, end) or None the standstill at the mark, s; None in motion.   stated : variance of
+    one fix, m^2.   up_ratio : variance up against that in the level.
     """
     begin, end = span or (mark.t, mark.t)
     floor = slow * slow_share(end - begin, tau)
@@ -122,19 +100,10 @@ def marks_no_better(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats, wa
     """
     Return both marks of a leg no better than the slow part of its fix errors allows.
 
-    Parameters
-    ----------
-    marks : (MarkFix, MarkFix)
-        With the variance of their own fixes.
-    spans : (k, 2) array
-        Standstills, s.
-    t, way_n, residual, covariance_n : (n,), (n, 3), (n, 3), (n, 3, 3) arrays
-        Times of the fixes, s, corrected track there, track less fix, m, and stated, m^2.
-    chord_n : (3,) array
-        From mark to mark, m.
-    drift_n : (3, k) array
-        What the gyros may have bent the track by, m.
-
+    marks : (MarkFix, MarkFix) with the variance of their own fixes.   spans : (k, 2) standstills,
+    s.   t, way_n, residual, covariance_n : (n,), (n, 3), (n, 3), (n, 3, 3) times of the fixes, s,
+    corrected track there, track less fix, m, and stated, m^2.   chord_n : (3,) from mark to mark,
+    m.   drift_n : (3, k) what the gyros may have bent the track by, m.
     """
     along = chord_n[:2] / np.hypot(*chord_n[:2])
     stated = np.einsum('nij,i,j->n', covariance_n[:, :2, :2], along, along)

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Scale against speed: the odometer as sent, compared with the fixes, cell by cell of a leg."""
 
@@ -47,17 +41,9 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     """
     Return the scale against speed of a leg.
 
-    Parameters
-    ----------
-    t_fix : (k,) array
-        Times of fixes, s, rising.
-    fix_n, dead_n : (k, 2 or more) arrays
-        Positions by fixes and by dead reckoning, m.
-    distance : (k,) array
-        Distance driven by dead reckoning, m; with ``dead_n`` it gives path length by chord.
-    travel : Travel
-        Of the odometer as sent.
-
+    t_fix : (k,) times of fixes, s, rising.   fix_n, dead_n : (k, 2 or more) positions by fixes and
+    by dead reckoning, m.   distance : (k,) distance driven by dead reckoning, m; with ``dead_n``
+    it gives path length by chord.   travel : of the odometer as sent.
     """
     if len(t_fix) < FEWEST_CELLS or len(travel.t) < FEWEST_CELLS:
         return SpeedScale(NO_BINS)

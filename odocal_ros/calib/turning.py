@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Turns by the gyro beside turns of the course: a wrong sign or unit, before all that follows."""
 
@@ -31,15 +25,8 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
 
     None where the drive hardly turns or the two have little to do with each other.
 
-    Parameters
-    ----------
-    t_imu, w_up : (n,) arrays
-        s, and turn rate about the upward axis.
-    t_fix, fixes_n, sigma : (k,), (k, 2 or more), float
-        s, m, and m horizontally.
-    least : float
-        Distance over which fixes surely move, m.
-
+    t_imu, w_up : (n,) s, and turn rate about the upward axis.   t_fix, fixes_n, sigma : (k,), (k,
+    2 or more), float s, m, and m horizontally.   least : distance over which fixes surely move, m.
     """
     # m: a course is then good to 0.14 rad
     knots = knots_of(fixes_n, max(min(5.0, least), 10 * sigma))

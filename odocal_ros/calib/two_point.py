@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The two-point method: scale, yaw and pitch from where a leg ended, by track and by fix.
@@ -139,21 +133,9 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
     """
     Return scale, yaw and pitch of one leg with their sigmas and the error budget.
 
-    Parameters
-    ----------
-    chord : Chord
-        Track, marks and alignment of the leg.
-    nominal_scale : float
-        K0, 0 where unknown.
-    scale_unit : str
-        Unit of the scale factor.
-    quantum : float
-        Size of a count in scale units, 0 for speeds.
-    fix_scale : (3,) array
-        Factor on the stated fix sigmas, east, north, up.
-    config : Config
-        Limits.
-
+    chord : track, marks and alignment of the leg.   nominal_scale : k0, 0 where unknown.
+    scale_unit : Unit of the scale factor.   quantum : size of a count in scale units, 0 for
+    speeds.   fix_scale : (3,) factor on the stated fix sigmas, east, north, up.   config : limits.
     """
     f, vertical_known = solve(chord, fix_scale[2])
     sources = (*_sources(chord, f, vertical_known, quantum, fix_scale, config),

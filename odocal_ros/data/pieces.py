@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Long columns some rows at a time: row by row, step by step, medians; to the last bit as if at once.
@@ -96,14 +90,8 @@ def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Fl
     """
     Return the number of rows in each bin, and the mean of each vector there.
 
-    Parameters
-    ----------
-    t : (n,) array
-        Times of the rows, rising.
-    edges : (m + 1,) array
-        Of the bins, in the same unit; a bin holds its upper edge.
-    vectors : (n, k) arrays
-        Values of the rows.
+    t : (n,) times of the rows, rising.   edges : (m + 1,) of the bins, in the same unit; a bin
+    holds its upper edge.   vectors : (n, k) values of the rows.
 
     Returns
     -------

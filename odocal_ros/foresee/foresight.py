@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Foresight: how good a leg would be if it ended here, and how far to drive until it is good enough.
@@ -88,18 +82,9 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
     """
     Return the forecast of a leg that ends here, and the reasons of its methods so far.
 
-    Parameters
-    ----------
-    leg : Leg
-        The data so far; its last row is the current position.
-    fix_rate : float
-        Hz.
-    config : Config
-        As frozen into the leg.
-    wanted : callable
-        Asked now and then; Abandoned is raised when it says no.
-    smoother : SmootherSoFar, optional
-        That of this leg; looks go from the one before to the next.
+    leg : the data so far; its last row is the current position.   fix_rate : Hz.   config : as
+    frozen into the leg.   wanted : asked now and then; Abandoned is raised when it says no.
+    smoother : that of this leg; looks go from the one before to the next.
 
     Raises
     ------

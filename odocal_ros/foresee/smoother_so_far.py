@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Running estimate of the smoother on a thinned leg, each update from the previous one."""
 
@@ -73,14 +67,8 @@ class SmootherSoFar:
         """
         Return the running estimate.
 
-        Parameters
-        ----------
-        leg : Leg
-            The data so far: the earlier data, and more.
-        config : Config
-            As frozen into the leg.
-        wanted : callable
-            Asked between passes; Abandoned is raised when it says no.
+        leg : the data so far: the earlier data, and more.   config : as frozen into the leg.
+        wanted : asked between passes; Abandoned is raised when it says no.
 
         Raises
         ------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 A leg in few rows, kept while it is recorded: enough to foresee its sigmas, never for a result.
@@ -31,12 +25,15 @@ from odocal_ros.data.samples import (
     SomeSamples,
     take,
 )
-from odocal_ros.foresee.late_so_far import LateSoFar, UNROLLED
+from odocal_ros.screening.late_rows import on_time, ON_TIME_WINDOW
 
 # judgement: a tenth of what keyframes are apart; of a topic as many as 26 minutes of them,
 # pre-roll and all, so that a look has a bound
 FIRST_CELL_NS = 100_000_000
 MOST_CELLS = 16_000
+SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # definition: after which no row to come moves one
+RHYTHM_NS = 3 * SETTLED_NS       # judgement: of earlier rows, which determine the rhythm
+UNROLLED = OdometerForm('cumulative', 0, '')     # definition: a count that never rolls over
 
 
 class ThinnedLeg:
@@ -152,3 +149,37 @@ def _gathered(rows: SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> SomeS
     since_ns = rows.stamp_ns - np.repeat(rows.stamp_ns[first], count)
     return replace(last, stamp_ns=rows.stamp_ns[first] + mean(since_ns).astype(np.int64),
                    **columns)
+
+
+class LateSoFar:
+    """
+    The newest rows of one counter that never rolls over; ``feed`` takes them as sent.
+
+    Late ones are put back as the result has them.
+    """
+
+    def __init__(self) -> None:
+        self._rows: OdometerSamples | None = None
+        self._given = 0             # of these, given away
+
+    def feed(self, rows: OdometerSamples) -> OdometerSamples:
+        """Take rows, and return those that stay where they are now."""
+        rows = rows if self._rows is None else join([self._rows, rows])
+        settled = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[-1] - SETTLED_NS))
+        settled = max(settled, self._given)
+        out = take(_on_time(rows), slice(self._given, settled))
+        first = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[settled] - RHYTHM_NS))
+        self._rows, self._given = take(rows, slice(first, None)), settled - first
+        return out
+
+    def rest(self) -> OdometerSamples:
+        """Return the rows that are not given away, where they seem to belong; some were fed."""
+        assert self._rows is not None
+        return take(_on_time(self._rows), slice(self._given, None))
+
+
+def _on_time(rows: OdometerSamples) -> OdometerSamples:
+    since_s = (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9
+    true_s = on_time(rows, since_s, UNROLLED, [])
+    true_ns = rows.stamp_ns[0] + np.rint(true_s * 1e9).astype(np.int64)
+    return replace(rows, stamp_ns=np.maximum.accumulate(true_ns))

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Bags to one calibration: what ``odocal replay`` does, for any program."""
 
@@ -21,7 +15,7 @@ from odocal_ros.library.asked import config_of, Leg, legs_of, paths_of, Settings
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.listener import Listener, Notes
 from odocal_ros.library.read_bag import read_bag, readers_of, Recording
-from odocal_ros.pipeline.stage import Stage
+from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
@@ -67,7 +61,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
 
     """
     from odocal_ros.library.bags import look_at_all, unique_names, unique_paths
-    from odocal_ros.output.frames import framed
+    from odocal_ros.output.ros_files import framed
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
     received = Notes(hearer or Listener())
@@ -98,7 +92,7 @@ class _Asked:
 def _look(path: Path, asked: _Asked) -> None:
     """Open a bag and check that it has the required data."""
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.library.journal import journal_notes
+    from odocal_ros.library.read_bag import journal_notes
     journal = journal_notes(path)
     settings = config_of(asked.config, journal.settings if journal else None)
     with open_bag(path) as bag:

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Points on the floor where the robot stood: positions of a leg without GNSS or SLAM."""
 
@@ -18,7 +12,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import FixSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.messages.local_types import local_fixes
+from odocal_ros.messages.sensor_types import local_fixes
 from odocal_ros.settings.config import Config
 
 # s before and after a mark, and positions in between. Judgement: a fit needs ten positions

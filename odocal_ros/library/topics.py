@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Which topic of a bag is which input: by message type, where exactly one can be meant."""
 
@@ -15,9 +9,8 @@ import re
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
-from odocal_ros.messages.local_types import LOCAL_TYPES
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import FIX, IMU, VELOCITY
+from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, VELOCITY
 from odocal_ros.settings.config import Config
 
 OPTION = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic',

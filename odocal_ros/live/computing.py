@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The running computation, and the callers that wait for its result."""
 
@@ -17,9 +11,8 @@ from typing import Any
 from rclpy.task import Future
 
 from odocal_ros.live import answers
-from odocal_ros.live.memory import give_back
-from odocal_ros.live.worker import Job, Worker
-from odocal_ros.pipeline.stage import Stage
+from odocal_ros.live.worker import give_back, Job, Worker
+from odocal_ros.pipeline.method_run import Stage
 
 # judgement: s that ~/stop_leg waits for the result. It answers within 5 s, of which one is for a
 # busy machine; the last samples take up to 1 s, the fit of a leg of ten minutes 1 to 2 s

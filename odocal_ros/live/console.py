@@ -1,20 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Console log of the node: missing inputs, readiness, failures."""
 
 import re
 
-from odocal_ros.live.losses import LossReport
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.waiting_messages import LossReport
 from odocal_ros.reasons import Code
 
 # judgement: of waiting, until it is said, and said again

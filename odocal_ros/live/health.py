@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """How well one topic arrives: counts, rate, gaps, losses. Knows nothing of ROS."""
 
@@ -102,42 +96,43 @@ class Health:
         return sound
 
     def _take(self, stamps: Ints, max_gap_s: float | None) -> None:
-        newest = self._newest(stamps)
-        steps = np.diff(stamps if not self.newest_ns else np.r_[self.newest_ns, stamps]) * 1e-9
-        rising = steps[steps > 0]
+        known = np.concatenate(([self.newest_ns], stamps)) if self.newest_ns else stamps
+        steps = known[1:] - known[:-1]
+        newest = self._newest(known, steps)
+        rising = np.sort(steps[steps > 0]) * 1e-9
         if len(rising):
             limit = max_gap_s or 5 * self._interval_s
             self.gaps += int((rising > limit).sum()) if limit else 0
-            typical = float(np.median(rising))
+            typical = float(rising[(len(rising) - 1) // 2])
             self._interval_s = 0.9 * self._interval_s + 0.1 * typical if self._interval_s \
                 else typical
         self.newest_ns = newest
         self._ends.append((self.count, newest))
 
-    def _newest(self, stamps: Ints) -> int:
+    def _newest(self, known: Ints, steps: Ints) -> int:
         """
         Return the newest stamp with a block of them, and note whether time has restarted.
 
         One or two stale stamps are a hiccup of the driver, more are a new start of time; where a
         block ends with few of them, or has but one row, the next one decides.
         """
-        known = stamps if not self.newest_ns else np.r_[self.newest_ns, stamps]
-        steps = np.diff(known)
-        at = int(np.argmin(steps)) if len(steps) else 0
-        after = known[at + 1:].max() if len(steps) else 0
-        fell = bool(len(steps)) and after < known[at] - TIME_ANEW_NS
+        behind, self._behind = self._behind, 0
+        at = int(steps.argmin()) if len(steps) else 0
+        if not len(steps) or steps[at] >= -TIME_ANEW_NS:
+            return int(known[-1])
+        after = known[at + 1:].max()
+        fell = after < known[at] - TIME_ANEW_NS
         # back to where the stamps were before one that was wild
         after_wild = at and steps[at - 1] > TIME_ANEW_NS and after >= known[at - 1] - TIME_ANEW_NS
         after_wild = after_wild or not (at or self.newest_ns)
-        behind, self._behind = self._behind, 0
         if not fell or after_wild:
-            return int(stamps[-1])
+            return int(known[-1])
         rows = len(known) - 1 - at
         if rows < TIME_ANEW_ROWS if at else rows + behind < 2:
             self._behind = rows
             return int(known[at])
         self.jumped_back = True
-        return int(stamps[-1])
+        return int(known[-1])
 
     def silent_s(self, now_ns: int) -> float:
         """Return seconds since the last message, infinite before the first."""

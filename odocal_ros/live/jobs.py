@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The heavy work, as the worker thread runs it: pure of the node and its state."""
 
@@ -24,8 +18,8 @@ from odocal_ros.live.session import LEGS_HELD
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold, refusal
 from odocal_ros.pipeline.calibrate import combine
+from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.pipeline.parts import calibrate_parts
-from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The journal: each leg as a bag on the disk while it is driven, so that nothing of it is lost.
@@ -21,20 +15,27 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 
+from odocal_ros import __version__
 from odocal_ros.live.definitions import message_class
 from odocal_ros.live.journal_leg import Plan
-from odocal_ros.live.journal_text import journal_text
 from odocal_ros.live.journal_writer import JournalWriter, Received
 from odocal_ros.live.recording import PREROLL_MARGIN_S
 from odocal_ros.live.result_files import output_root
 from odocal_ros.live.session import Session
 from odocal_ros.live.topic_input import Input
-from odocal_ros.settings.config import Config
+from odocal_ros.outside.names import for_shell
+from odocal_ros.outside.yaml_text import parameters
+from odocal_ros.settings.config import Config, flat
 
 BATCH_NS = 800_000_000    # judgement: with the writing, a kill then costs about a second
 JOURNAL_GRACE_S = 2.0     # judgement: for the last batch, once the node must stop
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 DROPPED = ('cancelled', 'undone')
+HEAD = """\
+# Journal of a leg: 'odocal replay' on this folder computes it again with the settings below,
+# which are those in force when the leg was started. They are a ROS parameter file too:
+# --params-file, ros2 param load, odocal replay --config.
+"""
 
 
 class Journal:
@@ -167,3 +168,19 @@ class Journal:
         self._hand_over()
         self._writer.submit(self._writer.finish)
         return self._writer.close(JOURNAL_GRACE_S)
+
+
+def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, str],
+                 node: str = '') -> str:
+    """Return the text of journal.yaml; ``topics`` are slot -> topic, ``node`` its full name."""
+    about = {'software': f'odocal_ros {__version__}', 'node': node, 'leg_id': leg_id,
+             'leg_start_ns': start_ns}
+    about |= {f'topics.{slot}': topic for slot, topic in topics.items()}
+    return HEAD + parameters(flat(config)) + parameters(about, 'odocal_journal')
+
+
+def replay_command(folder: str, start_ns: int) -> str:
+    """Return the command that computes a cancelled leg from its journal, mark to last sample."""
+    seconds, nanoseconds = divmod(start_ns, 10**9)
+    start = f'{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{nanoseconds // 1000:06}'
+    return for_shell(['odocal', 'replay', folder, '--leg', f'{start}/'])

@@ -1,40 +1,46 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The node that applies a calibration: counter and IMU in, odometry and twist out."""
 
+from collections.abc import Callable
 import re
+import struct
 import sys
+import time
 from typing import Any
 
-from geometry_msgs.msg import TwistWithCovarianceStamped
+from geometry_msgs.msg import TransformStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.executors import Executor
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from odocal_ros.apply.odometry import BEGINS_ANEW, Odometry
 from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.vehicle import vehicle_of
+from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS
+from odocal_ros.live.definitions import message_class
 from odocal_ros.live.inputs import IMU, LOOK_AROUND_S
-from odocal_ros.live.losses import LossReport
-from odocal_ros.live.numbers_publisher import NumbersPublisher
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
-from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.live.waiting_messages import LossReport
+from odocal_ros.messages.cdr import layout_of
+from odocal_ros.outside.names import said_by
+from odocal_ros.settings.apply_config import ApplyConfig, OdomFrames
 
-# judgement: what a controller lets pose and twist be late; half of it costs 1.5 % of a core more
-POSE_TURN_S = 0.02
+# judgement, all in s: between looks at the odometer, which poses are late by; between turns of the
+# executor, which cost most; before a pose is due, when messages are looked at; between turns
+# without a pose
+LOOK_S, SERVE_S, EARLY_S, SILENT_S = 0.02, 0.1, 0.01, 0.2
 SAID_AGAIN_NS = 10 * 10**9      # judgement: between two sentences of one kind
 HELP = """\
 usage: odometry --ros-args --params-file CALIBRATION.yaml [-p NAME:=VALUE] [-r FROM:=TO] ...
@@ -45,8 +51,37 @@ its odometer and IMU, with a covariance (a ROS 2 node).
 subscribes   imu/data, odometer; if configured odometer_right
              (another name: -r odometer:=/your/topic)
 publishes    odometry (nav_msgs/Odometry), odometry/twist
-             (geometry_msgs/TwistWithCovarianceStamped)
+             (geometry_msgs/TwistWithCovarianceStamped); with publish_tf /tf
 settings     parameters, all described in config/odometry.yaml"""
+
+
+class NumbersPublisher:
+    """
+    Publishes copies of one message with another stamp and other numbers.
+
+    To set the fields of a message object and to serialise it costs many times as much.
+    """
+
+    def __init__(self, node: Node, topic: str, message: Any) -> None:
+        """
+        Create the publisher.
+
+        message : its header holds the frame; after its last string are only 64-bit floats.
+        """
+        raw = serialize_message(message)      # what follows the message is no part of it
+        package, name = type(message).__module__.split('.')[0], type(message).__name__
+        layout = layout_of(f'{package}/msg/{name}', raw)
+        assert layout is not None
+        self._raw = raw[:layout.size]
+        self._publisher = node.create_publisher(
+            type(message), topic, 10,
+            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False))
+
+    def send(self, stamp_ns: int, numbers: Floats) -> None:
+        """Publish with a stamp, ns, and all its floats in order: (n,)."""
+        values = numbers.tobytes()
+        stamp = struct.pack('<iI', *divmod(stamp_ns, 10**9))
+        self._publisher.publish(self._raw[:4] + stamp + self._raw[12:-len(values)] + values)
 
 
 class OdometryNode(SettledNode):
@@ -77,31 +112,68 @@ class OdometryNode(SettledNode):
             header=Header(frame_id=frames.odom), child_frame_id=frames.base))
         self._twist = NumbersPublisher(self, 'odometry/twist', TwistWithCovarianceStamped(
             header=Header(frame_id=frames.base)))
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._look_ns = self._silent_ns = 0
         self._begun, self._pause_ns = False, SILENCE_FIRST_NS
         self._said_ns: dict[str, int] = {}      # when, by kind of sentence
         self._doubled: set[str] = set()         # said
         self._losses = LossReport()
         self.add_on_set_parameters_callback(params.fixed)
-        self.create_timer(POSE_TURN_S, self._tick, clock=self._steady)
+        self._tf = self._transforms() if self.config.publish_tf else None
+        self._due_ns = self._reckoned_ns = 0
+        self._timer = self.create_timer(
+            LOOK_S, self._turn, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f'applies the {kept.words("")}')
 
-    def _tick(self) -> None:
-        now_ns = self._steady.now().nanoseconds
+    def spin(self, executor: Executor) -> None:
+        """Take messages when a pose may be due; let the executor serve the rest, seldom."""
+        self.destroy_timer(self._timer)      # for executors of others
+        serve_at = 0.0
+        while self.context.ok():
+            until = time.monotonic() + LOOK_S
+            self._turn()
+            if any(one.waiting.gate.is_open for one in self._inputs.values()):
+                while (left := until - time.monotonic()) > 0:      # it carries the messages
+                    executor.spin_once(timeout_sec=left)
+                continue
+            if until > serve_at:
+                serve_at = until + SERVE_S
+                executor.spin_once(timeout_sec=0.0)
+            time.sleep(max(0.0, until - time.monotonic()))
+
+    def _turn(self) -> None:
+        """Publish the poses that are due."""
+        now_ns = time.monotonic_ns()
         if now_ns - self._look_ns > LOOK_AROUND_S * 1e9:
             self._look_ns = now_ns
             self._look_around(now_ns)
-        for source in self._inputs.values():
-            self._pump(source)
-        poses = self._odometry.poses()
+        if now_ns < self._due_ns:
+            return
+        try:
+            poses = self._reckon(now_ns)
+        except Exception as error:      # whatever a message does, the node lives on
+            poses = []
+            self._odometry.begin_anew(f'internal error, please report it: {type(error).__name__}: '
+                                      f'{said_by(error)}')
         for pose in poses:
             self._publish(pose)
-        if poses and not self._begun:
-            self._begun = True
-            self.get_logger().info('odometry starts')
+        if poses:
+            self._due_ns = now_ns + round((1 / self.config.publish.rate - EARLY_S) * 1e9)
+            if not self._begun:
+                self._begun = True
+                self.get_logger().info('odometry starts')
         for text in self._odometry.take_notes():
             self._say(text, now_ns)
+
+    def _reckon(self, now_ns: int) -> list[Pose]:
+        """Return the poses that are due; the IMU's messages wait for the odometer's."""
+        for slot, source in self._inputs.items():
+            if slot != 'imu':
+                self._pump(source)
+        if not self._odometry.due() and now_ns - self._reckoned_ns < SILENT_S * 1e9:
+            return []
+        self._reckoned_ns = now_ns
+        self._pump(self._inputs['imu'])
+        return self._odometry.poses()
 
     def _say(self, text: str, now_ns: int) -> None:
         """Log the findings: every restart, other kinds of sentence at a limited rate."""
@@ -154,6 +226,28 @@ class OdometryNode(SettledNode):
         self._twist.send(pose.stamp_ns, twist)
         self._pose.send(pose.stamp_ns, np.concatenate([
             pose.position, pose.q, pose.pose_cov.ravel(), twist]))
+        if self._tf is not None:
+            self._tf(transform_of(pose, self.config.frames))
+
+    def _transforms(self) -> Callable[[TransformStamped], None]:
+        """Return a function that sends a transform, or raise BadConfig without its message."""
+        try:
+            kind = message_class('tf2_msgs/msg/TFMessage')
+        except BadConfig:
+            raise BadConfig('publish_tf needs the package tf2_msgs, which is not installed: '
+                            'install ros-jazzy-tf2-msgs, or set publish_tf to false') from None
+        publisher = self.create_publisher(kind, '/tf', 100)
+        return lambda one: publisher.publish(kind(transforms=[one]))
+
+
+def transform_of(pose: Pose, frames: OdomFrames) -> TransformStamped:
+    """Return a pose as a transform."""
+    out = TransformStamped(child_frame_id=frames.base, header=Header(frame_id=frames.odom))
+    out.header.stamp.sec, out.header.stamp.nanosec = divmod(pose.stamp_ns, 10**9)
+    move, turn = out.transform.translation, out.transform.rotation
+    move.x, move.y, move.z = pose.position.tolist()
+    turn.x, turn.y, turn.z, turn.w = pose.q.tolist()
+    return out
 
 
 def _wanted(config: ApplyConfig) -> dict[str, tuple[str, ...]]:

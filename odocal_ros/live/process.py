@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A node as a process: its start, its end, and the one line that says why there is none."""
 
@@ -20,15 +14,15 @@ import rclpy
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.utilities import remove_ros_args
 
 from odocal_ros import __version__
 from odocal_ros.errors import BadConfig, OdocalError
-from odocal_ros.live.memory import hold_little
 from odocal_ros.live.plain_log import PlainLog
+from odocal_ros.live.worker import hold_little
 from odocal_ros.outside.names import brief_line, said_by
 
 LOOK_FOR_NAMESAKE_S = 5.0      # judgement: s between looks for another node of the same name
@@ -53,6 +47,10 @@ class SettledNode(Node):
     def _build(self) -> None:
         raise NotImplementedError
 
+    def spin(self, executor: Executor) -> None:
+        """Handle what comes until the context ends."""
+        executor.spin()
+
     def _look_for_namesake(self) -> None:
         """Log once if another node has the same name."""
         own = self.get_name(), self.get_namespace()
@@ -67,7 +65,7 @@ class SettledNode(Node):
         return PlainLog(super().get_logger())  # type: ignore[no-untyped-call]
 
 
-def run(name: str, about: str, make: Callable[[], Node],
+def run(name: str, about: str, make: Callable[[], SettledNode],
         args: list[str] | None = None) -> int:
     """
     Run a node until it must stop.
@@ -100,7 +98,7 @@ def run(name: str, about: str, make: Callable[[], Node],
     try:
         node = make()
         executor.add_node(node)
-        executor.spin()
+        node.spin(executor)
     except ExternalShutdownException:
         pass
     except OdocalError as error:
@@ -111,7 +109,7 @@ def run(name: str, about: str, make: Callable[[], Node],
     finally:
         executor.shutdown()
         if node is not None:
-            node.destroy_node()
+            node.destroy_node()  # type: ignore[no-untyped-call]
         rclpy.try_shutdown()
     if getattr(node, 'at_work', False):
         # an interpreter that ends under a thread in C++ aborts; what is on the disk is whole

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What leaves the node besides status and parameters: paths and result files."""
 
@@ -79,7 +73,7 @@ def save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
 
     """
     from odocal_ros.output.files import Results
-    from odocal_ros.output.frames import framed
+    from odocal_ros.output.ros_files import framed
     calibration, config = framed(calibration, config, imu_frame)
     root = output_root(config, inputs[0]['node'])
     name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'

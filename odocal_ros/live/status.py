@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What ``~/status`` and ``/diagnostics`` say: keys for machines, a sentence for people."""
 
@@ -17,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from odocal_ros.calib.result import wheel_factors
 from odocal_ros.foresee import quantities
 from odocal_ros.foresee.forecast import as_keys
-from odocal_ros.live import losses
 from odocal_ros.live.guidance import (
     hint,
     manoeuvres,
@@ -28,7 +21,8 @@ from odocal_ros.live.guidance import (
 from odocal_ros.live.health import Health
 from odocal_ros.live.session import Session, State
 from odocal_ros.live.session_view import SessionView
-from odocal_ros.pipeline.stage import Stage
+from odocal_ros.live.waiting_messages import losses_in_words
+from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.reasons import Code, Verdict
 
 SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a move in a yard is no fault
@@ -153,8 +147,8 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
         ('the result is not saved', now.save_trouble),
         ('the journal cannot be written', now.journal_trouble)) if trouble]
     return '; '.join(filter(None, (seen, *_changes(session), good, now.lost, text,
-                                   _unused(session), *now.doubled, losses.words(now.lost_messages),
-                                   *troubles)))
+                                   _unused(session), *now.doubled,
+                                   losses_in_words(now.lost_messages), *troubles)))
 
 
 def _computing(now: SessionView) -> dict[str, object]:

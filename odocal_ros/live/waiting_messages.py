@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Messages that wait, serialised, in the middleware's queue until they are taken.
@@ -26,6 +20,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 Message: TypeAlias = tuple[bytes, dict[str, Any]]     # serialised, and the info of the middleware
+AGAIN = 10     # judgement: times as many as were said, to say it again
 
 
 class Gate(MutuallyExclusiveCallbackGroup):
@@ -107,3 +102,33 @@ class WaitingMessages:
         if self._simulated:
             info['source_timestamp'] = self._node.get_clock().now().nanoseconds
         self._pending.append((raw, info))
+
+
+class LossReport:
+    """Turns counts of lost messages into sentences, each topic again at ten times the number."""
+
+    def __init__(self) -> None:
+        self._said: dict[str, int] = {}
+
+    def news(self, lost: dict[str, int]) -> list[str]:
+        """
+        Return the new sentences.
+
+        lost : topic -> messages so far; fewer than before: a new count.
+        """
+        found = []
+        for topic, count in lost.items():
+            said = self._said.get(topic, 0)
+            if count < said:
+                said = self._said[topic] = 0
+            if count >= max(1, AGAIN * said):
+                self._said[topic] = count
+                found.append(f'{losses_in_words({topic: count})}. Likely cause: CPU load or '
+                             'network. Reduce the load, or set the QoS of the topic to reliable')
+        return found
+
+
+def losses_in_words(lost: dict[str, int]) -> str:
+    """Return the counts as text, empty if nothing was lost in a queue or on the network."""
+    return ', '.join(f'{count} message{"s" * (count != 1)} of {topic} lost'
+                     for topic, count in lost.items() if count)

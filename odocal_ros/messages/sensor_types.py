@@ -1,13 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
-"""Messages of the IMU, GNSS and heading: where the values lie in each type, and what they mean."""
+"""Messages of the IMU, positions and heading: where the values lie, and what they mean."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,6 +14,7 @@ from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
     ImuSamples,
+    LOCAL,
     OdometerForm,
     of_columns,
     Samples,
@@ -27,7 +22,7 @@ from odocal_ros.data.samples import (
 )
 from odocal_ros.errors import BadData
 from odocal_ros.messages.fields import array, Column, fixed, STAMP, stamp_ns, View, xyz
-from odocal_ros.messages.local_types import local_fixes, LOCAL_TYPES
+from odocal_ros.nav.local_frame import geodetic_of
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 
@@ -36,6 +31,16 @@ FIX = 'sensor_msgs/msg/NavSatFix'
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
 Pairs = list[tuple[str, Samples]]
 Build = Callable[..., Samples]        # of stamps, arrivals and a slot's columns
+# format: block of the position in a 6 x 6 covariance, row by row
+_COVARIANCE = array('pose.covariance', 0, 1, 2, 6, 7, 8, 12, 13, 14)
+# columns of each type: position, and its covariance where the type has one
+LOCAL_TYPES: dict[str, Sequence[Column]] = {
+    'geometry_msgs/msg/PoseStamped': (xyz('pose.position'),),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': (xyz('pose.pose.position'), _COVARIANCE),
+    'geometry_msgs/msg/PointStamped': (xyz('point'),),
+    'geometry_msgs/msg/TransformStamped': (xyz('transform.translation'),),
+    'nav_msgs/msg/Odometry': (xyz('pose.pose.position'), _COVARIANCE),
+}
 
 
 class SensorPlan:
@@ -127,3 +132,14 @@ def sensor_plan(slot: str, msgtype: str, config: Config) -> SensorPlan:
         raise BadData(f'{slot}: messages of type {msgtype} cannot be used; give a topic of type '
                       f'{" or ".join(types)}')
     return SensorPlan(slot, *SENSORS[slot, msgtype])
+
+
+def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
+    """Return the function that makes fixes of stamps, arrivals, positions and covariances."""
+    def build(stamps: Ints, received: Ints, position: Floats, *covariance: Floats) -> FixSamples:
+        n = len(stamps)
+        known = np.full(n, 3 if covariance else 0)      # zeros and negative ones are unknown too
+        given = covariance[0].reshape(n, 3, 3) if covariance else np.zeros((n, 3, 3))
+        return of_columns(FixSamples, stamps, received, *geodetic_of(position, latitude_deg),
+                          given, known, np.full(n, LOCAL))
+    return build

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Alignment: level, gyro bias and heading at the start of a leg, each with its sigma.
@@ -132,16 +126,8 @@ def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[floa
     """
     Level from the mean specific force of a standstill.
 
-    Parameters
-    ----------
-    t, w_b, f_b : (n,), (n, 3), (n, 3) arrays
-        IMU rows, s, rad/s, m/s^2.
-    span : (2,)
-        Begin and end of the standstill, s.
-    grade : Grade
-        Accelerometer bias, axes and noise.
-    gyro_noise : float
-        rad/s/sqrt(Hz).
+    t, w_b, f_b : (n,), (n, 3), (n, 3) IMU rows, s, rad/s, m/s^2.   span : (2,) begin and end of
+    the standstill, s.   grade : accelerometer bias, axes and noise.   gyro_noise : rad/s/sqrt(Hz).
 
     Returns
     -------
@@ -172,20 +158,10 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
     In axes fixed at the start 0, the integral of C_0b f is the change of velocity plus g T up;
     the velocity lies along b's x axis but for the mounting angles, taken as within 3 deg.
 
-    Parameters
-    ----------
-    t, f_b : (n,), (n, 3) arrays
-        IMU rows of the stretch: s, m/s^2.
-    q_0b : (n, 4) array
-        Attitude against the first row, from the gyro.
-    speed : (2,) array
-        Speed at the first and the last row, m/s.
-    latitude : float
-        rad.
-    grade : Grade
-        Sensor figures: without a standstill the turn-on gyro bias is still in the attitude, and
-        the Earth's turn cannot be taken out before heading is known.
-
+    t, f_b : (n,), (n, 3) IMU rows of the stretch: s, m/s^2.   q_0b : (n, 4) attitude against the
+    first row, from the gyro.   speed : (2,) speed at the first and the last row, m/s.   latitude :
+    rad.   grade : sensor figures: without a standstill the turn-on gyro bias is still in the
+    attitude, and the Earth's turn cannot be taken out before heading is known.
     """
     T = t[-1] - t[0]
     C_0b = matrix_from_quat(q_0b)

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Dead reckoning: attitude and odometer travel to a track in n, linear in scale and forward axis.
@@ -106,12 +100,8 @@ def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
     """
     Sum attitude over travel: docs/method.md (T1).
 
-    Parameters
-    ----------
-    t, q_nb : (m,), (m, 4) arrays
-        Epochs, s, and attitude at them.
-    travel : Travel
-        Odometer travel, interpolated to the epochs.
+    t, q_nb : (m,), (m, 4) epochs, s, and attitude at them.   travel : odometer travel,
+    interpolated to the epochs.
 
     Returns
     -------

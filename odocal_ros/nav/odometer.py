@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Odometer: counters, increments and speeds to travel, with rollover and resets undone."""
 
@@ -66,18 +60,9 @@ def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool =
     """
     Sum an odometer's rows up to travel.
 
-    Parameters
-    ----------
-    t : (n,) array
-        Times, s, rising.
-    value : (n,) array
-        As sent: int64 counters or float64.
-    form : OdometerForm
-        What the value means.
-    reversed_counts : bool
-        Positive values mean backwards.
-    name : str
-        What findings call it.
+    t : (n,) times, s, rising.   value : (n,) as sent: int64 counters or float64.   form : what the
+    value means.   reversed_counts : positive values mean backwards.   name : what findings call
+    it.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Standstill: when the vehicle stands, from odometer and gyro."""
 
@@ -30,16 +24,9 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     """
     Find when the vehicle stands.
 
-    Parameters
-    ----------
-    t_imu, w_b : (n,), (n, 3) arrays
-        IMU times, s, and turn rates, rad/s, bias and all.
-    travel : Travel
-        Odometer travel.
-    metres_per_unit : float
-        Rough scale of it, above 0.
-    shortest : float
-        Least duration, s.
+    t_imu, w_b : (n,), (n, 3) IMU times, s, and turn rates, rad/s, bias and all.   travel :
+    odometer travel.   metres_per_unit : rough scale of it, above 0.   shortest : least duration,
+    s.
 
     Returns
     -------

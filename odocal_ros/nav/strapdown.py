@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Strapdown attitude: gyro rates to q_nb, as a blocked prefix product of quaternions.
@@ -171,20 +165,10 @@ def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every:
     """
     Propagate attitude through gyro samples.
 
-    Parameters
-    ----------
-    t : (n,) array
-        Sample times, s, rising; the attitude ``q_nb0`` holds at ``t[0]``.
-    w_b : (n, 3) array
-        Turn rate of b against inertial space, rad/s.
-    q_nb0 : (4,) array
-        Attitude at t[0], x y z w.
-    earth_rate_n : (3,) array
-        Earth rate in n, rad/s (n is fixed to the Earth).
-    every : int
-        Keep one epoch in this many.
-    bias : (3,) array, optional
-        Of the gyro, taken out, rad/s.
+    t : (n,) sample times, s, rising; the attitude ``q_nb0`` holds at ``t[0]``.   w_b : (n, 3) turn
+    rate of b against inertial space, rad/s.   q_nb0 : (4,) attitude at t[0], x y z w.
+    earth_rate_n : (3,) Earth rate in n, rad/s (n is fixed to the Earth).   every : keep one epoch
+    in this many.   bias : (3,) of the gyro, taken out, rad/s.
 
     Returns
     -------

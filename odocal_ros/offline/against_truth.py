@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Show a calibration beside the truth of its drive.
@@ -61,14 +55,9 @@ def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[
     """
     Return each figure whose truth is known.
 
-    Parameters
-    ----------
-    calibration : dict
-        Content of calibration.json.
-    truth : dict
-        Content of a truth.yaml: of odocal simulate, where ``scale`` holds the scale factor and
-        its ratio, or of a real drive, where its value is the ratio to the nominal scale.
-
+    calibration : content of calibration.json.   truth : content of a truth.yaml: of odocal
+    simulate, where ``scale`` holds the scale factor and its ratio, or of a real drive, where its
+    value is the ratio to the nominal scale.
     """
     result, found = calibration['result'], []
     if 'scale' in truth:

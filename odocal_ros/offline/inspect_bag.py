@@ -1,33 +1,20 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """odocal inspect: what a bag holds, what is odd about it, how to replay it, what it lacks."""
 
 import argparse
 from pathlib import Path
 
+from odocal_ros.offline.replay import add_input_arguments, asked_settings, asked_topics
 from odocal_ros.offline.say import say
-
-SLOTS = ('imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add = parser.add_argument
-    add('bag', metavar='BAG', help='bag folder or file')
-    add('--json', action='store_true', help='print everything as JSON')
-    add('--config', metavar='FILE', help='ROS parameter file, the same YAML as for the node')
-    add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
-        help='any setting by its parameter name; repeatable')
-    for slot in SLOTS:
-        add(f'--{slot.replace("_", "-")}-topic', metavar='TOPIC', dest=f'{slot}_topic',
-            help=f'use this topic as {slot.replace("_", " ")}')
+    parser.add_argument('bag', metavar='BAG', help='bag folder or file')
+    parser.add_argument('--json', action='store_true', help='print everything as JSON')
+    add_input_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -38,13 +25,8 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.offline.inspection import inspect
     from odocal_ros.offline.inspection_text import text
     from odocal_ros.settings.config import Config, with_settings
-    from odocal_ros.settings.config_file import parse_set, read_config_file
-    config = Config()
-    if args.config:
-        config = with_settings(config, read_config_file(Path(args.config)))
-    config = with_settings(config, dict(parse_set(setting) for setting in args.settings))
-    overrides = {slot: topic for slot in SLOTS if (topic := getattr(args, f'{slot}_topic'))}
+    config = with_settings(Config(), asked_settings(args))
     with open_bag(Path(args.bag)) as bag:
-        found = inspect(bag, args.bag, config, overrides)
+        found = inspect(bag, args.bag, config, asked_topics(args))
     say(json.dumps(found, indent=2, allow_nan=False) if args.json else text(found))
     return 0

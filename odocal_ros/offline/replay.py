@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """odocal replay: the node's pipeline over recorded bags."""
 
@@ -51,8 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
 
 
-def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
+def add_input_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options for settings and topics."""
     add = parser.add_argument
     add('--config', metavar='FILE', help='ROS parameter file, the same YAML as for the node')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
@@ -61,6 +55,12 @@ def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
         add(f'--{slot.replace("_", "-")}-topic', metavar='TOPIC', dest=f'{slot}_topic',
             help=f'topic of the {slot.replace("_", " ")}; default: the only topic of a fitting '
             'type')
+
+
+def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
+    add_input_arguments(parser)
+    add = parser.add_argument
     add('--leg', action='append', default=[], metavar='A:B',
         help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
         'each-stop; repeatable')
@@ -127,11 +127,9 @@ class _Screen(Listener):
 
 def asked_config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings asked for: --config < --set < --accept and --method, each checked."""
-    from odocal_ros.settings.accept_option import parse_accept
+    from odocal_ros.settings.accept_config import parse_accept
     from odocal_ros.settings.config import Config, with_settings
-    from odocal_ros.settings.config_file import parse_set, read_config_file
-    asked = read_config_file(Path(args.config)) if args.config else {}
-    asked |= dict(parse_set(text) for text in args.settings)
+    asked = asked_settings(args)
     for text in args.accept:
         asked |= parse_accept(text)
     if args.strict:
@@ -140,6 +138,13 @@ def asked_config(args: argparse.Namespace) -> dict[str, Any]:
         asked['method'] = args.method
     with_settings(Config(), asked)
     return asked
+
+
+def asked_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings of --config < --set."""
+    from odocal_ros.settings.config_file import parse_set, read_config_file
+    asked = read_config_file(Path(args.config)) if args.config else {}
+    return asked | dict(parse_set(text) for text in args.settings)
 
 
 def asked_topics(args: argparse.Namespace) -> dict[str, str]:

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The error budget as people read it: each source with its share of each parameter's variance."""
 
@@ -44,21 +38,10 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
     """
     Return the lines of a budget, none without one.
 
-    Parameters
-    ----------
-    table : dict
-        Source to one-sigma share of each parameter, as calibration.json has it.
-    scale : float
-        Scale factor that its scale column belongs to.
-    shown : float
-        Share of the variance below which a source is but named.
-    hidden : collection of str
-        Parameters that are not determined: their column stays empty.
-    width : int
-        Columns of the screen.
-    small_too : bool
-        Name the small ones.
-
+    table : source to one-sigma share of each parameter, as calibration.json has it.   scale :
+    scale factor that its scale column belongs to.   shown : share of the variance below which a
+    source is but named.   hidden : parameters that are not determined: their column stays empty.
+    width : columns of the screen.   small_too : name the small ones.
     """
     if not table:
         return []

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Result files: calibration.json (schema 1) and what other programs load."""
 
@@ -40,16 +34,8 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
     """
     Return the content of calibration.json.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The combination of all legs.
-    config : Config
-        Settings it was made with.
-    inputs : list of dict
-        One a bag: its name, sha256 and topics.
-    created : str
-        ISO 8601 date and time.
+    calibration : the combination of all legs.   config : settings it was made with.   inputs : one
+    a bag: its name, sha256 and topics.   created : ISO 8601 date and time.
 
     Returns
     -------

@@ -1,13 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
-"""The legs as a table for a spreadsheet: one row a leg, plain numbers, units in the head."""
+"""The legs as a table for a spreadsheet, their verdicts as shown, and their searches as lines."""
 
 import csv
 from datetime import datetime, UTC
@@ -15,9 +9,11 @@ import io
 from typing import Any
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.result import Calibration, Estimate, LegResult, wheel_factors
+from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, wheel_factors
 from odocal_ros.output.figures import known
 from odocal_ros.outside.names import for_table
+from odocal_ros.pipeline.combination import driven_twice
+from odocal_ros.reasons import Verdict, verdict_of
 from odocal_ros.settings.config import Config
 
 LEGS = 'legs.csv'
@@ -70,3 +66,51 @@ def _estimate(leg: LegResult, calibration: Calibration, name: str) -> Estimate:
 
 def _iso(stamp_ns: int) -> str:
     return f'{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}'
+
+
+def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
+    """Return a table of each leg's search, empty where there was none."""
+    lines = []
+    for k, leg in enumerate(legs, 1):
+        found = next((m.details['search'] for m in leg.methods.values()
+                      if m.details.get('search')), None)
+        if not found:
+            continue
+        best, after = found['best_row'], found['after']
+        rows = ((f'best of {found["array"]["rows"]} ({found["array"]["name"]})', best, best),
+                ('response surface', found['response_surface'], after),
+                ('least squares', found['least_squares'], None))
+        lines += ['search by positions alone (CN104359492A), without sigmas'
+                  + (f', leg {k}' if len(legs) > 1 else ''),
+                  f'  {"":24}  {"left":>10}  {"right":>10}  turn, deg  mean, m   max, m']
+        for name, values, fit in rows:
+            how = '' if fit is None else f'  {fit["mean"]:7.3f}  {fit["max"]:7.3f}'
+            lines.append(f'  {name:24}  {values["scale_left"]:10.6g}  '
+                         f'{values["scale_right"]:10.6g}  {values["heading_deg"]:+9.4f}{how}')
+        if found['left_and_right_held_together']:
+            lines.append('  the fixes do not separate left and right: their ratio is kept')
+    return lines
+
+
+def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
+    """
+    Return the verdict of a method's figures, '(leg)' behind it where it is that of the leg.
+
+    What is wrong with a leg's data is no method's reason, but touches each of them: a method that
+    found nothing to say of a dead wheel is no way round it.
+
+    legs : those the figures rest on; of several that are good in part, the good ones count.
+    """
+    twice = driven_twice([leg for leg in legs if verdict_of(leg.reasons) is not Verdict.REJECTED])
+    of_data = [verdict_of(leg.reasons) for leg in legs if leg not in twice]
+    used = [v for v in of_data if v is not Verdict.REJECTED] or of_data
+    worst = Verdict.worst([method.verdict, *used])
+    if worst is method.verdict:
+        return worst.value
+    return f'{worst.value} (leg{"s" * (len(legs) > 1)})'
+
+
+def leg_verdicts(legs: tuple[LegResult, ...]) -> list[str]:
+    """Return the verdict of each leg, 'not used' where it is good and an earlier one is used."""
+    twice = driven_twice([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
+    return ['not used' if leg in twice else leg.verdict.value for leg in legs]

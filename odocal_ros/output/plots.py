@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The figures of a leg, from its evidence: track, residuals, scale by section, speed, fixes."""
 
@@ -47,18 +41,10 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
     """
     Draw a leg.
 
-    Parameters
-    ----------
-    found : Evidence
-        Of the leg.
-    name : str
-        Put before the ids of each figure.
-    scale_sigma : float, optional
-        Relative sigma of the leg's scale: the band about zero of the sections.
-    before_word : str
-        What the track before the correction rests on.
-    smoothed : dict, optional
-        Details of the smoother: slips, and biases at its keyframes.
+    found : of the leg.   name : put before the ids of each figure.   scale_sigma : relative sigma
+    of the leg's scale: the band about zero of the sections.   before_word : what the track before
+    the correction rests on.   smoothed : details of the smoother: slips, and biases at its
+    keyframes.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """How figures become parts of a page: one look, SVG with text as text, nothing left outside."""
 
@@ -73,15 +67,8 @@ def svg(figure: Any, name: str, says: str) -> str:
     """
     Return a figure as an svg element.
 
-    Parameters
-    ----------
-    figure : Figure
-        Made under ``look``.
-    name : str
-        Put before each id in it: a page holds many figures.
-    says : str
-        For those who cannot see it.
-
+    figure : made under ``look``.   name : put before each id in it: a page holds many figures.
+    says : for those who cannot see it.
     """
     from html import escape
 

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The tables of the report as rows of text: values, methods, budget, what was left out, origin."""
 
@@ -35,9 +29,9 @@ from odocal_ros.output.figures import (
     two_digits,
     with_sigma,
 )
+from odocal_ros.output.leg_table import shown_verdict
 from odocal_ros.output.summary import DEG, DEG_PER_HOUR
 from odocal_ros.output.track_table import before_label, in_pieces
-from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 

@@ -1,14 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Texts of the files that other programs load unchanged."""
 
+from dataclasses import replace
 import re
 from typing import Any
 from xml.etree import ElementTree
@@ -17,17 +12,22 @@ import numpy as np
 
 from odocal_ros.calib.result import BESIDE, Calibration
 from odocal_ros.data.arrays import Floats
-from odocal_ros.output.controller_files import CONTROLLERS, controllers
-from odocal_ros.output.device_files import DEVICES, devices
+from odocal_ros.output.controller_files import CONTROLLERS, controllers, DEVICES, devices
 from odocal_ros.output.file_head import about, head
-from odocal_ros.output.frames import IMU_FRAME
 from odocal_ros.output.geojson import geojson, TRACK
 from odocal_ros.output.leg_table import leg_table, LEGS
 from odocal_ros.output.noise_files import IMU_ERRORS, imu_errors, TWIST, wheel_covariance
-from odocal_ros.outside.names import for_comment, for_launch, for_shell, for_xml_comment
+from odocal_ros.outside.names import (
+    for_comment,
+    for_launch,
+    for_shell,
+    for_xml_comment,
+    is_frame,
+    one_line,
+)
 from odocal_ros.outside.yaml_text import no_date, parameters
-from odocal_ros.reasons import Verdict
-from odocal_ros.settings.config import Config
+from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.settings.config import Config, with_settings
 
 PARAMS = 'calibration.yaml'
 VELOCITY = 'vehicle_velocity_converter.param.yaml'
@@ -38,6 +38,7 @@ NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, CONTROLLERS, DEVICES, TRA
 # declared by the node for every drive; of one wheel they stay unknown
 TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width')
 AXES = 'xyz'
+IMU_FRAME = 'imu_link'      # REP-145, where nobody names one
 
 
 def texts(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
@@ -161,3 +162,20 @@ def _xml(root: Any, note: str) -> str:
 MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': controllers,
           'devices': devices, 'covariance': wheel_covariance, 'imu': imu_errors, 'track': geojson,
          'legs': leg_table}
+
+
+def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibration, Config]:
+    """
+    Return both with the IMU's frame in force.
+
+    frame : of the IMU's headers, as somebody sent it; a note says if it is not used.
+    """
+    if config.frames.imu or not frame:
+        return calibration, config
+    taken = frame.lstrip('/')       # as ROS 1 wrote it
+    taken = taken if is_frame(taken) else IMU_FRAME
+    if taken != frame:
+        note = Reason(Code.FRAME_REPLACED, 'the frame of the IMU messages, '
+                      f"'{one_line(frame[:60])}', is not valid in TF; {taken} is written")
+        calibration = replace(calibration, reasons=(*calibration.reasons, note))
+    return calibration, with_settings(config, {'frames.imu': taken})

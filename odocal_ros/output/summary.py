@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A calibration in words: one screen for a terminal, one sentence for an answer."""
 
@@ -34,10 +28,9 @@ from odocal_ros.output.figures import (
     with_sigma,
     with_unit,
 )
+from odocal_ros.output.leg_table import leg_verdicts, search_lines, shown_verdict
 from odocal_ros.output.reason_lines import bag_lines, reason_lines
-from odocal_ros.output.search_table import search_lines
 from odocal_ros.output.track_table import track_lines
-from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Verdict
 
 WIDTH = 98    # judgement: columns
@@ -57,18 +50,10 @@ def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
     """
     Return everything a person needs to judge a calibration, as plain text.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Of all legs.
-    styled : bool
-        The verdict in bold and in colour, for a terminal.
-    width : int
-        Columns; below 98 what is said twice or is of less use is left out.
-    rows : int, optional
-        Lines there are. Where they do not do, small errors, notes and the whole budget, in this
-        order, are left to the report: verdict, values and what to do are not.
-
+    calibration : of all legs.   styled : the verdict in bold and in colour, for a terminal.
+    width : columns; below 98 what is said twice or is of less use is left out.   rows : lines
+    there are. Where they do not do, small errors, notes and the whole budget, in this order, are
+    left to the report: verdict, values and what to do are not.
     """
     for small, notes, budget in ((True, True, True), (False, True, True), (False, False, True),
                                  (False, False, False)):

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Closed forms of Shi et al.'s error analysis: plane, chord, straight leg (eq. 11-14, 29-33).
@@ -51,33 +45,6 @@ def chord_error(x: Floats | float, y: Floats | float, dx: Floats | float, dy: Fl
     """
     S2 = np.hypot(x, y)
     return -K0 * S1 / S2**3 * (x * dx + y * dy), (y * dx - x * dy) / S2**2
-
-
-@dataclass(frozen=True)
-class StraightLeg:
-    """What a straight leg ends with: phi_U, dL, dlam, dalpha in rad, dK relative to K."""
-
-    phi_U: float
-    dL: float
-    dlam: float
-    dalpha: float
-    dK: float
-
-
-def straight_leg(phi_U0: float, eps_z: float, duration: float, velocity_E: float,
-                 velocity_N: float, latitude: float, radius: float) -> StraightLeg:
-    """
-    Return eq. (29)-(33) in closed form: constant velocity, m/s, for ``duration``, s.
-
-    phi_U0 : rad at the start.   eps_z : drift up, rad/s.   latitude : rad.   radius : m.
-    """
-    turned = phi_U0 * duration - eps_z * duration**2 / 2
-    return StraightLeg(
-        phi_U=phi_U0 - eps_z * duration,                                     # (29)
-        dL=-velocity_E / radius * turned,                                    # (30)
-        dlam=velocity_N / np.cos(latitude) / radius * turned,                # (31)
-        dalpha=-turned / duration,                                           # (33)
-        dK=eps_z**2 * duration**2 / 24)                                      # in place of (32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Error model of dead reckoning: how attitude errors and gyro drift become a wrong end point.
@@ -40,9 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.earth import C_en, E2, OMEGA, radii
-from odocal_ros.nav.rotations import transpose
+from odocal_ros.nav.earth import E2, OMEGA, radii
 from odocal_ros.paper.path import Path
 
 STATES = ('phi_E', 'phi_N', 'phi_U', 'dL', 'dlam', 'dh')
@@ -140,17 +132,8 @@ def propagate(path: Path, x_0: Floats | list[float], eps_b: Floats | list[float]
     """
     Return the states at every epoch, (m, 6).
 
-    Parameters
-    ----------
-    path : Path
-        Leg.
-    x_0 : (6,) array
-        States at its first epoch.
-    eps_b : (3,) or (m - 1, 3) array
-        Gyro drift in b, rad/s, constant or mean of each interval.
-    radius : float, optional
-        See the module.
-
+    path : leg.   x_0 : (6,) states at its first epoch.   eps_b : (3,) or (m - 1, 3) gyro drift in
+    b, rad/s, constant or mean of each interval.   radius : see the module.
     """
     S = _steps(path, radius, np.asarray(eps_b, dtype=float)[..., None])
     _scan(S)
@@ -215,18 +198,3 @@ def _after(then: Floats, first: Floats) -> Floats:
     both = then[..., :6] @ first
     both[..., 6:] += then[..., 6:]
     return both
-
-
-def in_fixed_axes(path: Path, x: Floats, origin: Origin) -> tuple[Floats, Floats]:
-    """
-    Return psi (rad) and dr (m) in the n of ``origin``, (m, 3) each, of states x, (m, 6).
-
-    The relation of the module's text; the ellipsoid's radii.
-    """
-    phi, dL, dlam, dh = x[:, :3], x[:, LAT], x[:, LON], x[:, H]
-    s, c = np.sin(path.latitude), np.cos(path.latitude)
-    meridian, normal = radii(path.latitude)
-    dtheta = np.stack([-dL, dlam * c, dlam * s], -1)
-    dr = np.stack([(normal + path.height) * c * dlam, (meridian + path.height) * dL, dh], -1)
-    C_nl = transpose(C_en(origin.latitude, origin.longitude)) @ C_en(path.latitude, path.longitude)
-    return np.einsum('mij,mj->mi', C_nl, phi - dtheta), np.einsum('mij,mj->mi', C_nl, dr)

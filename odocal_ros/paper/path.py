@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A leg as the error model of the paper sees it: recorded, or planned."""
 
@@ -15,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.dead_reckoning import Origin, Track
-from odocal_ros.nav.earth import C_en, radii
-from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy, transpose
+from odocal_ros.nav.earth import radii
+from odocal_ros.nav.rotations import matrix_from_rpy
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,43 +37,13 @@ class Path:
         return np.concatenate([[0.0], np.cumsum(step)])
 
 
-def path_of_track(track: Track, forward: Floats, origin: Origin,
-                  start_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Path:
-    """
-    Return the path of a dead-reckoned leg.
-
-    Parameters
-    ----------
-    track : Track
-        Attitude and travel in the n of ``origin``.
-    forward : (3,) array
-        Scale times forward axis in b, m per unit of travel.
-    origin : Origin
-        Where n is fixed.
-    start_n : (3,) array
-        Position of the track's first epoch in n, m.
-
-    """
-    position_n = track.P @ np.asarray(forward, dtype=float) + start_n
-    latitude, longitude, height = origin.to_geodetic(position_n).T
-    C_ln = transpose(C_en(latitude, longitude)) @ C_en(origin.latitude, origin.longitude)
-    step_n = np.diff(position_n, axis=0) / np.diff(track.t)[:, None]
-    velocity = np.einsum('mij,mj->mi', (C_ln[:-1] + C_ln[1:]) / 2, step_n)
-    C_nb = C_ln @ matrix_from_quat(track.q_nb)
-    return Path(track.t, latitude, longitude, height, velocity, C_nb)
-
-
 def planned_path(t: Floats, speed: Floats, yaw: Floats | float, latitude: float,
                  longitude: float = 0.0, height: float = 0.0) -> Path:
     """
     Return the path of a level drive that is not driven yet.
 
-    Parameters
-    ----------
-    t, speed, yaw : (m,) arrays
-        Epochs, s; speed, m/s, and ENU yaw of the vehicle, rad, there (straight in between).
-    latitude, longitude, height : float
-        Start, rad, rad, m (WGS 84).
+    t, speed, yaw : (m,) epochs, s; speed, m/s, and ENU yaw of the vehicle, rad, there (straight in
+    between).   latitude, longitude, height : start, rad, rad, m (WGS 84).
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 How well parameter sets do: distances at the fixes, and heading against course over ground.
@@ -58,17 +52,9 @@ def score(leg: PlanarLeg, sets: Floats, robust: bool = False, course: bool = Tru
     """
     Return the criteria of parameter sets.
 
-    Parameters
-    ----------
-    leg : PlanarLeg
-        What was driven.
-    sets : (m, 3) array
-        Left and right scale, m per unit, and heading, rad.
-    robust : bool
-        Weight fixes by their sigma and bound the pull of outliers in ``loss``.
-    course : bool
-        Compare with the course over ground too.
-
+    leg : what was driven.   sets : (m, 3) left and right scale, m per unit, and heading, rad.
+    robust : weight fixes by their sigma and bound the pull of outliers in ``loss``.   course :
+    compare with the course over ground too.
     """
     sets = np.atleast_2d(np.asarray(sets, dtype=float))
     m = len(sets)

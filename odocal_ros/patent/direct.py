@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Direct nonlinear least squares of left scale, right scale and heading on all fixes.
@@ -66,17 +60,8 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
     """
     Return the parameters that lower the (robust) mean square, by Gauss-Newton from x.
 
-    Parameters
-    ----------
-    leg : PlanarLeg
-        What was driven.
-    x : (3,) array
-        Where to begin: left, right (relative), heading (rad).
-    space : Space
-        Which parameters there are.
-    robust : bool
-        As in ``criteria.score``.
-
+    leg : what was driven.   x : (3,) where to begin: left, right (relative), heading (rad).
+    space : which parameters there are.   robust : as in ``criteria.score``.
     """
     q = space.q_of(x)
     iterations, settled = 0, False

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The embodiment of CN104359492A as given: radii +-0.03 m in seven levels, heading +-1 deg in nine.
@@ -107,15 +101,9 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
     """
     Run the embodiment on a leg.
 
-    Parameters
-    ----------
-    leg : PlanarLeg
-        Its start values belong to wheels of the nominal radius.
-    radius : float
-        Nominal radius of both wheels, m.
-    truth : (left, right, heading), optional
-        True errors, m and deg, for a line of their own.
-
+    leg : its start values belong to wheels of the nominal radius.   radius : nominal radius of
+    both wheels, m.   truth : (left, right, heading) true errors, m and deg, for a line of their
+    own.
     """
     heading_step = np.deg2rad(0.25)
     half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * heading_step])

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Dead reckoning in the plane for many parameter sets at once (CN104359492A, steps 2 to 4).
@@ -80,21 +74,12 @@ def planar_leg(track_left: Track, track_right: Track, t_fix: Floats, fixes_n: Fl
     """
     Project a leg of two wheels on the plane.
 
-    Parameters
-    ----------
-    track_left, track_right : Track
-        Dead reckoned with the travel of each wheel alone, same attitude.
-    t_fix, fixes_n, covariance_n : (k,), (k, 2 or 3), (k, 3, 3) arrays
-        Fixes, s, m, m^2; those that the tracks do not reach are left out.
-    start : (t, position_n)
-        Time, s, and antenna position, m, at which the tracks begin.
-    scales : (left, right)
-        Start values, m per unit.
-    pitch : float
-        Pitch mounting angle, rad: the forward axis is that of yaw 0.
-    lever_b : (3,) array
-        Antenna from the odometer's point, m.
-
+    track_left, track_right : dead reckoned with the travel of each wheel alone, same attitude.
+    t_fix, fixes_n, covariance_n : (k,), (k, 2 or 3), (k, 3, 3) fixes, s, m, m^2; those that the
+    tracks do not reach are left out.   start : (t, position_n) time, s, and antenna position, m,
+    at which the tracks begin.   scales : (left, right) start values, m per unit.   pitch : pitch
+    mounting angle, rad: the forward axis is that of yaw 0.   lever_b : (3,) antenna from the
+    odometer's point, m.
     """
     t_start, start_n = start
     tracks = track_left, track_right

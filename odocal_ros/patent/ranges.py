@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Ranges and levels of the search: what is tried about the start values, and why."""
 
@@ -48,13 +42,8 @@ def ranges_of(wheels: WheelsConfig, heading_sigma: float | None = None) -> Range
     """
     Return the ranges that the settings ask for.
 
-    Parameters
-    ----------
-    wheels : WheelsConfig
-        ``radius_range``, ``heading_range``, ``levels``.
-    heading_sigma : float, optional
-        Of heading and mounting angle together, rad, where both are known that well.
-
+    wheels : ``radius_range``, ``heading_range``, ``levels``.   heading_sigma : of heading and
+    mounting angle together, rad, where both are known that well.
     """
     if wheels.radius_range > 0:
         scale, why = wheels.radius_range, 'wheels.radius_range'

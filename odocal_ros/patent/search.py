@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The search of CN104359492A: an orthogonal array, then response surfaces, checked by least squares.
@@ -122,16 +116,9 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
     """
     Search left scale, right scale and heading.
 
-    Parameters
-    ----------
-    leg : PlanarLeg
-        What was driven; its start values are the middle of the ranges.
-    ranges : Ranges
-        What is searched.
-    robust : bool
-        Weight fixes by their sigma and bound the pull of outliers.
-    accuracy : (maximum, mean), optional
-        Distances asked for, m.
+    leg : what was driven; its start values are the middle of the ranges.   ranges : what is
+    searched.   robust : weight fixes by their sigma and bound the pull of outliers.   accuracy :
+    (maximum, mean) distances asked for, m.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Response surface: a second-order polynomial fitted to a criterion, its minimum in the range.
@@ -107,21 +101,10 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
     """
     Lower a criterion by surfaces.
 
-    Parameters
-    ----------
-    value : callable
-        (m, 3) parameters x to the criterion, (m,).
-    x : (3,) array
-        Where to begin: the best row of an array.
-    width : (3,) array
-        Half width of the first box in x: a step between levels.
-    half : (3,) array
-        Half of the range about zero that is searched.
-    space : Space
-        Which parameters there are.
-    widen : bool
-        Double the range where the minimum lies on its edge.
-
+    value : (m, 3) parameters x to the criterion, (m,).   x : (3,) where to begin: the best row of
+    an array.   width : (3,) half width of the first box in x: a step between levels.   half : (3,)
+    half of the range about zero that is searched.   space : which parameters there are.   widen :
+    double the range where the minimum lies on its edge.
     """
     walk = _Walk(value, space, np.asarray(half, dtype=float), np.asarray(width, dtype=float), x)
     first = last = walk.surface()

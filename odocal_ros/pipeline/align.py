@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Alignment of a leg: which standstill, which heading source.
@@ -51,20 +45,8 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     """
     Align a leg.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        Screened leg.
-    spans : (k, 2) array
-        Standstills, s.
-    metres_per_unit : float
-        Rough scale.
-    fixes_n : (n, 3) array
-        Fixes in n, m.
-    origin : Origin
-        Where n is fixed.
-    config : Config
-        Heading source, grade.
+    inputs : screened leg.   spans : (k, 2) standstills, s.   metres_per_unit : rough scale.
+    fixes_n : (n, 3) fixes in n, m.   origin : where n is fixed.   config : heading source, grade.
 
     Returns
     -------

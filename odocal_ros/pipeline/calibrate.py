@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The pipeline: one pure function from a leg to its result, one from results to a calibration.
@@ -28,8 +22,8 @@ from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.pipeline.leg_run import leg_result, run_leg
+from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.pipeline.prepare import prepare
-from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.local_frame import settings_by_frame
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
@@ -56,20 +50,11 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     """
     Take one leg from samples to result.
 
-    Parameters
-    ----------
-    leg : Leg
-        Raw samples between two marks, with pre-roll.
-    config : Config
-        Settings in force.
-    alignment : Alignment, optional
-        Used instead of the leg's own (a simulation puts errors in it).
-    notes : tuple of Reason
-        What the door knows of the data already (a truncated bag).
-    holdout : bool
-        Keep the last fifth of the distance back from the fit and check the correction on it.
-    progress : callable, optional
-        Called with each stage of the work, and with each pass of a fit.
+    leg : raw samples between two marks, with pre-roll.   config : settings in force.   alignment :
+    used instead of the leg's own (a simulation puts errors in it).   notes : what the door knows
+    of the data already (a truncated bag).   holdout : keep the last fifth of the distance back
+    from the fit and check the correction on it.   progress : called with each stage of the work,
+    and with each pass of a fit.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Several legs to one calibration: which legs count, what is said of the whole."""
 
@@ -40,16 +34,9 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     """
     Combine legs of one vehicle.
 
-    Parameters
-    ----------
-    legs : sequence of LegResult
-        At least one. Rejected legs are left out while any other is left, and named.
-    config : Config
-        Limits, frames.
-    carried : Carried, optional
-        Information of earlier legs on the vehicle.
-    imu : Carried, optional
-        Information of other legs on its IMU, if nothing is carried.
+    legs : at least one. Rejected legs are left out while any other is left, and named.   config :
+    limits, frames.   carried : information of earlier legs on the vehicle.   imu : information of
+    other legs on its IMU, if nothing is carried.
 
     Returns
     -------

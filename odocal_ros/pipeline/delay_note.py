@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A delay that the methods saw and estimated: say it, with the setting that takes it out."""
 
@@ -25,15 +19,8 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
     """
     Return DELAY_SEEN for each delay that is there for certain and matters at the speed driven.
 
-    Parameters
-    ----------
-    prepared : PreparedLeg
-        The leg.
-    seen : dict
-        'gnss' or 'odometer' -> by how many s its stamps are late, with what is set, and sigma.
-    scale : float
-        As the method that saw them found it.
-
+    prepared : the leg.   seen : 'gnss' or 'odometer' -> by how many s its stamps are late, with
+    what is set, and sigma.   scale : as the method that saw them found it.
     """
     speed = _speed(prepared) * scale
     notes = []

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """One leg: its methods run, what they found put together, the result chosen and checked."""
 
@@ -21,11 +15,10 @@ from odocal_ros.calib.drive import way_and_chord
 from odocal_ros.calib.result import LegResult, MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
-from odocal_ros.pipeline.method_run import Passed
+from odocal_ros.pipeline.method_run import Passed, Stage
 from odocal_ros.pipeline.methods import found_by, METHODS, run_methods
 from odocal_ros.pipeline.prepare import judged_by
 from odocal_ros.pipeline.prepared import PreparedLeg
-from odocal_ros.pipeline.stage import Stage
 from odocal_ros.pipeline.tracks import check_of, tracks
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid

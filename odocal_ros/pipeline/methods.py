@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The methods of a leg: each a pure function of it, and what becomes of one that breaks."""
 
@@ -21,9 +15,8 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.coarse_odometer import held_steps
 from odocal_ros.pipeline.delay_note import delay_notes
 from odocal_ros.pipeline.method_run import MethodRun, Passed
-from odocal_ros.pipeline.no_force import upright
 from odocal_ros.pipeline.prepared import PreparedLeg
-from odocal_ros.pipeline.slow_slip import held
+from odocal_ros.pipeline.scale_error import held, upright
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.screen import Inputs

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """From screened inputs to a leg that methods can be run on: placed, faced, aligned, reckoned."""
 
@@ -45,16 +39,9 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     """
     Prepare a leg for the methods.
 
-    Parameters
-    ----------
-    leg, inputs, config : Leg, Inputs, Config
-        The leg, screened, and the settings in force.
-    reasons : sequence of Reason
-        What was found of it so far.
-    alignment : Alignment, optional
-        Used instead of the leg's own.
-    holdout : bool
-        Keep the last fifth of the distance back from the fit.
+    leg, inputs, config : the leg, screened, and the settings in force.   reasons : what was found
+    of it so far.   alignment : used instead of the leg's own.   holdout : keep the last fifth of
+    the distance back from the fit.
 
     Returns
     -------

@@ -1,13 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
-"""An error of the scale beyond a method's own model, put into its sigmas and budget."""
+"""Errors of the scale beyond a method's own model, put into its sigmas and budget."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -27,17 +21,9 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
     """
     Return a method's result with an error in the sigmas of its scales.
 
-    Parameters
-    ----------
-    method, prepared : MethodResult, PreparedLeg
-        The result, and the leg.
-    name : str
-        Of the source.
-    relative : dict
-        1 sigma of each of SCALES, relative; of a wheel by default that of the scale factor.
-    shared : bool
-        The same in every leg of the vehicle.
-
+    method, prepared : the result, and the leg.   name : of the source.   relative : 1 sigma of
+    each of SCALES, relative; of a wheel by default that of the scale factor.   shared : the same
+    in every leg of the vehicle.
     """
     relative = dict.fromkeys(wheel_factors(method.estimates),
                              relative['scale_factor']) | dict(relative)
@@ -59,3 +45,38 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
                                                          relative['scale_factor']}),
         reasons=(*(r for r in method.reasons if r.code is not Code.SCALE_SIGMA_TOO_LARGE),
                  *judged))
+
+
+def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+    """
+    Return a method's result with the change of one wheel in its sigmas, or as it was.
+
+    A wheel that slips all along from some moment on, or loses air, leaves a scale between that of
+    before and that of after; the fixes do not determine which of them is the vehicle's.
+    """
+    change = abs(prepared.wheel_slips.change)
+    if not change:
+        return method
+    # halves of the path half the change apart in the mean of two wheels: the mean is a quarter off
+    mean, own = change / 2 / prepared.wheel_slips.count, change / 2
+    return with_scale_error(method, prepared, 'slow_wheel_slip', dict.fromkeys(SCALES, mean)
+                            | dict.fromkeys(wheel_factors(method.estimates), own))
+
+
+def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+    """
+    Return a method's result as it was, or of an IMU without force: hills in, no angles.
+
+    ``screening/force.py`` says why.
+    """
+    if prepared.inputs.felt:
+        return method
+    hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a path longer
+    method = with_scale_error(method, prepared, 'hills', dict.fromkeys(SCALES, hills))
+    # what NO_ACCELEROMETER says of the angles, with another remedy
+    said = {Code.PITCH_NOT_DETERMINED} | (
+        set() if prepared.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
+    return replace(
+        method, reasons=tuple(r for r in method.reasons if r.code not in said), estimates={
+            name: replace(e, value=None, sigma=None) if name == 'pitch_mounting_angle' else e
+            for name, e in method.estimates.items()})

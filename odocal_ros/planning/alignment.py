@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The alignment that a planned drive will have: from the functions that align a recorded one."""
 
@@ -39,17 +33,8 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
     """
     Return the alignment a drive will have, and what is to be said of it.
 
-    Parameters
-    ----------
-    drive : PlannedDrive
-        As planned.
-    config : Config
-        Grade, heading source and its sigma.
-    fix_sigma : float
-        Of one fix, m, for a course.
-    spans : list of (begin, end)
-        Standstills, s.
-
+    drive : as planned.   config : grade, heading source and its sigma.   fix_sigma : of one fix,
+    m, for a course.   spans : list of (begin, end) standstills, s.
     """
     grade = grade_of(config.imu)
     before = [span for span in spans if span[0] <= 0.5]

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A drive not yet driven, or only looked at: speed, direction and slope by time."""
 
@@ -131,15 +125,9 @@ def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.p
     """
     Return the drive of a speed and a turn rate by time; marked where it first moves and ends.
 
-    Parameters
-    ----------
-    t, speed, yaw_rate : (m,) arrays
-        s, m/s, rad/s (left positive).
-    heading : float
-        Of the vehicle at the start, clockwise from north, rad.
-    more :
-        Further fields of PlannedDrive; slope is 0 where it is not given.
-
+    t, speed, yaw_rate : (m,) s, m/s, rad/s (left positive).   heading : of the vehicle at the
+    start, clockwise from north, rad.   more : further fields of PlannedDrive; slope is 0 where
+    it is not given.
     """
     t, speed, yaw_rate = (np.asarray(x, dtype=float) for x in (t, speed, yaw_rate))
     turned = np.concatenate([[0.0], np.cumsum((yaw_rate[:-1] + yaw_rate[1:]) / 2 * np.diff(t))])

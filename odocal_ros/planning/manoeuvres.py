@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Manoeuvres to add to a planned drive; they determine what a straight run does not."""
 
@@ -74,15 +68,8 @@ def inserted(drive: PlannedDrive, k: int, t: Floats, speed: Floats,
     """
     Return the drive with a piece after row k; what follows comes later and turned.
 
-    Parameters
-    ----------
-    drive : PlannedDrive
-        As planned.
-    k : int
-        Row between the marks.
-    t, speed, turned : (m,) arrays
-        s since row k, above 0 and rising; m/s; rad turned to the left since row k.
-
+    drive : as planned.   k : row between the marks.   t, speed, turned : (m,) s since row k, above
+    0 and rising; m/s; rad turned to the left since row k.
     """
     return replace(
         drive, t=np.concatenate([drive.t[:k + 1], drive.t[k] + t, drive.t[k + 1:] + t[-1]]),

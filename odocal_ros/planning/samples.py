@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Ideal samples of a planned drive: what IMU, odometer and fixes would show without any error."""
 
@@ -64,15 +58,9 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
     """
     Return the samples that a drive would give were nothing in error.
 
-    Parameters
-    ----------
-    drive : PlannedDrive
-        As planned. Mounting angles are zero, the scale is 1: a sigma does not hang on them.
-    sigmas : Sigmas
-        Lever arms, fix rate and sigma, size of a count, heading from outside.
-    spacing : float
-        s between keyframes.
-
+    drive : as planned. Mounting angles are zero, the scale is 1: a sigma does not hang on them.
+    sigmas : lever arms, fix rate and sigma, size of a count, heading from outside.   spacing : s
+    between keyframes.
     """
     config = sigmas.config
     spans = np.array(drive.standstills(config.leg.standstill)).reshape(-1, 2)

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the smoother will make of a planned drive: its own covariance, at what is true."""
 
@@ -42,12 +36,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     The rows are those of ``smooth`` at the true states of ideal samples, the levels those of
     ``planned_levels``, and what is said of the outcome is said by the code that says it of a fit.
 
-    Parameters
-    ----------
-    drive, sigmas : PlannedDrive, Sigmas
-        As for ``predict``.
-    spacing : float, optional
-        s between keyframes; as ``spacing_for`` has it.
+    drive, sigmas : as for ``predict``.   spacing : s between keyframes; as ``spacing_for`` has it.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The axles of a vehicle: those that count, and those that steer."""
 
@@ -131,15 +125,8 @@ def steering_path(t: Floats, turn: Floats, s: Floats, ahead: float = 0.0,
     """
     Return the path of a steered wheel beyond that of a fixed one, by its squared distance: (n,).
 
-    Parameters
-    ----------
-    t : (n,) array
-        Equal steps, s.
-    turn, s : (n,) arrays
-        Turn of the vehicle, rad, and travel of its unsteered axle.
-    ahead, left : float
-        Place of the wheel from the middle of that axle, in the unit of s.
-
+    t : (n,) equal steps, s.   turn, s : (n,) turn of the vehicle, rad, and travel of its unsteered
+    axle.   ahead, left : place of the wheel from the middle of that axle, in the unit of s.
     """
     rate, speed = np.gradient(turn, t), np.gradient(s, t)
     speed = np.convolve(np.pad(speed, len(SMOOTH) // 2, mode='edge'), SMOOTH, mode='valid')

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Clocks: how far apart the topics' stamps are, and whether one was set during the leg."""
 
@@ -35,13 +29,8 @@ def judge_clocks(leg: Leg, offsets: Mapping[str, float],
     """
     Compare each topic's clock with the IMU's, at equal times of arrival.
 
-    Parameters
-    ----------
-    leg : Leg
-        As it came.
-    offsets, labels : dict
-        Of each slot: s to be added to its stamps, and what people call it.
-
+    leg : as it came.   offsets, labels : of each slot: s to be added to its stamps, and what
+    people call it.
     """
     found = [r for slot in ('imu', *TOPICS) for r in _was_set(getattr(leg, slot), labels[slot],
                                                               leg.start_ns)]

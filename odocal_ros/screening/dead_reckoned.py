@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 """
 Fixes of a receiver that dead-reckons where it has no satellites, and jumps when it has them again.
 
@@ -40,17 +34,8 @@ def reckoned(t_fix: Floats, fixes_n: Floats, path: Floats, turned: Callable[[Flo
     """
     Return a mask of fixes that a receiver has reckoned, and FIXES_DEAD_RECKONED.
 
-    Parameters
-    ----------
-    t_fix : (k,) array
-        s.
-    fixes_n : (k, 3) array
-        m.
-    path : (k,) array
-        Path length by the odometer, m, its scale good to 30 %.
-    turned : callable
-        Angle turned about the vertical by (m,) times, rad: (m,).
-
+    t_fix : (k,) s.   fixes_n : (k, 3) m.   path : (k,) path length by the odometer, m, its scale
+    good to 30 %.   turned : angle turned about the vertical by (m,) times, rad: (m,).
     """
     spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], path, turned)
     found = np.zeros(len(t_fix), bool)

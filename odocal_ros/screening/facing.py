@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Where an IMU faces in the vehicle: forward is where speeding up pushes it.
@@ -66,17 +60,9 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
     """
     Return the pushes of a drive, None where it is too short.
 
-    Parameters
-    ----------
-    t, w, f : (n,), (n, 3), (n, 3) arrays
-        Times, s, turn rate, rad/s, and specific force, in any one frame fixed to the IMU.
-    up : (3,)
-        Unit vector, as gravity shows.
-    travel : Travel
-        Odometer; positive is taken as forward.
-    metres_per_unit : float
-        Its rough scale.
-
+    t, w, f : (n,), (n, 3), (n, 3) times, s, turn rate, rad/s, and specific force, in any one frame
+    fixed to the IMU.   up : (3,) unit vector, as gravity shows.   travel : odometer; positive is
+    taken as forward.   metres_per_unit : its rough scale.
     """
     t0, t1 = max(t[0], travel.t[0]) + BIN_S, min(t[-1], travel.t[-1]) - BIN_S
     if t1 - t0 < FEWEST_BINS_FACING * BIN_S:
@@ -103,13 +89,7 @@ def facing(inputs: 'Inputs', metres_per_unit: float) -> Facing | None:
     Changes from bin to bin are compared, so that a slope, which changes slowly, is no push. The
     turns have a factor of their own: a gyro of the wrong sign does not turn the answer.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        In the configured body frame.
-    metres_per_unit : float
-        As for ``pushes``.
-
+    inputs : in the configured body frame.   metres_per_unit : as for ``pushes``.
     """
     mean = inputs.usual_f_b
     size = float(np.linalg.norm(mean))

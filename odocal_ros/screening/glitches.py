@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Values no sensor means: beyond any range, or alone against all their neighbours."""
 
@@ -102,14 +96,8 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
     """
     Return a mask of rows that jump away from their neighbours and back.
 
-    Parameters
-    ----------
-    t : (n,) array
-        Times, s, rising.
-    x : (n, k) array
-        Values.
-    least : float
-        Smallest bound, from one row to the next, that may be a glitch.
+    t : (n,) times, s, rising.   x : (n, k) values.   least : smallest bound, from one row to the
+    next, that may be a glitch.
 
     Returns
     -------

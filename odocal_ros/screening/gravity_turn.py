@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Fit of the direction of gravity to the gyro, one coefficient for each axis of the gyro.
@@ -74,17 +68,9 @@ def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
     """
     Return the coefficients of the gyro axes, None where the drive is too short.
 
-    Parameters
-    ----------
-    t, w, f : (n,), (n, 3), (n, 3) arrays
-        Times, s, turn rate, rad/s, and specific force, m/s^2, in one frame fixed to the IMU.
-    axes : (3, 3) array
-        Rows e1, e2, up in that frame: right-handed.
-    travel : Travel
-        Odometer; positive is forward.
-    metres_per_unit : float
-        Its approximate scale.
-
+    t, w, f : (n,), (n, 3), (n, 3) times, s, turn rate, rad/s, and specific force, m/s^2, in one
+    frame fixed to the IMU.   axes : (3, 3) rows e1, e2, up in that frame: right-handed.   travel :
+    odometer; positive is forward.   metres_per_unit : its approximate scale.
     """
     begin, end = max(t[0], travel.t[0]), min(t[-1], travel.t[-1])
     edges = begin + ROW_S * np.arange(max(int((end - begin) / ROW_S), 0) // ROWS_A_SECOND

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """An odometer's rows as steps of travel, as they come: rough, for what cannot wait."""
 
@@ -13,6 +7,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints, Values
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
+from odocal_ros.screening.glitches import beyond
 
 # counts, rad, m: less is not called motion
 STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
@@ -31,12 +26,17 @@ class Steps:
         return STILL_TRAVEL.get(self.form.scale_unit, 0.02)
 
     def of(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
-        """Return the step of each row since the row before, its stamp, ns, and its duration, s."""
-        stamps, values = block.stamp_ns, block.value
+        """
+        Return the step of each row since the row before, its stamp, ns, and its duration, s.
+
+        Rows without a possible value are passed over.
+        """
+        good = ~beyond('value', block.value)
+        stamps, values = block.stamp_ns[good], block.value[good]
         if self._last is not None:
             stamps = np.r_[self._last[0], stamps]
             values = np.r_[self._last[1], values]
-        self._last = (block.stamp_ns[-1:], block.value[-1:])
+        self._last = (stamps[-1:], values[-1:])
         seconds = np.diff(stamps) * 1e-9
         if self.form.quantity == 'increment':
             steps = values[1:]

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Reversing with an unsigned counter: it counts up while accelerations point backwards.
@@ -39,14 +33,9 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     """
     Return the intervals of reversing in which the counter counts up: (m, 2) s.
 
-    Parameters
-    ----------
-    travel : Travel
-        Of the odometer, any unit.
-    t_imu, w_b, f_b : (n,), (n, 3), (n, 3) arrays
-        s, turn rate, rad/s, bias and all, specific force, m/s^2.
-    between : (2,)
-        The marks, s; earlier travel gives the usual values.
+    travel : of the odometer, any unit.   t_imu, w_b, f_b : (n,), (n, 3), (n, 3) s, turn rate,
+    rad/s, bias and all, specific force, m/s^2.   between : (2,) the marks, s; earlier travel gives
+    the usual values.
 
     Returns
     -------

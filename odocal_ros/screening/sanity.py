@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Checks of units and axes of an IMU at rest or on average."""
 
@@ -29,16 +23,9 @@ def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
     """
     Judge units and axes of an IMU.
 
-    Parameters
-    ----------
-    mean : (3,)
-        Specific force as it usually is (its median), m/s^2, in the configured body frame.
-    w_b : (n, 3) array
-        Turn rate there, rad/s.
-    C_bi : (3, 3)
-        Nominal rotation configured.
-    imu : ImuConfig
-        Its scales are in the figures already.
+    mean : (3,) specific force as it usually is (its median), m/s^2, in the configured body
+    frame.   w_b : (n, 3) turn rate there, rad/s.   C_bi : (3, 3) nominal rotation configured.
+    imu : its scales are in the figures already.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Screening: a raw leg to clean arrays on one time axis, with a sentence for each thing found.
@@ -33,7 +27,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
 from odocal_ros.screening.clocks import judge_clocks
 from odocal_ros.screening.dead_reckoned import reckoned
-from odocal_ros.screening.fix_screen import usable_fixes
+from odocal_ros.screening.fix_screen import contradicted, usable_fixes
 from odocal_ros.screening.force import with_force
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
@@ -42,7 +36,6 @@ from odocal_ros.screening.other_imus import other_imus
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import LABEL, usable_rows
-from odocal_ros.screening.velocity_screen import contradicted
 from odocal_ros.screening.wheel_travel import wheels
 from odocal_ros.settings.config import Config, SIDES
 

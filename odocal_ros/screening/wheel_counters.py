@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Wheel counters that roll over below the range of their message type, each separately.
@@ -104,14 +98,8 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
     """
     Return rows with hidden rollovers corrected, the reasons, and the remaining uncertainty.
 
-    Parameters
-    ----------
-    t, samples : (n,) s, OdometerSamples
-        Usable rows of a running count.
-    step : (n - 1,)
-        Its steps, rollovers of the type's span undone.
-    side : str
-        Whose counter it is, for people.
+    t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its
+    steps, rollovers of the type's span undone.   side : whose counter it is, for people.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Wheels that do not count as wheels: one dead or hung, one that counts against the other.
@@ -36,14 +30,8 @@ def broken_wheels(axle: Sequence[Travel], imu: Imu,
     """
     Return WHEEL_DEAD and WHEEL_REVERSED where one wheel fails, empty where both count.
 
-    Parameters
-    ----------
-    axle : (2,) sequence of Travel
-        The left and the right wheel, scale units.
-    imu : (t, w_b, f_b)
-        (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.
-    between : (2,)
-        The marks, s.
+    axle : (2,) Travel of the left and the right wheel, scale units.   imu : (t, w_b, f_b)
+    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.   between : (2,) the marks, s.
 
     Returns
     -------

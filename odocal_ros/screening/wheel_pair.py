@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Two wheels and the gyro on one time grid, and the line that joins them."""
 
@@ -88,16 +82,9 @@ def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floa
     """
     Return the coefficients of y = A x by least squares, rows far off left out by Tukey's weights.
 
-    Parameters
-    ----------
-    A, y : (n, k), (n,) arrays
-        Design and values.
-    floor : float
-        Least sigma of a value.
-    prior : (k,) array, optional
-        Sigmas of the coefficients about zero, inf: free.
-    start : (k,) array, optional
-        Coefficients that many rows are known to follow; default: least squares.
+    A, y : (n, k), (n,) design and values.   floor : least sigma of a value.   prior : (k,) sigmas
+    of the coefficients about zero, inf: free.   start : (k,) coefficients that many rows are known
+    to follow; default: least squares.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Drives with faults at random places and of random sizes, fed to ``odometry`` and held to the truth.
@@ -192,7 +186,8 @@ def worst_of(drive, poses, topics, path=0):
     """Return the largest error over sigma of the poses, and what it is of."""
     set_ns, by_ns = topics.get('set', (0, 0))
     stamp_ns = np.array([p.stamp_ns for p in poses])
-    anew = path > 0 and stamp_ns[0] >= set_ns + by_ns
+    # a pose is on the clock of its IMU row: after a step of it on the new one
+    anew = (stamp_ns >= set_ns + max(by_ns, 0)) | (path > 0 and stamp_ns[0] >= set_ns + by_ns)
     t = (stamp_ns - by_ns * anew - drive.options.start_ns) * 1e-9
     inside = (t > 0) & (t < drive.motion.duration)
     if not inside.all():

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Faulty streams into odometry: nothing unsaid, no NaN, no pose beyond five of its sigmas."""
 
@@ -13,8 +7,9 @@ from faulty_streams import calibration, columns_of, drive_of, run, SIGMAS, strea
 import numpy as np
 import pytest
 
-from odocal_ros.apply.arrivals import Arrivals
+from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
 from odocal_ros.apply.odometry import Odometry
+from odocal_ros.apply.spikes import SpikeScreen
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import with_settings
@@ -108,6 +103,39 @@ def test_angles_of_1e300_do_not_end_it(number):
     assert said
 
 
+WITHIN = {143: 'imu clock set back by 0.117 s', 168: 'turn of 0.155 rad/s in 5 rows',
+          184: 'heading off by 0.12 rad', 196: 'turn of 0.167 rad/s for 1.5 s',
+          308: 'a gap of a counter at rest', 310: 'speeds of 548 m/s',
+          353: 'restart while it brakes', 371: 'imu clock ahead by 0.32 s',
+          828: 'a counter that hangs for 0.4 s', 905: 'a counter that hangs for 4.3 s'}
+
+
+@pytest.mark.parametrize('number', WITHIN, ids=WITHIN.get)
+def test_streams_that_were_beyond_their_covariance(number):
+    _, faults, worst, what, _, said = stream(1, number)
+    assert worst <= SIGMAS, (faults, what)
+    assert said
+
+
+def test_a_step_of_the_gyro_is_doubted_where_it_stands_alone():
+    t = np.arange(200) * 0.01
+    w = 0.002 * np.random.default_rng(1).standard_normal((200, 3))
+    turns = np.minimum(np.maximum(t - 1.0, 0.0) * 2.0, 0.2)        # as a vehicle starts to turn
+    for add, odd in ((0.2 * (t >= 1.0), 1), (turns, 0)):
+        for block in (1, 7, 200):
+            screen, found, at = SpikeScreen(), [], 1
+            x = np.hstack([w + add[:, None] * [0, 0, 1], np.full((200, 3), 5.0) + w])
+            x[0] = x[1]
+            last = 0
+            while at < len(t):
+                rows = slice(last, min(at + block, len(t)))
+                keep, strange, hold = screen.sift(t[rows], x[rows])
+                found += [k + last for k in np.flatnonzero(strange[1:hold].any(axis=1)) + 1]
+                last, at = last + hold - 1, max(at + block, last + hold)
+            assert found[:odd] == [100] * odd
+            assert bool(found) is bool(odd)
+
+
 def test_a_turn_that_no_vehicle_begins_is_doubted():
     drive = drive_of(0)
     topics = columns_of(drive)
@@ -119,6 +147,23 @@ def test_a_turn_that_no_vehicle_begins_is_doubted():
     before, after = (np.sqrt(poses[k][1].pose_cov[5, 5]) for k in (150, -1))
     assert before < 0.05
     assert 0.3 < after < 2.0         # of 1 rad that it turned falsely
+
+
+def test_a_clock_that_moved_a_little_shows_and_late_messages_do_not():
+    stamp = 10**18 + np.arange(0, 20 * SECOND, SECOND // 50)
+    late = np.random.default_rng(1).exponential(5e6, len(stamp)).astype(np.int64)
+    arrivals = Arrivals()
+    assert arrivals.believed(stamp, np.maximum.accumulate(stamp + late)).all()
+    assert arrivals.moved_s(MOVED_ROWS) == 0.0
+    for by in (0.1, -0.1):
+        odd = stamp.copy()
+        odd[500:] += int(by * SECOND)
+        arrivals = Arrivals()
+        arrivals.believed(odd[:510], np.maximum.accumulate(stamp + late)[:510])
+        assert arrivals.moved_s(MOVED_ROWS) == pytest.approx(0.1, abs=0.015)
+        assert arrivals.moved_s(STAYS_ROWS) == 0.0
+        arrivals.believed(odd[510:560], np.maximum.accumulate(stamp + late)[510:560])
+        assert arrivals.moved_s(STAYS_ROWS) == pytest.approx(0.1, abs=0.015)
 
 
 def test_bags_played_fast_are_believed_and_clocks_that_are_set_are_not():

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the smoother leaves over: against the equations made anew, closed forms, drawn errors."""
 
@@ -140,7 +134,7 @@ def test_where_no_odometer_was_there_is_nothing():
 def test_sigmas_of_the_biases_are_honest_all_along():
     apart = []
     for seed in range(1, 9):
-        drive, config, leg, _, fit = fitted(seed=seed)
+        drive, config, leg, _, fit = fitted(seed=seed, duration=120.0)
         true = truth(drive, config, leg)
         sigma = bias_sigmas(fit.marginals(), 1.0)
         off = np.stack([fit.state.gyro_bias - true.gyro_bias,

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Legs combined on their border are one fit of all their rows, whatever each is blind to."""
 
@@ -24,7 +18,7 @@ from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
 from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS
 from odocal_ros.pipeline.combination import combine
-from odocal_ros.pipeline.slow_slip import held
+from odocal_ros.pipeline.scale_error import held
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import with_settings
 

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Each wheel beside the mean of both: ratio and track width on simulated drives, and refusals."""
 
@@ -54,7 +48,7 @@ def codes(method):
 
 
 @pytest.mark.parametrize('options', [
-    {'seed': 1}, {'seed': 2}, {'seed': 3, 'imu_grade': 'consumer'},
+    {'seed': 1}, {'seed': 3, 'imu_grade': 'consumer'},
     {'seed': 4, 'fix_noise': 'rtk'},
     {'seed': 5, 'odometer': 'angle'}, {'seed': 7, 'slip_walk': 0.01},
     {'seed': 8, 'wheel_difference': -0.5}, {'seed': 9, 'scenario': 'out_and_back'}],

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The stated covariance of a wheel twist against the errors of simulated drives."""
 
@@ -47,20 +41,20 @@ def errors_over_sigma(made):
 
 
 @pytest.mark.parametrize('options', [
-    {}, {'two_wheels': True}, {'two_wheels': True, 'slip_walk': 0.01},
+    {}, {'two_wheels': True, 'slip_walk': 0.01},
     {'two_wheels': True, 'odometer_rate': 50.0, 'scenario': 'yard', 'fix_noise': 'rtk'},
     {'odometer': 'angle', 'slip_walk': 0.01, 'odometer_rate': 20.0},
     {'odometer': 'speed', 'speed_noise': 0.02},
-    {'odometer': 'speed', 'seed': 12, 'real': Real(speed_step=1 / 3.6)},
+    {'odometer': 'speed', 'seed': 12, 'real': Real(speed_step=1 / 3.6), 'duration': 500.0},
     {'odometer': 'speed', 'speed_noise': 0.005, 'scenario': 'motorway',
      'real': Real(speed_law=0.01)}], ids=str)
 def test_errors_over_sigma_are_one(options):
     """
-    With 500 s at 10 Hz or more, the rms of independent errors is within 1 % of one.
+    With 300 s at 10 Hz or more, the rms of independent errors is within 1.3 % of one.
 
     The tolerance is for what is not independent: constants, one cruise of a quantised speed.
     """
-    made = drive(**({'scenario': 'town', 'duration': 500.0, 'seed': 4, 'imu_grade': 'industrial',
+    made = drive(**({'scenario': 'town', 'duration': 300.0, 'seed': 4, 'imu_grade': 'industrial',
                      'odometer_rate': 10.0} | options))
     for ratio in errors_over_sigma(made):
         assert 0.85 < ratio < 1.15

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Wheels that fail one by one are named, with where; wheels that count are let be."""
 
@@ -322,14 +316,14 @@ def test_a_gyro_that_does_not_turn_is_no_ground_for_factors():
 
 def test_a_gyro_of_noise_ends_in_reasons_too():
     """Heights left out in the last round: what was solved with them has another length."""
-    made = drive(**TOWN, seed=3, imu_grade='industrial')
+    made = drive(**TOWN | {'duration': 200.0}, seed=3, imu_grade='industrial')
     noise = np.random.default_rng(0).normal(0.0, 0.3, made.imu.w_i.shape)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
     assert calibrate(leg, settings(made, method='smoother')).methods['smoother'].reasons
 
 
 def test_a_gyro_of_less_noise_widens_the_track_width():
-    made = drive(**TOWN, seed=3, imu_grade='consumer')
+    made = drive(**TOWN | {'duration': 200.0}, seed=3, imu_grade='consumer')
     noise = np.random.default_rng(0).normal(0.0, 0.1, made.imu.w_i.shape)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
     noisy, clean = (calibrate(x, settings(made, method='smoother')).methods['smoother']

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The running estimate: what it costs, how near to the result it is, what it says is lacking."""
 
@@ -186,7 +180,8 @@ def test_the_size_of_an_imperfection_is_carried_on(config):
 
     offs = []
     for seed in range(3, 11):
-        drive = drive_of(accel_scale_error=3e-3, seed=seed)       # as large as is usual
+        # as large as is usual
+        drive = drive_of(accel_scale_error=3e-3, seed=seed, duration=130.0)
         first, later = looked(drive, graded, (40.0, 60.0))
         assert (first.once_s, later.once_s) == (0.0, 0.0)     # not grown by half: no cold start
         leg = SmootherSoFar().look(later.leg, graded)

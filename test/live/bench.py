@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A bench for the node: its process, a client beside it, and waits that end with the event."""
 
@@ -79,6 +73,11 @@ def wait_for(condition, what: str, patience: float = PATIENCE):
             return result
         time.sleep(0.005)
     raise AssertionError(f'{what} did not come within {patience:g} s')
+
+
+def given(settings: dict[str, object]) -> list[str]:
+    """Return settings as ROS arguments."""
+    return [x for name, value in settings.items() for x in ('-p', f'{name}:={value}')]
 
 
 class Client:

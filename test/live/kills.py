@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Kill the node in the middle of a leg and look what its journal has left of it."""
 
@@ -16,8 +10,8 @@ import json
 from pathlib import Path
 import time
 
-from bench import Client, NodeProcess, wait_for
-from player import messages_of, part, Player
+from bench import wait_for
+from player import messages_of, part, playing_to
 
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.library.legs import marked_legs
@@ -57,10 +51,7 @@ def drive():
 def killed(driven, moment_s: float, folder: Path, *args: str) -> Remains:
     """Kill a node that records a leg of a drive ``moment_s`` after its start mark."""
     types, sent = driven
-    node, client = NodeProcess('-p', f'output.directory:={folder}', *args), Client()
-    try:
-        player = Player(client.node, types)
-        wait_for(player.matched, 'subscriptions')
+    with playing_to(types, '-p', f'output.directory:={folder}', *args) as (node, client, player):
         player.play(part(sent, BEFORE_S, START_S), 3 * SPEED)
         client.until(state='idle')
         answer = client.call('start_leg')
@@ -75,9 +66,6 @@ def killed(driven, moment_s: float, folder: Path, *args: str) -> Remains:
             node.process.kill()
             node.wait()
             moment_s = time.monotonic() - marked
-    finally:
-        node.end()
-        client.close()
     journal, = (folder / 'journal').iterdir()
     return remains(journal, moment_s, end_ns, int(status['leg_start_ns']), told_s)
 
@@ -122,10 +110,7 @@ class Files:
 def killed_at_files(driven, stage: str, moment_s: float, folder: Path, *args: str) -> Files:
     """Kill a node ``moment_s`` after ~/stop_leg was asked, or ~/save after that (stage)."""
     types, sent = driven
-    node, client = NodeProcess('-p', f'output.directory:={folder}', *args), Client()
-    try:
-        player = Player(client.node, types)
-        wait_for(player.matched, 'subscriptions')
+    with playing_to(types, '-p', f'output.directory:={folder}', *args) as (node, client, player):
         player.play(part(sent, BEFORE_S, START_S), 3 * SPEED)
         client.until(state='idle')
         client.start()
@@ -139,9 +124,6 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path, *args: st
         time.sleep(max(0.0, moment_s - (time.monotonic() - begin)))
         node.process.kill()
         node.wait()
-    finally:
-        node.end()
-        client.close()
     journal, = (folder / 'journal').iterdir()
     results = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()
                and path.name != 'journal' and not path.name.startswith('.')]
@@ -151,6 +133,12 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path, *args: st
                  [path for path, c in contents.items() if c is None and any(path.iterdir())],
                  not latest.is_symlink() or bool(whole_content(latest)),
                  replayed(journal, *NUMBERS))
+
+
+def same_result(live: dict, offline: dict, *more: str) -> None:
+    """Assert that two results are the same in every digit, and more of their parts."""
+    for key in ('result', 'verdict', 'reasons', 'methods', 'check', *more):
+        assert live[key] == offline[key], key
 
 
 def wrong(left: Files | Remains) -> list[float]:

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A small rclpy player: publishes serialised messages by their stamps, N times real time."""
 
@@ -18,7 +12,7 @@ import threading
 import time
 from types import SimpleNamespace
 
-from bench import wait_for
+from bench import Client, NodeProcess, wait_for
 import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
@@ -65,6 +59,14 @@ class Player:
             kind = getattr(importlib.import_module(f'{package}.{folder}'), name)
             self.publishers[slot] = node.create_publisher(kind, names[slot], qos)
 
+    @classmethod
+    def connected(cls, client: Client, types: dict[str, str], names: dict[str, str] | None = None
+              ) -> 'Player':
+        """Return a player to whose topics somebody has subscribed."""
+        player = cls(client.node, types, names)
+        wait_for(player.matched, 'subscriptions of the node')
+        return player
+
     def matched(self) -> bool:
         """Return whether every topic has a subscriber."""
         return all(p.get_subscription_count() for p in self.publishers.values())
@@ -92,6 +94,17 @@ class Player:
             if ahead > 0.001 and self._stop.wait(ahead):
                 return
             self.publishers[one.slot].publish(one.raw)
+
+
+@contextlib.contextmanager
+def playing_to(types: dict[str, str], *args: str, names: dict[str, str] | None = None, **more):
+    """Yield a node with these arguments, a client and a player that it listens to; all end."""
+    node, client = NodeProcess(*args, **more), Client()
+    try:
+        yield node, client, Player.connected(client, types, names)
+    finally:
+        node.end()
+        client.close()
 
 
 def part(messages: list[Sent], first_s: float, last_s: float) -> list[Sent]:

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The node inside another program: its executor, its context, and a pipeline that fails."""
 
@@ -128,8 +122,7 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
     drive = simulate(SimOptions(duration=180.0, imu_rate=20.0, odometer_rate=10.0,
                                 odometer='speed', fix_noise='rtk'))
     types, messages = messages_of(drive)
-    player = Player(client.node, types, {'fix': 'gps/fix'})
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, types, {'fix': 'gps/fix'})
     player.play(part(messages, 45, 60), 30)
     client.until(state='idle')
     assert client.call('start_leg').success

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A flood of parameters in a leg, and a sender that restarts in it: the node goes on."""
 
@@ -42,8 +36,7 @@ def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(start,
         scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
         fix_noise='rtk', imu_grade='tactical')))
     node, client = start(), connect()
-    player = Player(client.node, types)
-    wait_for(player.matched, 'subscriptions of the node')
+    player = Player.connected(client, types)
     player.play(part(sent, 45, 60), SPEED)
     client.start()
     with player.playing(part(sent, 60, 95), SPEED):
@@ -58,8 +51,7 @@ def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(start,
     assert len(node.lines) < 20
     for publisher in player.publishers.values():
         client.node.destroy_publisher(publisher)
-    player = Player(client.node, types)
-    wait_for(player.matched, 'subscriptions of the node, again')
+    player = Player.connected(client, types)
     player.play(part(sent, 95, 115), SPEED)
     stopping = client.ask('stop_leg')
     player.play(part(sent, 115, 117), SPEED)

@@ -1,22 +1,15 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The IMU falls silent in a leg: said at once, the leg is cut there, its parts make the result."""
 
 import json
 from pathlib import Path
-import subprocess
-import sys
 from types import SimpleNamespace
 
-from bench import Client, NodeProcess, ROOT, wait_for
-from player import messages_of, part, Player
+from bench import given, wait_for
+from kills import NUMBERS, replayed, same_result
+from player import messages_of, part, playing_to
 import pytest
 
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -37,12 +30,8 @@ def seen(tmp_path_factory):
             or not GAP[0] <= (one.stamp_ns - first_ns) * 1e-9 < GAP[1]]
     found = SimpleNamespace(truth=drive.truth, folder=tmp_path_factory.mktemp('results'))
     # the status comes seldom by itself: what is said at once is seen to be
-    found.node = NodeProcess('-p', f'output.directory:={found.folder}',
-                             '-p', 'publish.rate:=0.2')
-    client = Client()
-    try:
-        player = Player(client.node, types)
-        wait_for(player.matched, 'subscriptions of the node')
+    settings = {'output.directory': found.folder, 'publish.rate': 0.2}
+    with playing_to(types, *given(settings)) as (found.node, client, player):
         player.play(part(sent, 4, 15), SPEED)
         client.start()
         player.play(part(sent, 15, GAP[0]), SPEED)
@@ -63,9 +52,6 @@ def seen(tmp_path_factory):
         found.journal = Path(found.status['journal'])
         wait_for((found.journal / 'metadata.yaml').exists, 'the joined journal')
         yield found
-    finally:
-        found.node.end()
-        client.close()
 
 
 def test_it_is_said_while_the_leg_is_driven(seen):
@@ -96,13 +82,9 @@ def test_its_parts_make_the_result(seen):
     assert seen.undone.message == 'leg 1 is undone; no leg is left'
 
 
-def test_a_replay_of_the_journal_gives_the_same(seen, tmp_path):
+def test_a_replay_of_the_journal_gives_the_same(seen):
     ends_ns = (int(seen.status[f'leg_{end}_ns']) for end in ('start', 'stop'))
     marks = [f'{ns // 10**9}.{ns % 10**9:09}' for ns in ends_ns]
-    run = subprocess.run(       # undone since: it must be asked for by its marks
-        [sys.executable, '-m', 'odocal_ros.offline.cli', 'replay', str(seen.journal), '--json',
-         '--leg', ':'.join(marks), '--output', str(tmp_path / 'out')],
-        cwd=ROOT, text=True, capture_output=True, check=False)
-    offline = json.loads(run.stdout)
-    for part_of in ('result', 'verdict', 'reasons', 'methods', 'check'):
-        assert seen.written[part_of] == offline[part_of], part_of
+    # undone since: it must be asked for by its marks
+    _, offline, _ = replayed(seen.journal, '--leg', ':'.join(marks), *NUMBERS)
+    same_result(seen.written, offline)

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The journal of a real node: replayed to the last bit, killed, undone, without a disk."""
 
@@ -16,9 +10,9 @@ import resource
 import time
 from types import SimpleNamespace
 
-from bench import Client, NodeProcess, wait_for
-from kills import drive, killed, remains, replayed, wrong
-from player import by_now, messages_of, part, Player, sent_of
+from bench import given, wait_for
+from kills import drive, killed, remains, replayed, same_result, wrong
+from player import by_now, messages_of, part, Player, playing_to, sent_of
 import pytest
 
 from odocal_ros.bagio import encode
@@ -32,8 +26,7 @@ NAMES = {'imu': '/front/imu', 'fix': '/gps/fix'}
 
 def same(live, offline, journal):
     """Assert that a result written live is the one of its journal, in every digit."""
-    for key in ('result', 'verdict', 'reasons', 'methods', 'check', 'config'):
-        assert live[key] == offline[key], key
+    same_result(live, offline, 'config')
     for here, there in zip(live['legs'], offline['legs'], strict=True):
         assert here | {'bag': Path(journal).name} == there
 
@@ -47,15 +40,10 @@ def session(tmp_path_factory):
     types, sent = messages_of(simulated)
     folder = tmp_path_factory.mktemp('journal')
     remaps = [x for slot, name in NAMES.items() for x in ('-r', f'{slot_name(slot)}:={name}')]
-    node = NodeProcess('-p', f'output.directory:={folder}',
-                       '-p', 'alignment.heading_source:=fixed',
-                       '-p', f'alignment.heading:={simulated.truth.heading!r}',
-                       '-p', 'leg.preroll:=20.0', *remaps)
-    client = Client()
+    settings = {'output.directory': folder, 'alignment.heading_source': 'fixed',
+                'alignment.heading': simulated.truth.heading, 'leg.preroll': 20.0}
     seen = SimpleNamespace(folder=folder)
-    try:
-        player = Player(client.node, types, NAMES)
-        wait_for(player.matched, 'subscriptions')
+    with playing_to(types, *given(settings), *remaps, names=NAMES) as (_, client, player):
         player.play(part(sent, 30, 60), SPEED)
         client.until(state='idle')
         client.call('start_leg')
@@ -86,9 +74,6 @@ def session(tmp_path_factory):
         wait_for((seen.undone / 'metadata.yaml').exists, 'its end')
         client.call('undo_leg')
         wait_for((seen.undone / f'{seen.undone.name}_1.mcap').exists, 'the mark')
-    finally:
-        node.end()
-        client.close()
     return seen
 
 
@@ -202,8 +187,7 @@ def slow():
 
 def recording(client, slow):
     """Start a leg and return the player."""
-    player = Player(client.node, slow[0])
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, slow[0])
     player.play(part(slow[1], 0, 10), SPEED)
     client.until(state='idle')
     assert client.call('start_leg').success

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Parts of the journal that need no node: settings, space, pre-roll, definitions."""
 
@@ -22,12 +16,12 @@ from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import pack
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.library.journal import journal_notes
+from odocal_ros.library.read_bag import journal_notes
 from odocal_ros.live import journal_leg, journal_writer
 from odocal_ros.live.definitions import _in_msg, definition_of
+from odocal_ros.live.journal import journal_text
 from odocal_ros.live.journal_leg import LegJournal, Plan
 from odocal_ros.live.journal_space import claim, journals, make_room, size_of
-from odocal_ros.live.journal_text import journal_text
 from odocal_ros.live.journal_writer import PreRoll
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config import Config, flat, with_settings

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Three live legs with a headerless counter on a busy machine: lateness is no slip, slip is."""
 
@@ -38,20 +32,6 @@ BUSY = ('import os, time; os.nice(5)\n'
         '    until = time.monotonic() + 0.1\n'
         '    while time.monotonic() < until: pass\n'
         '    time.sleep(0.3)\n')
-
-
-class Load:
-    """Keeps two cores at work, now and then."""
-
-    def __init__(self) -> None:
-        # a little nicer than the test: else it is the player that cannot keep up
-        self._loops = [subprocess.Popen([sys.executable, '-c', BUSY]) for _ in range(2)]
-
-    def close(self) -> None:
-        """Let go of them."""
-        for loop in self._loops:
-            loop.kill()
-            loop.wait()
 
 
 def messages(drive, begin_ns):
@@ -99,12 +79,13 @@ def test_lateness_is_no_slip_and_slip_is_found(tmp_path):
         wait_for(player.matched, 'subscriptions of the nodes')
         first_ns, sent = by_now(lambda ns: messages(drive, ns - round(FIRST_S * 1e9)))
         begin_ns = first_ns - round(FIRST_S * 1e9)
-        load = Load()
+        # a little nicer than the test: else it is the player that cannot keep up
+        load = subprocess.Popen([sys.executable, '-c', BUSY])
         play(player, sent, begin_ns, FIRST_S, START_S)
         starting = [client.ask('start_leg') for client in clients.values()]
         play(player, sent, begin_ns, START_S, LAST_S)
         assert [one.result().message for one in starting if not one.result().success] == []
-        load.close()
+        load.kill()
         stopping = {name: client.ask('stop_leg') for name, client in clients.items()}
         answers = {name: clients[name].result(one) for name, one in stopping.items()}
         for client in clients.values():
@@ -113,7 +94,8 @@ def test_lateness_is_no_slip_and_slip_is_found(tmp_path):
                    clients.items()}
     finally:
         if load is not None:
-            load.close()
+            load.kill()
+            load.wait()
         for client in clients.values():
             client.close()
         for node in nodes:

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Start and end of the node's process, its inputs, and its times."""
 
@@ -43,8 +37,7 @@ def sent():
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_the_node_cleanly_even_in_a_leg(start, connect, sent, how):
     node, client = start(), connect()
-    player = Player(client.node, sent[0])
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, sent[0])
     player.play(part(sent[1], 0, 5), 20)
     client.until(state='idle')
     assert client.call('start_leg').success
@@ -218,8 +211,7 @@ def test_a_restored_result_gives_way_to_a_leg_and_comes_back_when_it_is_undone(
           'result.legs:=2', '-p', 'result.valid:=true')
     client = connect()
     client.until(restored='an unknown date', scale_ok='yes')
-    player = Player(client.node, sent[0])
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, sent[0])
     player.play(part(sent[1], 0, 5), 20)
     assert ('including the result restored from an unknown '
             'date') in client.until(state='idle')['message']
@@ -240,8 +232,7 @@ def test_an_input_that_never_spoke_is_an_error_in_the_diagnostics(start, connect
     imu = wait_for(lambda: client.health.get('calibrator: imu'), 'diagnostics')
     assert imu['level'] == b'\x02'         # as diagnostic_updater has it; STALE is not ours to say
     assert imu['message'].startswith('no IMU on /imu/data')
-    player = Player(client.node, sent[0])
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, sent[0])
     with player.playing(sent[1], 10):
         good = wait_for(lambda: (h := client.health['calibrator: imu'])['level'] == b'\x00' and h,
                         'good diagnostics')
@@ -254,9 +245,8 @@ def test_namespace_and_remaps(start, connect, sent):
     start('-r', '__ns:=/car', '-r', 'imu/data:=/front/imu', '-p',
           'diagnostic_updater.use_fqn:=true')
     client = connect('/car/calibrator')
-    player = Player(client.node, sent[0], {
+    player = Player.connected(client, sent[0], {
         'imu': '/front/imu', 'odometer': '/car/odometer', 'fix': '/car/fix'})
-    wait_for(player.matched, 'subscriptions under the namespace')
     player.play(part(sent[1], 0, 3), 20)
     client.until(state='idle')
     wait_for(lambda: '/car/calibrator: imu' in client.health, 'diagnostics with the full name')
@@ -296,8 +286,7 @@ def test_sim_time_and_its_jump_back(start, connect, sent):
 
 def test_imu_stamps_that_start_anew_cancel_the_leg(start, connect, sent):
     node, client = start(), connect()
-    player = Player(client.node, sent[0])
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, sent[0])
     player.play(part(sent[1], 10, 20), 20)
     client.until(state='idle')
     assert client.call('start_leg').success
@@ -313,8 +302,7 @@ def test_imu_stamps_that_start_anew_cancel_the_leg(start, connect, sent):
 
 def test_a_forgotten_leg_is_stopped(start, connect, sent):
     node, client = start('-p', 'leg.max_duration:=10.0'), connect()
-    player = Player(client.node, sent[0])
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, sent[0])
     player.play(part(sent[1], 0, 5), 20)
     client.until(state='idle')
     assert client.call('start_leg').success
@@ -342,8 +330,7 @@ def test_the_odometer_type_is_taken_from_its_publisher(start, connect, sent):
     others = [one for one in sent[1] if one.slot != 'odometer']
     counters = counter_messages([one for one in sent[1] if one.slot == 'odometer'],
                                 types['odometer'])
-    player = Player(client.node, types)
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, types)
     wait_for(lambda: 'odometer: std_msgs/msg/Int64 on /odometer, best effort' in node.text,
              'the log line')
     # header stamps of last year beside arrival stamps of now: no leg can be made of these
@@ -397,8 +384,7 @@ def test_1_khz_arrives_whole_and_services_answer_meanwhile(start, connect):
     messages = part(messages, 60, 63)
     start()
     client = connect()
-    player = Player(client.node, types)
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, types)
     player.play(part(messages, 0, 1), 1)
     assert client.call('start_leg').success
     player.play(part(messages, 1, 3), 1)

@@ -1,20 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A leg by an IMU without accelerometer, over DDS: what is told of it, and replay's figures."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
-from bench import Client, NodeProcess, wait_for
+from bench import given
 import numpy as np
-from player import messages_of, part, Player
+from player import messages_of, part, playing_to
 import pytest
 
 from odocal_ros.data.leg import LegRecorder
@@ -38,12 +32,9 @@ def drive():
 @pytest.fixture(scope='module')
 def session(drive, tmp_path_factory):
     """Drive one leg; keep what the node said."""
-    node = NodeProcess('-p', f'output.directory:={tmp_path_factory.mktemp("out")}')
-    client, seen = Client(), SimpleNamespace()
-    try:
-        types, sent = messages_of(drive)
-        player = Player(client.node, types)
-        wait_for(player.matched, 'subscriptions of the node')
+    types, sent = messages_of(drive)
+    settings, seen = {'output.directory': tmp_path_factory.mktemp('out')}, SimpleNamespace()
+    with playing_to(types, *given(settings)) as (_, client, player):
         player.play(part(sent, FIRST_S, MARK_S), SPEED)
         client.until(state='idle')
         seen.start = client.call('start_leg')
@@ -54,9 +45,6 @@ def session(drive, tmp_path_factory):
         seen.status = client.until(state='calibrated')
         seen.scale, seen.sigma = client.get('result.scale_factor', 'result.scale_factor_sigma')
         yield seen
-    finally:
-        node.end()
-        client.close()
 
 
 def test_the_start_says_what_the_leg_cannot_tell(session):

@@ -1,18 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Poses on the topic fix, over DDS: a leg by services; its journal replays to the same bits."""
 
 
-from bench import Client, NodeProcess, wait_for
-from kills import replayed
-from player import part, Player, sent_of, stopped
+from bench import given, wait_for
+from kills import replayed, same_result
+from player import part, playing_to, sent_of, stopped
 import pytest
 
 from odocal_ros.bagio import encode
@@ -38,21 +32,16 @@ def session(drive, tmp_path_factory):
     sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)),
                   key=lambda one: one.stamp_ns)
     start_s = (drive.leg().start_ns - sent[0].stamp_ns) * 1e-9
-    node = NodeProcess('-p', f'output.directory:={tmp_path_factory.mktemp("posed")}',
-                       '-p', 'leg.preroll:=20.0', '-r', 'fix:=/slam/pose')
-    client = Client()
-    try:
-        player = Player(client.node, {s: topic.msgtype for s, topic in topics.items()}, NAMES)
-        wait_for(player.matched, 'subscriptions')
+    settings = {'output.directory': tmp_path_factory.mktemp('posed'), 'leg.preroll': 20.0}
+    types = {slot: topic.msgtype for slot, topic in topics.items()}
+    with playing_to(types, *given(settings), '-r', 'fix:=/slam/pose', names=NAMES) as (
+            node, client, player):
         player.play(part(sent, start_s - 10, start_s), SPEED)
         client.start()
         player.play(part(sent, start_s, start_s + 150), SPEED)
         seen = stopped(client, player, part(sent, start_s + 150, start_s + 153), SPEED)
         seen.node = node
         yield seen
-    finally:
-        node.end()
-        client.close()
 
 
 def test_the_node_subscribes_with_the_type_that_is_published(session):
@@ -70,8 +59,7 @@ def test_its_journal_replays_to_the_last_bit(session):
     code, offline, said = replayed(session.journal)
     assert code == 0, said
     assert 'no NavSatFix' not in said       # the journal names its topics
-    for key in ('result', 'verdict', 'reasons', 'methods', 'check', 'config'):
-        assert session.live[key] == offline[key], key
+    same_result(session.live, offline, 'config')
     for here, there in zip(session.live['legs'], offline['legs'], strict=True):
         assert here | {'bag': session.journal.name} == there
     assert offline['inputs'][0]['topics']['fix'] == '/slam/pose'

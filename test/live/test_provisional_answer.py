@@ -1,20 +1,15 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A leg whose fit takes long: ~/stop_leg answers with the running estimate; the result follows."""
 
+from contextlib import ExitStack
 import math
 import time
 from types import SimpleNamespace
 
-from bench import answer_of, Client, NodeProcess, PATIENCE, wait_for
-from player import messages_of, part, Player
+from bench import answer_of, PATIENCE, wait_for
+from player import messages_of, part, playing_to
 import pytest
 
 from odocal_ros.live import answers
@@ -57,12 +52,11 @@ def seen(tmp_path_factory):
     gate = folder / 'go on'
     drive = simulate(SimOptions(scenario='town', duration=160.0, imu_rate=50.0, odometer='speed',
                                 odometer_rate=25.0, fix_noise='rtk', imu_grade='industrial'))
-    node = NodeProcess('-p', f'output.directory:={folder}', before=HELD.format(str(gate)))
-    client, found = Client(), SimpleNamespace(truth=drive.truth)
-    try:
-        types, sent = messages_of(drive)
-        player = Player(client.node, types)
-        wait_for(player.matched, 'subscriptions of the node')
+    found, (types, sent) = SimpleNamespace(truth=drive.truth), messages_of(drive)
+    with ExitStack() as ends:
+        _, client, player = ends.enter_context(playing_to(
+            types, '-p', f'output.directory:={folder}', before=HELD.format(str(gate))))
+        ends.callback(gate.touch)      # the node's end waits for what its worker was given
         player.play(part(sent, FIRST_S, MARK_S), SPEED)
         client.until(state='idle')
         client.start()
@@ -72,10 +66,6 @@ def seen(tmp_path_factory):
         _held_leg(found, client, player, sent, gate)
         _without_estimate(found, client, player, sent, gate)
         yield found
-    finally:
-        gate.touch()      # the node's end waits for what its worker was given
-        node.end()
-        client.close()
 
 
 def _held_leg(found, client, player, sent, gate):

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Each ros2 line of README and docs, checked by name and done by a client on a driven leg."""
 
@@ -52,8 +46,7 @@ def driven(tmp_path_factory):
                                    odometer_rate=25.0, odometer='speed', fix_noise='rtk'))
         types, sent = messages_of(made)
         seen.truth = made.truth.scale
-        player = Player(client.node, types, TOPICS)
-        wait_for(player.matched, 'subscriptions to the topics of the page')
+        player = Player.connected(client, types, TOPICS)
         calls = list(dict.fromkeys(map(tuple, of('service', 'call'))))
         # standing; driving to the next stop, and a little on: a leg ends with its last message
         stretches = [(45, 60, 60), (60, 117, 119)]

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A signal right after a good leg, while its files are written and its report is drawn."""
 
@@ -36,14 +30,13 @@ def sent():
 
 
 @pytest.mark.parametrize(('how', 'before'), [
-    (signal.SIGINT, ''), (signal.SIGTERM, ''), (signal.SIGINT, SLOW), (signal.SIGTERM, SLOW)])
+    (signal.SIGINT, ''), (signal.SIGTERM, SLOW)])
 def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
         start, connect, sent, tmp_path, how, before):
     node = start('-p', 'alignment.heading_source:=fixed', '-p', 'alignment.heading:=0.7',
                  '-p', 'method:=two_point', before=before)
     client = connect()
-    player = Player(client.node, sent[0])
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, sent[0])
     player.play(part(sent[1], 40, 60), 30)
     client.until(state='idle')
     client.start()

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A leg that a jump of time cancels: the operator is told, and its journal is computed."""
 
@@ -19,7 +13,7 @@ import pytest
 
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.library.legs import parse_leg
-from odocal_ros.live.journal_text import replay_command
+from odocal_ros.live.journal import replay_command
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 30.0
@@ -36,8 +30,7 @@ def test_a_leg_lost_to_a_jump_of_time_is_said_and_computed_from_its_journal(
                  f'alignment.heading:={drive.truth.heading!r}', '-p',
                  f'journal.max_bytes:={10**9 * journal}')
     client = connect()
-    player = Player(client.node, types)
-    wait_for(player.matched, 'subscriptions')
+    player = Player.connected(client, types)
     player.play(part(sent, 30, 60), SPEED)
     client.until(state='idle')
     started = int(client.until(leg_event='')['leg_start_ns']), client.start()

@@ -1,19 +1,13 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Two wheels on one JointState topic, over DDS: what is told before, during and after a leg."""
 
 import re
 from types import SimpleNamespace
 
-from bench import Client, NodeProcess, wait_for
-from player import part, Player, sent_of
+from bench import given, wait_for
+from player import part, playing_to, sent_of
 import pytest
 
 from odocal_ros.bagio import encode
@@ -47,12 +41,8 @@ def session(drive, tmp_path_factory):
     settings = {'output.directory': folder, 'method': 'wheels',
                 'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': 0.002,
                 'wheels.radius': 0.3, 'imu.grade': 'tactical'}
-    node = NodeProcess(*(x for name, value in settings.items() for x in (
-        '-p', f'{name}:={value}')))
-    client, seen = Client(), SimpleNamespace()
-    try:
-        player = Player(client.node, {slot: topic.msgtype for slot, topic in topics.items()})
-        wait_for(player.matched, 'subscriptions of the node')
+    types, seen = {slot: topic.msgtype for slot, topic in topics.items()}, SimpleNamespace()
+    with playing_to(types, *given(settings)) as (_, client, player):
         player.play(part(sent, start_s - REST_S, start_s), SPEED)
         seen.idle = client.until(state='idle')
         seen.start = client.call('start_leg')
@@ -70,9 +60,6 @@ def session(drive, tmp_path_factory):
             seen.result = wait_for(lambda: client.status['state'] in ('calibrated', 'rejected')
                                    and client.status, 'the result')
         yield seen
-    finally:
-        node.end()
-        client.close()
 
 
 def test_the_start_says_what_to_drive_and_what_it_can_tell(session):

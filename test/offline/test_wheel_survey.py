@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """odocal inspect on lists of values: which of them roll, and which side each is on."""
 
@@ -77,7 +71,8 @@ def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, caps
     assert 'the mean of 0 and 1 is used' in wheels['chosen']
     options = ['--set', 'odometer.left=1', '--set', 'odometer.right=0']
     assert told['command'].split()[-4:] == options
-    assert main(['replay', str(path), *options, '--output', str(tmp_path / 'out'), '--json']) < 2
+    assert main(['replay', str(path), *options, '--output', str(tmp_path / 'out'), '--json',
+                 '--set', 'output.formats=[params]']) < 2
     said = capsys.readouterr().out
     assert 'scale_factor_left' in json.loads(said)['methods']['smoother']['estimates']
     assert 'WHEELS_SWAPPED' not in said

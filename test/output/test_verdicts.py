@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A method's row follows the leg: its figures are shown, but not as good."""
 
@@ -15,10 +9,10 @@ import pytest
 
 from odocal_ros.output import report_tables
 from odocal_ros.output.files import as_json
+from odocal_ros.output.leg_table import leg_verdicts, shown_verdict
 from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.report import report_html
 from odocal_ros.output.summary import screen
-from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Names from outside in every format: what was sent is shown, nothing of it is acted on."""
 
@@ -22,8 +16,8 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.errors import BadConfig
 from odocal_ros.output import ros_files
 from odocal_ros.output.files import as_json
-from odocal_ros.output.frames import framed
 from odocal_ros.output.leg_table import leg_table, LEGS
+from odocal_ros.output.ros_files import framed
 from odocal_ros.outside import names as outside
 from odocal_ros.outside.yaml_text import parameters, value_text
 from odocal_ros.reasons import Code

@@ -1,13 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Closed forms of the error analysis against the projection, the chord and the full model."""
+
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.testing import assert_allclose
@@ -15,12 +11,21 @@ import pytest
 
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.projection import Plane
-from odocal_ros.paper.error_forms import chord_error, plane_error, SpeedProfile, straight_leg
+from odocal_ros.paper.error_forms import chord_error, plane_error, SpeedProfile
 from odocal_ros.paper.error_model import PAPER_RADIUS, propagate
 from odocal_ros.paper.path import planned_path
 
 DRIFT = np.deg2rad(0.01) / 3600     # 0.01 deg/h
 PHI_U = np.deg2rad(0.06)            # 3.6'
+
+
+def straight_leg(phi_U0, eps_z, T, velocity_E, velocity_N, latitude):
+    """Return phi_U, dL, dlam, dalpha, rad, and dK / K at the end of a leg: (29)-(33)."""
+    turned = phi_U0 * T - eps_z * T**2 / 2
+    return SimpleNamespace(
+        phi_U=phi_U0 - eps_z * T, dL=-velocity_E / PAPER_RADIUS * turned,
+        dlam=velocity_N / np.cos(latitude) / PAPER_RADIUS * turned,
+        dalpha=-turned / T, dK=eps_z**2 * T**2 / 24)      # in place of (32)
 
 
 def papers_profile(n=4001):
@@ -70,8 +75,7 @@ def test_straight_leg_is_the_model_without_earth_rate_and_tilt():
     t = np.linspace(0.0, T, 601)
     path = planned_path(t, np.full(601, speed), yaw, latitude)
     phi_U0, eps_z = PHI_U, 20 * DRIFT
-    closed = straight_leg(phi_U0, eps_z, T, speed * np.cos(yaw), speed * np.sin(yaw), latitude,
-                          PAPER_RADIUS)
+    closed = straight_leg(phi_U0, eps_z, T, speed * np.cos(yaw), speed * np.sin(yaw), latitude)
     x = propagate(path, [0, 0, phi_U0, 0, 0, 0], [0, 0, eps_z], PAPER_RADIUS)[-1]
     # left out of (24)-(31): phi_E grows by w cos L phi_U t and feeds back w cos L phi_E: half of
     # (5.6e-5 t)^2 = 5.6e-4; vN tan L / R phi_U: 1.8e-6 t = 1.1e-3; dL by 5.96e-5 t v t / 2R: 3e-5
@@ -102,7 +106,7 @@ def test_end_error_through_plane_and_chord_is_minus_the_mean_heading_error():
 
 def test_profile_of_constant_speed_gives_the_papers_forms():
     t = np.linspace(0.0, 600.0, 301)
-    closed = straight_leg(PHI_U, DRIFT, 600.0, 14.0, 14.0, 0.7, PAPER_RADIUS)
+    closed = straight_leg(PHI_U, DRIFT, 600.0, 14.0, 14.0, 0.7)
     dalpha, dK = SpeedProfile(t, 20 * t).heading_and_drift(PHI_U, DRIFT)
     assert dalpha == pytest.approx(closed.dalpha, rel=1e-12)
     assert dK == pytest.approx(closed.dK, rel=1e-9)      # a difference of squares 2e3 times larger

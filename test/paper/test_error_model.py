@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The linear error model against finite differences of the dead reckoning that is really run."""
 
@@ -23,12 +17,14 @@ from odocal_ros.nav.strapdown import attitude
 from odocal_ros.paper import error_model
 from odocal_ros.paper.error_model import (
     coefficients,
-    in_fixed_axes,
+    H,
+    LAT,
+    LON,
     PAPER_RADIUS,
     propagate,
     transition,
 )
-from odocal_ros.paper.path import path_of_track, planned_path
+from odocal_ros.paper.path import Path, planned_path
 from odocal_ros.sim.motion import attitude as true_attitude
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -65,6 +61,27 @@ def reckon(town, x_0, eps_b):
     return dead_reckon(epochs, q_nb, travel), origin
 
 
+def path_of(track, origin):
+    """Return the path of a dead-reckoned leg."""
+    latitude, longitude, height = origin.to_geodetic(track.P @ FORWARD).T
+    C_ln = transpose(C_en(latitude, longitude)) @ C_en(origin.latitude, origin.longitude)
+    step_n = np.diff(track.P @ FORWARD, axis=0) / np.diff(track.t)[:, None]
+    velocity = np.einsum('mij,mj->mi', (C_ln[:-1] + C_ln[1:]) / 2, step_n)
+    C_nb = C_ln @ matrix_from_quat(track.q_nb)
+    return Path(track.t, latitude, longitude, height, velocity, C_nb)
+
+
+def in_fixed_axes(path, x, origin):
+    """Return psi (rad) and dr (m) in the n of the origin, as error_model's text relates them."""
+    phi, dL, dlam, dh = x[:, :3], x[:, LAT], x[:, LON], x[:, H]
+    s, c = np.sin(path.latitude), np.cos(path.latitude)
+    meridian, normal = radii(path.latitude)
+    dtheta = np.stack([-dL, dlam * c, dlam * s], -1)
+    dr = np.stack([(normal + path.height) * c * dlam, (meridian + path.height) * dL, dh], -1)
+    C_nl = transpose(C_en(origin.latitude, origin.longitude)) @ C_en(path.latitude, path.longitude)
+    return np.einsum('mij,mj->mi', C_nl, phi - dtheta), np.einsum('mij,mj->mi', C_nl, dr)
+
+
 def level_state(track, origin, k):
     """Return position (3,) and attitude against the local level there of epoch k."""
     position = origin.to_geodetic(track.P[k] @ FORWARD)
@@ -97,7 +114,7 @@ def size(path, k):
 @pytest.mark.parametrize('column', range(9))
 def test_transition_is_the_derivative_of_the_real_dead_reckoning(town, column):
     track, origin = reckon(town, np.zeros(6), np.zeros(3))
-    path = path_of_track(track, FORWARD, origin)
+    path = path_of(track, origin)
     moved = transition(path)
     k = np.linspace(0, len(path.t) - 1, 12).astype(int)[1:]
     start = np.eye(6, 9)[:, column]       # what the states were is no test: only their change is
@@ -114,7 +131,7 @@ def test_fixed_axes_show_the_error_of_strapdown_and_dead_reckoning(town):
     phi_0, eps_b = np.array([2e-4, -1e-4, 3e-4]), np.array([3e-7, 1e-7, -2e-7])
     x_0 = np.concatenate([phi_0, np.zeros(3)])
     track, origin = reckon(town, np.zeros(6), np.zeros(3))
-    path = path_of_track(track, FORWARD, origin)
+    path = path_of(track, origin)
     psi, dr = in_fixed_axes(path, propagate(path, x_0, eps_b), origin)
     (plus, _), (minus, _) = reckon(town, x_0, eps_b), reckon(town, -x_0, -eps_b)
     turn = matrix_from_quat(plus.q_nb) @ transpose(matrix_from_quat(minus.q_nb))
@@ -127,7 +144,7 @@ def test_fixed_axes_show_the_error_of_strapdown_and_dead_reckoning(town):
 
 def test_without_drift_only_the_earth_turns_the_error_in_fixed_axes(town):
     track, origin = reckon(town, np.zeros(6), np.zeros(3))
-    path = path_of_track(track, FORWARD, origin)
+    path = path_of(track, origin)
     psi_0 = np.array([1e-4, 2e-4, -3e-4])
     psi, _ = in_fixed_axes(path, propagate(path, [*psi_0, 0, 0, 0], np.zeros(3)), origin)
     turned = exp_so3(-earth_rate_n(origin.latitude) * (path.t - path.t[0])[:, None]) @ psi_0

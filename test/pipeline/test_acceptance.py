@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Pass or fail: the rule against the normal law, its limits, and what bars a pass."""
 
@@ -19,7 +13,7 @@ from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.pipeline.acceptance import accept, decide, Decision
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.accept_option import parse_accept
+from odocal_ros.settings.accept_config import parse_accept
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core

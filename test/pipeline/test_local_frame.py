@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A leg whose positions are poses in a local frame gives the values of the same leg with fixes."""
 
@@ -20,7 +14,7 @@ from odocal_ros.calib.smoother import problem
 from odocal_ros.calib.smoother.leg import smoother_leg
 from odocal_ros.calib.smoother.problem import _priors
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.messages.local_types import local_fixes
+from odocal_ros.messages.sensor_types import local_fixes
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, OMEGA, PartlyKnownRate, rate_without_north
 from odocal_ros.nav.rotations import matrix_from_rpy

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The iteration of a fit: linearise, solve, update the noise levels, until convergence.
@@ -119,19 +113,9 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     """
     Iterate from a state to the restricted maximum of the likelihood.
 
-    Parameters
-    ----------
-    problem, state, levels : Problem, State, Levels
-        The leg and the initial values.
-    most : int
-        Iterations.
-    frozen : bool
-        Keep the noise levels constant.
-    about : WarmStart, optional
-        From an earlier fit, whose slips and priors are used.
-    trace : callable, optional
-        Called after each pass, for progress and benchmarks.
-
+    problem, state, levels : the leg and the initial values.   most : iterations.   frozen : keep
+    the noise levels constant.   about : from an earlier fit, whose slips and priors are used.
+    trace : called after each pass, for progress and benchmarks.
     """
     before, still, settled, fitted = np.ones(3), 0.0, False, about is not None
     was_fitted = fitted

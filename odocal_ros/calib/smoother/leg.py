@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the smoother works on: one leg as clean arrays, and how the parameters are numbered."""
 
@@ -98,21 +92,10 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
     """
     Return the smoother's view of screened inputs.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        Of ``screen``.
-    config : Config
-        Lever arms, nominal scale.
-    origin, fixes_n : Origin, (k, 3) array
-        Where n is fixed and the fixes in it, m; NaN up where a fix has no height.
-    spans : (s, 2) array
-        Standstills, s.
-    rough_scale : float
-        Metres per unit of travel.
-    t_stop : float, optional
-        End of what is used, s (a held-out rest); the stop mark by default.
-
+    inputs : of ``screen``.   config : lever arms, nominal scale.   origin, fixes_n : Origin, (k,
+    3) where n is fixed and the fixes in it, m; NaN up where a fix has no height.   spans : (s, 2)
+    standstills, s.   rough_scale : metres per unit of travel.   t_stop : end of what is used, s (a
+    held-out rest); the stop mark by default.
     """
     t_stop = inputs.t_stop if t_stop is None else t_stop
     if not inputs.felt:         # the ground is taken as level, so heights have no say

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The growth of fix errors with time, against that of the model: docs/method.md (S17a).
@@ -35,15 +29,8 @@ def long_run(fixes: Fixes, levels: Levels,
     The largest ratio, for spans of 1, 2, 4, ... s, of the mean square of the error differences to
     its expectation, less REMARK_SIGMAS of its standard deviations.
 
-    Parameters
-    ----------
-    fixes : Fixes
-        With white and correlated errors.
-    levels : Levels
-        Of the pass.
-    found : dict
-        Quadratic sum and expectation of each level.
-
+    fixes : with white and correlated errors.   levels : of the pass.   found : quadratic sum and
+    expectation of each level.
     """
     t, error = fixes.state.t[fixes.k] + fixes.points.tau, fixes.errors()
     stated = 1 / np.diagonal(fixes.root, axis1=1, axis2=2)**2

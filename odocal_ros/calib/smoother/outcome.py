@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The smoother's fit as a method's result: estimates, reasons, budget, what the drive was like."""
 
@@ -146,20 +140,10 @@ def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nom
     """
     Return the estimates of the constants that the data determine, and why not the others.
 
-    Parameters
-    ----------
-    value, sigma : (M,) arrays
-        Of the constants, ln K first, whole lever arms.
-    ratio : (M,) array
-        Posterior sigma by that of the prior.
-    scale_unit, nominal : str, float
-        Of the scale; K0, 0 unknown.
-    config : Config
-        Limits.
-    doubt : float
-        Factor by which the model was found to doubt its sigmas: of an angle that is known badly,
-        by a model that does not hold, nothing is known.
-
+    value, sigma : (M,) of the constants, ln K first, whole lever arms.   ratio : (M,) posterior
+    sigma by that of the prior.   scale_unit, nominal : of the scale; K0, 0 unknown.   config :
+    limits.   doubt : factor by which the model was found to doubt its sigmas: of an angle that is
+    known badly, by a model that does not hold, nothing is known.
     """
     K, yaw, pitch = float(np.exp(value[LN_K])), float(wrap(value[YAW])), float(value[PITCH])
     found = unknown(scale_unit)

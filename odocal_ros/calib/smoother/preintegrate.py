@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Preintegration: dR, dv, dp and S of each interval, docs/method.md (S4).
@@ -113,20 +107,10 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
     """
     Sum up all intervals.
 
-    Parameters
-    ----------
-    imu : ImuSteps
-        Steps.
-    gyro_bias, accel_bias : (K, 3) arrays
-        Taken out, one for each interval.
-    travel : callable
-        (m,) times, s, to travel, scale units.
-    forward : (3,) array
-        Scale times forward axis, for S_by.
-    t_points : (m,) array
-        Times of fixes, rising, within the keyframes.
-    constants : (M,) array, optional
-        Of which GYRO and ACCEL are taken out.
+    imu : steps.   gyro_bias, accel_bias : (K, 3) taken out, one for each interval.   travel : (m,)
+    times, s, to travel, scale units.   forward : (3,) scale times forward axis, for S_by.
+    t_points : (m,) times of fixes, rising, within the keyframes.   constants : (M,) of which GYRO
+    and ACCEL are taken out.
 
     Returns
     -------

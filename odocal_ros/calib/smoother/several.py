@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Several legs of the smoother to one result, on the border of their equations."""
 
@@ -46,16 +40,9 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     """
     Combine what the smoother says of several legs of one vehicle.
 
-    Parameters
-    ----------
-    results : sequence of MethodResult
-        Those with a border, at least one.
-    times_ns : sequence of int
-        When each leg was driven.
-    config : Config
-        Limits, ``verdict.scale_drift_per_day``.
-    numbers : sequence of int, optional
-        What the legs are called; 1, 2, ...; 0: legs of an earlier result, carried on.
+    results : those with a border, at least one.   times_ns : when each leg was driven.   config :
+    limits, ``verdict.scale_drift_per_day``.   numbers : what the legs are called; 1, 2, ...; 0:
+    legs of an earlier result, carried on.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The smoother: scale and mounting angles from all samples of a leg at once (docs/method.md)."""
 
@@ -45,14 +39,8 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
     """
     Estimate scale, yaw and pitch mounting of a leg from all its samples.
 
-    Parameters
-    ----------
-    leg : SmootherLeg
-        Screened samples.
-    config : Config
-        Grade, lever arms' and delays' sigmas, limits.
-    trace : callable, optional
-        Called with each pass of the iteration, for benchmarks.
+    leg : screened samples.   config : grade, lever arms' and delays' sigmas, limits.   trace :
+    called with each pass of the iteration, for benchmarks.
 
     Returns
     -------
@@ -142,16 +130,9 @@ def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
     """
     Return the covariance of the constants at a given state, covariance only.
 
-    Parameters
-    ----------
-    leg, config : SmootherLeg, Config
-        As for ``smooth``.
-    truth : State
-        Values of all unknowns, at the times of ``keyframe_times``.
-    levels : Levels
-        Noise levels.
-    imperfect : (k,) array, optional
-        Sigmas of what is imperfect, as IMPERFECT; None: as usual.
+    leg, config : as for ``smooth``.   truth : values of all unknowns, at the times of
+    ``keyframe_times``.   levels : noise levels.   imperfect : (k,) sigmas of what is imperfect, as
+    IMPERFECT; None: as usual.
 
     Returns
     -------

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 A first state from nothing: level, gyro bias, scale, heading and yaw mounting, whatever they are.
@@ -72,17 +66,8 @@ def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
     """
     Return a state to start from.
 
-    Parameters
-    ----------
-    leg : SmootherLeg
-        The leg.
-    imu : ImuSteps
-        Its IMU steps with the keyframes.
-    priors : Priors
-        Turn-on bias.
-    yaw : float, optional
-        Yaw mounting to start from, rad, in place of that found from accelerations.
-
+    leg : the leg.   imu : its IMU steps with the keyframes.   priors : turn-on bias.   yaw : yaw
+    mounting to start from, rad, in place of that found from accelerations.
     """
     bias, rest = rest_bias(leg, imu)
     sigma = np.full(3, 2e-4) if rest else np.maximum(priors.gyro_bias, 1e-3)

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Each wheel beside the mean: its factor, and where it rolls, docs/method.md (W1) to (W4).
@@ -89,17 +83,9 @@ def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
     """
     Return each wheel of a leg by name, none where there are no two or too little motion.
 
-    Parameters
-    ----------
-    problem, fit : Problem, Fit
-        The leg and its fit.
-    covariance : (M, M) array
-        Of the constants.
-    drift : float
-        Sigma of the gyro's bias about up, rad/s: of how the attitudes of the fit drift.
-    width : float
-        Track width as set, m, 0: unknown.
-
+    problem, fit : the leg and its fit.   covariance : (M, M) of the constants.   drift : sigma of
+    the gyro's bias about up, rad/s: of how the attitudes of the fit drift.   width : track width
+    as set, m, 0: unknown.
     """
     wheels, state = problem.leg.wheels, fit.state
     if len(wheels) < 2:

@@ -1,11 +1,5 @@
 # Copyright 2026 odocal_ros maintainers
-# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
-# in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
-# Unless required by applicable law or agreed to in writing, software distributed under the License
-# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
-# or implied. See the License for the specific language governing permissions and limitations under
-# the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Faults of two wheels by the gyro: exchanged, one slipping, counting unlike each other.
@@ -61,28 +55,12 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     """
     Return what the gyro finds wrong with wheels that both count, and the slips of one of them.
 
-    Parameters
-    ----------
-    axle : (2,) sequence of Travel
-        The left and the right wheel, scale units.
-    imu : (t, w_b, f_b)
-        (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.
-    between : (2,)
-        The marks, s.
-    track : Track
-        Dead reckoned with their mean: attitude.
-    latitude : float
-        rad.
-    metres_per_unit : float
-        Rough scale of the mean of both.
-    track_width : float
-        m, 0 unknown.
-    doubt_t : (d,) array, optional
-        s, where travel is in doubt for other reasons (gaps, resets).
-    max_deviation : float
-        Ratio of the counts less one, from which on it is said.
-    count : int
-        Of the wheels in the mean.
+    axle : (2,) sequence of Travel the left and the right wheel, scale units.   imu : (t, w_b, f_b)
+    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.   between : (2,) the marks, s.   track : dead
+    reckoned with their mean: attitude.   latitude : rad.   metres_per_unit : rough scale of the
+    mean of both.   track_width : m, 0 unknown.   doubt_t : (d,) s, where travel is in doubt for
+    other reasons (gaps, resets).   max_deviation : ratio of the counts less one, from which on it
+    is said.   count : of the wheels in the mean.
 
     Returns
     -------
