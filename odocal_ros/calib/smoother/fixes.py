@@ -49,7 +49,6 @@ class Fixes(PointRows):
     def __init__(self, problem: 'Problem', point: LinearisationPoint) -> None:
         leg, state, points = problem.leg, point.state, point.points['fixes']
         self.state, self.points, self.root = state, points, problem.root
-        self.local = leg.origin.local is not None
         k, tau = points.interval, points.tau[:, None]
         self.k = k
         self.C = state.C_nb[k]
@@ -95,8 +94,7 @@ class Fixes(PointRows):
         J, c = np.zeros((m, 3, n)), np.zeros((m, 3, M))
         J[:, :, P], J[:, :, V] = -one, -one * tau
         J[:, :, PHI] = skew(self.dp + self.arm_n)
-        # a car turns by 0.3 rad in a second at most, a robot by more, on the spot
-        J[:, :, BA] = self.C @ self.points.AA if self.local else self.C * tau**2 / 2
+        J[:, :, BA] = self.C @ self.points.AA
         J[:, :, BG] = -skew(self.dp) @ self.C * tau / 3 - skew(self.arm_n) @ self.C * tau
         if n > BARE:
             J[:, :, SLOW] = -one * (1 - self.share)[:, None, None]
