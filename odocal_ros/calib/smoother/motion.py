@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
 ROWS = D.stop
 # of Motion, what each interval has
-EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'rolled', 'heaved', 'faster',
-        'eased', 'unsaid', 'pushed', 'pitched', 'from_mean', 'varied', 'travelled', 'residual')
+EACH = ('T', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed', 'nose_down',
+        'from_mean', 'varied', 'travelled', 'residual')
 
 
 def rotvec(C: Floats) -> Floats:
@@ -93,14 +93,11 @@ class Motion:
         _, self.left, self.up = state.C_bv.T
         w = leg.origin.earth_rate_n
         W = skew(w)
-        self.f_n, self.f_n_end = self.C @ self.f, self.C_end @ self.f
         dv, dp = turn(self.C, intervals.dv), turn(self.C, intervals.dp)
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
-        self._vary()
-        way = turn(intervals.S, self.f + self.leaned) * self.varied
-        self.faster, self.eased = self._by_odometer_filter()
+        way = turn(intervals.S, self.f + self._vary()) * self.varied
+        self.faster = self._by_odometer_filter()
         self.rolled = turn(half @ self.C, way)
-        self.heaved = turn(self.C, self.pitched * state.constants[PITCH_CENTRE])
         self.way = self.rolled + self.heaved
         self.unsaid = self._by_speed_offset(leg.travel.coarse)
         if self.unsaid is not None:
@@ -133,8 +130,34 @@ class Motion:
             setattr(part, name, whole if whole is None else whole[rows])
         return part
 
-    def _vary(self) -> None:
-        """Work out how scale and forward axis change on the way: docs/method.md (S11), (S12)."""
+    @property
+    def f_n(self) -> Floats:
+        """Return the forward axis times the scale at the begins: (K, 3)."""
+        return self.C @ self.f
+
+    @property
+    def f_n_end(self) -> Floats:
+        """Return the same at the ends: (K, 3)."""
+        return self.C_end @ self.f
+
+    @property
+    def pitched(self) -> Floats:
+        """Return the derivative of the way by the centre of pitching: (K, 3)."""
+        out: Floats = (self.C @ self.up) * self.nose_down[:, None]
+        return out
+
+    @property
+    def heaved(self) -> Floats:
+        """Return what pitching lifts the odometer: (K, 3) m."""
+        out: Floats = self.pitched * self.state.constants[PITCH_CENTRE]
+        return out
+
+    def _vary(self) -> Floats:
+        """
+        Work out how scale and forward axis change on the way: docs/method.md (S11), (S12).
+
+        Returns what is added to the forward axis times the scale, (K, 3).
+        """
         state, T, c = self.state, self.T, self.state.constants
         self.pushed = self.axle.accelerations()
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
@@ -143,10 +166,10 @@ class Motion:
             speed, t - state.t[0], self.axle.acceleration()) - self.axle.means_by_way(self.sums)
         self.varied = 1 + self.from_mean @ c[TYRES, None]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
-        self.leaned = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
         # nose down about a point ahead, the odometer goes up
-        nose_down = (self.sums.mean_rate - state.gyro_bias[:-1]) @ self.left * T[:, 0]
-        self.pitched = np.outer(nose_down, self.up)
+        self.nose_down = (self.sums.mean_rate - state.gyro_bias[:-1]) @ self.left * T[:, 0]
+        out: Floats = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
+        return out
 
     def _by_speed_offset(self, coarse: CoarseSpeed | None) -> Floats | None:
         """Return the derivative of the way by what speeds in steps lack: (K, 3), or None."""
@@ -157,12 +180,12 @@ class Motion:
         ahead: Floats = (self.f_n + self.f_n_end) / 2 * (np.sign(said) * moves)[:, None]
         return np.asarray(ahead * self.T)
 
-    def _by_odometer_filter(self) -> tuple[Floats, Floats]:
-        """Return the derivatives of the way by delay and filter of the odometer: (K, 3) each."""
-        ahead, wheel = (self.f_n + self.f_n_end) / 2, self.axle.wheel / self.state.scale
+    def _by_odometer_filter(self) -> Floats:
+        """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
+        wheel = self.axle.wheel / self.state.scale
         # by the fit, whose accelerometer knows it better than readings do
         push = np.gradient(wheel, self.state.t)
-        return ahead * np.diff(wheel)[:, None], -ahead * np.diff(push)[:, None] / 2
+        return np.stack([np.diff(wheel), -np.diff(push) / 2], -1)
 
     def jacobians(self, n: int) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by begin, end and constants: (K, 18, n), (K, 18, n), (K, 18, M)."""
@@ -208,12 +231,13 @@ class Motion:
         for i, axis in enumerate((self.up, -self.left)):
             turned = C @ s.S @ (state.scale * axis)
             c[:, D, LEAN.start + i:LEAN.stop:2] = -turned[:, :, None] * self.pushed[:, None, i::2]
-        c[:, D, PITCH_CENTRE] = -turn(C, self.pitched)
+        c[:, D, PITCH_CENTRE] = -self.pitched
         c[:, D, ODO_ARM] = swing @ state.C_bv
         if self.unsaid is not None:
             c[:, D, SPEED_OFFSET] = -self.unsaid
         # stamps late by d: the reading at a time is the travel d before it
-        c[:, D, ODO_DELAY], c[:, D, ODO_LAG2] = -self.faster, -self.eased
+        ahead = (self.f_n + self.f_n_end) / 2
+        c[:, D, [ODO_DELAY, ODO_LAG2]] = -ahead[:, :, None] * self.faster[:, None]
         if self.by_steps:       # of such a way the direction counts, which these do not change
             c[:, D, [LN_K, ODO_DELAY, ODO_LAG2, SPEED_OFFSET]] = 0.0
             c[:, D, TYRES] = 0.0
