@@ -102,8 +102,8 @@ def test_nose_up_the_yaw_holds_what_y_has_of_z_where_axes_are_off(skew):
     # axis, and that is still in the yaw
     held = found.details['accelerometer_axis_yz']['sigma']
     usual = np.sqrt(2) * GRADES['consumer'].misalignment
-    # seeds 4 to 7 have 0.51 to 0.61, and 0.30 to 0.34 without: the limits are their means and three
-    # times their scatters
+    # seeds 4 to 7 have 0.51 to 0.61, and 0.30 to 0.34 without: the limits are their means and
+    # three times their scatters
     assert 0.15 * usual < held < (0.68 if skew else 0.37) * usual
     assert e.sigma > 0.9 * 0.12 * held
     if skew:    # a fit that knows of no such axes is wrong
