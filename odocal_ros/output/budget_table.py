@@ -12,7 +12,7 @@ from odocal_ros.output.figures import two_digits
 
 COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
-          'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body roll and pitch'}
+          'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion'}
 HEAD = ('scale, ppm', 'yaw, deg', 'pitch, deg')
 NAME, WIDTHS = 24, (13, 15, 15)      # judgement: with 'shared' within 80 columns
 
@@ -66,5 +66,5 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
     if not (small and small_too):
         return lines
     rest = f'under {shown:.1%}: '.replace('.0%', '%').replace('%', ' %') + ', '.join(small)
-    return lines + textwrap.wrap(rest, width - 2, initial_indent='  ',
+    return lines + textwrap.wrap(rest, width, initial_indent='  ',
                                  subsequent_indent='    ')

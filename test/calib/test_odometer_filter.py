@@ -52,3 +52,13 @@ def test_the_derivative_by_the_square_is_half_the_acceleration(square):
     found = (rolled(travel(FINE), T, square + h) - rolled(travel(FINE), T, square - h)) / (2 * h)
     expected = SWING * RATE**2 * np.sin(RATE * (AT + T)) / 2
     np.testing.assert_allclose(found, expected, atol=SWING * RATE**4 * REACH**2 / 24)
+
+
+def test_a_drive_that_ends_in_motion_has_the_acceleration_of_its_last_second():
+    """And one that begins so of its first: beyond the readings nothing is known."""
+    push = 2.0                                  # m/s^2
+    constants = np.zeros(M)
+    constants[ODO_LAG2] = T**2
+    readings = Travel(AT, push * AT**2 / 2, 0.0)
+    expected = push * (AT**2 - T**2) / 2
+    np.testing.assert_allclose(as_rolled(readings, constants)(AT), expected, atol=1e-9)

@@ -5,6 +5,8 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
 from odocal_ros.calib.smoother.state import ODO_DELAY, ODO_LAG2
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.odometer import Travel
@@ -27,7 +29,10 @@ def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
     delay, half = float(constants[ODO_DELAY]), float(constants[ODO_LAG2]) / 2
 
     def rolled(t: Floats) -> Floats:
-        x, ahead, behind = (travel.at(t + delay + step) for step in (0.0, REACH, -REACH))
-        out: Floats = x - half * (ahead - 2 * x + behind) / REACH**2
+        at = t + delay
+        # at the ends that of the first and last second: beyond them there is no reading
+        middle = np.clip(at, travel.t[0] + REACH, travel.t[-1] - REACH)
+        before, here, after = (travel.at(middle + step) for step in (-REACH, 0.0, REACH))
+        out: Floats = travel.at(at) - half * (after - 2 * here + before) / REACH**2
         return out
     return rolled

@@ -17,19 +17,24 @@ from odocal_ros.calib.smoother.state import (
     BA,
     BG,
     constants_from,
+    FIX_BY_MOTION,
+    FIX_LAG2,
+    FIX_TIME,
     GNSS_ARM,
     IMPERFECT,
     KIND_OF,
     KIND_SIZES,
     M,
     ODO_ARM,
+    ODO_DELAY,
+    ODO_LAG2,
     P,
     PHI,
     TYRES,
     V,
     VELOCITY,
 )
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
@@ -51,22 +56,20 @@ START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
 # m: without heights; 1e4 m would be lost in rounding. Definition
 UP, LEVEL_START = slice(P.stop - 1, P.stop), 1.0
 # priors of the vehicle, shared by all legs
-SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
-          'odometer_delay': constants_from('odometer_delay'),
-          'fix_latency': constants_from('gnss_delay'),
-          'gyro_scale': constants_from('gyro_scale_z', 'gyro_scale_y'),
-          'gyro_axes': constants_from('gyro_axis_xy', 'gyro_axis_zy'),
-          'gyro_by_force': constants_from('gyro_x_by_force_x', 'gyro_z_by_force_y'),
-          'accelerometer_scale': constants_from('accelerometer_scale_x', 'accelerometer_scale_z'),
-          'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz'),
-          'receiver_smoothing': constants_from('fix_lag_square'),
-          'receiver_odometer': constants_from('fix_error_by_motion'),
-          'receiver_odometer_time': constants_from('fix_motion_time'),
-          'odometer_filter': constants_from('odometer_lag_square'),
-          'tyre_changes': TYRES,
-          'body_lean': constants_from('squat', 'pitch_centre'),
-          'speed_truncation': constants_from('speed_offset'),
-          'heading': constants_from('heading_offset'), 'velocity': VELOCITY}
+SHARED: dict[str, slice | Ints] = {
+    'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
+    'odometer_delay': np.array([ODO_DELAY, ODO_LAG2]),
+    'fix_latency': constants_from('gnss_delay'),
+    'gyro_scale': constants_from('gyro_scale_z', 'gyro_scale_y'),
+    'gyro_axes': constants_from('gyro_axis_xy', 'gyro_axis_zy'),
+    'gyro_by_force': constants_from('gyro_x_by_force_x', 'gyro_z_by_force_y'),
+    'accelerometer_scale': constants_from('accelerometer_scale_x', 'accelerometer_scale_z'),
+    'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz'),
+    'receiver_smoothing': np.array([FIX_LAG2, FIX_BY_MOTION, FIX_TIME]),
+    'tyre_changes': TYRES,
+    'body_lean': constants_from('squat', 'pitch_centre'),
+    'speed_truncation': constants_from('speed_offset'),
+    'heading': constants_from('heading_offset'), 'velocity': VELOCITY}
 
 
 class PriorRows(Factor):
