@@ -4,14 +4,14 @@
 """
 Small robots indoors, without GNSS: does the sigma hold for each kind of position reference.
 
-    python benchmarks/indoor.py [--drives 24] [--only KIND] [--jobs 1] [--file F]
+    python benchmarks/indoor.py [--drives 40] [--only KIND] [--jobs 1] [--file F]
 
 Differential robots with two counters on a level floor, 30 s to 3 min at 0.2 to 1.2 m/s with turns
 on the spot (odocal_ros/sim/indoor.py), references with their usual errors (sim/references.py).
 IMUs are those of the zoo (docs/zoo.md) with their effects, by turns consumer and industrial; each
-wheel has a random slip of 1 mm/sqrt(s). Settings are the defaults, but for the grade of the IMU
-and the nominal scale. Drive k of kind e has seed 93_000_000 + 1_000_000 e + k, fixed before the
-first run. Rows go to the file line by line: an interrupted run continues where it stopped.
+wheel has a random slip of 1 mm/sqrt(s). Settings are the defaults, except for the grade of the
+IMU and the nominal scale. Drive k of kind e has seed 93_000_000 + 1_000_000 e + k, fixed before
+the first run. Rows go to the file line by line: an interrupted run continues where it stopped.
 
 Printed by kind for the scale of the mean (wheel radius), the ratio of right to left, the track
 width, yaw and pitch of the IMU: in how many drives that are not rejected it is given, the share
@@ -19,19 +19,16 @@ within 1.96 sigma, the rms and the largest of error over sigma, the largest of a
 the median sigma; verdicts; in how many drives each reason was given.
 """
 
-import argparse
 from collections import Counter
 import math
 import os
-from pathlib import Path
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-import numpy as np
-from resumed import read_rows, run_missing
+from resumed import run_by_name
 from zoo import configured
-from zoo_table import WITHIN
+from zoo_table import print_errors
 
 FIRST_SEED, SEEDS_A_KIND = 93_000_000, 1_000_000
 KINDS = ('mocap', 'total_station', 'slam', 'amcl')
@@ -97,34 +94,14 @@ def table(rows):
             continue
         print(f'{kind}: {len(own)} drives, {dict(Counter(row["verdict"] for row in own))}')
         for key, unit, size in FIGURES:
-            _print_figure(key, unit, size, own)
+            print_errors(key, unit, size, own)
         print(f'    {dict(Counter(code for row in own for code in row["codes"]))}')
-
-
-def _print_figure(key, unit, size, rows):
-    rows = [row for row in rows if f'{key}_sigma' in row and row['verdict'] != 'rejected']
-    if not rows:
-        return
-    z = np.array([abs(row[f'{key}_error']) / row[f'{key}_sigma'] for row in rows])
-    accepted = [x for x, row in zip(z, rows, strict=True) if row['verdict'] == 'accepted']
-    sigma = np.median([row[f'{key}_sigma'] for row in rows]) * size
-    print(f'    {key:6} given {len(rows):3}  share {100 * (z <= WITHIN).mean():4.0f} %  '
-          f'rms {np.sqrt((z**2).mean()):5.2f}  worst {z.max():5.1f}  accepted {len(accepted):3}, '
-          f'worst {max(accepted, default=np.nan):5.1f}  sigma {sigma:.0f} {unit}')
 
 
 def main():
     """Run what the file does not hold yet, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=24, help='of each kind')
-    parser.add_argument('--only', choices=KINDS, action='append', default=[], metavar='KIND')
-    parser.add_argument('--jobs', type=int, default=1, help='processes')
-    parser.add_argument('--file', type=Path, default=Path('/tmp/indoor.jsonl'))
-    args = parser.parse_args()
-    have = read_rows(args.file)
-    seeds = [FIRST_SEED + SEEDS_A_KIND * KINDS.index(kind) + k for k in range(args.drives)
-             for kind in args.only or KINDS]
-    table(run_missing(run_drive, seeds, have, args.file, args.jobs))
+    run_by_name(__doc__, run_drive, KINDS, (FIRST_SEED, SEEDS_A_KIND), table,
+                '/tmp/indoor.jsonl')
 
 
 if __name__ == '__main__':

@@ -17,19 +17,16 @@ and the median sigma; verdicts; in how many drives each reason was given. NAMES 
 that name the effect: of drives whose scale is off by more than its stated sigma, how many name it.
 """
 
-import argparse
 from collections import Counter
 import os
-from pathlib import Path
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from alarms import RTK
-import numpy as np
-from resumed import read_rows, run_missing
+from resumed import run_by_name
 from zoo import configured, outcome
-from zoo_table import FIGURES, WITHIN
+from zoo_table import FIGURES, print_errors
 
 FIRST_SEED, SEEDS_A_RUN = 91_000_000, 1_000_000
 VEHICLES = (('industrial', RTK), ('consumer', {'fix_noise': 'correlated', 'fix_sigma': 1.5}))
@@ -76,7 +73,7 @@ def table(rows):
             continue
         print(f'{run}: {len(own)} drives, {dict(Counter(row["verdict"] for row in own))}')
         for key, unit, size in FIGURES[:3]:
-            _print_figure(key, unit, size, [row for row in own if f'{key}_sigma' in row])
+            print_errors(key, unit, size, own)
         off = [row for row in own if 'scale_sigma' in row
                and abs(row['scale_error']) > row['scale_sigma']]
         if names:
@@ -86,32 +83,10 @@ def table(rows):
         print(f'    {dict(Counter(code for row in own for code in row["codes"]))}')
 
 
-def _print_figure(key, unit, size, rows):
-    z = np.array([abs(row[f'{key}_error']) / row[f'{key}_sigma'] for row in rows])
-    given = np.array([row['verdict'] != 'rejected' for row in rows], dtype=bool)
-    accepted = [x for x, row in zip(z, rows, strict=True) if row['verdict'] == 'accepted']
-    if not given.any():
-        return
-    sigma = np.median([row[f'{key}_sigma'] for row in rows]) * size
-    print(f'    {key:6} given {given.sum():3}  share {100 * (z[given] <= WITHIN).mean():4.0f} %  '
-          f'rms {np.sqrt((z[given]**2).mean()):5.2f}  worst {z[given].max():5.1f}  accepted '
-          f'{len(accepted):3}, worst {max(accepted, default=np.nan):5.1f}  sigma '
-          f'{sigma:.0f} {unit}')
-
-
 def main():
     """Run what the file does not hold yet, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=40, help='of each run')
-    parser.add_argument('--only', choices=RUNS, action='append', default=[], metavar='RUN')
-    parser.add_argument('--jobs', type=int, default=1, help='processes')
-    parser.add_argument('--file', type=Path, default=Path('/tmp/receivers.jsonl'))
-    args = parser.parse_args()
-    have = read_rows(args.file)
-    # by turns, so that what is there after an interruption is of all runs
-    seeds = [FIRST_SEED + SEEDS_A_RUN * list(RUNS).index(run) + k for k in range(args.drives)
-             for run in args.only or RUNS]
-    table(run_missing(run_drive, seeds, have, args.file, args.jobs))
+    run_by_name(__doc__, run_drive, list(RUNS), (FIRST_SEED, SEEDS_A_RUN), table,
+                '/tmp/receivers.jsonl')
 
 
 if __name__ == '__main__':

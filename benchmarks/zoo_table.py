@@ -114,3 +114,16 @@ def _print_group(title, rows):
           f'{sum(map(silent, wrong))}, accepted '
           f'{sum(r["verdict"] == "accepted" for r in wrong)}; false reasons in {len(false)}; '
           f'{np.median(seconds):.1f} s')
+
+
+def print_errors(key, unit, size, rows):
+    """Print of a value how many rows have it, its errors over sigma, its median sigma."""
+    given = [row for row in rows if f'{key}_sigma' in row and row['verdict'] != 'rejected']
+    if not given:
+        return
+    z = np.array([abs(row[f'{key}_error']) / row[f'{key}_sigma'] for row in given])
+    accepted = [x for x, row in zip(z, given, strict=True) if row['verdict'] == 'accepted']
+    sigma = np.median([row[f'{key}_sigma'] for row in given]) * size
+    print(f'    {key:6} given {len(given):3}  share {100 * (z <= WITHIN).mean():4.0f} %  '
+          f'rms {np.sqrt((z**2).mean()):5.2f}  worst {z.max():5.1f}  accepted {len(accepted):3}, '
+          f'worst {max(accepted, default=np.nan):5.1f}  sigma {sigma:.0f} {unit}')

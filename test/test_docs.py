@@ -167,9 +167,9 @@ def test_the_walk_through_a_room_prints_what_the_page_says(tmp_path, monkeypatch
             of_run = shown[:2] if words[1] == 'robot' else shown[2:]
             assert all('\n'.join(text) in out for text in of_run), out
     made = yaml.safe_load((tmp_path / 'truth.yaml').read_text())
-    told = f'{made["scale"]["value"]:g} m/pulse, ' + ', '.join(
+    true = f'{made["scale"]["value"]:g} m/pulse, ' + ', '.join(
         f'{x:.8f}' for x in made['scale']['wheels'])
-    assert f'True values: {told.replace("8.9e-05", "0.000089")}, 0.3 m' in page_of(INDOOR)
+    assert f'True values: {true.replace("8.9e-05", "0.000089")}, 0.3 m' in page_of(INDOOR)
 
 
 def test_the_figures_of_the_page_are_those_that_are_drawn():

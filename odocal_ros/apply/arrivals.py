@@ -52,7 +52,7 @@ class Arrivals:
         least = max(min(last) - self._usual_ns, self._usual_ns - max(last)) * 1e-9
         return abs(sum(last) / rows - self._usual_ns) * 1e-9 if least > MOVED_S else 0.0
 
-    def believed(self, stamp_ns: Ints, received_ns: Ints) -> Bools:
+    def usable(self, stamp_ns: Ints, received_ns: Ints) -> Bools:
         """Return a mask of rows of the next block with a usable stamp: (n,)."""
         good = np.zeros(len(stamp_ns), bool)
         self.odd_from = self.dropped = 0

@@ -77,16 +77,16 @@ class Odometry:
              form: OdometerForm | None = None) -> None:
         """Take a block of 'imu', 'odometer' or 'odometer_right', the latter with their form."""
         arrivals = self._arrivals.setdefault(slot, Arrivals())
-        believed = arrivals.believed(block.stamp_ns, block.received_ns)
+        usable = arrivals.usable(block.stamp_ns, block.received_ns)
         if arrivals.anew:
             self.begin_anew(f'the stamps of the {slot} jump by {arrivals.off_s:+.3g} s')
             block = take(block, slice(arrivals.odd_from, None))
             arrivals = self._arrivals[slot] = Arrivals()
-            believed = arrivals.believed(block.stamp_ns, block.received_ns)
+            usable = arrivals.usable(block.stamp_ns, block.received_ns)
         if arrivals.dropped:
             self._notes.append(f'{slot}: {arrivals.dropped} messages dropped: their stamps differ '
                               f'from their arrival times by {arrivals.off_s:+.3g} s')
-        block = take(block, believed)
+        block = take(block, usable)
         if isinstance(block, OdometerSamples):
             self.wheels.feed(slot, block, form or COUNTER)
         else:

@@ -111,7 +111,7 @@ def _spread(legs: LinkedLegs, spread: dict[str, float], name: str, target: float
 
     target : the disagreement that is left where the constant is each leg's own, and one for each
     leg but one (Paule and Mandel 1982). No more than its prior: what is known to 1 %
-    does not differ by 4 %, and legs told of it without that say what their noise wants.
+    does not differ by 4 %, and without this limit the legs would determine it from their noise.
     """
     i = legs.names.index(name)
     high = 1e3 * max(np.ptp([b.value[i] for b in legs.borders]), legs.unit[i])

@@ -12,7 +12,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import FixSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.messages.sensor_types import local_fixes
+from odocal_ros.nav.local_frame import local_fixes
 from odocal_ros.settings.config import Config
 
 # s before and after a mark, and positions in between. Judgement: a fit needs ten positions
@@ -50,10 +50,10 @@ def mark_positions(config: Config, recorder: LegRecorder, start_ns: int) -> FixS
 
     """
     reference = config.reference
-    marks = np.sort(reference.marks)
+    order = np.argsort(reference.marks)
+    marks = np.array(reference.marks)[order]
     _check_still(marks, recorder, start_ns)
-    points = np.reshape(reference.points, (-1, 2))[np.arange(len(marks)) % (
-        len(reference.points) // 2)]
+    points = np.reshape(reference.points, (-1, 2))[order % (len(reference.points) // 2)]
     position = np.repeat(np.column_stack([points, np.zeros(len(points))]), ROWS, axis=0)
     t = (marks[:, None] + np.linspace(-WITHIN, WITHIN, ROWS)).ravel()
     stamps = start_ns + np.round(t * 1e9).astype(np.int64)

@@ -14,7 +14,6 @@ from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
     ImuSamples,
-    LOCAL,
     OdometerForm,
     of_columns,
     Samples,
@@ -22,7 +21,7 @@ from odocal_ros.data.samples import (
 )
 from odocal_ros.errors import BadData
 from odocal_ros.messages.fields import array, Column, fixed, STAMP, stamp_ns, View, xyz
-from odocal_ros.nav.local_frame import geodetic_of
+from odocal_ros.nav.local_frame import local_fixes
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 
@@ -132,14 +131,3 @@ def sensor_plan(slot: str, msgtype: str, config: Config) -> SensorPlan:
         raise BadData(f'{slot}: messages of type {msgtype} cannot be used; give a topic of type '
                       f'{" or ".join(types)}')
     return SensorPlan(slot, *SENSORS[slot, msgtype])
-
-
-def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
-    """Return the function that makes fixes of stamps, arrivals, positions and covariances."""
-    def build(stamps: Ints, received: Ints, position: Floats, *covariance: Floats) -> FixSamples:
-        n = len(stamps)
-        known = np.full(n, 3 if covariance else 0)      # zeros and negative ones are unknown too
-        given = covariance[0].reshape(n, 3, 3) if covariance else np.zeros((n, 3, 3))
-        return of_columns(FixSamples, stamps, received, *geodetic_of(position, latitude_deg),
-                          given, known, np.full(n, LOCAL))
-    return build

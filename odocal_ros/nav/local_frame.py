@@ -8,11 +8,13 @@ The frame is a tangent plane of the ellipsoid (x east, y north, z up) at FRAME_L
 latitude has a meaning.
 """
 
+from collections.abc import Callable
 import math
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.samples import FixSamples, LOCAL, of_columns
 from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
 
 # definition: in the Atlantic, so that the positions are not mistaken for real ones
@@ -44,3 +46,14 @@ def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, 
         own_e, C_en(latitude, FRAME_LONGITUDE), strict=True)])
     place = geodetic_from_ecef(r_e.T)
     return place
+
+
+def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:
+    """Return the function that makes fixes of stamps, arrivals, positions and covariances."""
+    def build(stamps: Ints, received: Ints, position: Floats, *covariance: Floats) -> FixSamples:
+        n = len(stamps)
+        known = np.full(n, 3 if covariance else 0)      # zeros and negative ones are unknown too
+        given = covariance[0].reshape(n, 3, 3) if covariance else np.zeros((n, 3, 3))
+        return of_columns(FixSamples, stamps, received, *geodetic_of(position, latitude_deg),
+                          given, known, np.full(n, LOCAL))
+    return build

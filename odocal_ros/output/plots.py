@@ -10,6 +10,7 @@ import numpy as np
 
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.samples import LOCAL
 from odocal_ros.output.plots_speed import by_speed
 from odocal_ros.output.plots_svg import (
     BAND,
@@ -89,7 +90,8 @@ def draw_track(ax: Any, found: Evidence, before_word: str = 'as configured',
         ax.annotate(word, point, xytext=(7 * side, 6 * up), textcoords='offset points',
                     ha='right' if side < 0 else 'left', va='top' if up < 0 else 'bottom')
     _marks(ax, found, lambda t: np.stack([np.interp(t, found.t, x) for x in after.T]), slips)
-    ax.set(xlabel=f'east of the start, {unit}', ylabel=f'north of the start, {unit}')
+    axes = ('x from', 'y from') if (found.fix_status == LOCAL).any() else ('east of', 'north of')
+    ax.set(xlabel=f'{axes[0]} the start, {unit}', ylabel=f'{axes[1]} the start, {unit}')
     ax.set_aspect('equal', adjustable='datalim')
     ax.margins(0.06)
 

@@ -7,6 +7,8 @@ from datetime import datetime, UTC
 import math
 import textwrap
 
+import numpy as np
+
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import (
     AS_SENT,
@@ -172,7 +174,8 @@ def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
         return ''
     ratio = sum(r * distance for r, distance in ratios) / way
     unit = '' if scale.unit == '1' else f' {scale.unit}'
-    return _line('  path ratio', f'{ratio:#.4g}{unit}   fixes / odometer, uncorrected '
+    plain = np.format_float_positional(ratio, 4, unique=False, fractional=False, trim='k')
+    return _line('  path ratio', f'{plain}{unit}   fixes / odometer, uncorrected '
                  f'({100 * (ratio / scale.value - 1):+.1f} %)')
 
 

@@ -3,14 +3,12 @@
 
 """Position references of a simulated drive: topic, message type and usual errors of each kind."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.samples import FixSamples, LOCAL
-from odocal_ros.nav.local_frame import geodetic_of
 from odocal_ros.sim.noise import stream
 
 REMAINDER = 0.2     # judgement: share of the accumulated drift that a loop closure leaves
@@ -73,13 +71,3 @@ def drift(t: Floats, travel: Floats, options: Any) -> Floats | float:
 def stationary_sigma(options: Any) -> float:
     """Return the sigma of a drift that is forgotten with the path, m, 0 of one that is not."""
     return float(options.reference_drift * np.sqrt(options.drift_length / 2))
-
-
-def local_fixes(fix: FixSamples, position: Floats, reference: Reference) -> FixSamples:
-    """Return positions in a local frame, (n, 3) m, as the fixes that a reader makes of them."""
-    n = len(position)
-    latitude, longitude, height = geodetic_of(position, np.nan)
-    return replace(
-        fix, latitude=latitude, longitude=longitude, height=height,
-        status=np.full(n, LOCAL), covariance_type=np.full(n, 3 if reference.stated else 0),
-        covariance_n=fix.covariance_n if reference.stated else np.zeros((n, 3, 3)))

@@ -22,6 +22,7 @@ from odocal_ros.data.samples import (
 )
 from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.local_frame import local_fixes
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim import body, real_wheels, sensors
 from odocal_ros.sim.housing import own_angles
@@ -29,7 +30,7 @@ from odocal_ros.sim.motion import attitude, Motion, Start
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Profile
-from odocal_ros.sim.references import local_fixes, Reference, REFERENCES
+from odocal_ros.sim.references import Reference, REFERENCES
 from odocal_ros.sim.road import Hills
 from odocal_ros.sim.routes import Route, ROUTES
 from odocal_ros.sim.vehicle_wheels import wheels_of
@@ -105,8 +106,10 @@ class Drive:
 
     def leg(self) -> Leg:
         """Return the drive as one leg between its marks, with all that came before."""
-        fix = (self.fix if self.options.reference == 'fix'
-               else local_fixes(self.fix, self.positions(), self.reference))
+        fix = self.fix
+        if self.options.reference != 'fix':
+            stated = [fix.covariance_n] if self.reference.stated else []
+            fix = local_fixes(np.nan)(fix.stamp_ns, fix.received_ns, self.positions(), *stated)
         wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
         return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
                    fix=fix, heading=self.heading, fix_velocity=self.velocity,

@@ -153,35 +153,35 @@ def test_a_clock_that_moved_a_little_shows_and_late_messages_do_not():
     stamp = 10**18 + np.arange(0, 20 * SECOND, SECOND // 50)
     late = np.random.default_rng(1).exponential(5e6, len(stamp)).astype(np.int64)
     arrivals = Arrivals()
-    assert arrivals.believed(stamp, np.maximum.accumulate(stamp + late)).all()
+    assert arrivals.usable(stamp, np.maximum.accumulate(stamp + late)).all()
     assert arrivals.moved_s(MOVED_ROWS) == 0.0
     for by in (0.1, -0.1):
         odd = stamp.copy()
         odd[500:] += int(by * SECOND)
         arrivals = Arrivals()
-        arrivals.believed(odd[:510], np.maximum.accumulate(stamp + late)[:510])
+        arrivals.usable(odd[:510], np.maximum.accumulate(stamp + late)[:510])
         assert arrivals.moved_s(MOVED_ROWS) == pytest.approx(0.1, abs=0.015)
         assert arrivals.moved_s(STAYS_ROWS) == 0.0
-        arrivals.believed(odd[510:560], np.maximum.accumulate(stamp + late)[510:560])
+        arrivals.usable(odd[510:560], np.maximum.accumulate(stamp + late)[510:560])
         assert arrivals.moved_s(STAYS_ROWS) == pytest.approx(0.1, abs=0.015)
 
 
-def test_bags_played_fast_are_believed_and_clocks_that_are_set_are_not():
+def test_stamps_of_fast_bags_are_usable_and_those_of_set_clocks_are_not():
     stamp = 10**18 + np.arange(0, 60 * SECOND, SECOND // 25)
     arrivals = Arrivals()
-    assert arrivals.believed(stamp, 10**18 + (stamp - stamp[0]) // 20).all()
+    assert arrivals.usable(stamp, 10**18 + (stamp - stamp[0]) // 20).all()
     assert not arrivals.anew
     for by in (3 * SECOND, -3 * SECOND):
         odd = stamp.copy()
         odd[500:] += by
         arrivals = Arrivals()
-        believed = arrivals.believed(odd[:510], stamp[:510])
-        assert believed[:500].all()
-        assert not believed[500:509].any()
+        usable = arrivals.usable(odd[:510], stamp[:510])
+        assert usable[:500].all()
+        assert not usable[500:509].any()
         assert arrivals.anew
         assert abs(arrivals.off_s) == pytest.approx(3.0, abs=0.4)
     few = stamp.copy()
     few[500:503] += 29 * SECOND
     arrivals = Arrivals()
-    assert (~arrivals.believed(few, stamp)).nonzero()[0].tolist() == [500, 501, 502]
+    assert (~arrivals.usable(few, stamp)).nonzero()[0].tolist() == [500, 501, 502]
     assert not arrivals.anew

@@ -66,6 +66,16 @@ def test_without_noise_wheels_and_width_are_those_of_the_closed_form(tmp_path):
     assert width == pytest.approx(0.41, rel=2e-4)
 
 
+def test_marks_may_be_given_in_any_order_with_their_points(tmp_path):
+    made, bag = robot(tmp_path)
+    pairs = np.reshape(POINTS, (-1, 2))[np.arange(len(TIMES)) % (len(POINTS) // 2)]
+    order = [4, 0, 8, 2, 6, 1, 5, 3, 7]
+    plain, shuffled = (calibrate_bag(bag, TOPICS, asked(made, **more)) for more in (
+        {}, {'reference.marks': [TIMES[k] for k in order],
+             'reference.points': pairs[order].ravel().astype(float).tolist()}))
+    assert shuffled.values == plain.values
+
+
 def test_the_axes_of_the_points_are_free(tmp_path):
     made, bag = robot(tmp_path)
     plain, turned = (calibrate_bag(bag, TOPICS, asked(made, **{'reference.points': list(
@@ -96,15 +106,15 @@ def test_replay_takes_marks(tmp_path, capsys):
     assert abs(width['value'] - 0.3) < 3 * width['sigma'] < 3 * 3e-3 * 0.3
 
 
-@pytest.mark.parametrize(('change', 'told'), [
+@pytest.mark.parametrize(('change', 'message'), [
     ({'reference.marks': [5.0, 14.0]}, '--mark 14: the wheels turn within 0.5 s of it'),
     ({'reference.marks': [5.0, 23.5]}, '--mark 23.5: the wheels turn'),      # on the spot
     ({'reference.marks': [5.0, 500.0]}, '--mark 500: the odometer has no data there'),
     ({'reference.points': [0.0, 0.0, 4.0]}, 'reference.points has 3 values; required with marks'),
     ({'reference.points': []}, 'reference.points has 0 values')])
-def test_marks_that_cannot_be_are_refused(change, told, tmp_path):
+def test_marks_that_cannot_be_are_refused(change, message, tmp_path):
     made, bag = robot(tmp_path, imu_rate=20.0)
-    with pytest.raises(BadUsage, match=told):
+    with pytest.raises(BadUsage, match=message):
         calibrate_bag(bag, TOPICS, asked(made) | change)
 
 

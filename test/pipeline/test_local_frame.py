@@ -7,6 +7,7 @@ from dataclasses import replace
 import math
 
 from drives import changed, drive, everything_said, settings
+from matplotlib.figure import Figure
 import numpy as np
 import pytest
 
@@ -14,10 +15,11 @@ from odocal_ros.calib.smoother import problem
 from odocal_ros.calib.smoother.leg import smoother_leg
 from odocal_ros.calib.smoother.problem import _priors
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.messages.sensor_types import local_fixes
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, OMEGA, PartlyKnownRate, rate_without_north
+from odocal_ros.nav.local_frame import local_fixes
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.output.plots import draw_track
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening import placed
@@ -235,3 +237,15 @@ def test_the_simulated_frame_starts_at_the_vehicle_and_looks_ahead():
     own = Origin(made.options.latitude, made.options.longitude, made.options.height)
     turned = position @ matrix_from_rpy([0.0, 0.0, math.pi / 2 - made.options.heading]).T
     np.testing.assert_allclose(turned, own.to_n(geodetic), atol=1e-9)
+
+
+def test_a_track_in_a_local_frame_has_no_north():
+    made = drive(**CAR | {'duration': 120.0})
+    config = settings(made, **SMOOTHER)
+    labels = []
+    for leg in (without_covariance(made), posed(made)):
+        ax = Figure().subplots()
+        draw_track(ax, calibrate(leg, config).evidence)
+        labels.append([label.split(',')[0] for label in (ax.get_xlabel(), ax.get_ylabel())])
+    assert labels == [['east of the start', 'north of the start'],
+                      ['x from the start', 'y from the start']]

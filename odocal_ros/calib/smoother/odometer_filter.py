@@ -11,28 +11,35 @@ from odocal_ros.calib.smoother.state import ODO_DELAY, ODO_LAG2
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.odometer import Travel
 
-# s to each side of a time, for the acceleration at it. Judgement: with a filter of 0.4 s the
-# rounding of a counter then adds a quarter of what the reading has
+# s to each side of a time, for the derivatives at it. Judgement: with a filter of 0.4 s the
+# rounding of a counter then adds twice what the reading has
 REACH = 0.5
+# definition: differences over it
+STENCIL = REACH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+BY_SQUARE = np.array([1.0, 0.0, -2.0, 0.0, 1.0]) / REACH**2
+BY_CUBE = np.array([-1.0, 2.0, 0.0, -2.0, 1.0]) * 4 / REACH**3
 
 
 def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
     """
     Return the travel of the wheel as a function of time, scale units.
 
-    A reading behind a filter is the mean of past ones with some weights. Of these count the mean
-    delay D and the variance T^2, for a first-order filter the square of its time constant: the
-    wheel has travelled x(t + D) - T^2 x''(t + D) / 2, but for the third moment.
+    A filtered reading is a weighted mean of past ones. Its weights have a mean delay D and a
+    variance T^2, which is the square of the time constant for a first-order filter. The travel of
+    the wheel is x(t + D) - T^2 x''(t + D) / 2 + T^3 x'''(t + D) / 3, with the third moment of such
+    a filter.
 
     travel : of the readings.   constants : (M,), with D, s, and T^2, s^2.
     """
-    delay, half = float(constants[ODO_DELAY]), float(constants[ODO_LAG2]) / 2
+    delay, square = float(constants[ODO_DELAY]), float(constants[ODO_LAG2])
+    weights = -square / 2 * BY_SQUARE + max(square, 0.0)**1.5 / 3 * BY_CUBE
 
     def rolled(t: Floats) -> Floats:
         at = t + delay
         # at the ends that of the first and last second: beyond them there is no reading
         middle = np.clip(at, travel.t[0] + REACH, travel.t[-1] - REACH)
-        before, here, after = (travel.at(middle + step) for step in (-REACH, 0.0, REACH))
-        out: Floats = travel.at(at) - half * (after - 2 * here + before) / REACH**2
+        out: Floats = travel.at(at) + sum(
+            weight * travel.at(middle + step)
+            for weight, step in zip(weights.tolist(), STENCIL.tolist(), strict=True))
         return out
     return rolled

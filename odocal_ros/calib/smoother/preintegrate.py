@@ -180,12 +180,15 @@ class _Chunk:
         self.step_v, self.step_p = turn(self.R, dv), turn(self.R, dp)
         self.v, self.dv = self._running(self.step_v)
         self.p, self.dp = self._running(self.v * dt + self.step_p)
-        by = list(ACCEL_SIGNAL)
-        self.step_F = (self.R @ self.G)[:, :, ACCEL_AXIS] * self.signals[:, None, 3:][:, :, by]
-        self.step_FF = (self.R @ self.GG)[:, :, ACCEL_AXIS] \
-            * self.signals[:, None, 3:][:, :, by] * dt[:, None]
+        dt, by = dt[:, None], self.signals[:, None, 3:][:, :, list(ACCEL_SIGNAL)]
+        # sums of R over time, and of what the errors of the accelerometer add
+        self.mean, twice = self.R @ self.G, self.R @ self.GG * dt
+        self.step_AA, self.step_FF = twice * dt, twice[:, :, ACCEL_AXIS] * by
+        self.step_F = self.mean[:, :, ACCEL_AXIS] * by
+        self.A_before, self.A = self._running(self.mean * dt)
+        self.AA_before, self.AA = self._running(self.A_before * dt + self.step_AA)
         self.F_before, self.F = self._running(self.step_F)
-        self.FF_before, self.FF = self._running(self.F_before * dt[:, None] + self.step_FF)
+        self.FF_before, self.FF = self._running(self.F_before * dt + self.step_FF)
 
     def _errors(self, gyro_bias: Floats, accel_bias: Floats,
                 constants: Floats | None) -> tuple[Floats, Floats]:
@@ -213,28 +216,25 @@ class _Chunk:
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval."""
         T, dt, ds = np.diff(self.t[self.key]), self.dt[:, None, None], np.diff(travel(self.t))
-        mean = self.R @ self.G
-        A_before, A = self._running(mean * dt)
-        AA = self._sum(A_before * dt + self.R @ self.GG * dt**2)
         by = np.concatenate([np.repeat(self.dt[:, None], 3, axis=1),
                              self.signals[:, GYRO_SIGNAL]], axis=1)
         axes = [0, 1, 2, *GYRO_AXIS]
-        step = mean[:, :, axes] * by[:, None, :]
+        step = self.mean[:, :, axes] * by[:, None, :]
         before, turned = self._running(step)
         grows = (self.R @ self.grows)[:, :, axes] * by[:, None, :]
         moment = self.step_v - self.step_p / self.dt[:, None]
         dv_before, dv_by = self._running(_cross(self.step_v, before) + _cross(moment, grows))
         dp_by = self._sum(dv_before * dt + _cross(self.step_p, before)
                           + _cross(self.step_v, grows) * (dt / 6))
-        way = mean * ds[:, None, None]
+        way = self.mean * ds[:, None, None]
         cross, ahead = skew(self.turn), skew(forward)
         own = ahead / 2 + (cross @ ahead + skew(np.cross(self.turn, forward))) / 6
         own = (self.R @ own * ds[:, None, None])[:, :, axes] * by[:, None, :]
         S_by = self._sum(_cross(way @ forward, before) + own)
         measured = self._sum(self.signals) / T[:, None]
-        return Intervals(T, self.R_end, self.dv, self.dp, A, AA, self.F, self.FF, turned, dv_by,
-                         dp_by, self._sum(way), S_by, measured[:, :3], measured[:, 3:],
-                         np.maximum.reduceat(self.longest, self.key[:-1]))
+        return Intervals(T, self.R_end, self.dv, self.dp, self.A, self.AA, self.F, self.FF,
+                         turned, dv_by, dp_by, self._sum(way), S_by, measured[:, :3],
+                         measured[:, 3:], np.maximum.reduceat(self.longest, self.key[:-1]))
 
     def points(self, t: Floats, interval: Ints, first: int) -> Points:
         """Return the sums to times in given intervals: rate and force change evenly in a step."""
@@ -249,17 +249,8 @@ class _Chunk:
         rate = self.turn[j] / dt - spin * dt / 2
         R = self.R[j] @ exp_so3(rate * h + spin * h**2 / 2)
         after, share = h[:, None], (h / dt)[:, None]
+        AA = self.AA_before[j] + self.A_before[j] * after + self.step_AA[j] * share**2
         F = self.F_before[j] + self.step_F[j] * share
         FF = self.FF_before[j] + self.F_before[j] * after + self.step_FF[j] * share**2
-        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R,
-                      self._twice_turned(j, after, share), F, FF,
-                      force + rise * h, rate + spin * h, spin)
-
-    def _twice_turned(self, j: Ints, after: Floats, share: Floats) -> Floats:
-        """Return the double integral of R up to a share of steps j: (m, 3, 3)."""
-        dt = self.dt[:, None, None]
-        A, _ = self._running(self.R @ self.G * dt)
-        step = self.R @ self.GG * dt**2
-        AA, _ = self._running(A * dt + step)
-        out: Floats = AA[j] + A[j] * after + step[j] * share**2
-        return out
+        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, AA,
+                      F, FF, force + rise * h, rate + spin * h, spin)

@@ -44,6 +44,8 @@ FALLS_WITH_SPEED = ('Possible causes: truncated speed values, a dead band, or sl
                     'wheel at high speed. Tyres grow with speed, which is the opposite. Use wheel '
                     'pulses, or a wheel that is not driven.')
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
+OF_POSES = ('Uncertainties were increased to match the residuals. Check the map, and the '
+            'covariance that this source of positions states.')
 SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have the same error, it is '
           'imu.lever_arm. Skid steering and tracks look the same; then keep the setting.')
 
@@ -129,7 +131,8 @@ def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
     if factor <= 1.5:       # worth a word: receivers state their errors no better
         return []
     return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'fix errors (white and time-correlated) are '
-                   f'{factor:.1f} times as large as their covariance states')]
+                   f'{factor:.1f} times as large as their covariance states',
+                   OF_POSES if problem.leg.origin.local else '')]
 
 
 def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
