@@ -174,7 +174,7 @@ def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
         return ''
     ratio = sum(r * distance for r, distance in ratios) / way
     unit = '' if scale.unit == '1' else f' {scale.unit}'
-    plain = np.format_float_positional(ratio, 4, unique=False, fractional=False, trim='k')
+    plain = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'  # 4 digits
     return _line('  path ratio', f'{plain}{unit}   fixes / odometer, uncorrected '
                  f'({100 * (ratio / scale.value - 1):+.1f} %)')
 
