@@ -54,7 +54,7 @@ def test_the_first_step_is_taken_as_it_is():
 
 
 def test_at_the_limit_of_passes_the_best_so_far_is_stated_with_a_wider_sigma():
-    drive, config, leg = made(duration=200.0, imu_grade='industrial', fix_noise='rtk')
+    drive, config, leg = made(duration=200.0, imu_grade='consumer', fix_noise='white')
     whole = smooth(leg, config)
     few = smooth(leg, with_settings(config, {'leg.compute_limit': 5}))
     assert few.details['iterations'] == 5

@@ -37,14 +37,16 @@ class Convergence:
     """
     Convergence limits: steps of the constants in the last pass, in sigmas.
 
-    Judgement: the remaining change is then far below the stated sigma.
+    Judgement: the remaining change is then far below the stated sigma. Measured: with ``moves`` of
+    0.03, results differ by 0.02 sigma (rms of 29 drives; at most 0.08), passes are 1.11 times as
+    many. With ``sigmas`` of 0.05, some sigmas are up to 19 % too large.
     """
 
     # residuals are noise from the first on, and no more from the second; the first step with
     # derivatives by the fitted signal takes back what noise made of it, however much
     fitted_below: float = 1.0
     measured_above: float = 4.0
-    moves: float = 0.03         # a constant may still
+    moves: float = 0.08         # a constant may still
     others: float = 0.3         # weight of what is not scale or mounting, in that
     nearly: float = 0.1         # scale and mounting, after the last pass
     creeping: float = 0.5       # the same: values that are worth having, with wider sigmas
@@ -158,7 +160,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
         if not frozen:
             marginals = solved.marginals()
             tail, before_levels = tails <= count <= last_tails, levels
-            levels = update(weighted, marginals, levels, problem, pace, fitted)
+            levels = update(weighted, marginals, levels, problem, pace, was_fitted)
             # slips and levels are factors on the same rows: slips are evaluated at the new levels
             if tail:
                 spread = slips(weighted, marginals, spread, before_levels, levels)

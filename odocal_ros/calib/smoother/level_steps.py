@@ -23,7 +23,9 @@ class OverRelaxation:
 
     first: float = 1.6          # from 2 on a single level oscillates
     faster: float = 1.25        # factor after a step in the same direction
-    slower: float = 0.5         # factor after a step that reverses
+    # factor after a step that reverses; taken back at once if the next one does not, since a small
+    # exponent creeps (an exponent that recovers by ``faster``: 1.04 times the passes)
+    slower: float = 0.5
     most: float = 3.0
 
 
@@ -62,7 +64,7 @@ def update(weighted: Weighted, marginals: JointMarginals, levels: Levels, proble
         first = RELAXATION.first if name in SLIPPING or name in PRIOR_ROWS else 1.0
         move = np.clip(_paced(pace, name, step, first) * step, np.log(0.03), np.log(30.0))
         new[name] = max(level * float(np.exp(move)), problem.least[name])
-    # while residuals contain the start, sizes are constant
+    # constants by residuals that contain the start are not judged
     for name, size in weighted[PriorRows].sizes(marginals).items() if fitted else ():
         step = float(np.log(size / levels[name]))
         new[name] = levels[name] * float(np.exp(min(_paced(pace, name, step, 1.0), 1.0) * step))
@@ -72,6 +74,9 @@ def update(weighted: Weighted, marginals: JointMarginals, levels: Levels, proble
 def _paced(pace: dict[str, tuple[float, float]], name: str, step: float, first: float) -> float:
     """Return the exponent of a step: larger after one in the same direction, else smaller."""
     power, last = pace.get(name, (first, 0.0))
-    power *= RELAXATION.slower if step * last < 0 else RELAXATION.faster if last else 1.0
+    if step * last < 0:
+        power *= RELAXATION.slower
+    elif last:
+        power *= RELAXATION.faster if power >= 1.0 else 1 / RELAXATION.slower
     pace[name] = min(power, RELAXATION.most), step
     return pace[name][0]
