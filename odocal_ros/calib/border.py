@@ -4,12 +4,14 @@
 """The information of a leg's data on the constants of the vehicle, no prior in it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
+
+SCATTER_POINTS = 11     # judgement: of the grid over the scatter between legs
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +26,7 @@ class Border:
     a lever arm is the whole one.   information : (m, m), semidefinite.   pull : (m,).
     centre, sigma : (m,) of the priors, inf where there is none.   used : (m,) the sigmas, those
     widened that the leg contradicts, and those of imperfections by the sizes it found.
+    told : of combined legs, by name: log likelihood of the scatter between them (S38), (g,).
     """
 
     names: tuple[str, ...]
@@ -33,10 +36,18 @@ class Border:
     centre: Floats
     sigma: Floats
     used: Floats
+    told: dict[str, Floats] = field(default_factory=dict)
 
     def widened(self, factor: float) -> 'Border':
         """Return what data are worth whose sigmas are too small by a factor."""
         return replace(self, information=self.information / factor**2, pull=self.pull / factor**2)
+
+    def plus(self, other: 'Border') -> 'Border':
+        """Return what both tell, on the same constants, where this one was linearised."""
+        pull = other.pull - other.information @ (self.value - other.value)
+        return replace(self, information=self.information + other.information,
+                       pull=self.pull + pull, sigma=np.maximum(self.sigma, other.sigma),
+                       used=np.maximum(self.used, other.used))
 
     def loosened(self, sigmas: dict[str, float]) -> 'Border':
         """
@@ -79,7 +90,8 @@ class Border:
         D, off = free.information, np.where(np.isfinite(self.used), self.centre - self.value, 0.0)
         return Border(tuple(n for n in self.names if n in names), self.value[at],
                       D[np.ix_(at, at)], free.pull[at] - D[np.ix_(at, ~at)] @ off[~at],
-                      self.centre[at], self.sigma[at], self.used[at])
+                      self.centre[at], self.sigma[at], self.used[at],
+                      {n: told for n, told in self.told.items() if n in names})
 
     def turned(self, name: str, about: float) -> 'Border':
         """Return the border with an angle, rad, given within half a turn of another."""

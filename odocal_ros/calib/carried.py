@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.border import Border
+from odocal_ros.calib.border import Border, SCATTER_POINTS
 from odocal_ros.data.arrays import Floats
 
+NUMBERS = [f for f in fields(Border) if f.name not in ('names', 'told')]
 NOTHING = {'sigma': np.inf, 'used': np.inf}      # for a null in a file
 
 
@@ -46,8 +47,9 @@ class Carried:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as calibration.json has it."""
-        border = {f.name: np.asarray(getattr(self.border, f.name)).tolist()
-                  for f in fields(Border)}
+        border = {f.name: np.asarray(getattr(self.border, f.name)).tolist() for f in NUMBERS}
+        border |= {'names': list(self.border.names),
+                   'told': {n: told.tolist() for n, told in self.border.told.items()}}
         return {'unit': self.unit, 'first_ns': self.first_ns, 'last_ns': self.last_ns,
                 'legs': self.legs, 'border': border}
 
@@ -68,9 +70,11 @@ def carried_from(content: dict[str, Any]) -> Carried:
         m = len(names)
         numbers = {f.name: _array(entry[f.name], (m, m) if f.name == 'information' else (m,),
                                   NOTHING.get(f.name, np.nan))
-                   for f in fields(Border) if f.name != 'names'}
-        return Carried(Border(names, **numbers), str(content['unit']), int(content['first_ns']),
-                       int(content['last_ns']), int(content['legs']))
+                   for f in NUMBERS}
+        told = {str(n): _array(x, (SCATTER_POINTS,), np.nan)
+                for n, x in dict(entry.get('told', {})).items()}
+        return Carried(Border(names, **numbers, told=told), str(content['unit']),
+                       int(content['first_ns']), int(content['last_ns']), int(content['legs']))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f'carried: {error}') from None
 

@@ -8,19 +8,22 @@ Each leg comes as its border. Constants are those of the vehicle, the same in ev
 ln K walks at random from leg to leg; priors count once: docs/method.md (S35).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
-from odocal_ros.calib.border import Border
+from odocal_ros.calib.border import Border, SCATTER_POINTS
 from odocal_ros.calib.linked_legs import LinkedLegs
 
 Floats = NDArray[np.float64]
 # statistical, deviates of a chi-square from which legs disagree: once in 20 sets of sound legs by
 # chance; in one constant once in 300, since some 15 are looked at: again one set in 20
 Z95, DISPUTED_DEVIATES = 1.6449, 2.7
+# judgement: of the logarithm of a sigma between legs over the usual one, for a mean over it
+SCATTER_GRID = np.linspace(-2.5, 5.0, SCATTER_POINTS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +34,9 @@ class Joint:
     names, value, covariance : (m,), (m, m), of the last leg where they walk.
     sigma, used : (m,) of the priors, first and with what legs gainsaid.
     chi2, freedom : disagreement of the legs before anything was widened, and what it should be.
-    spread : sigma by which legs differ, of each constant that does.   deviation : (J, m) of each
-    leg from the others, in sigmas, before that.   factor : on all sigmas, in ``covariance``.
+    between : sigma by which a constant scatters between legs, by name.   disputed : constants in
+    which legs differ for certain.   deviation : (J, m) of each leg from the others, in sigmas,
+    without scatter.   factor : on all sigmas, in ``covariance``.
     bent : (J,) rad, error of taking the leg's equations to where the constants are.
     carried : what all of them tell, for legs to come.
     """
@@ -46,39 +50,50 @@ class Joint:
     freedom: float
     deviation: Floats
     carried: Border
-    spread: dict[str, float] = field(default_factory=dict)
+    between: dict[str, float] = field(default_factory=dict)
+    disputed: tuple[str, ...] = ()
     factor: float = 1.0
     bent: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
           drifting: str = 'scale_factor', angles: Sequence[str] = (),
-          curved: Sequence[str] = ()) -> Joint:
+          curved: Sequence[str] = (), usual: Mapping[str, float] | None = None,
+          same: Sequence[bool] = ()) -> Joint:
     """
     Combine legs of one vehicle.
 
     borders : by time, at least one.   steps : (J - 1,) sigma by which ``drifting`` may have
     changed from leg to leg.   drifting : the constant that walks.   angles : constants that are
     the same after a whole turn.   curved : those in which a leg's equations are not linear: 1 -
-    cos of their change is an error of that leg's own.
+    cos of their change is an error of that leg's own.   usual : constants that scatter between
+    legs, with the usual sigma of it; their levels are estimated, (S38).   same : (J - 1,) the
+    next is a section of the same leg, and does not scatter from it.
 
     Returns
     -------
-    Joint. Constants in which legs differ for certain are taken to scatter between them by as much
-    as it takes; where legs still differ by more than their sigmas allow, all sigmas are widened.
+    Joint. Where legs differ by more than their sigmas and their scatter allow, all sigmas are
+    widened.
 
     """
+    usual = usual or {}
     legs = LinkedLegs(list(borders), drifting, np.asarray(steps, float), angles)
     bent = _bend(legs, [n for n in curved if n in legs.names])
     chi2, freedom = legs.disagreement()
-    deviation, spread = legs.deviations(), _disputed(legs)
-    left, rest = legs.disagreement(spread)
+    drives = legs.joined(same)
+    scatter = _scatter(drives, usual)
+    # the constants of a single leg are its own
+    alone = len(drives.borders) == 1 and not borders[0].told
+    between = {} if alone else scatter.sigmas
+    left, rest = (apart + of_legs - of_drives for apart, of_legs, of_drives in zip(
+        drives.disagreement(between), (chi2, freedom), drives.disagreement(), strict=True))
     factor = float(np.sqrt(left / rest)) if rest and deviate(left, rest) > Z95 else 1.0
-    x, C = legs.solve(spread)
-    where = legs.place(len(borders) - 1)
+    where = drives.place(len(drives.borders) - 1)
+    x, C = drives.solve() if alone else _averaged(drives, scatter, usual)
+    carried = drives.carried(x[where], scatter.sigmas, scatter.told).widened(factor)
     return Joint(legs.names, x[where], C[np.ix_(where, where)] * factor**2, legs.sigma, legs.used,
-                 chi2, freedom, deviation, legs.carried(x[where], spread).widened(factor), spread,
-                 factor, bent)
+                 chi2, freedom, legs.deviations(), carried, between,
+                 _disputed(legs, between, usual), factor, bent)
 
 
 def deviate(chi2: float, freedom: float) -> float:
@@ -88,41 +103,78 @@ def deviate(chi2: float, freedom: float) -> float:
     return out
 
 
-def _disputed(legs: LinkedLegs) -> dict[str, float]:
-    """Return the constants in which legs differ for certain, and by what sigma."""
-    spread: dict[str, float] = {}
-    while len(spread) < 3:      # where legs differ in more, all their sigmas are in doubt
-        now, freedom = legs.disagreement(spread)
-        found = []
-        for name in (n for n in legs.names if n not in spread):
-            left, rest = legs.disagreement(spread | {name: np.inf})
-            if freedom - rest > 0.5:    # less is no constant that legs tell
-                found.append((deviate(now - left, freedom - rest), name, left + freedom - rest))
-        if not found or max(found)[0] < DISPUTED_DEVIATES:
-            break
-        _, name, target = max(found)
-        spread = spread | {name: _spread(legs, spread, name, target)}
-    return spread
-
-
-def _spread(legs: LinkedLegs, spread: dict[str, float], name: str, target: float) -> float:
+@dataclass(frozen=True, eq=False)
+class Scatter:
     """
-    Return the sigma of a constant between legs at which they differ in it as much as they may.
+    How much constants scatter between legs, by name.
 
-    target : the disagreement that is left where the constant is each leg's own, and one for each
-    leg but one (Paule and Mandel 1982). No more than its prior: what is known to 1 %
-    does not differ by 4 %, and without this limit the legs would determine it from their noise.
+    sigmas : the mean of its logarithm.   told : (g,) log likelihood at the points of SCATTER_GRID.
+    weights : (g,) of these points.
     """
-    i = legs.names.index(name)
-    high = 1e3 * max(np.ptp([b.value[i] for b in legs.borders]), legs.unit[i])
-    high = min(high, float(legs.used[i]))
-    low = high * 1e-12
-    for _ in range(40):     # halvings of the logarithm: to 3e-11 of it
-        middle = float(np.sqrt(low * high))
-        chi2, _ = legs.disagreement(spread | {name: middle})
-        low, high = (middle, high) if chi2 > target else (low, middle)
-    out: float = high
-    return out
+
+    sigmas: dict[str, float]
+    told: dict[str, Floats]
+    weights: dict[str, Floats]
+
+
+def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
+    """
+    Return how much these constants scatter between the legs, docs/method.md (S38).
+
+    By restricted likelihood, with a half-Cauchy prior whose scale is the usual sigma (Gelman
+    2006).
+    """
+    between, told, weights = dict(usual), dict[str, Floats](), dict[str, Floats]()
+    fine = np.linspace(SCATTER_GRID[0], SCATTER_GRID[-1], 301)
+    for _ in range(2):      # sweeps: the scatter of one hardly depends on that of another
+        for name, size in usual.items():
+            own = np.array([legs.log_likelihood({**between, name: size * float(np.exp(off))})
+                            for off in SCATTER_GRID])
+            told[name] = own - own.max() + legs.told(name, len(own))
+            odds = CubicSpline(SCATTER_GRID, told[name])(fine) + fine - np.log1p(np.exp(2 * fine))
+            weight = np.exp(odds - odds.max())
+            weight /= weight.sum()
+            between[name] = size * float(np.exp(weight @ fine))
+            weights[name] = np.array([weight @ np.interp(fine, SCATTER_GRID, node)
+                                      for node in np.eye(len(own))])
+    return Scatter(between, told, weights)
+
+
+def _averaged(legs: LinkedLegs, scatter: Scatter,
+              usual: Mapping[str, float]) -> tuple[Floats, Floats]:
+    """
+    Return the unknowns at this scatter, and their covariance over all scatters.
+
+    Few legs hardly tell how much a constant scatters: docs/method.md (S39).
+    """
+    x, C = legs.solve(scatter.sigmas)
+    out = C.copy()
+    for name, weight in scatter.weights.items():
+        for w, off in zip(weight, SCATTER_GRID, strict=True):
+            value, covariance = legs.solve(scatter.sigmas | {name: usual[name] * np.exp(off)})
+            out += w * (covariance - C + np.multiply.outer(value - x, value - x))
+    return x, out
+
+
+def _disputed(legs: LinkedLegs, between: Mapping[str, float],
+              usual: Mapping[str, float]) -> tuple[str, ...]:
+    """
+    Return the constants in which legs differ for certain.
+
+    By more than the usual scatter; of those without a level, the one that explains most of what
+    is left.
+    """
+    def deviates(name: str) -> float:
+        now, freedom = legs.disagreement({**between, name: usual.get(name, 0.0)})
+        left, rest = legs.disagreement({**between, name: np.inf})
+        # less is no constant that legs tell
+        return deviate(now - left, freedom - rest) if freedom - rest > 0.5 else -np.inf
+    if len(legs.borders) < 2:
+        return ()
+    odds = {name: deviates(name) for name in legs.names}
+    others = [name for name in legs.names if name not in between]
+    sure = [*between, *([max(others, key=odds.__getitem__)] if others else [])]
+    return tuple(name for name in sure if odds[name] > DISPUTED_DEVIATES)
 
 
 def _bend(legs: LinkedLegs, curved: Sequence[str]) -> Floats:

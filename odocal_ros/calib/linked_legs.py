@@ -36,6 +36,16 @@ class LinkedLegs:
         # 0.1 ppm of ln K: no vehicle keeps it, and rows of less would swamp all others by rounding
         self.steps = np.maximum(steps, 1e-7)
 
+    def joined(self, same: Sequence[bool]) -> 'LinkedLegs':
+        """Return these legs, each one with the next if that is a section of the same leg."""
+        apart = [not together for together in same] or [True] * len(self.steps)
+        if all(apart):
+            return self
+        borders = self.borders[:1]
+        for border, own in zip(self.borders[1:], apart, strict=True):
+            borders = [*borders, border] if own else [*borders[:-1], borders[-1].plus(border)]
+        return LinkedLegs(borders, self.names[self.drifting], self.steps[apart])
+
     def take(self, borders: list[Border]) -> None:
         """Take legs in place of those there, on the names of all."""
         self.borders = borders
@@ -60,7 +70,7 @@ class LinkedLegs:
         m, J = len(self.names), len(self.borders)
         A, b = [], []
         for j, border in enumerate(borders or self.borders):
-            R, y = (border.loosened(spread) if spread else border).rows(self.unit)
+            R, y = _scattering(border, spread).rows(self.unit)
             A.append(np.zeros((len(R), m + J)))
             A[-1][:, self.columns(j)] = R
             b.append(y)
@@ -88,6 +98,20 @@ class LinkedLegs:
             scale[self.place(j)] = self.unit
         return x * scale, inverse @ inverse.T * np.multiply.outer(scale, scale)
 
+    def log_likelihood(self, spread: dict[str, float]) -> float:
+        """Return the restricted log likelihood of a scatter between legs, but for a constant."""
+        at, size = [self.names.index(n) for n in spread], np.array(list(spread.values()))
+        A, b = self.system(spread)
+        prior, centre = self._prior_rows(A.shape[1])
+        Q, R = np.linalg.qr(np.concatenate([A, prior]))
+        b = np.concatenate([b, centre])
+        out = -(b @ b - ((b @ Q)**2).sum()) / 2 - np.log(np.abs(np.diag(R))).sum()
+        for border in self.borders:
+            if not border.told:
+                own = border.information[np.ix_(at, at)] * np.multiply.outer(size, size)
+                out -= np.linalg.slogdet(np.eye(len(at)) + own)[1] / 2
+        return float(out)
+
     def _prior_rows(self, columns: int, but: Sequence[int] | Ints = ()) -> tuple[Floats, Floats]:
         """Return the priors of constants, but for some, as rows and what they should be."""
         held = np.setdiff1d(np.flatnonzero(np.isfinite(self.used)), but)
@@ -95,13 +119,24 @@ class LinkedLegs:
         prior[np.arange(len(held)), self.place(0)[held]] = 1.0     # columns are in its units
         return prior, self.centre[held] / self.used[held]
 
-    def carried(self, value: Floats, spread: dict[str, float] | None = None) -> Border:
-        """Return what all legs tell, of the last leg's constants, where those are ``value``."""
+    def carried(self, value: Floats, spread: dict[str, float],
+                told: dict[str, Floats]) -> Border:
+        """
+        Return what all legs tell, of the last leg's constants, where those are ``value``.
+
+        told : what they tell of the scatter between legs.
+        """
         A, b = self.system(spread)
         rows, b = _left(A, b, self.place(len(self.borders) - 1))
         rows = rows / self.unit
         return Border(self.names, value, rows.T @ rows, rows.T @ (b - rows @ value),
-                      self.centre, self.sigma, self.used)
+                      self.centre, self.sigma, self.used, told)
+
+    def told(self, name: str, points: int) -> Floats:
+        """Return what combined legs tell of the scatter of a constant: (points,)."""
+        out: Floats = sum((border.told[name] for border in self.borders if name in border.told),
+                          np.zeros(points))
+        return out
 
     def disagreement(self, spread: dict[str, float] | None = None) -> tuple[float, float]:
         """
@@ -129,7 +164,7 @@ class LinkedLegs:
         x, C = self.solve(spread)
         out = np.zeros((len(self.borders), len(self.names)))
         for j, border in enumerate(self.determined()):
-            border = border.loosened(spread) if spread else border
+            border = _scattering(border, spread)
             D, where = border.information, self.place(j)
             pull = border.pull - D @ (x[where] - border.value)
             variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
@@ -137,6 +172,11 @@ class LinkedLegs:
             news = variance > np.maximum(1e-6 * np.diag(D), 1e-300)
             out[j, news] = pull[news] / np.sqrt(variance[news])
         return out
+
+
+def _scattering(border: Border, spread: dict[str, float] | None) -> Border:
+    """Return the border of a leg whose constants scatter; combined legs tell their mean."""
+    return border.loosened(spread) if spread and not border.told else border
 
 
 def _left(A: Floats, b: Floats, keep: Ints) -> tuple[Floats, Floats]:
@@ -162,4 +202,4 @@ def _on(border: Border, names: tuple[str, ...]) -> Border:
         return out
     # a prior that a leg does not have is none that it has widened
     return Border(names, on(border.value, 0.0), D, on(border.pull, 0.0), on(border.centre, 0.0),
-                  on(border.sigma, 0.0), on(border.used, 0.0))
+                  on(border.sigma, 0.0), on(border.used, 0.0), border.told)

@@ -9,12 +9,12 @@ import json
 import numpy as np
 import pytest
 from smoother_legs import made
-from test_legs_on_border import apart, leg_result, Toy, TRUTH
+from test_legs_on_border import apart, leg_result, NO_SCATTER, Toy, TRUTH
 
 from odocal_ros.calib.carried import carried_from
 from odocal_ros.calib.joint import joint
 from odocal_ros.calib.scale_steps import scale_steps
-from odocal_ros.calib.smoother import smooth
+from odocal_ros.calib.smoother import several, smooth
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.files import as_json
 from odocal_ros.output.stored import known_imu
@@ -119,7 +119,8 @@ def test_a_tyre_that_lost_air_is_said_and_the_scale_follows(session):
     assert Code.LEGS_DISAGREE in {r.code for r in plain.reasons}
 
 
-def test_a_result_on_the_disk_goes_on(session):
+def test_a_result_on_the_disk_goes_on(session, monkeypatch):
+    monkeypatch.setattr(several, 'SCATTER', NO_SCATTER)
     config, results = session
     legs = legs_of(results)
     whole = combine(legs, config)
@@ -186,7 +187,23 @@ def test_an_imu_is_of_one_vehicle_and_no_leg_counts_twice(session, tmp_path):
             known_imu(with_settings(own, other))
 
 
-def test_legs_folded_into_what_is_carried_count_as_before(session):
+def test_what_combined_legs_tell_of_the_scatter_goes_on(session):
+    """One leg more or less tells half of what three do of a sigma between them: 10 % of others."""
+    config, results = session
+    legs = legs_of(results)
+    whole = combine(legs, config)
+    found = combine(legs[2:], config, carried_from(json.loads(json.dumps(
+        fold(legs[:2], config).as_dict()))))
+    for name in (SCALE, YAW):
+        a, b = found.estimates[name], whole.estimates[name]
+        assert a.value == pytest.approx(b.value, abs=0.1 * b.sigma), name
+        assert a.sigma == pytest.approx(b.sigma, rel=0.1), name
+    told = found.carried.border.told
+    assert set(told) == {'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'}
+
+
+def test_legs_folded_into_what_is_carried_count_as_before(session, monkeypatch):
+    monkeypatch.setattr(several, 'SCATTER', NO_SCATTER)
     config, results = session
     legs = legs_of(results)
     whole, carried = combine(legs, config), fold(legs[:2], config)

@@ -24,13 +24,16 @@ from odocal_ros.calib.smoother.refusal import OPTIONAL
 from odocal_ros.calib.smoother.remarks import beside, MODEL_FLOOR
 from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, LN_K, PITCH
 from odocal_ros.calib.smoother.wheel_result import joined, wheel_details, wheel_estimates
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 DAY = 86400e9        # ns, definition
+# usual scatter of ln K, yaw and pitch between the legs of a vehicle: 20 ppm by tyres, 2 and 5 mdeg
+# by load and the cross slopes of roads. Judgement
+SCATTER = 2e-5, 3.5e-5, 8.7e-5
 DELAY_DIFFERS = ('A delay changed between the legs, not the vehicle. Check the clocks and the '
                  'time stamps of this sensor: driver restarts, buffering, clock synchronisation.')
 
@@ -61,7 +64,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED]) \
         if config.leg.automatic else []
     steps[[change.leg - 1 for change in changes]] = FREE_STEP
-    found = _joint(borders, steps)
+    found = _joint(borders, steps, days == 0)
     at = [found.names.index(name) for name in CONSTANTS]
     C = floored(found.covariance[np.ix_(at, at)])
     sigma = np.sqrt(np.diag(C))
@@ -115,8 +118,10 @@ def _of_one_vehicle(borders: Sequence[Border]) -> list[Border]:
         border.names, border.used, strict=True)])) for border in borders]
 
 
-def _joint(borders: list[Border], steps: Floats) -> Joint:
-    return joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED], CONSTANTS[:WANTED])
+def _joint(borders: list[Border], steps: Floats, same: Bools) -> Joint:
+    usual = dict(zip(CONSTANTS[:WANTED], SCATTER, strict=True))
+    return joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED], CONSTANTS[:WANTED],
+                 usual, same.tolist())
 
 
 def _changed(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:
@@ -135,7 +140,7 @@ def _name(number: int) -> str:
 def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
     """Say in which constants legs differ, and which leg differs most from the others."""
     J, said = len(found.deviation), list[Reason]()
-    apart = {name: found.deviation[:, found.names.index(name)] for name in found.spread}
+    apart = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
     # what is determined with a parameter differs with it
     worst = max((np.abs(z).max() for n, z in apart.items() if n in PARAMETERS), default=0.0)
     for name, z in apart.items():
@@ -173,5 +178,5 @@ def _details(found: Joint, value: Floats, C: Floats, sources: tuple[Source, ...]
         'budget': budget_table(sources, PARAMETERS, (float(np.exp(value[LN_K])), 1.0, 1.0)),
         'correlation': correlations(C[:WANTED, :WANTED], PARAMETERS),
         'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
-                         'between_legs': found.spread, 'curvature': found.bent.tolist()},
+                         'between_legs': found.between, 'curvature': found.bent.tolist()},
         **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])} for i in SCALES}}
