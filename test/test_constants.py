@@ -15,8 +15,8 @@ import re
 import odocal_ros
 
 PACKAGE = Path(odocal_ros.__file__).parent
-ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'pipeline', 'planning', 'foresee',
-         'apply', 'live')
+ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'pipeline', 'forecast', 'apply',
+         'live')
 # where a vector's unknowns lie: two vectors may hold the same quantity
 LAYOUTS = ('calib/smoother/state.py', 'apply/errors.py')
 

@@ -7,13 +7,13 @@ import math
 import textwrap
 
 from odocal_ros.calib.smoother.slow_error import WHITE_SHARE
+from odocal_ros.forecast.planned_methods import Plan
+from odocal_ros.forecast.planned_smoother import SWAY_RATE
+from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
 from odocal_ros.library.what_helps import Change, ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, share, time_span
-from odocal_ros.planning.methods import Plan
-from odocal_ros.planning.predict import Sigmas
-from odocal_ros.planning.smoother import SWAY_RATE
 
 WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 

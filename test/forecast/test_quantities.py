@@ -13,9 +13,9 @@ pytest.importorskip('diagnostic_msgs', reason='no ROS here: pip install odocal_r
 
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.data.samples import HeadingSamples
-from odocal_ros.foresee import ability as ability_module, quantities
-from odocal_ros.foresee.ability import ability, Received, stated_variance
-from odocal_ros.foresee.forecast import better, Forecast, Prospect, WheelsForecast
+from odocal_ros.forecast import ability as ability_module, quantities
+from odocal_ros.forecast.ability import ability, Received, stated_variance
+from odocal_ros.forecast.forecast import better, Forecast, Prospect, WheelsForecast
 from odocal_ros.live import answers
 from odocal_ros.live.guidance import hint, manoeuvres, quantities_ok, seconds_to_stand, TURNS
 from odocal_ros.live.restored import Restored

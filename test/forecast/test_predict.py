@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadConfig, BadUsage
+from odocal_ros.forecast.leg_profile import fix_figures, profile_of
+from odocal_ros.forecast.planned_drive import from_rates, PlannedDrive
+from odocal_ros.forecast.predict import metres_to_go, predict, Sigmas
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.earth import A
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate
-from odocal_ros.planning.drive import from_rates, PlannedDrive
-from odocal_ros.planning.leg_profile import fix_figures, profile_of
-from odocal_ros.planning.predict import metres_to_go, predict, Sigmas
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings

@@ -18,11 +18,11 @@ from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.warm_start import carried, steps_of
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, OdocalError
-from odocal_ros.foresee.forecast import Abandoned, as_keys, Forecast, Prospect
-from odocal_ros.foresee.foresight import forecast_of
-from odocal_ros.foresee.smoother_forecast import look, with_running
-from odocal_ros.foresee.smoother_so_far import SmootherSoFar
-from odocal_ros.foresee.thinned_leg import ThinnedLeg
+from odocal_ros.forecast.forecast import Abandoned, as_keys, Forecast, Prospect
+from odocal_ros.forecast.foresight import forecast_of
+from odocal_ros.forecast.smoother_forecast import look, with_running
+from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.live.guidance import hint
 from odocal_ros.live.session import Session
 from odocal_ros.live.session_view import SessionView

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples
-from odocal_ros.foresee.ability import Received, stated_variance
-from odocal_ros.foresee.clocks_so_far import Clocks
+from odocal_ros.forecast.ability import Received, stated_variance
+from odocal_ros.forecast.clocks_so_far import Clocks
 from odocal_ros.nav.earth import radii
 from odocal_ros.screening.force import felt
 from odocal_ros.screening.odometer_steps import Steps

@@ -6,6 +6,7 @@
 
 import numpy as np
 
+from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.nav.alignment import (
     Alignment,
     COMPASS_LIMIT,
@@ -20,7 +21,6 @@ from odocal_ros.nav.alignment import (
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, gravity
 from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_multiply, transpose
-from odocal_ros.planning.drive import PlannedDrive
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import AlignmentConfig, Config
 from odocal_ros.settings.grades import Grade, grade_of

@@ -19,8 +19,8 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData
-from odocal_ros.foresee.ability import stated_variance, with_heading
-from odocal_ros.foresee.forecast import (
+from odocal_ros.forecast.ability import stated_variance, with_heading
+from odocal_ros.forecast.forecast import (
     Abandoned,
     FARTHEST_M,
     Forecast,
@@ -28,8 +28,11 @@ from odocal_ros.foresee.forecast import (
     REST_FORESEEN_S,
     sources_of,
 )
-from odocal_ros.foresee.leg_so_far import screened_in_cells
-from odocal_ros.foresee.smoother_forecast import (
+from odocal_ros.forecast.leg_profile import fix_figures, profile_of
+from odocal_ros.forecast.leg_so_far import screened_in_cells
+from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
+from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
+from odocal_ros.forecast.smoother_forecast import (
     gives_all,
     look,
     nothing_foreseen,
@@ -40,10 +43,7 @@ from odocal_ros.foresee.smoother_forecast import (
     without_force,
     YAW,
 )
-from odocal_ros.foresee.smoother_so_far import SmootherSoFar
-from odocal_ros.planning.drive import PlannedDrive, REST_SPEED
-from odocal_ros.planning.leg_profile import fix_figures, profile_of
-from odocal_ros.planning.predict import metres_to_go, predict, Prediction, Sigmas
+from odocal_ros.forecast.smoother_so_far import SmootherSoFar
 from odocal_ros.screening.force import felt
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import Inputs

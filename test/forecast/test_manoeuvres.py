@@ -6,8 +6,8 @@
 import numpy as np
 import pytest
 
-from odocal_ros.planning.drive import from_rates
-from odocal_ros.planning.manoeuvres import left_and_right_turns, stop_and_start, town_driving
+from odocal_ros.forecast.manoeuvres import left_and_right_turns, stop_and_start, town_driving
+from odocal_ros.forecast.planned_drive import from_rates
 
 pytestmark = pytest.mark.core
 

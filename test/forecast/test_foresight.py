@@ -14,12 +14,12 @@ import pytest
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
 from odocal_ros.errors import OdocalError
-from odocal_ros.foresee import foresight
-from odocal_ros.foresee.forecast import as_keys, Forecast, Prospect
-from odocal_ros.foresee.foresight import Abandoned, DriveSoFar, forecast_of
-from odocal_ros.foresee.leg_so_far import faults_in_cells
-from odocal_ros.foresee.smoother_so_far import SmootherSoFar
-from odocal_ros.foresee.thinned_leg import MOST_CELLS, ThinnedLeg
+from odocal_ros.forecast import foresight
+from odocal_ros.forecast.forecast import as_keys, Forecast, Prospect
+from odocal_ros.forecast.foresight import Abandoned, DriveSoFar, forecast_of
+from odocal_ros.forecast.leg_so_far import faults_in_cells
+from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
 from odocal_ros.live import running_estimate as watch
 from odocal_ros.live.guidance import hint
 from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
-from odocal_ros.foresee.progress import Travel
+from odocal_ros.forecast.progress import Travel
 
 SECOND = 10**9
 

@@ -21,12 +21,12 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.two_point import Chord, fit, refusal, unsolved
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig, BadUsage
+from odocal_ros.forecast.planned_alignment import plan_alignment
+from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import quat_from_matrix
-from odocal_ros.planning.alignment import plan_alignment
-from odocal_ros.planning.drive import PlannedDrive
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import SWAY

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.planning.drive import DRIVE_STEP, PlannedDrive, REST_SPEED
+from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 
 BRAKING = 1.5    # m/s^2, judgement: as in a town
 QUARTER = np.pi / 2    # definition: rad

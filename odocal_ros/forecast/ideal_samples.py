@@ -13,13 +13,13 @@ from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.outside import GIVEN_HEADING_NOISE, Heading, OUTSIDE_RATE
 from odocal_ros.calib.smoother.state import M, State
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.forecast.planned_drive import PlannedDrive
+from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose
-from odocal_ros.planning.drive import PlannedDrive
-from odocal_ros.planning.predict import Sigmas
 from odocal_ros.settings.config import Config
 
 SENT = ('heading_topic', 'imu_orientation')

@@ -14,14 +14,14 @@ from odocal_ros.calib.choice import ABOUT, choose, deciding
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
-from odocal_ros.foresee.forecast import (
+from odocal_ros.forecast.forecast import (
     FARTHEST_M,
     Forecast,
     Prospect,
     sources_of,
     WheelsForecast,
 )
-from odocal_ros.foresee.smoother_so_far import Running, SmootherSoFar
+from odocal_ros.forecast.smoother_so_far import Running, SmootherSoFar
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
 

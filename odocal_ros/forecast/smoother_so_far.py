@@ -21,8 +21,8 @@ from odocal_ros.calib.smoother import (
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData
-from odocal_ros.foresee.forecast import Abandoned
-from odocal_ros.foresee.leg_so_far import screened_in_cells
+from odocal_ros.forecast.forecast import Abandoned
+from odocal_ros.forecast.leg_so_far import screened_in_cells
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.reasons import Reason

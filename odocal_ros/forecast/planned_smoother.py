@@ -18,9 +18,9 @@ from odocal_ros.calib.smoother.refusal import refused
 from odocal_ros.calib.smoother.slow_error import WHITE_SHARE
 from odocal_ros.calib.smoother.smoother import too_little
 from odocal_ros.calib.smoother.state import M
-from odocal_ros.planning.drive import PlannedDrive
-from odocal_ros.planning.predict import Sigmas
-from odocal_ros.planning.samples import Ideal, ideal
+from odocal_ros.forecast.ideal_samples import Ideal, ideal
+from odocal_ros.forecast.planned_drive import PlannedDrive
+from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import grade_of
 

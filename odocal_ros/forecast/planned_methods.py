@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from odocal_ros.calib.choice import choose, deciding, worth_saying
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.planning.drive import PlannedDrive
-from odocal_ros.planning.predict import predict, Prediction, Sigmas
-from odocal_ros.planning.smoother import predict_smoother
+from odocal_ros.forecast.planned_drive import PlannedDrive
+from odocal_ros.forecast.planned_smoother import predict_smoother
+from odocal_ros.forecast.predict import predict, Prediction, Sigmas
 from odocal_ros.reasons import Reason, Verdict, verdict_of
 
 

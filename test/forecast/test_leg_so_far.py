@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import take
-from odocal_ros.foresee.leg_so_far import faults_in_cells, ImuGaps
-from odocal_ros.foresee.thinned_leg import ThinnedLeg
+from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps
+from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.screen import screen
