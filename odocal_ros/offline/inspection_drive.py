@@ -17,7 +17,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.pieces import lengths, medians
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.library.legs import EACH_STOP, find_legs, LegSpan, marked_legs, stops_of
+from odocal_ros.library.asked import EACH_STOP, LegSpan
+from odocal_ros.library.legs import find_legs, marked_legs, stops_of
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.stretches import (
     Drive,
