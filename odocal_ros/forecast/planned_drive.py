@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import runs
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.rotations import matrix_from_rpy
 
@@ -80,9 +81,7 @@ class PlannedDrive:
     def standstills(self, shortest: float) -> list[tuple[float, float]]:
         """Return begin and end of the stretches at rest that last ``shortest`` s or more."""
         rest = np.abs(self.speed) <= REST_SPEED
-        edge = np.diff(np.concatenate([[False], rest, [False]]).astype(int))
-        spans = zip(self.t[np.flatnonzero(edge == 1)], self.t[np.flatnonzero(edge == -1) - 1],
-                    strict=True)
+        spans = self.t[runs(rest) - [0, 1]]
         return [(float(a), float(b)) for a, b in spans if b - a >= shortest]
 
     def lengthened(self, metres: float) -> 'PlannedDrive':
