@@ -45,8 +45,7 @@ from odocal_ros.forecast.smoother_forecast import (
 )
 from odocal_ros.forecast.smoother_so_far import SmootherSoFar
 from odocal_ros.screening.force import felt
-from odocal_ros.screening.placed import place
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.settings.config import Config
 
 DRIVE_ROWS = 1000         # judgement: of the drive that a prediction is made from

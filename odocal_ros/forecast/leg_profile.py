@@ -9,8 +9,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.screening.placed import place, Placed
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs, place, Placed
 from odocal_ros.settings.config import Config
 
 

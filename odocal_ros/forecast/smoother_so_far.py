@@ -27,7 +27,7 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.facing import axes_reasons, facing
-from odocal_ros.screening.placed import place
+from odocal_ros.screening.inputs import place
 from odocal_ros.screening.sanity import UNUSABLE
 from odocal_ros.settings.config import Config
 

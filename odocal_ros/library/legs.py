@@ -16,9 +16,9 @@ from odocal_ros.library.asked import EACH_STOP, LegSpan
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.local_frame import settings_by_frame
-from odocal_ros.screening.placed import place
-from odocal_ros.screening.screen import Inputs, screen
+from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
