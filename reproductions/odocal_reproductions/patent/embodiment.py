@@ -58,8 +58,8 @@ class Embodiment:
 
     imbalance : of the array of 81, see ``imbalance``.   least : rows of an orthogonal array.
     small, whole : the rows of the best of 81 and of all 441 among ``rows``.
-    refined, refined_together : by surfaces inside the range, left and right free or together.
-    direct, direct_together : by least squares, in no range.   radius : m, nominal, of both wheels.
+    refined : by surfaces inside the range.   direct : by least squares, in no range.   radius :
+    m, nominal, of both wheels.
     grid : (7, 7) m, least mean distance over the headings, by left and right radius of all 441.
     """
 
@@ -69,9 +69,7 @@ class Embodiment:
     small: Row
     whole: Row
     refined: Refined
-    refined_together: Refined
     direct: LeastSquares
-    direct_together: LeastSquares
     radius: float
     grid: NDArray[np.float64]
 
@@ -167,7 +165,7 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
              row('least squares', direct.x), row('  wheels together', direct_together.x)]
     rows += [] if truth is None else [given('truth', truth)]
     return Embodiment(tuple(rows), imbalance(array, LEVELS), least_rows(LEVELS), *best, refined,
-                      together, direct, direct_together, radius, means.reshape(LEVELS).min(axis=2))
+                      direct, radius, means.reshape(LEVELS).min(axis=2))
 
 
 def _levels(rows: Ints, half: Floats) -> Floats:
