@@ -69,9 +69,9 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.data.leg import LegRecorder
     from odocal_ros.data.samples import take
-    from odocal_ros.foresee.foresight import forecast_of
-    from odocal_ros.foresee.smoother_so_far import SmootherSoFar
-    from odocal_ros.foresee.thinned_leg import ThinnedLeg
+    from odocal_ros.forecast.foresight import forecast_of
+    from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+    from odocal_ros.forecast.thinned_leg import ThinnedLeg
     from odocal_ros.live.jobs import compute
     import odocal_ros.live.node  # noqa: F401 all that a node holds
     from odocal_ros.live.worker import give_back, hold_little

@@ -33,7 +33,7 @@ def run(name, options, seed):
     """Print one line of figures."""
     from odocal_ros.calib.smoother import smooth, smoother_leg
     from odocal_ros.nav.standstill import standstills
-    from odocal_ros.screening.placed import place
+    from odocal_ros.screening.inputs import place
     from odocal_ros.screening.screen import screen
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.scenarios import SimOptions, simulate

@@ -16,10 +16,10 @@ import time
 
 import numpy as np
 
-from odocal_ros.patent.criteria import score
-from odocal_ros.patent.planar import course_pieces, PlanarLeg
-from odocal_ros.patent.ranges import ranges_of
-from odocal_ros.patent.search import search
+from odocal_ros.calib.wheel_search.criteria import score
+from odocal_ros.calib.wheel_search.planar import course_pieces, PlanarLeg
+from odocal_ros.calib.wheel_search.search import search
+from odocal_ros.calib.wheel_search.space import ranges_of
 from odocal_ros.settings.config import WheelsConfig
 
 RATE, FIX_EVERY, TRACK = 50, 10, 1.6     # Hz, epochs, m

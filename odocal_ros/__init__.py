@@ -21,9 +21,8 @@ Packages data       samples and legs         settings   settings and IMU grades
          messages   bytes to samples         bagio      bags; the only user of rosbags
          screening  input checks             nav        strapdown, odometer, dead reckoning
          calib      methods, budgets, verdict, combination of legs
-         patent     the search of CN104359492A; paper: the tables of Shi et al. 2015
          pipeline   one pure function from leg to result
-         planning   prediction of a planned drive; foresee: prediction during a leg
+         forecast   the sigmas that a drive will give: planned, or as far as it is driven
          apply      dead reckoning with a calibration, sample by sample
          sim        drives with known truth  output     result files, report, printed text
          live       the nodes; the only user of rclpy

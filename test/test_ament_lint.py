@@ -11,7 +11,9 @@ import pytest
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
-CODE = [str(ROOT / name) for name in ('odocal_ros', 'examples', 'launch', 'tools', 'setup.py')]
+CODE = [str(ROOT / name) for name in (
+    'odocal_ros', 'examples', 'launch', 'tools', 'setup.py', 'reproductions/odocal_reproductions',
+    'reproductions/setup.py')]
 
 
 def linter(name):
@@ -40,7 +42,8 @@ def test_xmllint(capsys):
     main = linter('ament_xmllint').main
     if shutil.which('xmllint') is None:
         pytest.skip('NO xmllint HERE: apt install libxml2-utils')
-    files = [str(ROOT / 'package.xml'), *map(str, (ROOT / 'launch').glob('*.xml'))]
+    files = [str(path) for path in (ROOT / 'package.xml', ROOT / 'reproductions' / 'package.xml',
+                                    *(ROOT / 'launch').glob('*.xml'))]
     code, said = main(argv=files), capsys.readouterr()
     if 'failed to load' in said.err and 'package_format3' in said.err:
         pytest.skip('NO NETWORK: the schema of package.xml is at download.ros.org')

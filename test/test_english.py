@@ -50,7 +50,8 @@ WORDS = {
     r'in vain|hence|thereof|therein|aught|naught|thence|whereof': 'plain words',
 }
 UNUSED = re.compile(r'(?<![\w/.`:-])(?:(?i:' + '|'.join(WORDS) + r')|Imus?)(?![\w/`-])')
-MODULES = [path for folder in ('odocal_ros', 'benchmarks', 'tools', 'examples')
+MODULES = [path for folder in (
+            'odocal_ros', 'reproductions/odocal_reproductions', 'benchmarks', 'tools', 'examples')
            for path in sorted((ROOT / folder).rglob('*.py'))
            if 'calib' not in path.relative_to(ROOT).parts]      # calib: printed text only
 PAGES = [*sorted(ROOT.glob('*.md')), *sorted((ROOT / 'docs').rglob('*.md'))]
@@ -84,7 +85,8 @@ def literals(path):
 def printed():
     """Return the printed texts of the package: literals with a space; sim names random streams."""
     return [(f'{path.relative_to(ROOT)}:{line}', text)
-            for path in sorted((ROOT / 'odocal_ros').rglob('*.py'))
+            for folder in ('odocal_ros', 'reproductions/odocal_reproductions')
+            for path in sorted((ROOT / folder).rglob('*.py'))
             for line, text in literals(path)
             if len(text.split()) > (3 if path.parent.name == 'sim' else 1)]
 

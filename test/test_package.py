@@ -58,6 +58,10 @@ def test_one_version_everywhere():
     assert XML.findtext('version') == version
     changes = (ROOT / 'CHANGELOG.rst').read_text()
     assert re.search(r'^(\d+\.\d+\.\d+) \(', changes, re.MULTILINE).group(1) == version
+    second = ROOT / 'reproductions'
+    assert ElementTree.parse(second / 'package.xml').findtext('version') == version
+    assert f"__version__ = '{version}'" in (
+        second / 'odocal_reproductions' / '__init__.py').read_text()
     cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
     assert cited['version'] == version
 
@@ -69,7 +73,8 @@ def test_each_source_file_says_whose_it_is_and_under_what_licence():
     head = '\n'.join(f'# {line}' for line in words.splitlines())
     assert (ROOT / 'setup.py').read_text().startswith(f'{head}\n\n')
     assert f'{Licence.__module__}:SPDX' in (ROOT / 'setup.py').read_text()
-    rooms = ('odocal_ros', 'test', 'tools', 'benchmarks', 'examples', 'launch', 'docs')
+    rooms = ('odocal_ros', 'reproductions', 'test', 'tools', 'benchmarks', 'examples', 'launch',
+             'docs')
     files = [path for room in rooms for path in (ROOT / room).rglob('*.py')]
     assert len(files) > 500
     assert [path for path in files if path.stat().st_size

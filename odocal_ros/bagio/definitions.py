@@ -10,11 +10,21 @@ import signal
 import threading
 from typing import Any
 
-from odocal_ros.bagio.optional import rosbags_for
+from odocal_ros.errors import BadUsage
 
 BAR = '=' * 80 + '\n'    # format: between definitions, of ros2msg in mcap.dev/spec/registry
 TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/@()]+|.',
                    re.DOTALL)
+
+
+@contextmanager
+def rosbags_for(what: str) -> Iterator[None]:
+    """Raise BadUsage if an import of rosbags, which is optional, fails; ``what`` needs it."""
+    try:
+        yield
+    except ModuleNotFoundError:
+        raise BadUsage(f'{what} needs the Python package rosbags, which is not installed: '
+                       'pip install rosbags') from None
 
 
 def parsed(msgtype: str, form: str, text: str) -> dict[str, Any]:

@@ -6,8 +6,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from odocal_ros.bagio.definitions import parsed, within
-from odocal_ros.bagio.optional import rosbags_for
+from odocal_ros.bagio.definitions import parsed, rosbags_for, within
 from odocal_ros.errors import BadData
 from odocal_ros.outside.limits import check, DEFINITION, ELEMENTS, factor, LimitReached, SECONDS
 

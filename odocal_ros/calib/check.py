@@ -11,8 +11,9 @@ from odocal_ros.calib.marks import MarkFix, Path
 from odocal_ros.calib.result import TrackCheck
 from odocal_ros.calib.slow_errors import window_means
 from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.levels import NORMAL_MEDIAN, OUTLIER_SIGMAS
+from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
 # ratio of two measures of one motion, ways or turns, by track and by fixes. Physical: no error of
 # scale, skid or lean is so large; fixes that only jump go as far as they like
@@ -55,7 +56,7 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
     level2 = np.median((residual[:, :2]**2).sum(axis=1)) / np.log(2)     # mean of an exponential
     rise = residual[:, 2] - np.median(residual[:, 2])
-    up2 = (np.median(np.abs(rise)) / NORMAL_MEDIAN)**2
+    up2 = robust_sigma(rise)**2
     seen = np.array([level2, level2, up2]) - drift**2
     level = stated[0] + stated[1] + sum(np.trace(m.covariance_n[:2, :2]) for m in marks) / 3
     asked = np.array([level, level, stated[2]])

@@ -10,9 +10,10 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.local_frame import GNSS_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import yaw_from_quat
+from odocal_ros.nav.statistics import NORMAL_MEDIAN
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
-from odocal_ros.settings.levels import FASTEST, NORMAL_MEDIAN, TYRE_SPREAD
+from odocal_ros.settings.levels import FASTEST, TYRE_SPREAD
 
 
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,

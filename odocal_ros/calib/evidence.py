@@ -20,7 +20,7 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.gaps import gaps_in_rhythm, gaps_longer
 from odocal_ros.nav.rotations import yaw_from_quat
 from odocal_ros.screening.fix_screen import sigma_limit
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
 KEPT_ROWS = 5000       # of each kind kept in a result, more than a screen has columns: judgement

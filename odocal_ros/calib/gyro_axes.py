@@ -18,10 +18,10 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.gravity_turn import gravity_fit
-from odocal_ros.screening.placed import Placed
+from odocal_ros.screening.inputs import Placed
 
 if TYPE_CHECKING:
-    from odocal_ros.screening.screen import Inputs
+    from odocal_ros.screening.inputs import Inputs
 
 Found = list[tuple[str, str, str]]      # sent axis, true axis with its sign, sentence
 SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a sound gyro

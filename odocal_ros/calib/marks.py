@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.settings.levels import NORMAL_MEDIAN, OUTLIER_SIGMAS, RAYLEIGH_MEDIAN
+from odocal_ros.nav.statistics import NORMAL_MEDIAN, RAYLEIGH_MEDIAN
+from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
 Path = Callable[[Floats], Floats]     # t (n,) s to an antenna's path, (n, 3) m, or t () to (3,)
 # s, least half-window of fixes about a mark in motion. Judgement: two seconds of fixes, over which

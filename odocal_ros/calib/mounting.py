@@ -16,7 +16,7 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import FEWEST_BINS_FACING, pushes
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs
 
 # rad of yaw from nominal: a nominal rotation or heading is wrong; no mounting, but the other way
 # round. Judgement: nobody mounts an Imu 20 deg askew unawares, and quarter turns are set

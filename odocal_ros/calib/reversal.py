@@ -19,8 +19,9 @@ from odocal_ros.calib.check import ONE_MOTION_RATIO
 from odocal_ros.calib.drive import knots_of
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.nav.angles import arctan2, wrap
+from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.levels import FAULT_SIGMAS, NORMAL_MEDIAN
+from odocal_ros.settings.levels import FAULT_SIGMAS
 
 # rad: a direction that changes by more is taken to flip. Judgement: half a turn, less what noise
 # and drift may take off
@@ -93,7 +94,7 @@ def backwards(found: Pieces) -> Bools:
     if len(moves) < 3:
         return back
     dt, step = np.maximum(np.diff(found.t[moves]), 1e-9), wrap(np.diff(found.off[moves]))
-    usual = np.median(np.abs(step)) / NORMAL_MEDIAN
+    usual = robust_sigma(step)
     sigma = usual * np.sqrt(np.maximum(dt / np.median(dt), 1.0))
     unknown = np.flatnonzero(FAULT_SIGMAS * sigma > FLIP) + 1
     state = np.cumsum(np.append(False, np.abs(step) > FLIP)) % 2 == 1

@@ -25,8 +25,8 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.levels import NORMAL_MEDIAN
 
 SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill: judgement
 SPIN_GRID = 0.2      # s between rows, a spin lasts longer: judgement
@@ -112,7 +112,7 @@ class _Windows:
         """Return time, s, and size, m, of each slip if the odometer is so late, s."""
         excess = self.excess(late)
         # what the drive as a whole does (rough road, soft suspension) is no event
-        usual = np.median(np.abs(excess[excess != 0.0])) / NORMAL_MEDIAN if excess.any() else 0.0
+        usual = robust_sigma(excess[excess != 0.0]) if excess.any() else 0.0
         least = 0.45    # m, 3 sigmas: a tilt that wanders makes 0.1 m/s^2 of a window, 0.15 m
         limit = max(least, PIN_COUNTS * self.quantum * self.K, 6 * usual)
         return _events(self.grid[PIN_STEPS:-SPAN - PIN_STEPS] + SPIN_WINDOW / 2, excess, limit)

@@ -9,7 +9,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.settings.levels import NORMAL_MEDIAN
+from odocal_ros.nav.statistics import robust_sigma
 
 # judgement: s of a comparison at most, where the speed hardly varies, and at least; cells wanted
 LONGEST_CELL, SHORTEST_CELL, WANTED_CELLS = 5.0, 2.0, 40
@@ -85,7 +85,7 @@ def _fit(length: Floats, rolled: Floats, T: Floats, change: Floats
     for _ in range(3):      # passes, until outliers are found
         x, *_ = np.linalg.lstsq(X[used], length[used], rcond=None)
         off = np.abs(length - X @ x)
-        sigma = float(np.median(off[used])) / NORMAL_MEDIAN
+        sigma = robust_sigma(off[used])
         used = np.asarray(off <= 4 * max(sigma, 1e-6))     # statistical: one in 16,000
     spread = float(np.std(mean_speed[used]) / np.mean(mean_speed[used]))
     if used.sum() < FEWEST_CELLS or spread < LEAST_SPREAD:

@@ -14,7 +14,7 @@ from typing import Any, final
 import numpy as np
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.data.pieces import by_row
+from odocal_ros.data.pieces import by_row, runs
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
@@ -189,6 +189,6 @@ def _cut(samples: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
     keep = (key >= first_ns) & (key <= last_ns)
     if keep.all():
         return samples
-    edges = np.flatnonzero(np.diff(keep, prepend=False, append=False))
+    spans = runs(keep)
     # in order, as rows are wont to come, they are a view and no copy
-    return take(samples, slice(*edges) if len(edges) == 2 else keep)
+    return take(samples, slice(*spans[0]) if len(spans) == 1 else keep)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import let_go, room
 
 Array = NDArray[Any]
@@ -55,6 +55,11 @@ def across(ufunc: np.ufunc, x: Array) -> Array:
 def lengths(x: Floats) -> Floats:
     """Return ``np.linalg.norm(x, axis=1)``, (n, k) to (n,), likewise."""
     return np.sqrt(across(np.add, x * x))
+
+
+def runs(flags: Bools) -> Ints:
+    """Return begin and end of the runs of True: (k, 2), ends exclusive."""
+    return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
 
 
 def median(x: Floats) -> float:

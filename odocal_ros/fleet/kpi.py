@@ -20,6 +20,7 @@ from typing import Any
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.fleet.tables import LEGS, VALUES
+from odocal_ros.output.figures import table_row
 from odocal_ros.outside.whole import locked, write_text
 from odocal_ros.pipeline.acceptance import Decision, hold
 from odocal_ros.reasons import Verdict
@@ -29,6 +30,8 @@ KPI = 'kpi.json'
 NORMAL = 1.4826                  # statistical: sigma over the median of absolute errors
 FEWEST = 3                       # judgement: legs of a reference; a tested leg is one of them
 MINUTES = (2.0, 5.0, 10.0, 30.0)      # judgement: upper ends of the rows of the table
+SHARES = ('precision', 'recall', 'false_accept', 'false_reject', 'undecided')
+WIDTHS = 10, 7, 11, 9, 14, 14, 11     # definition: of the columns of the table
 Limits = dict[str, tuple[float, float]]
 
 
@@ -143,14 +146,10 @@ def _lines(found: dict[str, Any], output: Path) -> str:
     of = found['vehicles']
     lines = ['', f'legs tested against the limits: {of["good"]} good vehicles, {of["bad"]} bad, '
              f'{of["on_the_limit"]} left out (undecided, or fewer than {FEWEST} legs)',
-             f'  {"minutes":<10}{"legs":>7}{"precision":>11}{"recall":>9}{"false accept":>14}'
-             f'{"false reject":>14}{"undecided":>11}']
+             table_row(('minutes', 'legs', *(name.replace('_', ' ') for name in SHARES)), WIDTHS)]
     for row in [*found['by_minutes'], {'up_to': 'all'} | found['all']]:
         label = 'longer' if row['up_to'] is None else row['up_to'] if row['up_to'] == 'all' \
             else f'up to {row["up_to"]:g}'
-        shares = [row[k] for k in ('precision', 'recall', 'false_accept', 'false_reject',
-                                   'undecided')]
-        texts = ['-' if x is None else f'{100 * x:.1f} %' for x in shares]
-        lines.append(f'  {label:<10}{row["legs"]:>7}{texts[0]:>11}{texts[1]:>9}{texts[2]:>14}'
-                     f'{texts[3]:>14}{texts[4]:>11}')
+        texts = ('-' if row[k] is None else f'{100 * row[k]:.1f} %' for k in SHARES)
+        lines.append(table_row((label, str(row['legs']), *texts), WIDTHS))
     return '\n'.join([*lines, f'written: {output / KPI}'])

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 import io
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.fleet.bag_task import BagJob
 from odocal_ros.fleet.bags import at_hand
 from odocal_ros.fleet.engine import results
+from odocal_ros.fleet.page import fleet_page, remarks
 from odocal_ros.fleet.second_stage import (
     file_name,
     flagged,
@@ -24,11 +24,9 @@ from odocal_ros.fleet.second_stage import (
     vehicles_together,
 )
 from odocal_ros.fleet.tables import VEHICLES
-from odocal_ros.output.summary import DEG
 from odocal_ros.outside.names import for_table
 from odocal_ros.outside.whole import locked, write_text
 from odocal_ros.reasons import Verdict
-from odocal_ros.settings.levels import TYRE_SPREAD
 
 TABLE, PAGE = 'fleet.csv', 'fleet.html'
 
@@ -44,7 +42,6 @@ class ReportJob:
 def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], output: Path,
                   args: Namespace) -> list[dict[str, Any]]:
     """Write tables, reports and page from the rows of all bags; return the vehicles' rows."""
-    from odocal_ros.fleet.page import fleet_page
     of = vehicle_jobs([job.bag for job in jobs], rows, asked(jobs))
     vehicles = vehicles_together(client, of, output, args.files)
     with locked(output):          # another fleet's command may write here too
@@ -119,29 +116,6 @@ def said(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
         lines.append(f'  and {len(worth) - most} more')
     return '\n'.join([*lines, f'written: {output}/ ({TABLE}, vehicles.parquet, legs.parquet)',
                       f'report:  {output / PAGE}'])
-
-
-def remarks(row: dict[str, Any]) -> list[str]:
-    """Return the remarks on a vehicle."""
-    out = [row['decision'] or row['verdict']]
-    for change in json.loads(row['changes']):
-        size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else
-                f'{DEG * change["size"]:+.2f} deg')
-        odometer = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
-        out.append(f'{change["value"].replace("_", " ")} changed by {size} between '
-                   f'{change["after"][:10]} and {change["by"][:10]}'
-                   + ', too large for tyres: check the odometer' * odometer)
-    if row['outlier']:
-        out.append(f'{" and ".join(row["outlier"].split())} outlier of its model')
-    if row['odd_legs']:
-        out.append(f'outlier leg {", ".join(row["odd_legs"].split())}')
-    if row['rejected_for']:
-        since = f', all since {row["rejected_since"]:%Y-%m-%d}' if row['rejected_since'] else ''
-        out.append(f'{row["legs"] - row["legs_good"]} of {row["legs"]} legs rejected '
-                   f'({", ".join(row["rejected_for"].split())}){since}')
-    if row['bags_failed']:
-        out.append(f'{row["bags_failed"]} of {row["bags"]} bags failed ({row["failures"]})')
-    return [*out, row['why']] if row['why'] else out
 
 
 def exit_code(vehicles: Sequence[dict[str, Any]], strict: bool) -> int:

@@ -6,6 +6,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from importlib.resources import files
+import json
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -13,12 +14,12 @@ from urllib.parse import quote
 import numpy as np
 
 from odocal_ros import __version__
-from odocal_ros.fleet.outcome import remarks
 from odocal_ros.fleet.population import LEAST, Population, population
 from odocal_ros.fleet.second_stage import COMPARED, file_name
 from odocal_ros.fleet.tables import LEGS
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.summary import DEG
+from odocal_ros.settings.levels import TYRE_SPREAD
 
 
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
@@ -104,3 +105,26 @@ def _cell(row: dict[str, Any], name: str, factor: float) -> str:
     if row[name] is None:
         return '-'
     return with_sigma(row[name], row[f'{name}_sigma'], factor, signed=factor != 1.0)
+
+
+def remarks(row: dict[str, Any]) -> list[str]:
+    """Return the remarks on a vehicle."""
+    out = [row['decision'] or row['verdict']]
+    for change in json.loads(row['changes']):
+        size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else
+                f'{DEG * change["size"]:+.2f} deg')
+        odometer = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
+        out.append(f'{change["value"].replace("_", " ")} changed by {size} between '
+                   f'{change["after"][:10]} and {change["by"][:10]}'
+                   + ', too large for tyres: check the odometer' * odometer)
+    if row['outlier']:
+        out.append(f'{" and ".join(row["outlier"].split())} outlier of its model')
+    if row['odd_legs']:
+        out.append(f'outlier leg {", ".join(row["odd_legs"].split())}')
+    if row['rejected_for']:
+        since = f', all since {row["rejected_since"]:%Y-%m-%d}' if row['rejected_since'] else ''
+        out.append(f'{row["legs"] - row["legs_good"]} of {row["legs"]} legs rejected '
+                   f'({", ".join(row["rejected_for"].split())}){since}')
+    if row['bags_failed']:
+        out.append(f'{row["bags_failed"]} of {row["bags"]} bags failed ({row["failures"]})')
+    return [*out, row['why']] if row['why'] else out

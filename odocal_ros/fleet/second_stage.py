@@ -3,7 +3,7 @@
 
 """From rows to vehicles on the engine: groups of vehicles, each a task that writes its part."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, UTC
 import hashlib
@@ -54,8 +54,8 @@ def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
             for vehicle, which in of.items()]
 
 
-def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path, files: bool,
-                      tell: Callable[[int], None] = lambda done: None) -> list[dict[str, Any]]:
+def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path,
+                      files: bool) -> list[dict[str, Any]]:
     """
     Return the rows of all vehicles, the worst first; write legs.parquet and vehicles.parquet.
 
@@ -73,7 +73,6 @@ def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path, fil
             if error is not None:
                 raise error
             found[k] = rows
-            tell(len(rows))
         vehicles = beside_their_model([row for k in sorted(found) for row in found[k]])
         write_table(folder / LEGS, leg_schema(), batches(sorted(parts.glob('*.parquet'))))
         write_table(folder / VEHICLES, vehicle_schema(), in_batches(vehicles))

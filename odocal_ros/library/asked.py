@@ -5,18 +5,30 @@
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime, UTC
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.outside.limits import LATEST_NS
 from odocal_ros.outside.names import brief_line, said_by
 from odocal_ros.settings.config import Config, with_settings
 
-if TYPE_CHECKING:
-    from odocal_ros.library.legs import LegSpan
-
 Settings = Config | Mapping[str, object] | str | Path | None
 Leg = str | tuple[float | None, float | None]
+EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
+EACH_STOP = 'each-stop'
+
+
+@dataclass(frozen=True)
+class LegSpan:
+    """A leg as asked for; None: open on that side."""
+
+    start_ns: int | None
+    stop_ns: int | None
+    relative: tuple[bool, bool] = (False, False)   # against the bag's first message
 
 
 def paths_of(asked: Any) -> list[Path]:
@@ -81,7 +93,7 @@ def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> C
     return with_settings(with_settings(Config(), journal or {}), asked or {})
 
 
-def legs_of(asked: Iterable[Leg] | Leg | None) -> 'list[LegSpan | str]':
+def legs_of(asked: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
     """
     Return legs as ``find_legs`` takes them.
 
@@ -94,7 +106,6 @@ def legs_of(asked: Iterable[Leg] | Leg | None) -> 'list[LegSpan | str]':
         One is not of these forms.
 
     """
-    from odocal_ros.library.legs import EACH_STOP, parse_leg
     if asked is None:
         return []
     if not isinstance(asked, Iterable):
@@ -114,3 +125,49 @@ def _text(leg: Any) -> str:
     if not (isinstance(leg, tuple) and _is_pair(leg)):
         raise BadUsage(f"legs: {leg!r} is neither 'A:B', 'A/B', 'each-stop' nor (A, B)")
     return ':'.join('' if edge is None else f'{float(edge):.9f}' for edge in leg)
+
+
+def parse_leg(text: str) -> LegSpan:
+    """
+    Return the leg of ``A:B`` (seconds) or ``A/B`` (ISO 8601); either side may be empty.
+
+    Raises
+    ------
+    BadUsage
+        Not of that form, or B not after A.
+
+    """
+    separator = '/' if '/' in text else ':'
+    parts = text.split(separator)
+    if len(parts) != 2:
+        raise BadUsage(f'--leg {text}: required: A:B in seconds, or A/B for ISO 8601 dates')
+    (start, rel_a), (stop, rel_b) = (_edge(p.strip(), text) for p in parts)
+    if start is not None and stop is not None and rel_a == rel_b and stop <= start:
+        raise BadUsage(f'--leg {text}: the end is not after the start')
+    return LegSpan(start, stop, (rel_a, rel_b))
+
+
+def _edge(text: str, whole: str) -> tuple[int | None, bool]:
+    """Return nanoseconds and whether they are against the bag's first message."""
+    if not text:
+        return None, False
+    try:
+        seconds = Decimal(text)
+        if seconds.is_finite():
+            if seconds.copy_abs() >= LATEST_NS // 10**9:
+                raise BadUsage(f'--leg {whole}: {text[:40]} is not a valid time: beyond the year '
+                               '2116')
+            return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH
+    except InvalidOperation:
+        pass
+    try:
+        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
+    except ValueError:
+        raise BadUsage(f'--leg {whole}: {text!r} is neither seconds nor an ISO 8601 date; use A:B '
+                       'for seconds, A/B for dates') from None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    whole_ns = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
+    if abs(whole_ns) >= LATEST_NS:
+        raise BadUsage(f'--leg {whole}: {text} is not a valid time')
+    return whole_ns, False

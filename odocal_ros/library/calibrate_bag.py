@@ -13,8 +13,9 @@ from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.library.asked import config_of, Leg, legs_of, paths_of, Settings, topics_of
 from odocal_ros.library.calibration import Calibration
+from odocal_ros.library.legs import open_ended, OPEN_LEG
 from odocal_ros.library.listener import Listener, Notes
-from odocal_ros.library.read_bag import read_bag, readers_of, Recording
+from odocal_ros.library.read_bag import journal_notes, read_bag, readers_of, Recording
 from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
@@ -92,7 +93,6 @@ class _Asked:
 def _look(path: Path, asked: _Asked) -> None:
     """Open a bag and check that it has the required data."""
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.library.read_bag import journal_notes
     journal = journal_notes(path)
     settings = config_of(asked.config, journal.settings if journal else None)
     with open_bag(path) as bag:
@@ -155,7 +155,6 @@ def _settings_of_all(done: list[_BagLegs], received: Notes) -> Config:
 
 def _legs_of(bag: Recording, asked: _Asked, received: Notes) -> list[LegResult]:
     """Return the results of a bag's legs."""
-    from odocal_ros.library.legs import open_ended, OPEN_LEG
     if bag.dropped and not asked.legs:
         raise LegDropped(f'{bag.name}: its leg was cancelled or undone and is not replayed; use '
                          '--leg : to replay it anyway')

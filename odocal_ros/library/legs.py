@@ -4,33 +4,25 @@
 """Which legs a recording holds: as asked, as marked by the node, or from its standstills."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from datetime import datetime, UTC
-from decimal import Decimal, InvalidOperation
-from typing import Any, TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 
+from odocal_ros.bagio.read import Bag
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
+from odocal_ros.library.asked import EACH_STOP, LegSpan
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.outside.limits import LATEST_NS
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.local_frame import settings_by_frame
-from odocal_ros.screening.placed import place
-from odocal_ros.screening.screen import Inputs, screen
+from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
-
-if TYPE_CHECKING:
-    from odocal_ros.bagio.read import Bag
-    from odocal_ros.library.read_bag import Recording
 
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
 Stops = tuple[Ints, tuple[Floats, float] | None]     # as ``stops_of`` gives them
-EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
-EACH_STOP = 'each-stop'
 OPENING = 0.2                 # judgement: of the distance; a first stop later splits no leg
 STATUS_NAME = 'calibrator: calibration'
 DROPPED = ('cancelled', 'undone')
@@ -39,62 +31,23 @@ OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: i
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 
 
-@dataclass(frozen=True)
-class LegSpan:
-    """A leg as asked for; None: open on that side."""
+class Recorded(Protocol):
+    """A bag that is open or was read."""
 
-    start_ns: int | None
-    stop_ns: int | None
-    relative: tuple[bool, bool] = (False, False)   # against the bag's first message
+    @property
+    def name(self) -> str:
+        """Return its name."""
 
+    @property
+    def start_ns(self) -> int:
+        """Return the bag time of its first message."""
 
-def parse_leg(text: str) -> LegSpan:
-    """
-    Return the leg of ``A:B`` (seconds) or ``A/B`` (ISO 8601); either side may be empty.
-
-    Raises
-    ------
-    BadUsage
-        Not of that form, or B not after A.
-
-    """
-    separator = '/' if '/' in text else ':'
-    parts = text.split(separator)
-    if len(parts) != 2:
-        raise BadUsage(f'--leg {text}: required: A:B in seconds, or A/B for ISO 8601 dates')
-    (start, rel_a), (stop, rel_b) = (_edge(p.strip(), text) for p in parts)
-    if start is not None and stop is not None and rel_a == rel_b and stop <= start:
-        raise BadUsage(f'--leg {text}: the end is not after the start')
-    return LegSpan(start, stop, (rel_a, rel_b))
+    @property
+    def end_ns(self) -> int:
+        """Return the bag time of its last message."""
 
 
-def _edge(text: str, whole: str) -> tuple[int | None, bool]:
-    """Return nanoseconds and whether they are against the bag's first message."""
-    if not text:
-        return None, False
-    try:
-        seconds = Decimal(text)
-        if seconds.is_finite():
-            if seconds.copy_abs() >= LATEST_NS // 10**9:
-                raise BadUsage(f'--leg {whole}: {text[:40]} is not a valid time: beyond the year '
-                               '2116')
-            return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH
-    except InvalidOperation:
-        pass
-    try:
-        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
-    except ValueError:
-        raise BadUsage(f'--leg {whole}: {text!r} is neither seconds nor an ISO 8601 date; use A:B '
-                       'for seconds, A/B for dates') from None
-    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    whole_ns = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
-    if abs(whole_ns) >= LATEST_NS:
-        raise BadUsage(f'--leg {whole}: {text} is not a valid time')
-    return whole_ns, False
-
-
-def marked_legs(bag: 'Bag') -> list[tuple[int, int]]:
+def marked_legs(bag: Bag) -> list[tuple[int, int]]:
     """
     Return the legs that a node marked in the bag by its status; cancelled ones are left out.
 
@@ -119,12 +72,12 @@ def open_ended(spans: Spans, marks: Sequence[tuple[int, int]]) -> list[tuple[Rea
             for start, _ in spans]
 
 
-def dropped_legs(bag: 'Bag') -> bool:
+def dropped_legs(bag: Bag) -> bool:
     """Return True if the operator cancelled or undid a leg that is marked in the bag."""
     return any(values.get('leg_event') in DROPPED for values in _last_marks(bag))
 
 
-def _last_marks(bag: 'Bag') -> list[dict[str, str]]:
+def _last_marks(bag: Bag) -> list[dict[str, str]]:
     """Return the last that was said of each leg."""
     last: dict[tuple[str, int], dict[str, str]] = {}
     for topic in bag.topics.values():
@@ -155,7 +108,7 @@ def _remember(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str
     last[leg_id] = values | {'leg_event': event}
 
 
-def find_legs(recorder: LegRecorder, bag: 'Bag | Recording', asked: Sequence[LegSpan | str],
+def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | str],
               marks: Sequence[tuple[int, int]], config: Config,
               stops: Stops | None = None) -> Spans:
     """
@@ -165,7 +118,7 @@ def find_legs(recorder: LegRecorder, bag: 'Bag | Recording', asked: Sequence[Leg
     ----------
     recorder : LegRecorder
         Fed with the whole bag.
-    bag : Bag
+    bag : Recorded
         For its time span.
     asked : list of LegSpan or 'each-stop'
         Empty: marks if there are any, else automatic legs with leg.automatic, else one from
@@ -200,7 +153,7 @@ def find_legs(recorder: LegRecorder, bag: 'Bag | Recording', asked: Sequence[Leg
     return [_by_standstill(first, last, stops_known())]
 
 
-def _marked(marks: Sequence[tuple[int, int]], last: int, bag: 'Bag | Recording') -> Spans:
+def _marked(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans:
     """Return marked legs, each with an end."""
     legs = [(a, b or last) for a, b in marks if (b or last) > a]
     if not legs:
@@ -222,7 +175,7 @@ def _common(recorder: LegRecorder) -> tuple[int, int]:
     return first, max(last, first + 1)
 
 
-def _placed(span: LegSpan, bag: 'Bag | Recording', first: int, last: int) -> tuple[int, int]:
+def _placed(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, int]:
     start = first if span.start_ns is None else span.start_ns + bag.start_ns * span.relative[0]
     stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.relative[1]
     # stamps may be of another clock than the bag's times, as of a drive that was played again
@@ -234,7 +187,7 @@ def _placed(span: LegSpan, bag: 'Bag | Recording', first: int, last: int) -> tup
     return start, stop
 
 
-def _s(stamp: int, bag: 'Bag | Recording') -> str:
+def _s(stamp: int, bag: Recorded) -> str:
     return f'{(stamp - bag.start_ns) * 1e-9:.2f}'
 
 

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.forecast.planned_drive import PlannedDrive
+from odocal_ros.forecast.planned_methods import Plan, plan_methods
+from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.library import planned_drives
 from odocal_ros.library.asked import config_of, Settings
 from odocal_ros.library.what_helps import Change, changes, SCALE, YAW
-from odocal_ros.planning.drive import PlannedDrive
-from odocal_ros.planning.methods import Plan, plan_methods
-from odocal_ros.planning.predict import Sigmas
 from odocal_ros.reasons import Reason, Verdict
 
 PITCH = 'pitch_mounting_angle'

@@ -12,8 +12,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
+from odocal_ros.forecast.planned_drive import DRIVE_STEP, from_rates, marked, PlannedDrive
 from odocal_ros.nav.angles import arctan2
-from odocal_ros.planning.drive import DRIVE_STEP, from_rates, marked, PlannedDrive
 from odocal_ros.settings.config import Config
 
 MOST_SECONDS = 36_000.0      # of a planned drive, judgement: ten hours
@@ -191,10 +191,10 @@ def from_bag(path: Path, config: Config,
     """Return the drive of a recorded bag's first leg, and the figures of its own fixes."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.data.leg import LegRecorder
+    from odocal_ros.forecast.leg_profile import count_size, fix_figures, profile_of
     from odocal_ros.library.legs import find_legs, marked_legs
     from odocal_ros.library.topics import choose_topics
     from odocal_ros.messages.decode import make_reader
-    from odocal_ros.planning.leg_profile import count_size, fix_figures, profile_of
     from odocal_ros.screening.screen import screen
     with open_bag(path) as bag:
         chosen = choose_topics(bag.topics, config, topics)

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.read import Bag, bag_sha256, open_bag, TopicInfo
 from odocal_ros.data.leg import Leg, LegRecorder, SLOTS
 from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, Settings
+from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, LegSpan, Settings
+from odocal_ros.library.legs import dropped_legs, find_legs, marked_legs
 from odocal_ros.library.listener import Listener
 from odocal_ros.library.marks import mark_positions, with_marks
 from odocal_ros.messages.decode import make_reader, Reader
@@ -22,9 +22,6 @@ from odocal_ros.outside.limits import is_file
 from odocal_ros.outside.names import one_line
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
-
-if TYPE_CHECKING:
-    from odocal_ros.library.legs import LegSpan
 
 BLOCK = 'odocal_journal'
 
@@ -97,9 +94,8 @@ class Recording:
         rows: Samples = self.recorder.rows(slot)
         return rows
 
-    def spans(self, legs: 'list[LegSpan | str]') -> list[tuple[int, int]]:
+    def spans(self, legs: list[LegSpan | str]) -> list[tuple[int, int]]:
         """Return (start, stop) stamps of legs that ``legs_of`` gave; of none, those it holds."""
-        from odocal_ros.library.legs import find_legs
         return find_legs(self.recorder, self, legs, [] if legs else list(self.marks), self.config)
 
     def legs(self, legs: AskedLeg | list[AskedLeg] | None = None) -> list[Leg]:
@@ -145,7 +141,6 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
         The bag cannot be read, lacks an input, or holds several that could be it.
 
     """
-    from odocal_ros.library.legs import dropped_legs, marked_legs
     hearer = hearer or Listener()
     path = Path(path)
     journal = journal_notes(path)

@@ -10,13 +10,13 @@ import math
 import numpy as np
 
 from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.forecast.manoeuvres import left_and_right_turns, stop_and_start, town_driving
+from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
+from odocal_ros.forecast.planned_methods import Plan, plan_methods
+from odocal_ros.forecast.planned_smoother import spacing_for
+from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.pipeline.combination import together
-from odocal_ros.planning.drive import PlannedDrive, REST_SPEED
-from odocal_ros.planning.manoeuvres import left_and_right_turns, stop_and_start, town_driving
-from odocal_ros.planning.methods import Plan, plan_methods
-from odocal_ros.planning.predict import predict, Sigmas
-from odocal_ros.planning.smoother import spacing_for
 from odocal_ros.settings.config import GRADES, with_settings
 
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'

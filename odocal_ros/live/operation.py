@@ -8,7 +8,7 @@ from functools import partial
 from rclpy.task import Future
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.foresee.quantities import words
+from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, jobs, result_files as outputs
 from odocal_ros.live.automatic_way import AutomaticWay
 from odocal_ros.live.computing import PATIENCE_S

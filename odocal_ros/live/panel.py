@@ -11,7 +11,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from odocal_ros.foresee.forecast import REST_FORESEEN_S, three_digits
+from odocal_ros.forecast.forecast import REST_FORESEEN_S, three_digits
 from odocal_ros.output.figures import with_sigma
 
 COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}

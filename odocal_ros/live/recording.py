@@ -13,8 +13,8 @@ from rclpy.node import Node
 
 from odocal_ros.data.leg import LegRecorder, WHEELS
 from odocal_ros.data.samples import Samples, take
-from odocal_ros.foresee.ability import Received
-from odocal_ros.foresee.progress import Progress
+from odocal_ros.forecast.ability import Received
+from odocal_ros.forecast.progress import Progress
 from odocal_ros.live.inputs import Inputs
 from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.config import Config

@@ -10,11 +10,11 @@ from typing import Any, TypeAlias
 
 from odocal_ros.data.leg import LegRecorder, SLOTS
 from odocal_ros.data.samples import join, OdometerForm, take
-from odocal_ros.foresee.forecast import Abandoned, better, Forecast
-from odocal_ros.foresee.foresight import forecast_of
-from odocal_ros.foresee.leg_so_far import faults_in_cells, ImuGaps, screened_in_cells
-from odocal_ros.foresee.smoother_so_far import SmootherSoFar
-from odocal_ros.foresee.thinned_leg import ThinnedLeg
+from odocal_ros.forecast.forecast import Abandoned, better, Forecast
+from odocal_ros.forecast.foresight import forecast_of
+from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps, screened_in_cells
+from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.live.answers import one_line
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.worker import Worker

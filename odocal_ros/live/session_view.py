@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from math import nan
 from typing import Any
 
-from odocal_ros.foresee.ability import Ability
-from odocal_ros.foresee.forecast import Forecast
+from odocal_ros.forecast.ability import Ability
+from odocal_ros.forecast.forecast import Forecast
 from odocal_ros.live.session import Session, State
 from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.reasons import Reason, Verdict

@@ -9,8 +9,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from odocal_ros.calib.result import wheel_factors
-from odocal_ros.foresee import quantities
-from odocal_ros.foresee.forecast import as_keys
+from odocal_ros.forecast import quantities
+from odocal_ros.forecast.forecast import as_keys
 from odocal_ros.live.guidance import (
     hint,
     manoeuvres,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats, Values
+from odocal_ros.data.pieces import runs
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed
 from odocal_ros.nav.held_speed import held_speed, HeldSpeed
@@ -151,8 +152,7 @@ def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
     limit = RESET_FACTOR * np.percentile(size[size > 0], 95)
     far = size > (max(limit, 3 / usual) if whole else limit)
     # motion of a drive that mostly stands comes in long runs, a reset or a false row does not
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(int)))
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+    for begin, end in runs(far):
         if end - begin > 2:
             far[begin:end] = False
     return far

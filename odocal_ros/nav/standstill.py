@@ -8,7 +8,7 @@ from functools import reduce
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import across, by_step
+from odocal_ros.data.pieces import across, by_step, runs
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 
@@ -62,8 +62,7 @@ def _allowed(travel: Travel, metres_per_unit: float) -> float:
 
 def _spans(quiet: Bools, edges: Floats, shortest: float) -> Floats:
     """Return begin and end of the runs of quiet cells that last: (k, 2)."""
-    steps = np.diff(np.concatenate([[False], quiet, [False]]).astype(int))
-    spans = np.stack([edges[np.flatnonzero(steps == 1)], edges[np.flatnonzero(steps == -1)]], -1)
+    spans: Floats = edges[runs(quiet)]
     return spans[spans[:, 1] - spans[:, 0] >= shortest - 1e-9]
 
 

@@ -8,12 +8,14 @@ import importlib
 import os
 import sys
 import tempfile
+from types import ModuleType
 from typing import NoReturn
 
 from odocal_ros import __version__
-from odocal_ros.errors import OdocalError
+from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.offline.say import warn
 
+# name: (its module, or the package that has it as an entry point; what it does)
 COMMANDS = {
     'try': ('odocal_ros.offline.try_bag', 'inspect a bag, calibrate, open the report'),
     'replay': ('odocal_ros.offline.replay', 'calibrate from recorded bags'),
@@ -21,12 +23,12 @@ COMMANDS = {
     'inspect': ('odocal_ros.offline.inspect_bag', 'show the content of a bag and what is missing '
                 'for a calibration'),
     'simulate': ('odocal_ros.offline.simulate', 'write a bag with known truth'),
-    'paper': ('odocal_ros.offline.paper', 'reproduce tables 1-4 of the two-point paper'),
-    'patent': ('odocal_ros.offline.patent', 'compute the embodiment of CN104359492A'),
     'plan': ('odocal_ros.offline.plan', 'predict the uncertainties of a planned drive'),
     'watch': ('odocal_ros.live.watch_command', 'show the progress of a running node'),
     'doctor': ('odocal_ros.offline.doctor', 'show the installation, for bug reports'),
     'compare': ('odocal_ros.offline.compare', 'compare calibrations: changes in sigmas'),
+    'paper': ('odocal_reproductions', 'reproduce tables 1-4 of the two-point paper'),
+    'patent': ('odocal_reproductions', 'compute the embodiment of CN104359492A'),
 }
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130    # definition: exit codes
 
@@ -48,13 +50,25 @@ def _parser(names: set[str]) -> argparse.ArgumentParser:
                      'GNSS: scale factor and yaw mounting angle, with reliable uncertainties.')
     parser.add_argument('--version', action='version', version=f'odocal_ros {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', parser_class=_Parser)
-    for name, (module, help_line) in COMMANDS.items():
+    for name, (_, help_line) in COMMANDS.items():
         sub = commands.add_parser(name, help=help_line, description=help_line)
         if name in names:      # only the asked command is imported: --help stays quick
-            command = importlib.import_module(module)
+            command = _module_of(name)
             command.add_arguments(sub)
             sub.set_defaults(run=command.run)
     return parser
+
+
+def _module_of(name: str) -> ModuleType:
+    home = COMMANDS[name][0]
+    if home.startswith('odocal_ros.'):
+        return importlib.import_module(home)
+    from importlib.metadata import entry_points
+    for entry in entry_points(group='odocal.commands', name=name):
+        module: ModuleType = entry.load()
+        return module
+    raise BadUsage(f'{name} is a command of {home}, which is not installed; install it from a '
+                   'checkout of odocal_ros: pip install ./reproductions')
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -43,19 +43,17 @@ def run(args: argparse.Namespace) -> int:
 
 def _screen(found: 'Comparison') -> list[str]:
     from odocal_ros.library.compare import hints, label
+    from odocal_ros.output.figures import columns
     from odocal_ros.output.worse import said as value_text
     stored = found.stored
     width = max(len(s.name) for s in stored)
     lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, {len(s.legs)} leg'
              f'{"s" * (len(s.legs) != 1)}' for i, s in enumerate(stored, 1)]
     for change in found.changes:
-        rows = [(str(e.index + 1), value_text(e.estimate), _cell(change, e.to_first, stored),
+        rows = [(f'{e.index + 1:>2}', value_text(e.estimate), _cell(change, e.to_first, stored),
                  _cell(change, e.to_previous, stored)) for e in change.entries]
         rows.insert(0, ('', 'value', 'since the first', 'since the previous'))
-        widths = [max(len(row[i]) for row in rows) for i in range(4)]
-        lines += ['', label(change.parameter)] + [
-            f'{row[0]:>3}  ' + '  '.join(f'{cell:<{w}}' for cell, w in zip(
-                row[1:], widths[1:], strict=True)).rstrip() for row in rows]
+        lines += ['', label(change.parameter), *columns(rows, ' ')]
     return [*lines, '', *(f'note: {note}' for note in found.notes), found.sentence,
             *hints(found.changes, stored)]
 

@@ -17,7 +17,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.pieces import lengths, medians
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.library.legs import EACH_STOP, find_legs, LegSpan, marked_legs, stops_of
+from odocal_ros.library.asked import EACH_STOP, LegSpan
+from odocal_ros.library.legs import find_legs, marked_legs, stops_of
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.stretches import (
     Drive,
@@ -26,9 +27,10 @@ from odocal_ros.offline.stretches import (
 )
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import usable_fixes
+from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.local_frame import settings_by_frame
 from odocal_ros.screening.sanity import imu_sanity, MAX_RATE
-from odocal_ros.screening.screen import Inputs, screen
+from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 from odocal_ros.settings.nominal import nominal_scale

@@ -7,13 +7,13 @@ import math
 import textwrap
 
 from odocal_ros.calib.smoother.slow_error import WHITE_SHARE
+from odocal_ros.forecast.planned_methods import Plan
+from odocal_ros.forecast.planned_smoother import SWAY_RATE
+from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
 from odocal_ros.library.what_helps import Change, ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines
-from odocal_ros.output.figures import length, share, time_span
-from odocal_ros.planning.methods import Plan
-from odocal_ros.planning.predict import Sigmas
-from odocal_ros.planning.smoother import SWAY_RATE
+from odocal_ros.output.figures import length, share, table_row, time_span
 
 WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 
@@ -44,11 +44,11 @@ def _head(before: Plan, sigmas: Sigmas) -> list[str]:
 
 
 def _methods(before: Plan) -> list[str]:
-    lines = [f'  {"predicted sigma":<20}{"scale":>14}{"yaw":>16}{"pitch":>16}']
-    for name, method in before.methods.items():
-        shown = [_shown(p, method.estimates[p].sigma) for p in PARAMETERS]
-        lines.append(f'  {name:<20}{shown[0]:>14}{shown[1]:>16}{shown[2]:>16}')
-    return [*lines, f'  (result: {_result(before)})']
+    rows = [('predicted sigma', 'scale', 'yaw', 'pitch'), *(
+        (name, *(_shown(p, method.estimates[p].sigma) for p in PARAMETERS))
+        for name, method in before.methods.items())]
+    return [*(table_row(row, (20, 14, 16, 16)) for row in rows),
+            f'  (result: {_result(before)})']
 
 
 def _result(before: Plan) -> str:

@@ -14,13 +14,12 @@ from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.listener import Listener
-from odocal_ros.offline.say import say, warn
+from odocal_ros.offline.say import Phase, say, warn
 from odocal_ros.outside.names import one_line
 
 if TYPE_CHECKING:
     from odocal_ros.calib.result import Calibration as Combined
     from odocal_ros.library.calibration import Calibration
-    from odocal_ros.offline.phases import Phase
     from odocal_ros.settings.config import Config
 
 SLOTS = ('imu', 'odometer', 'fix', 'heading', 'odometer_right', 'fix_velocity')
@@ -119,9 +118,8 @@ class _Screen(Listener):
         if not self._quiet:
             warn(f'odocal: {text}')
 
-    def phase(self, title: str) -> 'Phase':
+    def phase(self, title: str) -> Phase:
         """Return a line that is gone when the phase is over."""
-        from odocal_ros.offline.phases import Phase
         return Phase(title, self._silent)
 
 

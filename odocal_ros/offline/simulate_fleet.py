@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.phases import Phase
-from odocal_ros.offline.say import say
+from odocal_ros.offline.say import Phase, say
 from odocal_ros.outside.whole import write_text
 
 if TYPE_CHECKING:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.drive import white_noise
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.screening.placed import place
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.settings.config import Config
 
 

@@ -8,13 +8,13 @@ import textwrap
 from typing import Any
 
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.output.figures import two_digits
+from odocal_ros.output.figures import table_row, two_digits
 
 COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
           'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion'}
-HEAD = ('scale, ppm', 'yaw, deg', 'pitch, deg')
-NAME, WIDTHS = 24, (13, 15, 15)      # judgement: with 'shared' within 80 columns
+HEAD = ('error budget', 'scale, ppm', 'yaw, deg', 'pitch, deg')
+WIDTHS = 24, 13, 15, 15      # judgement: with 'shared' within 80 columns
 
 
 def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
@@ -47,8 +47,7 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
         return []
     factor = {COLUMNS[0]: 1e6 / scale}
     wholes = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in COLUMNS]
-    lines = [f'  {"error budget":<{NAME}}' + ''.join(
-        f'{word:>{columns}}' for word, columns in zip(HEAD, WIDTHS, strict=True))]
+    lines = [table_row(HEAD, WIDTHS)]
     small = []
     shared = '   shared by all legs' if width > 90 else '  shared'
     for name, row in table.items():
@@ -60,9 +59,8 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
         cells = ['-' if share < shown else
                  f'{two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(COLUMNS, shares, strict=True)]
-        lines.append(f'  {source_label(name):<{NAME}}' + ''.join(
-            f'{cell:>{columns}}' for cell, columns in zip(cells, WIDTHS, strict=True))
-            + (shared if row.get('shared') else ''))
+        lines.append(table_row([source_label(name), *cells], WIDTHS)
+                     + (shared if row.get('shared') else ''))
     if not (small and small_too):
         return lines
     rest = f'under {shown:.1%}: '.replace('.0%', '%').replace('%', ' %') + ', '.join(small)

@@ -3,6 +3,7 @@
 
 """Numbers as people read them: digits cut to the sigma, units converted at this rim only."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 import math
 
@@ -104,3 +105,17 @@ def inverse(scale: Estimate) -> str:
         return ''
     sigma = None if scale.sigma is None else scale.sigma / scale.value**2
     return f'{with_sigma(1 / scale.value, sigma)} {COUNTS[scale.unit]}'
+
+
+def columns(rows: Sequence[Sequence[str]], indent: str = '  ') -> list[str]:
+    """Return a table with columns as wide as their widest cell, all cells to the left."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [indent + '  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)
+                               ).rstrip() for row in rows]
+
+
+def table_row(cells: Sequence[str], widths: Sequence[int]) -> str:
+    """Return a line of a table of fixed widths: the name to the left, numbers to the right."""
+    name, *numbers = (f'{cell:{"<" if not k else ">"}{width}}' for k, (cell, width) in enumerate(
+        zip(cells, widths, strict=True)))
+    return f'  {name}{"".join(numbers)}'

@@ -12,20 +12,6 @@ from odocal_ros.errors import BadUsage
 PICTURES = ('.png', '.svg', '.pdf')
 
 
-def check_picture(path: Path) -> None:
-    """Refuse before computing what could not be drawn after it."""
-    if path.suffix.lower() not in PICTURES:
-        raise BadUsage(f'--plot {path}: required: a name that ends in {", ".join(PICTURES)}')
-    if not path.parent.is_dir():
-        raise BadUsage(f'--plot {path}: no folder {path.parent}; create it first')
-    if path.is_dir():
-        raise BadUsage(f'--plot {path}: is a folder; required: a file')
-    from importlib.util import find_spec
-    if find_spec('matplotlib') is None:
-        raise BadUsage('--plot needs matplotlib: pip install matplotlib (or apt install '
-                       'python3-matplotlib)')
-
-
 def new_figure(width: float, height: float) -> Any:
     """Return an empty figure, inches, that no window will show."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -55,11 +55,11 @@ def sheet(height: float, rows: int = 1, sharex: bool = True,
     return figure, axes
 
 
-def key(figure: Any, axes: Any, columns: int = 3) -> None:
+def key(figure: Any, axes: Any) -> None:
     """Put the legend above the axes, where it hides nothing."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        figure.legend(handles, labels, loc='upper center', ncols=columns, borderpad=0.1,
+        figure.legend(handles, labels, loc='upper center', ncols=3, borderpad=0.1,
                       handlelength=2.2, columnspacing=1.4, borderaxespad=0.2)
 
 
@@ -87,7 +87,7 @@ def svg(figure: Any, name: str, says: str) -> str:
     return f'<svg {box} role="img" aria-label="{escape(says, quote=True)}">{rest}'
 
 
-def thinned(y: Floats, most: int = MOST_POINTS) -> Ints:
+def thinned(y: Floats) -> Ints:
     """
     Return rows of a line that keep its peaks, and both its ends: (m,) int.
 
@@ -95,10 +95,10 @@ def thinned(y: Floats, most: int = MOST_POINTS) -> Ints:
     """
     y = np.asarray(y, float)
     n = len(y)
-    if n <= most:
+    if n <= MOST_POINTS:
         return np.arange(n)
     columns = np.nan_to_num(y.reshape(n, -1).T)
-    edges = np.linspace(0, n, most // (2 * len(columns)) + 1).astype(int)
+    edges = np.linspace(0, n, MOST_POINTS // (2 * len(columns)) + 1).astype(int)
     keep = {0, n - 1}
     for a, b in zip(edges[:-1], edges[1:], strict=True):
         for column in columns[:, a:b]:

@@ -21,6 +21,7 @@ from odocal_ros.calib.result import (
 from odocal_ros.output.budget_table import budget_lines, largest_source, source_label
 from odocal_ros.output.figures import (
     beyond_one,
+    columns,
     COUNTS,
     inverse,
     known,
@@ -239,13 +240,7 @@ def _leg_table(legs: tuple[LegResult, ...], width: int) -> list[str]:
     if width < WIDTH:        # without the date, the duration and the number of fixes
         rows = [(row[0], row[1].removesuffix(', UTC').rpartition(' ')[2], row[2], *row[5:])
                 for row in rows]
-    return _columns(rows) + bag_lines(legs, width) if legs else []
-
-
-def _columns(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ['  ' + '  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)
-                             ).rstrip() for row in rows]
+    return columns(rows) + bag_lines(legs, width) if legs else []
 
 
 def _method_table(calibration: Calibration) -> list[str]:
@@ -260,7 +255,7 @@ def _method_table(calibration: Calibration) -> list[str]:
         rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
                      *('-' if a.value is None else with_sigma(a.value, a.sigma, DEG, signed=True)
                        for a in angles), shown_verdict(method, calibration.legs)))
-    return _columns(rows)
+    return columns(rows)
 
 
 def _leg_row(leg: LegResult) -> tuple[str, ...]:

@@ -6,7 +6,7 @@
 import math
 
 from odocal_ros.calib.result import LegResult, PerDistance, TrackCheck
-from odocal_ros.output.figures import length
+from odocal_ros.output.figures import length, table_row
 
 SIDES = 'before', 'after'
 LABEL, CELL = 22, 9      # judgement: columns
@@ -72,5 +72,5 @@ def track_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
     if not rows:
         return []
     most = (width - LABEL) // CELL
-    return [f'  {label:<{LABEL - 2}}' + ''.join(f'{cell:>{CELL}}' for cell in cells[:most])
+    return [table_row([label, *cells[:most]], [LABEL - 2, *[CELL] * len(cells[:most])])
             for label, cells in (('track against fixes', heads), *rows)]

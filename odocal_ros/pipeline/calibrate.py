@@ -25,10 +25,11 @@ from odocal_ros.pipeline.leg_run import leg_result, run_leg
 from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.local_frame import settings_by_frame
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
 from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
-from odocal_ros.screening.screen import Inputs, screen
+from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
 __all__ = ['calibrate', 'combine', 'faults', 'Screened', 'screened']

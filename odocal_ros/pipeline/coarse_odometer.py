@@ -10,8 +10,7 @@ from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.scale_error import SCALES, with_scale_error
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.placed import Placed
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs, Placed
 
 NAME = 'speed_truncation'
 

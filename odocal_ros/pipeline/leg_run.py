@@ -22,7 +22,7 @@ from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import check_of, tracks
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs
 
 # judgement: of the time that methods take, and of the tracks after them
 METHOD_EFFORT = {'two_point': 1, 'smoother': 20}

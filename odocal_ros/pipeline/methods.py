@@ -19,7 +19,7 @@ from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.scale_error import held, upright
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.reasons import Code, Reason, Verdict
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs
 
 
 def _smoother(prepared: PreparedLeg, passed: Passed) -> MethodRun:

@@ -5,9 +5,9 @@
 
 import numpy as np
 
-from odocal_ros.patent.planar import planar_leg, PlanarLeg
-from odocal_ros.patent.ranges import ranges_of
-from odocal_ros.patent.search import search, SearchResult
+from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
+from odocal_ros.calib.wheel_search.search import search, SearchResult
+from odocal_ros.calib.wheel_search.space import ranges_of
 from odocal_ros.pipeline.prepared import PreparedLeg
 
 

@@ -22,8 +22,7 @@ from odocal_ros.nav.strapdown import attitude
 from odocal_ros.pipeline.method_run import Path
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.facing import Facing
-from odocal_ros.screening.placed import Placed
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.settings.config import Config
 
 

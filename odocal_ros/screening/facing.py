@@ -9,7 +9,6 @@ quarter or a half turn off, the odometer parts from the IMU at every start, as i
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +19,7 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
-
-if TYPE_CHECKING:
-    from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs
 
 BIN_S = 1.0                        # s, judgement: accelerations are compared as means over it
 FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain is known to a sixth
@@ -82,7 +79,7 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
                   np.diff(use, prepend=-9) == 1)
 
 
-def facing(inputs: 'Inputs', metres_per_unit: float) -> Facing | None:
+def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
     """
     Return the IMU orientation in the vehicle, None if the drive does not determine it.
 

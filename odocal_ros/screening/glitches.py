@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import across, by_row, by_step, lengths, median
+from odocal_ros.data.pieces import across, by_row, by_step, lengths, median, runs
 from odocal_ros.data.samples import HeadingSamples, ImuSamples
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
@@ -182,8 +182,7 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
         return ()
     same = by_step(lambda w: across(np.logical_and, w[1:] == w[:-1])
                    & across(np.logical_or, w[1:] != 0), w)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
-    begin, end = t[edges[::2]], t[edges[1::2]]
+    begin, end = t[runs(same)].T
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)
     rolled = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)
     held = np.flatnonzero((end - begin > limit) & (rolled > ROLLS * np.percentile(speed, 95)))

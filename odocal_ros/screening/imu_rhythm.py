@@ -17,7 +17,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.mapped import room
-from odocal_ros.data.pieces import chunks, PIECE_ROWS
+from odocal_ros.data.pieces import chunks, PIECE_ROWS, runs
 
 BLOCK_TIME = 1.0          # s, judgement: of rows in whose mean a lost row shows
 WINDOW_BLOCKS = 20        # judgement: of a mean, which leaves jitter over sqrt(2000) at 100 Hz
@@ -70,8 +70,7 @@ class _Rhythm:
         jump = np.abs(mean[2:] - mean[:-2]) > usual / 2
         for shift in range(3):
             self.lost[shift:shift + len(jump)] |= jump
-        edges = np.flatnonzero(np.diff(np.concatenate([[True], self.lost, [True]]).astype(int)))
-        lines = [self._line(mean, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        lines = [self._line(mean, a, b) for a, b in runs(~self.lost)]
         self.knots, self.late = np.concatenate([np.zeros((2, 0)), *lines], axis=1)
 
     def _means(self, t: Floats) -> Floats:

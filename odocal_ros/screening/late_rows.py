@@ -14,7 +14,7 @@ are not on it are placed by their travel.
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.pieces import median
+from odocal_ros.data.pieces import median, runs
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.imu_rhythm import APART, TESTED_ROWS
@@ -109,8 +109,7 @@ def _rising(t: Floats) -> Floats:
 def _fitting(t: Floats, even: Floats, travel: Floats, late: Bools,
              least: float) -> list[tuple[int, int, bool]]:
     """Return begin and end of the runs of late rows, and whether they fit the rhythm."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]]).astype(int)))
-    begin, end = edges[::2], edges[1::2]
+    begin, end = runs(late).T
     if not len(begin):
         return []
     low, high = np.maximum(begin - EVEN_BESIDE, 0), np.minimum(end + EVEN_BESIDE, len(t))

@@ -8,20 +8,17 @@ Rows that cannot be used are dropped and counted, the rest is used. Times are se
 start mark; the mark is an IMU stamp, so the IMU's time offset moves the others against it.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg, WHEELS
 from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import by_step, medians
+from odocal_ros.data.pieces import by_step
 from odocal_ros.nav.gaps import gaps_in_rhythm
-from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
-from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
@@ -31,60 +28,14 @@ from odocal_ros.screening.fix_screen import contradicted, usable_fixes
 from odocal_ros.screening.force import with_force
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
+from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.local_frame import without_north
-from odocal_ros.screening.other_imus import other_imus
-from odocal_ros.screening.placed import place
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import LABEL, usable_rows
 from odocal_ros.screening.wheel_travel import wheels
-from odocal_ros.settings.config import Config, SIDES
+from odocal_ros.settings.config import Config, ImuConfig, SIDES
 
-
-@dataclass(frozen=True, eq=False)
-class Inputs:
-    """A leg made usable: rising times since the start mark, SI, body frame."""
-
-    t_stop: float                      # s, the stop mark
-    t_imu: NDArray[np.float64]         # (n,)
-    w_b: NDArray[np.float64]           # (n, 3) rad/s
-    f_b: NDArray[np.float64]           # (n, 3) m/s^2
-    q_ni: NDArray[np.float64]          # (n, 4) orientation as sent, of frame i
-    yaw_variance: NDArray[np.float64]  # (n,) rad^2, NaN: no orientation
-    C_bi: NDArray[np.float64]          # (3, 3) nominal mounting rotation
-    travel: Travel                     # mean of the wheels
-    travels: tuple[Travel, ...]        # of each of several wheels; () of one, or of unknown sides
-    doubt_t: NDArray[np.float64]       # (d,) s, times of uncertain travel (resets, gaps)
-    doubt_sigma: NDArray[np.float64]   # (d,) its sigma, scale units
-    t_fix: NDArray[np.float64]         # (k,)
-    geodetic: NDArray[np.float64]      # (k, 3) latitude, longitude rad, height m (NaN: none)
-    covariance_n: NDArray[np.float64]  # (k, 3, 3) m^2
-    t_heading: NDArray[np.float64]     # (h,)
-    q_heading: NDArray[np.float64]     # (h, 4)
-    heading_variance: NDArray[np.float64]  # (h,) rad^2
-    t_velocity: NDArray[np.float64]    # (v,)
-    velocity_n: NDArray[np.float64]    # (v, 3) m/s of the antenna, ENU where it is
-    velocity_variance: NDArray[np.float64]  # (v, 3) (m/s)^2, 0 or less: unknown
-    fixes_rejected: int
-    scale_unit: str
-    felt: bool = True                  # False: f_b is made up, no accelerometer is there
-    local: bool = False                # True: fixes are positions in a local frame
-
-    @cached_property
-    def usual_f_b(self) -> Floats:
-        """Return the median of the specific force, which shows what is up: (3,) m/s^2."""
-        return medians(self.f_b)
-
-    @property
-    def least_motion(self) -> float:
-        """Return the distance over which positions surely move, m."""
-        return LOCAL_MOVES if self.local else GNSS_MOVES
-
-    def mirrored(self, spans: Floats) -> 'Inputs':
-        """Return them with the counts in spans, (m, 2) s, reversed."""
-        if not len(spans):
-            return self
-        return replace(self, travel=self.travel.mirrored(spans),
-                       travels=tuple(one.mirrored(spans) for one in self.travels))
+MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not a second IMU
 
 
 def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
@@ -101,7 +52,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     """
     leg, unfelt = with_force(leg, config)
     leg, local = without_north(leg, config)
-    found: list[Reason] = [*unfelt, *local, *other_imus(leg, config.imu)]
+    found: list[Reason] = [*unfelt, *local, *_other_imus(leg, config.imu)]
     for slot in ('imu', 'odometer', 'fix'):
         if not len(getattr(leg, slot).stamp_ns):
             code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
@@ -225,3 +176,24 @@ def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[
     length, at = max(gaps)
     return (Reason(Code.IMU_GAP, f'no IMU data for {length:.2f} s at t = {at:.2f} s ({len(gaps)} '
                    f'gap{"s" * (len(gaps) > 1)}; the limit is {limit:g} s)'),)
+
+
+def _other_imus(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
+    """Return the reasons about messages whose frame_id is not that of the IMU in use."""
+    other = leg.imu_other
+    count, total = len(other.stamp_ns), len(other.stamp_ns) + len(leg.imu.stamp_ns)
+    if not count or (imu.frame_id and len(leg.imu.stamp_ns)):
+        return ()
+    frames = Counter(frame.decode(errors='replace') for frame in other.frame.tolist())
+    names = ', '.join(f'{n} of {frame!r}' for frame, n in frames.most_common(3))
+    used = other.used[-1].decode(errors='replace')
+    if imu.frame_id:
+        return (Reason(Code.NO_IMU, f'no IMU message has the frame_id {used!r} of imu.frame_id; '
+                       f'received: {names}', 'Set imu.frame_id to a frame_id that is sent.'),)
+    if count < MIXED_SHARE * total:
+        return (Reason(Code.BAD_ROWS_DROPPED, f'{count} of {total} IMU messages have another '
+                       f'frame_id than {used!r} ({names}); dropped'),)
+    return (Reason(Code.SEVERAL_IMUS, f'the IMU topic carries several IMUs: '
+                   f'{len(leg.imu.stamp_ns)} messages of {used!r}, {names}; only {used!r} was '
+                   'used', f'Set imu.frame_id to the IMU to calibrate (imu.frame_id: {used!r}), '
+                   'or publish each IMU on its own topic.'),)

@@ -13,11 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.pieces import runs
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import ROLLS
-from odocal_ros.screening.wheel_pair import Imu, Pair, pair, robust_fit, runs, TUKEY
+from odocal_ros.screening.wheel_pair import Imu, Pair, pair, robust_fit, TUKEY
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 FAULT_GRID = 0.5          # s, judgement

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import medians
 from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.settings.config import SIDES
 
 Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2
@@ -101,7 +102,7 @@ def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floa
     for turn in range(tukey_passes):
         if turn or start is not None:
             residual = y - A @ x
-            sigma = max(float(np.median(np.abs(residual))) / 0.6745, floor)
+            sigma = max(robust_sigma(residual), floor)
             u = residual / (TUKEY * sigma)
             # absolute values first (Huber): without a start Tukey's weights can converge anywhere
             huber = start is None and turn < tukey_passes // 2
@@ -110,9 +111,3 @@ def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floa
         H = (A * weight[:, None]).T @ A + np.diag(weak * max(sigma, floor)**2 + 1e-12 * len(y))
         x = np.linalg.solve(H, A.T @ (weight * y))
     return x / size, np.linalg.inv(H) * sigma**2 / np.outer(size, size), sigma
-
-
-def runs(flags: Bools) -> Ints:
-    """Return begin and end of the runs of True: (k, 2), ends exclusive."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return edges.reshape(-1, 2)

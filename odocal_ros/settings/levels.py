@@ -23,9 +23,6 @@ TYRE_SPREAD = 0.05      # relative, by which scales of one vehicle's wheels, or 
 # judgement: of a prior sigma; a posterior one below it says that the data determined the value,
 # at half the data weigh three times the prior
 INFORMED_SHARE = 0.5
-# statistical: sigmas by a median, which half of the values may spoil
-NORMAL_MEDIAN = 0.6745      # of |x|, x normal with sigma 1
-RAYLEIGH_MEDIAN = 1.1774    # of the length of two such: sqrt(2 ln 2)
 # m/s, judgement: to the side and up, of a sprung body, not measured by wheels
 SWAY = 0.05
 # judgement: stamps further back, so many in turn, mean that time restarted

@@ -15,7 +15,7 @@ from odocal_ros.nav.dead_reckoning import mounting_from_forward
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.screening.placed import place
+from odocal_ros.screening.inputs import place
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim import body, motion, sensors
 from odocal_ros.sim.noise import random_walk, stream

@@ -15,16 +15,16 @@ from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
 from odocal_ros.errors import BadConfig
-from odocal_ros.planning.drive import from_rates
-from odocal_ros.planning.manoeuvres import TOWN_SIDES, TOWN_SPEED, TOWN_T
-from odocal_ros.planning.predict import Sigmas
-from odocal_ros.planning.samples import ideal
-from odocal_ros.planning.smoother import (
+from odocal_ros.forecast.ideal_samples import ideal
+from odocal_ros.forecast.manoeuvres import TOWN_SIDES, TOWN_SPEED, TOWN_T
+from odocal_ros.forecast.planned_drive import from_rates
+from odocal_ros.forecast.planned_smoother import (
     planned_levels,
     predict_smoother,
     spacing_for,
     WIDEST_SPACING,
 )
+from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import GRADES

@@ -11,19 +11,17 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from odocal_ros.calib.wheel_search import planar
+from odocal_ros.calib.wheel_search.criteria import HUBER, loss, score, weights
+from odocal_ros.calib.wheel_search.direct import least_squares, repeats
+from odocal_ros.calib.wheel_search.planar import course_pieces, planar_leg, PlanarLeg, positions
+from odocal_ros.calib.wheel_search.search import MOST_ROWS, search
+from odocal_ros.calib.wheel_search.space import Ranges, ranges_of, sets_of, Space
+from odocal_ros.calib.wheel_search.surface import fit_surface, minimum_in_box, refine
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
-from odocal_ros.patent import planar
-from odocal_ros.patent.criteria import HUBER, loss, score, weights
-from odocal_ros.patent.direct import least_squares, repeats
-from odocal_ros.patent.embodiment import embodiment, FOUND, PRINTED, RADIUS
-from odocal_ros.patent.planar import course_pieces, planar_leg, PlanarLeg, positions
-from odocal_ros.patent.ranges import Ranges, ranges_of
-from odocal_ros.patent.search import MOST_ROWS, search
-from odocal_ros.patent.space import sets_of, Space
-from odocal_ros.patent.surface import fit_surface, minimum_in_box, refine
 from odocal_ros.pipeline.align import align
 from odocal_ros.reasons import Code
 from odocal_ros.screening.fix_screen import origin_amid
@@ -378,13 +376,13 @@ def test_what_goes_into_json_is_finite_and_short(levels):
 
 def test_ranges_follow_the_settings():
     assert_allclose(RANGES.half, [0.05, 0.05, np.deg2rad(10.0)])
-    assert RANGES.levels == (7, 7, 7)
+    assert RANGES.levels == 7
     asked = ranges_of(WheelsConfig(radius_range=0.1, heading_range=0.2, levels=4))
     assert_allclose(asked.half, [0.1, 0.1, 0.2])
-    assert asked.levels == (5, 5, 5)            # zero is a level
+    assert asked.levels == 5            # zero is a level
     assert_allclose(ranges_of(WheelsConfig(), heading_sigma=0.01).half[2], 0.02)
     assert ranges_of(WheelsConfig(), heading_sigma=3.0).half[2] == np.pi
-    assert ranges_of(WheelsConfig(levels=2)).levels == (2, 2, 2)
+    assert ranges_of(WheelsConfig(levels=2)).levels == 2
 
 
 def test_levels_are_equal_steps_with_zero_among_them():
@@ -392,7 +390,7 @@ def test_levels_are_equal_steps_with_zero_among_them():
     for k, half in enumerate(RANGES.half):
         x = np.unique(np.round((found.sets[:, k] - (k < 2)), 12))
         assert_allclose(x, np.linspace(-half, half, 7), atol=1e-11)
-    one = Ranges(RANGES.half, RANGES.why, (1, 3, 3))
+    one = Ranges(RANGES.half, RANGES.why, 1)
     assert set(search(on_a_plane(), one).sets[:, 0]) == {1.0}
 
 
@@ -434,31 +432,3 @@ def test_residuals_alike_in_a_row_count_as_fewer():
         slow[:, k] = 0.9 * slow[:, k - 1] + white[:, k]
     assert repeats(slow) == pytest.approx(1.9 / 0.1, rel=0.3)      # (1 + r) / (1 - r)
     assert repeats(np.zeros((2, 5))) == 1.0
-
-
-# the embodiment
-
-
-def test_the_embodiment_as_printed():
-    left, right = RADIUS + FOUND[0], RADIUS + FOUND[1]
-    _, leg = simulated(
-        heading_error=np.deg2rad(FOUND[2]), scenario='town', duration=300.0, two_wheels=True,
-        odometer='angle', imu_grade='perfect', fix_sigma=0.0, yaw=0.0, pitch=0.0,
-        scale=2 / (1 / left + 1 / right), wheel_difference=right / left - 1,
-        nominal_scale=RADIUS, odometer_rate=50.0)
-    table = embodiment(leg, truth=FOUND)
-    rows = {row.name: row for row in table.rows}
-    assert [(round(r.left, 9), round(r.right, 9), round(r.heading_deg, 9)) for r in (
-        rows[f'printed {k}'] for k in range(1, 8))] == list(PRINTED)
-    assert table.least == 441
-    assert table.imbalance == pytest.approx(4 - 81 / 49)
-    # fixes without noise: among all 441 the true one is best, and the optimum is the truth
-    assert (table.whole.left, table.whole.right, table.whole.heading_deg) == pytest.approx(FOUND)
-    for name in ('response surface', 'least squares'):
-        found = rows[name]
-        # tracks good to 0.1 mm (the line truth) over 0.4 m for a difference of one
-        assert (found.left, found.right) == pytest.approx(FOUND[:2], abs=RADIUS * 1e-4 / 0.4)
-        assert found.heading_deg == pytest.approx(FOUND[2], abs=0.002)
-        assert found.criteria['mean'] <= rows['truth'].criteria['mean'] + 1e-6
-    others = [rows[f'printed {k}'] for k in range(1, 8)] + [table.small]
-    assert table.whole.criteria['mean'] < min(row.criteria['mean'] for row in others)

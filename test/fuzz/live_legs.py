@@ -21,7 +21,7 @@ from odocal_ros.bagio import encode
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
-from odocal_ros.foresee.progress import Progress
+from odocal_ros.forecast.progress import Progress
 from odocal_ros.live import jobs
 from odocal_ros.live.health import Health
 from odocal_ros.live.running_estimate import RunningEstimate

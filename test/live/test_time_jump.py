@@ -12,7 +12,7 @@ from player import messages_of, part, Player
 import pytest
 
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.library.legs import parse_leg
+from odocal_ros.library.asked import parse_leg
 from odocal_ros.live.journal import replay_command
 from odocal_ros.sim.scenarios import SimOptions, simulate
 

@@ -14,10 +14,12 @@ from odocal_ros.errors import BadBag
 from odocal_ros.offline import cli
 
 pytestmark = pytest.mark.core
+# what this package has itself, of others it knows the names
+OWN = [name for name, (home, _) in cli.COMMANDS.items() if home.startswith('odocal_ros.')]
 
 
 def test_help_of_everything_is_there(capsys):
-    for argv in (['--help'], *([c, '--help'] for c in cli.COMMANDS)):
+    for argv in (['--help'], *([c, '--help'] for c in OWN)):
         with pytest.raises(SystemExit) as end:
             cli.main(argv)
         assert end.value.code == 0
@@ -31,7 +33,7 @@ def test_no_command_shows_help_and_fails(capsys):
 
 def test_a_full_disk_is_a_sentence_and_exit_2():
     with open('/dev/full', 'w') as full:
-        done = subprocess.run([sys.executable, '-m', 'odocal_ros.offline.cli', 'paper', '--json'],
+        done = subprocess.run([sys.executable, '-m', 'odocal_ros.offline.cli', 'doctor'],
                               stdout=full, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 2
     assert done.stderr.count('\n') == 1
@@ -51,8 +53,8 @@ def fake_command(monkeypatch, error):
     """Make every command end in an error."""
     def run(args):
         raise error
-    for module, _ in cli.COMMANDS.values():
-        monkeypatch.setattr(importlib.import_module(module), 'run', run)
+    for name in OWN:
+        monkeypatch.setattr(importlib.import_module(cli.COMMANDS[name][0]), 'run', run)
 
 
 @pytest.mark.parametrize(('error', 'code'), [
@@ -87,3 +89,16 @@ def test_the_package_run_as_a_module_is_the_command():
     result = subprocess.run([sys.executable, '-m', 'odocal_ros', '--version'], text=True,
                             capture_output=True, check=True)
     assert result.stdout == f'odocal_ros {__version__}\n'
+
+
+@pytest.mark.parametrize('argv', [['paper'], ['patent', '--json'], ['paper', '--help']])
+def test_a_command_of_a_package_that_is_not_installed_names_what_to_install(
+        argv, monkeypatch, capsys):
+    assert set(cli.COMMANDS) - set(OWN) == {'paper', 'patent'}
+    monkeypatch.setattr('importlib.metadata.entry_points', lambda **asked: [])
+    assert cli.main(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err == (f'odocal: {argv[0]} is a command of odocal_reproductions, which is not '
+                   'installed; install it from a checkout of odocal_ros: '
+                   'pip install ./reproductions\n')

@@ -11,14 +11,8 @@ import pytest
 
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.library.legs import (
-    _marked,
-    find_legs,
-    LegSpan,
-    marked_legs,
-    open_ended,
-    parse_leg,
-)
+from odocal_ros.library.asked import LegSpan, parse_leg
+from odocal_ros.library.legs import _marked, find_legs, marked_legs, open_ended
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate

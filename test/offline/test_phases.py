@@ -12,7 +12,7 @@ import pytest
 
 pytestmark = pytest.mark.core
 CODE = """
-from odocal_ros.offline.phases import Phase
+from odocal_ros.offline.say import Phase
 with Phase('reading town', quiet={quiet}) as phase:
     phase(0.25)
     phase(0.5, 'leg 2 of 2')

@@ -12,13 +12,13 @@ import shlex
 import numpy as np
 import pytest
 
+from odocal_ros.forecast.manoeuvres import stop_and_start
+from odocal_ros.forecast.planned_methods import plan_methods
+from odocal_ros.forecast.planned_smoother import predict_smoother
+from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.offline.cli import main
-from odocal_ros.planning.manoeuvres import stop_and_start
-from odocal_ros.planning.methods import plan_methods
-from odocal_ros.planning.predict import predict, Sigmas
-from odocal_ros.planning.smoother import predict_smoother
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
 

@@ -22,8 +22,8 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.output.plots import draw_track
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screening import placed
-from odocal_ros.screening.placed import place
+from odocal_ros.screening import inputs as inputs_module
+from odocal_ros.screening.inputs import place
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.sim.real import Real
@@ -77,7 +77,7 @@ def test_with_the_earth_rate_of_the_frame_they_are_those_of_fixes(monkeypatch):
     made = drive(**CAR | {'fix_noise': 'white'})
     latitude, turned = made.options.latitude, math.pi / 2 - made.options.heading
     rate = earth_rate_n(latitude) @ matrix_from_rpy([0.0, 0.0, turned])
-    monkeypatch.setattr(placed, 'rate_without_north', lambda latitude: PartlyKnownRate(
+    monkeypatch.setattr(inputs_module, 'rate_without_north', lambda latitude: PartlyKnownRate(
         tuple(rate.tolist()), (0.0, 0.0, 0.0)))
     monkeypatch.setattr(problem, 'drift_time', lambda leg, t: np.diff(t))
     config = settings(made, **SMOOTHER, reference__default_sigma=2.5)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from odocal_ros.calib.smoother.outside import Heading, outside_heading, outside_velocity, Velocity
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
 

@@ -14,7 +14,8 @@ from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.point_rows import TAIL_SIGMAS
 from odocal_ros.data.arrays import Floats
-from odocal_ros.settings.levels import NORMAL_MEDIAN, REMARK_SIGMAS
+from odocal_ros.nav.statistics import NORMAL_MEDIAN
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
 # minimum number of spans in a leg: statistical, their variance is then good to 35 %, with two axes
 FEWEST_SPANS = 8

@@ -20,7 +20,7 @@ from odocal_ros.nav.angles import arctan2, wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_quat, transpose
-from odocal_ros.screening.screen import Inputs
+from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config, GnssConfig
 
 Floats = NDArray[np.float64]

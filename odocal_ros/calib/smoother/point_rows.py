@@ -21,7 +21,7 @@ from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.state import M, SLOW, State, WITH_SLOW
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import room
-from odocal_ros.settings.levels import NORMAL_MEDIAN
+from odocal_ros.nav.statistics import NORMAL_MEDIAN
 
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem

@@ -32,11 +32,12 @@ from odocal_ros.calib.wheels.whole_drive import (
     WHOLE_DRIVE_SIGMAS,
 )
 from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.pieces import runs
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.reasons import Reason
-from odocal_ros.screening.wheel_pair import Pair, pair, runs
-from odocal_ros.settings.levels import NORMAL_MEDIAN
+from odocal_ros.screening.wheel_pair import Pair, pair
 
 Event = tuple[float, float, float]      # begin, end, s, and size, m
 # steps between the ends of windows: slips of up to 1, 3, 8, 20, 50 s, those between are seen too.
@@ -189,7 +190,7 @@ def _limit(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -
     run = way[ends:][:n] - way[:n]
     spread = np.zeros(n)
     if (run > 0).any():
-        usual = np.median(np.abs(jump[run > 0])) / NORMAL_MEDIAN
+        usual = robust_sigma(jump[run > 0])
         spread = usual * np.maximum(1.0, run / np.median(run[run > 0]))
     turn = TURN_DOUBT * width * (turned[ends:][:n] - turned[:n])
     counts = (way[MEAN_STEPS - 1:] - way[:len(way) - MEAN_STEPS + 1]) / max(two.quantum, 1e-9)
@@ -245,7 +246,7 @@ def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: T
     at = int(np.searchsorted(grid, (begin + end) / 2)) - PIN_STEPS - span // 2
     if not 0 <= at < len(excess) or not straight[at] or straight.sum() < 20:
         return 0
-    sigma = np.median(np.abs(excess[straight])) / NORMAL_MEDIAN + 1e-3
+    sigma = robust_sigma(excess[straight]) + 1e-3
     log_odds = excess[at] * size / sigma**2
     # once in 150 the other wheel; parts mean and Imu by less than a quarter of the half, the slip
     # begins or ends elsewhere

@@ -1,0 +1,131 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Orthogonal arrays: which parameter sets are tried first (CN104359492A, step 5).
+
+In an orthogonal array (of strength two) each pair of columns holds each pair of levels equally
+often. Bose's construction gives q^2 rows of q + 1 columns for any prime power q: the points of a
+plane over the field of q elements, a column for each direction of parallel lines.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Ints
+from odocal_ros.errors import BadUsage
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """An orthogonal array of level numbers from 0, a row for each set to try."""
+
+    name: str
+    rows: NDArray[np.int64]      # (n, columns)
+
+
+def prime_power(q: int) -> tuple[int, int] | None:
+    """Return (p, m) with q = p^m, p prime; None where there are none."""
+    p = next((d for d in range(2, math.isqrt(max(q, 0)) + 1) if q % d == 0), q)
+    if p < 2:
+        return None
+    m = 0
+    while q % p == 0:
+        q, m = q // p, m + 1
+    return (p, m) if q == 1 else None
+
+
+def next_prime_power(n: int, odd: bool = False) -> int:
+    """Return the least prime power not below n; odd: of an odd prime."""
+    q = max(n, 2)
+    while prime_power(q) is None or (odd and q % 2 == 0):
+        q += 1
+    return q
+
+
+@cache
+def field_tables(q: int) -> tuple[Ints, Ints]:
+    """
+    Return addition and multiplication of the field of q elements: (q, q) each, of numbers 0..q-1.
+
+    An element is the number whose digits to base p are the coefficients of a polynomial.
+    """
+    power = prime_power(q)
+    if power is None:
+        raise BadUsage(f'{q} levels: no finite field has this many elements; give a prime power')
+    p, m = power
+    digits = np.array([_digits(k, p, m) for k in range(q)])
+    weight = p**np.arange(m)
+    add = ((digits[:, None] + digits) % p) @ weight
+    whole = np.zeros((q, q, 2 * m - 1), np.int64)
+    for i, j in product(range(m), repeat=2):
+        whole[..., i + j] += np.multiply.outer(digits[:, i], digits[:, j])
+    modulus = irreducible(p, m)
+    for k in range(2 * m - 2, m - 1, -1):      # x^k = -x^(k-m) * (the modulus less its head)
+        whole[..., k - m:k] -= whole[..., k, None] * np.array(modulus[:m], np.int64)
+    return add, (whole[..., :m] % p) @ weight
+
+
+def irreducible(p: int, m: int) -> tuple[int, ...]:
+    """Return the first monic polynomial of degree m over 0..p-1 that has no factor, low first."""
+    factors = [(*low, 1) for d in range(1, m // 2 + 1) for low in product(range(p), repeat=d)]
+    for low in product(range(p), repeat=m):
+        candidate = (*low, 1)
+        if not any(_divides(f, candidate, p) for f in factors):
+            return candidate
+    raise AssertionError('a field of every prime power exists')
+
+
+def _divides(factor: tuple[int, ...], polynomial: tuple[int, ...], p: int) -> bool:
+    """Return True if a monic factor divides a polynomial, both low first."""
+    rest, d = list(polynomial), len(factor) - 1
+    for k in range(len(rest) - 1, d - 1, -1):
+        head = rest[k]
+        for i, f in enumerate(factor):
+            rest[k - d + i] = (rest[k - d + i] - head * f) % p
+    return not any(rest[:d])
+
+
+def _digits(k: int, p: int, m: int) -> list[int]:
+    return [k // p**i % p for i in range(m)]
+
+
+def bose(q: int, columns: int) -> Ints:
+    """
+    Return Bose's orthogonal array L(q^2)(q^columns): (q^2, columns) level numbers.
+
+    Raises
+    ------
+    BadUsage
+        q is no prime power, or more than q + 1 columns are requested.
+
+    """
+    add, multiply = field_tables(q)
+    if not 1 <= columns <= q + 1:
+        raise BadUsage(f'{columns} columns: an array of {q} levels has 1 to {q + 1}')
+    i, j = np.divmod(np.arange(q * q), q)
+    slopes = [add[i, multiply[c, j]] for c in range(q)]     # slope 0 is i itself
+    return np.stack([slopes[0], j, *slopes[1:]][:columns], -1)
+
+
+def full_factorial(levels: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return all combinations: (product of levels, columns)."""
+    return np.stack([g.ravel() for g in np.indices(tuple(levels))], -1).astype(np.int64)
+
+
+def design_for(levels: int) -> Design:
+    """
+    Return the array of three parameters with that many levels each.
+
+    One or two levels: all combinations. More, a prime power: an orthogonal array.
+    """
+    if levels < 1:
+        raise BadUsage(f'{levels} levels: give 1 or more for each parameter')
+    if levels < 3:
+        return Design(f'all {levels**3} combinations', full_factorial((levels,) * 3))
+    return Design(f'L{levels**2}({levels}^{levels + 1})', bose(levels, 3))

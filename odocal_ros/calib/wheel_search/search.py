@@ -1,0 +1,205 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The search of CN104359492A: an orthogonal array, then response surfaces, checked by least squares.
+
+What is called heading here is the angle by which the dead-reckoned track must be turned,
+counter-clockwise: the error of the configured heading less the yaw mounting angle. Positions see
+only the two together.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.wheel_search.arrays import Design, design_for
+from odocal_ros.calib.wheel_search.criteria import score, Scores
+from odocal_ros.calib.wheel_search.direct import least_squares, LeastSquares
+from odocal_ros.calib.wheel_search.planar import PlanarLeg
+from odocal_ros.calib.wheel_search.space import NAMES, Ranges, sets_of, Space
+from odocal_ros.calib.wheel_search.surface import refine, Refined
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.angles import wrap
+from odocal_ros.reasons import Code, Reason
+
+HEADING_MEANS = ('counter-clockwise rotation of the track: error of the configured heading minus '
+                 'yaw mounting angle, which positions cannot separate')
+MOST_ROWS = 100      # judgement: of an array kept in calibration.json
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """
+    What the search found; parameter sets are left and right scale (m per unit), heading (rad).
+
+    start : scales before, m per unit.   sets, scores : of the array's rows.
+    best : the row with the least mean distance (robust: loss), ties by the largest.
+    meets : its maximum and mean meet the required accuracy, None without one.
+    refined : by response surfaces.   direct : by least squares.   free : least squares with left
+    and right free; the same unless held.   held : the fixes do not separate left and right, and
+    their ratio was kept at the start values.   before, after : criteria of the start values and
+    of the refined ones, one row each.
+    """
+
+    start: tuple[float, float]
+    ranges: Ranges
+    design: Design
+    sets: NDArray[np.float64]
+    scores: Scores
+    best: int
+    meets: bool | None
+    held: bool
+    refined: Refined
+    direct: LeastSquares
+    free: LeastSquares
+    refined_set: NDArray[np.float64]
+    direct_set: NDArray[np.float64]
+    before: Scores
+    after: Scores
+    reasons: tuple[Reason, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the content for calibration.json, angles in deg."""
+        r, d = self.refined, self.direct
+        shown = np.arange(len(self.sets))
+        if len(shown) > MOST_ROWS:      # the best ones, in the order of the array
+            shown = np.sort(np.argsort(self.scores.mean, kind='stable')[:MOST_ROWS])
+        return {
+            'ranges': [{'parameter': n, 'half': float(_deg(k, h)), 'at_the_end': float(
+                _deg(k, w)), 'unit': _unit(k), 'why': y} for k, (n, h, w, y) in enumerate(zip(
+                    NAMES, self.ranges.half, r.half, self.ranges.why, strict=True))],
+            'array': {'name': self.design.name, 'rows': len(self.sets),
+                      'imbalance': 0.0,
+                      'shown': [_set(self.sets[k]) | self.scores.row(k) for k in shown.tolist()]},
+            'best_row': _set(self.sets[self.best]) | self.scores.row(self.best),
+            'meets_accuracy': self.meets,
+            'left_and_right_held_together': self.held,
+            'heading_means': HEADING_MEANS,
+            'response_surface': _set(self.refined_set) | {
+                'iterations': r.iterations, 'settled': r.settled, 'widened': r.widened,
+                'on_edge': r.on_edge} | {
+                f'{name}_{place}': getattr(surface, name) for name in ('r_squared', 'lack_of_fit')
+                for place, surface in (('first', r.first), ('last', r.last))},
+            'least_squares': _set(self.direct_set) | {
+                'iterations': d.iterations, 'settled': d.settled,
+                'formal_sigma': _set(d.sigma * [*self.start, 1.0])},
+            'condition_number': _finite(self.free.condition),
+            'correlation': [[float(c) for c in row] for row in self.free.correlation],
+            'sigma_right_less_left': _finite(self.free.sigma_difference),
+            'before': self.before.row(0), 'after': self.after.row(0)}
+
+
+def _deg(k: int, value: float) -> float:
+    return np.rad2deg(value) if NAMES[k] == 'heading' else value
+
+
+def _unit(k: int) -> str:
+    return 'deg' if NAMES[k] == 'heading' else '1'
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _set(parameters: Floats) -> dict[str, float]:
+    left, right, heading = (float(p) for p in parameters)
+    return {'scale_left': left, 'scale_right': right, 'heading_deg': float(np.rad2deg(heading))}
+
+
+def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
+           accuracy: tuple[float, float] | None = None) -> SearchResult | None:
+    """
+    Search left scale, right scale and heading.
+
+    leg : what was driven; its start values are the middle of the ranges.   ranges : what is
+    searched.   robust : weight fixes by their sigma and bound the pull of outliers.   accuracy :
+    (maximum, mean) distances asked for, m.
+
+    Returns
+    -------
+    SearchResult; None where there are fewer than four fixes.
+
+    """
+    if len(leg.t) < 4:
+        return None
+    design = design_for(ranges.levels)
+    x = ranges.values(design.rows)
+    sets = sets_of(leg, x)
+    scores = score(leg, sets, robust)
+    best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
+    meets = None if accuracy is None else bool(
+        scores.max[best] <= accuracy[0] and scores.mean[best] <= accuracy[1])
+    free = direct = least_squares(leg, x[best], Space(held=False), robust)
+    held = not _separable(free, ranges)
+    space = Space(held)
+    if held:
+        direct = least_squares(leg, x[best], space, robust)
+    refined = _refined(leg, x[best], ranges, space, robust)
+    refined_set, direct_set = (_wrapped(sets_of(leg, found.x)[0]) for found in (refined, direct))
+    return SearchResult(
+        (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, meets, held,
+        refined, direct, free, refined_set, direct_set, score(leg, leg.start, robust),
+        score(leg, refined_set, robust), _reasons(ranges, refined, direct, free, held))
+
+
+def _refined(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
+    """Lower the mean square; robust: then Huber's mean, which far off is a cone, from there."""
+    def by(robust: bool) -> Callable[..., Any]:
+        return lambda x: score(leg, sets_of(leg, x), robust, course=False).loss
+
+    refined = refine(by(False), x, ranges.step, ranges.half, space)
+    if not robust:
+        return refined
+    again = refine(by(True), refined.x, ranges.step / 10, refined.half, space)
+    return replace(again, widened=refined.widened or again.widened, first=refined.first,
+                   iterations=refined.iterations + again.iterations)
+
+
+def _wrapped(parameters: Floats) -> Floats:
+    return np.array([*parameters[:2], wrap(parameters[2])])
+
+
+def _separable(free: LeastSquares, ranges: Ranges) -> bool:
+    """
+    Return True if the fixes constrain the wheel difference better than the range.
+
+    The range is twice the stated error of each wheel, the sigma of their difference follows.
+    """
+    return free.sigma_difference <= float(np.hypot(*ranges.half[:2])) / 2
+
+
+def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: LeastSquares,
+             held: bool) -> tuple[Reason, ...]:
+    found = []
+    if held:
+        sigma = 100 * free.sigma_difference
+        good = f'to {sigma:.2g} % at best' if sigma < 100 else 'not at all'
+        found.append(Reason(Code.WHEELS_NOT_SEPARABLE, 'positions separate left and right wheel '
+                            f'{good} (condition number {free.condition:.2g}, correlation '
+                            f'{free.correlation[0, 1]:+.6f}): the search moved both together'))
+    if refined.widened:
+        grown = [f'{name} +-{_amount(k, a)} to +-{_amount(k, b)}' for k, (name, a, b) in enumerate(
+            zip(NAMES, ranges.half, refined.half, strict=True)) if b > a]
+        found.append(Reason(Code.SEARCH_WIDENED, 'the minimum was on the edge of the search '
+                            f'range, which was widened: {", ".join(grown)}'))
+    if not refined.settled or refined.on_edge:
+        where = 'ends on the edge of the widest range' if refined.on_edge else \
+            f'has not converged after {refined.iterations} response surfaces'
+        found.append(Reason(Code.SEARCH_NOT_SETTLED, f'the search {where}'))
+    else:
+        apart = np.abs(refined.x - direct.x)
+        apart[2] = abs(wrap(apart[2]))
+        share = float((apart / ranges.half).max())
+        agree = 1e-3    # of the range: surface and least squares are one
+        if share > agree or not direct.settled:
+            found.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
+                                f'differ by {100 * share:.2g} % of the range'))
+    return tuple(found)
+
+
+def _amount(k: int, value: float) -> str:
+    return f'{np.rad2deg(value):.3g} deg' if NAMES[k] == 'heading' else f'{100 * value:.3g} %'

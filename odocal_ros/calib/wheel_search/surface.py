@@ -1,0 +1,196 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Response surface: a second-order polynomial fitted to a criterion, its minimum in the range.
+
+The box of fitted points then moves there and shrinks, until the parameters converge. If
+the minimum lies on the edge of the range, the range is increased.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.wheel_search.space import Space
+from odocal_ros.data.arrays import Bools, Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """
+    A fitted polynomial, value + gradient y + y hessian y / 2, of y in [-1, 1] in each coordinate.
+
+    r_squared, lack_of_fit : share of the variance explained; largest residual over the range of
+    the values.
+    """
+
+    value: float
+    gradient: NDArray[np.float64]
+    hessian: NDArray[np.float64]
+    r_squared: float
+    lack_of_fit: float
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """
+    Where the search by surfaces ended.
+
+    x : (3,) left, right (relative), heading (rad).   value : of the criterion there.
+    half : (3,) half range at the end.   widened : it is not the one asked for.
+    on_edge : the minimum still lies on its edge.   first, last : surfaces.
+    """
+
+    x: NDArray[np.float64]
+    value: float
+    iterations: int
+    settled: bool
+    half: NDArray[np.float64]
+    widened: bool
+    on_edge: bool
+    first: Surface
+    last: Surface
+
+
+def fit_surface(y: Floats, values: Floats) -> Surface:
+    """Fit a second-order polynomial to (m,) values at (m, n) points by least squares."""
+    n = y.shape[1]
+    i, j = np.triu_indices(n)
+    design = np.hstack([np.ones((len(y), 1)), y, y[:, i] * y[:, j]])
+    middle = values.mean()      # taken out so that its rounding is not fitted
+    c = np.linalg.lstsq(design, values - middle, rcond=None)[0]
+    residual = values - middle - design @ c
+    hessian = np.zeros((n, n))
+    hessian[i, j] = c[1 + n:]
+    spread, reach = ((values - middle)**2).sum(), np.ptp(values)
+    return Surface(float(c[0] + middle), c[1:1 + n], hessian + hessian.T,
+                   float(1 - (residual**2).sum() / spread) if spread > 0 else 1.0,
+                   float(np.abs(residual).max() / reach) if reach > 0 else 0.0)
+
+
+def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats) -> Floats:
+    """
+    Return the minimum of a quadratic in a box: exact for any signs of its curvature.
+
+    The minimum is stationary on one of the box's faces (the inside and the corners among them),
+    and of three parameters there are but 27.
+    """
+    n = len(gradient)
+    best, least = np.zeros(n), np.inf     # a corner at least is found
+    for face in product((None, low, high), repeat=n):
+        free = np.array([side is None for side in face])
+        y = np.array([0.0 if side is None else side[k] for k, side in enumerate(face)])
+        if free.any():
+            rest = gradient[free] + hessian[np.ix_(free, ~free)] @ y[~free]
+            y[free] = np.linalg.lstsq(hessian[np.ix_(free, free)], -rest, rcond=1e-15)[0]
+            if (y < low).any() or (y > high).any():
+                continue
+        value = gradient @ y + y @ hessian @ y / 2
+        if value < least:
+            best, least = y, value
+    return best
+
+
+def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, space: Space,
+           widen: bool = True) -> Refined:
+    """
+    Lower a criterion by surfaces.
+
+    value : (m, 3) parameters x to the criterion, (m,).   x : (3,) where to begin: the best row of
+    an array.   width : (3,) half width of the first box in x: a step between levels.   half : (3,)
+    half of the range about zero that is searched.   space : which parameters there are.   widen :
+    double the range where the minimum lies on its edge.
+    """
+    walk = _Walk(value, space, np.asarray(half, dtype=float), np.asarray(width, dtype=float), x)
+    first = last = walk.surface()
+    settled = False
+    iterations = 1
+    most = 300    # surfaces; a range widened as far as it goes takes a hundred
+    while True:
+        settled = walk.step(last)
+        if settled and walk.on_edge.any():
+            if not (widen and walk.widen()):
+                break
+            settled = False
+        elif settled:
+            break
+        if iterations == most:
+            break
+        last = walk.surface()
+        iterations += 1
+    return Refined(space.T @ walk.q, walk.least, iterations, settled, walk.half,
+                   bool((walk.half > walk.asked).any()), bool(walk.on_edge.any()), first, last)
+
+
+class _Walk:
+    """The state of one search: where the box is, how wide, and the range."""
+
+    def __init__(self, value: Callable[..., Any], space: Space, half: Floats, width: Floats,
+                 x: Floats) -> None:
+        self.value, self.space = value, space
+        self.asked = self.half = half
+        self.first_width = np.abs(space.q_of(width) if space.held else
+                                  np.array([width[:2].mean(), width[:2].sum(), width[2]]))
+        self.w = self.first_width
+        self.q = space.q_of(x)
+        self.grid = np.array(list(product((-1.0, 0.0, 1.0), repeat=len(self.q))))
+        self.on_edge = np.zeros(len(self.q), bool)
+        self.least = np.inf
+
+    def surface(self) -> Surface:
+        self.values = self.value((self.q + self.grid * self.w) @ self.space.T.T)
+        self.least = float(self.values[len(self.grid) // 2])
+        return fit_surface(self.grid, self.values)
+
+    def step(self, surface: Surface) -> bool:
+        """Move to the surface's minimum in the range, shrink the box; return if it settled."""
+        S, bound = self.space.S, self.space.bounds(self.half)
+        v = S @ self.q
+        # y = (q - q0) / w, and what the range bounds is v = S q, here in half ranges
+        to_y = np.linalg.inv(S) / self.w[:, None] * bound
+        low, high = -1.0 - v / bound, 1.0 - v / bound
+        u = minimum_in_box(to_y.T @ surface.gradient, to_y.T @ surface.hessian @ to_y, low, high)
+        self.on_edge = (u <= low) | (u >= high)
+        move = np.linalg.solve(S, u * bound)
+        there = float(self.value((self.space.T @ (self.q + move))[None])[0])
+        settled = 1e-6    # of the half range first asked for, the last step
+        small = np.abs(S @ move) <= settled * self.space.bounds(self.asked)
+        # of the criterion: a box is not shrunk to where less than this is left of it
+        drowned = 1e-6
+        shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < drowned * self.least)
+        narrow = 1e-3    # of it, the box to which the last surface is fitted
+        done = bool(small.all() and (~shrinks | (self.w <= narrow * self.first_width)).all())
+        beyond = np.abs(move) > self.w
+        rounding = 1e-12    # of the criterion, by which equal values may differ
+        if there <= self.least * (1 + rounding):
+            self.q, self.least = self.q + move, there
+        else:
+            beyond = self._to_best_of_grid(bound)
+        grow, shrink = 2.0, 0.25
+        grown = np.minimum(grow * self.w, self.first_width)
+        self.w = np.where(beyond, grown, np.where(shrinks, shrink * self.w, self.w))
+        return done
+
+    def _to_best_of_grid(self, bound: Floats) -> Bools:
+        """Move to the best fitted point within the range; return where it is an end of the box."""
+        points = self.q + self.grid * self.w
+        allowed = (np.abs(points @ self.space.S.T) <= bound).all(axis=1)
+        k = int(np.argmin(np.where(allowed, self.values, np.inf)))
+        if not allowed[k] or self.values[k] >= self.least:
+            return np.zeros(len(self.q), bool)
+        self.q, self.least = points[k], float(self.values[k])
+        at_end: Bools = self.grid[k] != 0
+        return at_end
+
+    def widen(self) -> bool:
+        """Double the range where the minimum lies on its edge; False: it is as wide as it goes."""
+        wider = self.space.widened(self.half, self.on_edge)
+        if np.array_equal(wider, self.half):
+            return False
+        self.half, self.w = wider, self.first_width
+        return True

@@ -1,0 +1,145 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Values that a drive can determine with these settings and inputs, before it is driven.
+
+Asked of the code that will judge the leg: the alignment it will have, the methods that run.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from odocal_ros.calib.choice import deciding
+from odocal_ros.forecast.planned_alignment import plan_alignment
+from odocal_ros.forecast.planned_drive import from_rates
+from odocal_ros.nav.alignment import Alignment, HEADING_LIMIT
+from odocal_ros.pipeline.methods import METHODS
+from odocal_ros.screening.glitches import Oriented, oriented
+from odocal_ros.settings.config import Config, with_settings
+
+EXACT_HEADING = 1e-6      # rad; judgement: of a heading that is said to be known exactly
+COURSE_FIX_SIGMA = 1.5    # m; physical: of a single receiver, that a course may come from
+SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topic',
+           'imu_orientation': 'the IMU orientation', 'gyrocompass': 'the gyrocompass'}
+ALL_SAMPLES = 'smoother'   # the method that needs no heading from outside
+
+
+@dataclass(frozen=True)
+class Received:
+    """
+    What came before the start mark.
+
+    variances : of the yaw, rad^2, that ``heading_topic`` and ``imu_orientation`` state, inf where
+    none is sent.   rested_s : length of the standstill that the leg begins with, or last had.
+    latitude : rad.   height : the fixes carry one.   felt : the IMU has an accelerometer.
+    """
+
+    variances: dict[str, float]
+    rested_s: float = 0.0
+    latitude: float = 0.7
+    height: bool = True
+    two_wheels: bool = False
+    felt: bool = True
+
+
+@dataclass(frozen=True)
+class Ability:
+    """Observable quantities, those that are not with the cause, and a common weakness."""
+
+    can: tuple[str, ...]
+    cannot: tuple[str, ...]
+    weak: str = ''
+
+    def words(self) -> str:
+        """Return it as a sentence."""
+        *first, last = self.can
+        values = f'{", ".join(first)} and {last}' if first else last
+        text = f'observable: {values}'
+        if self.cannot:
+            text += f'; not observable: {"; ".join(self.cannot)}'
+        return text + (f'; {self.weak}' if self.weak else '')
+
+
+def ability(config: Config, received: Received) -> Ability:
+    """Return the values that a leg can estimate with these settings, and those it cannot."""
+    methods = [name for name in METHODS if name in deciding(config.method)
+               and (received.felt or name != ALL_SAMPLES)]
+    values = [(True, 'the scale'), _yaw(config, received, methods),
+            (True, 'the pitch') if received.height else
+            (False, 'the pitch (fixes without height)')]
+    if not received.felt:
+        values[-1] = False, 'the pitch (IMU without acceleration)'
+    if received.two_wheels:
+        values += _of_two_wheels(config)
+    weak = '' if received.rested_s >= config.leg.standstill else (
+        'level and gyro bias are estimated from the drive, because it starts without a standstill')
+    return Ability(tuple(text for can, text in values if can),
+                   tuple(text for can, text in values if not can), weak)
+
+
+def _yaw(config: Config, received: Received, methods: Sequence[str]) -> tuple[bool, str]:
+    if ALL_SAMPLES in methods:
+        return True, 'the yaw (from stops, starts and turns)'
+    alignment = _alignment(config, received)
+    if not alignment.heading_separable:
+        return False, ('the yaw (the only heading is the course over ground, which includes it: '
+                       'set alignment.heading_source)')
+    source, sigma = SOURCES[alignment.heading_source], math.degrees(alignment.heading_sigma)
+    asked = math.degrees(config.verdict.max_yaw_sigma)
+    if sigma >= asked:
+        return False, (f'the yaw to {asked:.2g} deg ({source} has an uncertainty of {sigma:.2g} '
+                       'deg)')
+    return True, f'the yaw (from {source}, {sigma:.2g} deg)'
+
+
+def _of_two_wheels(config: Config) -> list[tuple[bool, str]]:
+    if ALL_SAMPLES not in deciding(config.method):
+        return [(False, f'left and right wheel separately (method {config.method} uses their '
+                 'mean)')]
+    width = config.odometer.track_width
+    return [(True, 'left and right wheel')] + [(True, 'the track width (in turns)')] * (not width)
+
+
+def _alignment(config: Config, received: Received) -> Alignment:
+    """Return the alignment that a drive straight on from here will have."""
+    rest = received.rested_s if received.rested_s >= config.leg.standstill else 0.0
+    t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
+    drive = from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
+                       latitude=received.latitude)
+    return plan_alignment(drive, with_heading(config, received.variances), COURSE_FIX_SIGMA,
+                          drive.standstills(config.leg.standstill))[0]
+
+
+def stated_variance(sent: Oriented) -> float:
+    """Return the variance of the yaw that orientations as sent state, rad^2; inf: none is sent."""
+    variance = oriented(sent).yaw_variance
+    stated = variance[~np.isnan(variance)]
+    return float(np.median(stated)) if len(stated) else math.inf
+
+
+def with_heading(config: Config, variances: dict[str, float]) -> Config:
+    """
+    Return config with the heading source, and its sigma, that the alignment will find.
+
+    variances : as in ``Received``. What is left ``auto`` is a gyrocompass or the course, as the
+    alignment itself decides.
+    """
+    asked = config.alignment
+    source, sigma = asked.heading_source, max(asked.heading_sigma, EXACT_HEADING)
+    if source == 'auto' and not math.isnan(asked.heading):
+        source = 'fixed'
+    if source == 'fixed' and math.isnan(asked.heading):
+        source = 'course'
+    for name, stated in variances.items():
+        if source not in ('auto', name):
+            continue
+        if stated <= HEADING_LIMIT**2:
+            source, sigma = name, math.sqrt(stated) if stated > 0 else sigma
+        elif source == name:
+            source = 'course'
+    return with_settings(config, {'alignment.heading_source': source,
+                                  'alignment.heading_sigma': sigma})

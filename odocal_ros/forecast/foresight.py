@@ -1,0 +1,192 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Foresight: how good a leg would be if it ended here, and how far to drive until it is good enough.
+
+Foreseen for a vehicle that comes to rest where it is and stands for REST_FORESEEN_S in all, with
+the start mark and the recorded path. Shown to the operator, never part of a result.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+import math
+
+import numpy as np
+
+from odocal_ros.calib.choice import choose, deciding
+from odocal_ros.data.arrays import Ints
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import take
+from odocal_ros.errors import BadData
+from odocal_ros.forecast.ability import stated_variance, with_heading
+from odocal_ros.forecast.forecast import (
+    Abandoned,
+    FARTHEST_M,
+    Forecast,
+    Prospect,
+    REST_FORESEEN_S,
+    sources_of,
+)
+from odocal_ros.forecast.leg_profile import fix_figures, profile_of
+from odocal_ros.forecast.leg_so_far import screened_in_cells
+from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
+from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
+from odocal_ros.forecast.smoother_forecast import (
+    gives_all,
+    look,
+    nothing_foreseen,
+    ONLY,
+    PITCH,
+    SCALE,
+    with_running,
+    without_force,
+    YAW,
+)
+from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.screening.force import felt
+from odocal_ros.screening.inputs import Inputs, place
+from odocal_ros.settings.config import Config
+
+DRIVE_ROWS = 1000         # judgement: of the drive that a prediction is made from
+# judgement: this many orientations, until this time after the start mark, give their accuracy
+ORIENTATION_NS, ORIENTATION_ROWS = 10**9, 100
+DRIVE_ON = 'drive on with stops, starts and turns'
+
+
+@dataclass(frozen=True, eq=False)
+class DriveSoFar(PlannedDrive):
+    """The recorded drive and its predicted rest; added manoeuvres continue from here."""
+
+    wanted: Callable[[], bool] = field(default=lambda: True)
+
+    def lengthened(self, metres: float) -> 'DriveSoFar':
+        """Return the drive with so many metres more straight on from here, at its own speed."""
+        if not self.wanted():
+            raise Abandoned
+        moving = np.flatnonzero(np.abs(self.speed) > REST_SPEED)
+        point = int(moving[-1])
+        usual = float(np.median(np.abs(self.speed[moving])))
+        on = np.linspace(0.0, metres / usual, 50)[1:]
+        speed, yaw, slope = (
+            np.insert(row, point + 1, np.full(len(on), value)) for row, value in (
+                (self.speed, usual), (self.yaw, self.yaw[point]), (self.slope, self.slope[point])))
+        t = np.concatenate([self.t[:point + 1], self.t[point] + on, self.t[point + 1:] + on[-1]])
+        return replace(self, t=t, speed=speed, yaw=yaw, slope=slope)
+
+
+def forecast_of(leg: Leg, fix_rate: float, config: Config,
+                wanted: Callable[[], bool] = lambda: True,
+                smoother: SmootherSoFar | None = None) -> Forecast:
+    """
+    Return the forecast of a leg that ends here, and the reasons of its methods so far.
+
+    leg : the data so far; its last row is the current position.   fix_rate : Hz.   config : as
+    frozen into the leg.   wanted : asked now and then; Abandoned is raised when it says no.
+    smoother : that of this leg; looks go from the one before to the next.
+
+    Raises
+    ------
+    OdocalError
+        Nothing can be foreseen yet: no motion, no fixes, scale unknown.
+
+    """
+    running = look(leg, config, smoother, wanted)
+    if deciding(config.method) == ONLY or gives_all(running):     # the ends add nothing to it
+        forecast = nothing_foreseen(config)
+    else:
+        forecast = _by_ends(leg, fix_rate, config, wanted)
+        if smoother is not None and 'smoother' in deciding(config.method):
+            forecast = replace(forecast, scale=_open_yet(forecast.scale))
+            if felt(leg.imu.f_i):
+                forecast = replace(forecast, yaw=_open_yet(forecast.yaw))
+    if not felt(leg.imu.f_i):
+        forecast = without_force(forecast)
+    if not wanted():
+        raise Abandoned
+    if running is not None:
+        forecast = with_running(forecast, running, config)
+    estimates, _ = choose(forecast.methods, config.method)
+    return replace(forecast, estimates=estimates, until_ns=leg.stop_ns)
+
+
+def _by_ends(leg: Leg, fix_rate: float, config: Config,
+             wanted: Callable[[], bool]) -> Forecast:
+    """Return the two_point forecast of the leg with its end points."""
+    inputs = screened_in_cells(leg, config).inputs
+    driven = profile_of(inputs, config)
+    sigmas = Sigmas(config=_heading_found(leg, config), quantum=_quantum(inputs, config),
+                    **fix_figures(inputs) | {'fix_rate': fix_rate})
+    drive = _at_rest(_thinned(driven), wanted)
+    now = predict(drive, sigmas)
+
+    def prospect(parameter: str, asked: float, why: str = '') -> Prospect:
+        sigma = now.sigma(parameter)
+        metres = 0.0 if sigma is not None and sigma <= asked else None
+        if metres is None and not why:
+            metres = metres_to_go(drive, sigmas, parameter, asked, FARTHEST_M)
+            why = f'even {FARTHEST_M / 1000:.0f} km more do not reach the limit'
+        return Prospect(sigma, asked, metres, sources_of(now.method, parameter), why)
+
+    limits = config.verdict
+    return Forecast(
+        prospect(SCALE, limits.max_scale_sigma),
+        prospect(YAW, limits.max_yaw_sigma, _yaw_limit(now, limits.max_yaw_sigma)),
+        now.method.estimates[PITCH].sigma)
+
+
+def _open_yet(by_ends: Prospect) -> Prospect:
+    """Return the two_point forecast without its refusals, which the smoother may still resolve."""
+    return by_ends if by_ends.metres is not None else replace(by_ends, lack=DRIVE_ON)
+
+
+def _yaw_limit(now: Prediction, asked: float) -> str:
+    """Return the explanation why no drive reaches the yaw limit, empty if one can."""
+    alignment = now.alignment
+    if not alignment.heading_separable:
+        return ('not separable from the course over ground, the only heading; set '
+                'alignment.heading_source')
+    if alignment.heading_sigma >= asked:
+        return ('limited by the heading uncertainty '
+                f'({math.degrees(alignment.heading_sigma):.2g} deg)')
+    return ''
+
+
+def _heading_found(leg: Leg, config: Config) -> Config:
+    """Return config with the heading source, and its sigma, that the alignment will find."""
+    def before(stamp_ns: Ints) -> Ints:
+        return np.flatnonzero(stamp_ns <= leg.start_ns + ORIENTATION_NS)[-ORIENTATION_ROWS:]
+
+    return with_heading(config, {
+        'heading_topic': stated_variance(take(leg.heading, before(leg.heading.stamp_ns))),
+        'imu_orientation': stated_variance(take(leg.imu, before(leg.imu.stamp_ns)))})
+
+
+def _quantum(inputs: Inputs, config: Config) -> float:
+    """Return the size of a count, m; raise BadData while metres are not known at all."""
+    scale = place(inputs, config).rough
+    if not scale:   # what the profile takes instead, 1, would promise far too much
+        raise BadData('the scale is not known yet: drive on, or set odometer.nominal_scale')
+    return inputs.travel.quantum * scale
+
+
+def _thinned(drive: PlannedDrive) -> PlannedDrive:
+    """Return a drive of not many rows; where it stops and starts it stays as it is."""
+    rest = np.abs(drive.speed) <= REST_SPEED
+    change = np.flatnonzero(np.diff(rest))
+    if len(change) > DRIVE_ROWS // 4:
+        change = change[:0]
+    every = np.linspace(0, len(rest) - 1, min(len(rest), DRIVE_ROWS - 2 * len(change))).astype(int)
+    keep = np.unique(np.concatenate([every, change, change + 1]))
+    return replace(drive, **{name: getattr(drive, name)[keep]
+                             for name in ('t', 'speed', 'yaw', 'slope')})
+
+
+def _at_rest(drive: PlannedDrive, wanted: Callable[[], bool]) -> DriveSoFar:
+    """Return the drive with as much rest at its end as makes REST_FORESEEN_S seconds."""
+    moving = np.flatnonzero(np.abs(drive.speed) > REST_SPEED)
+    rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0
+    if rested < REST_FORESEEN_S:
+        drive = drive.until(drive.duration, REST_FORESEEN_S - rested)
+    return DriveSoFar(drive.t, drive.speed, drive.yaw, drive.slope, drive.latitude,
+                      drive.longitude, drive.height, wanted)

@@ -1,0 +1,223 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Prediction: the sigmas a leg will have, before it is driven or while it is.
+
+The planned drive becomes what a recorded one becomes, a track, two marks and an alignment, and
+goes through ``two_point.fit``: the predicted sigma and that of a result are one budget, computed
+by one code path.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.calib.drive import judge_drive
+from odocal_ros.calib.judge import judge
+from odocal_ros.calib.marks import MARK_WINDOW, MarkFix, mean_fix, standing_at
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.two_point import Chord, fit, refusal, unsolved
+from odocal_ros.data.arrays import Floats
+from odocal_ros.errors import BadConfig, BadUsage
+from odocal_ros.forecast.planned_alignment import plan_alignment
+from odocal_ros.forecast.planned_drive import PlannedDrive
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.rotations import quat_from_matrix
+from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import SWAY
+
+SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive determines it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sigmas:
+    """
+    Error figures a drive is planned with, 1 sigma.
+
+    config : grade of the IMU (imu.*), heading source and its sigma (alignment.*; ``auto`` takes
+    the given heading sigma where the source is set, else a gyrocompass if the gyro allows, else
+    the course), lever arm, latencies, correlation time of the fixes (NaN: 60 s; 0: white).
+    fix, fix_up : m, error of one fix, east and north each, and up (None: twice that).
+    fix_rate : Hz.    quantum : m, size of an odometer count, 0 for speeds.
+    sway : m/s, white at 10 Hz, of the odometer's point to the side and up.    slip : m/sqrt(s) of
+    the wheels. Both while driving, for the smoother: the two-point method knows neither.
+    """
+
+    config: Config = Config()
+    fix: float = 1.5
+    fix_up: float | None = None
+    fix_rate: float = 5.0
+    quantum: float = 0.0
+    sway: float = SWAY
+    slip: float = SLIP
+
+    def __post_init__(self) -> None:
+        up = 2 * self.fix if self.fix_up is None else self.fix_up
+        for what, value in (('fix sigma', self.fix), ('height sigma of the fixes', up),
+                            ('fix rate', self.fix_rate),
+                            ('heading sigma', self.config.alignment.heading_sigma)):
+            if not (np.isfinite(value) and value > 0):
+                raise BadConfig(f'{what} {value:g}: required: a number above 0')
+        for what, value in (('size of a count', self.quantum), ('sway', self.sway),
+                            ('slip', self.slip)):
+            if not (np.isfinite(value) and value >= 0):
+                raise BadConfig(f'{what} {value:g}: required: 0 or more')
+
+    @property
+    def covariance_n(self) -> Floats:
+        """Return the covariance of one fix, (3, 3) m^2."""
+        up = 2 * self.fix if self.fix_up is None else self.fix_up
+        return np.diag([self.fix**2, self.fix**2, up**2])
+
+    @property
+    def correlation_time(self) -> float:
+        """Return the correlation time of fix errors, s; 0: white."""
+        asked = self.config.gnss.correlation_time
+        # s, default correlation time of fixes of one receiver
+        correlation_time = 60.0
+        return correlation_time if np.isnan(asked) else asked
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """
+    What a drive will give by one method.
+
+    method : as a result has it; scale factor 1, angles 0, sigmas and budget as they will be
+    (scale relative). reasons : what is said of drive and method.    of_drive : those of the drive
+    alone, whatever the method.
+    distance, chord : m.    duration : s.    standing : s of rest for each mark, 0 in motion.
+    """
+
+    method: MethodResult
+    reasons: tuple[Reason, ...]
+    alignment: Alignment
+    distance: float
+    chord: float
+    duration: float
+    standing: tuple[float, float]
+    of_drive: tuple[Reason, ...] = ()
+
+    def sigma(self, parameter: str) -> float | None:
+        """Return the sigma of a parameter, relative or rad; None: it will not be determined."""
+        return self.method.estimates[parameter].sigma
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the predicted verdict of such a leg."""
+        return Verdict.worst(r.code.gravity for r in self.reasons)
+
+
+def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
+    """
+    Return the prediction of the two-point method for a drive.
+
+    Raises
+    ------
+    BadUsage
+        The drive is shorter than one fix interval.
+
+    """
+    config = sigmas.config
+    if drive.duration < 1 / sigmas.fix_rate:
+        raise BadUsage(f'the leg lasts {drive.duration:.3g} s, less than one fix interval '
+                       f'({1 / sigmas.fix_rate:.3g} s); drive longer or raise the fix rate')
+    spans = drive.standstills(config.leg.standstill)
+    alignment, found = plan_alignment(drive, sigmas.config, sigmas.fix, spans)
+    track = _track(drive, sigmas.quantum)
+    distance, said = judge_drive(track, drive.duration, 1.0, config.leg)
+    track = _from(track, alignment.t)
+    start, end = (_mark(t, track, drive, sigmas, spans, asked) for t, asked in (
+        (0.0, config.reference.start), (drive.duration, config.reference.end)))
+    chord = Chord(track, Origin(drive.latitude, drive.longitude, drive.height), start, end,
+                  np.zeros(3), _velocity_change(track, (start, end)), alignment)
+    reasons = (*found, *said)
+    refused = refusal(chord, 1.0)
+    if refused:
+        method = unsolved(refused, '1')
+    else:
+        method = fit(chord, 1.0, '1', sigmas.quantum, np.ones(3), config)
+        reasons += judge(method.estimates, 1.0, config)
+    return Prediction(method, reasons + method.reasons, alignment, distance,
+                      float(np.linalg.norm((end.position_n - start.position_n)[:2])),
+                      drive.duration, (_rest(0.0, spans), _rest(drive.duration, spans)),
+                      tuple(r for r in said if r.code is not Code.LEG_NOT_STRAIGHT))
+
+
+def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: float,
+                 farthest: float = 1e5) -> float | None:
+    """
+    Return the straight distance, m, that brings a sigma down to its limit.
+
+    None where no distance up to ``farthest`` m does: a two-point yaw is never better than its
+    heading.
+    """
+    def enough(metres: float) -> bool:
+        longer = drive.lengthened(metres) if metres else drive
+        sigma = predict(longer, sigmas).sigma(parameter)
+        return sigma is not None and sigma <= asked
+
+    if enough(0.0):
+        return 0.0
+    # a drifting gyro may spoil what a longer chord gains: look at several lengths, then halve
+    tried = [farthest / 2**k for k in range(14, -1, -1)]
+    high: float | None = next((m for m in tried if enough(m)), None)
+    if high is None:
+        return None
+    low = 0.0 if high == tried[0] else high / 2
+    while high - low > max(1.0, 0.01 * high):
+        middle = (low + high) / 2
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    return high
+
+
+def _rest(t: float, spans: Sequence[tuple[float, float]]) -> float:
+    """Return the duration of the standstill at a mark, s."""
+    begin, end = standing_at(t, spans) or (0.0, 0.0)
+    return end - begin
+
+
+def _track(drive: PlannedDrive, quantum: float) -> Track:
+    return dead_reckon(drive.t, quat_from_matrix(drive.C_nb),
+                       Travel(drive.t, drive.travel, quantum))
+
+
+def _from(track: Track, t: float) -> Track:
+    """Return the track from an epoch on."""
+    keep = track.t >= t - 1e-9
+    return Track(track.t[keep], track.q_nb[keep], track.s[keep], track.P[keep])
+
+
+def _mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
+          spans: Sequence[tuple[float, float]], surveyed: tuple[float, ...]) -> MarkFix:
+    """Return the reference position there will be at a mark, by the fixes that fall to it."""
+    span = standing_at(t, spans)
+    forward = np.array([1.0, 0.0, 0.0])
+    position_n = (track.at(np.array(t)) - track.at(np.array(0.0))) @ forward
+    if surveyed:
+        return MarkFix(t, position_n, np.eye(3) * surveyed[3]**2, span is not None, 0, 0,
+                       surveyed=True)
+    window = max(MARK_WINDOW, 2.5 / sigmas.fix_rate)
+    low, high = span or (t - window, t + window)
+    low, high = max(low, drive.t[0]), min(high, drive.duration)
+    n = max(1, int((high - low) * sigmas.fix_rate))
+    times = low + np.arange(n) / sigmas.fix_rate
+    _, covariance, used, _ = mean_fix(times, np.zeros((n, 3)),
+                                      np.tile(sigmas.covariance_n, (n, 1, 1)),
+                                      sigmas.correlation_time)
+    return MarkFix(t, position_n, covariance, span is not None, used, 0)
+
+
+def _velocity_change(track: Track, marks: tuple[MarkFix, MarkFix]) -> Floats:
+    """Return C_nb s' at the end mark less that at the start, zero where it stands: (3, 3)."""
+    change = np.zeros((3, 3))
+    for mark, sign in zip(marks, (-1.0, 1.0), strict=True):
+        if not (mark.standing or mark.surveyed):
+            rate = np.interp(mark.t, track.t, np.gradient(track.s, track.t))
+            change += sign * track.C_nb_at(np.array(mark.t)) * rate
+    return change

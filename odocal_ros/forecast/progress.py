@@ -1,0 +1,180 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What the operator wants to know while driving: distance, speed, standing or not, clocks.
+
+Light estimates from the blocks as they come; nothing here enters a result.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples
+from odocal_ros.forecast.ability import Received, stated_variance
+from odocal_ros.forecast.clocks_so_far import Clocks
+from odocal_ros.nav.earth import radii
+from odocal_ros.screening.force import felt
+from odocal_ros.screening.odometer_steps import Steps
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import FASTEST
+from odocal_ros.settings.nominal import nominal_scale
+
+SPEED_SPAN_NS = 10**9       # judgement: speeds are taken over that long, or longer
+STANDING_S = 0.5            # judgement: without a count, the vehicle stands
+SHORTEST_REST_NS = 10**9    # judgement: a shorter pause is no standstill
+
+
+def known_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
+    """Return m per unit of the odometer as well as it is known, 0 where it is not."""
+    if np.isfinite(found) and found > 0:
+        return float(found)
+    if form is None:
+        return config.odometer.nominal_scale
+    return nominal_scale(config, form.scale_unit)
+
+
+class Travel:
+    """Distance, speed and standstill from odometer blocks, in odometer units."""
+
+    def __init__(self, form: OdometerForm) -> None:
+        self.form = form
+        self.total = 0.0
+        self.moved_ns = 0        # stamp of the last motion
+        self.newest_ns = 0
+        self._rows = Steps(form)
+        self._anchor = 0.0
+        self._rest = 0.0, 0      # length, s, and end of the last standstill
+        self.top = 0.0           # highest speed, units/s
+        self._since = 0.0, 0     # total and stamp that the speed is taken from
+
+    def feed(self, block: OdometerSamples, scale: float) -> None:
+        """Take a block; scale: m per unit, 0 unknown."""
+        steps, stamps, seconds = self._rows.of(block)
+        if not len(steps):
+            return
+        if scale > 0:
+            steps = np.where(np.abs(steps) * scale > FASTEST * np.maximum(seconds, 0.01), 0, steps)
+        path = self.total + np.cumsum(np.abs(steps))
+        for total, stamp in zip(path, stamps, strict=True):
+            if total - self._anchor > self._rows.still:
+                rest_ns = int(stamp) - self.moved_ns if self.moved_ns else 0
+                if rest_ns > SHORTEST_REST_NS:
+                    self._rest = rest_ns * 1e-9, int(stamp)
+                self._anchor, self.moved_ns = total, int(stamp)
+        self.newest_ns, self.total = int(stamps[-1]), float(path[-1])
+        self.moved_ns = min(self.moved_ns or int(stamps[0]), self.newest_ns)  # a clock set back
+        before, since_ns = self._since
+        if abs(self.newest_ns - since_ns) >= SPEED_SPAN_NS:    # rows of a burst give no speed
+            if since_ns:
+                self.top = max(self.top, (self.total - before) * 1e9 / (self.newest_ns - since_ns))
+            self._since = self.total, self.newest_ns
+
+    def still_s(self) -> float:
+        """Return the duration of the current standstill."""
+        return (self.newest_ns - self.moved_ns) * 1e-9 if self.moved_ns else 0.0
+
+    def rested_s(self, since_s: float) -> float:
+        """Return the duration of the current or the last standstill, if that is recent enough."""
+        length, end_ns = self._rest
+        recent = self.newest_ns - end_ns < since_s * 1e9
+        return max(self.still_s(), length if recent else 0.0)
+
+
+class FixPath:
+    """Distance along the fixes while the counter moves; steps below the noise do not count."""
+
+    def __init__(self) -> None:
+        self.total = self.top = 0.0      # m, m/s
+        self._anchor: tuple[float, float, int] | None = None      # rad, rad, stamp
+
+    def feed(self, block: FixSamples, min_status: int, moving: bool) -> None:
+        """Take a block of fixes; moving: as the counter has it."""
+        for lat, lon, stamp, variance, status in zip(
+                block.latitude, block.longitude, block.stamp_ns,
+                block.covariance_n[:, 0, 0], block.status, strict=True):
+            if status < min_status or not (abs(lat) <= np.pi / 2 and abs(lon) <= 2 * np.pi):
+                continue        # NaN among them
+            if self._anchor is None or not moving:
+                self._anchor = (lat, lon, stamp)
+                continue
+            meridian, normal = radii(lat)
+            step = np.hypot((lat - self._anchor[0]) * meridian,
+                            (lon - self._anchor[1]) * normal * np.cos(lat))
+            apart_ns = stamp - self._anchor[2]
+            noise = 3 * np.sqrt(variance) if variance > 0 else 0.0
+            if step > max(3.0, noise) and apart_ns >= SPEED_SPAN_NS:
+                self.total += float(step)
+                self.top = max(self.top, float(step) * 1e9 / apart_ns)
+                self._anchor = (lat, lon, stamp)
+
+
+class Progress:
+    """All of it, for one node; ``begin_leg`` sets distance and speed to zero."""
+
+    def __init__(self, simulated: bool = False) -> None:
+        self.clocks = Clocks(simulated)
+        self._travel: dict[str, Travel] = {}
+        self._path = FixPath()
+        self._zero = 0.0
+        self._scale = 0.0
+        self._last: dict[str, Any] = {}        # slot -> newest block
+
+    def feed(self, slot: str, block: Any, config: Config, form: OdometerForm | None,
+             found_scale: float) -> None:
+        """Take a block as it went into the recorder."""
+        if not len(block.stamp_ns):
+            return
+        self.clocks.feed(slot, block)
+        self._last[slot] = block
+        if slot == 'odometer' and form is not None:
+            self._scale = known_scale(config, form, found_scale)
+            self._travel.setdefault(slot, Travel(form)).feed(block, self._scale)
+        elif slot == 'fix':
+            travel = self._travel.get('odometer')
+            moving = travel is not None and bool(travel.moved_ns) and travel.still_s() < STANDING_S
+            self._path.feed(block, config.gnss.min_status, moving)
+
+    def received_before(self, preroll_s: float) -> Received:
+        """Return the samples so far that determine what a leg can estimate."""
+        travel = self._travel.get('odometer')
+        fix = self._last.get('fix')
+        place = Received({})
+        if fix is not None and np.isfinite(fix.latitude[-1]):
+            place = Received({}, latitude=float(fix.latitude[-1]),
+                          height=bool(np.isfinite(fix.height[-1])))
+        sent = {name: self._last.get(slot) for slot, name in (
+            ('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
+        variances = {name: np.inf if block is None else stated_variance(block)
+                     for name, block in sent.items()}
+        imu = self._last.get('imu')
+        return replace(place, variances=variances, felt=imu is None or felt(imu.f_i),
+                       rested_s=travel.rested_s(preroll_s) if travel else 0.0)
+
+    def begin_leg(self) -> None:
+        """Count distance and speed from here."""
+        self._path = FixPath()
+        travel = self._travel.get('odometer')
+        if travel is not None:
+            self._zero, travel.top = travel.total, 0.0
+
+    def distance_m(self) -> float:
+        """Return the distance of the leg so far: odometer where its scale is known, else fixes."""
+        travel = self._travel.get('odometer')
+        if travel is not None and self._scale > 0:
+            return (travel.total - self._zero) * self._scale
+        return self._path.total
+
+    def max_speed(self) -> float:
+        """Return the highest speed of the leg so far, m/s, over a second or more."""
+        travel = self._travel.get('odometer')
+        if travel is not None and self._scale > 0:
+            return travel.top * self._scale
+        return self._path.top
+
+    def still_s(self) -> float:
+        """Return the duration of the standstill by the odometer."""
+        travel = self._travel.get('odometer')
+        return travel.still_s() if travel else 0.0

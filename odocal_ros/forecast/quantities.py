@@ -1,0 +1,134 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Which quantities are good enough: yes, no or unknown, while a leg is recorded and after it."""
+
+from collections.abc import Set
+from dataclasses import dataclass
+import math
+
+from odocal_ros.calib.choice import ABOUT
+from odocal_ros.calib.result import Calibration, Estimate
+from odocal_ros.calib.track_width import TRACK_WIDTH
+from odocal_ros.forecast.forecast import Forecast
+from odocal_ros.reasons import Verdict
+from odocal_ros.settings.config import Config
+
+YES, NO, UNKNOWN = 'yes', 'no', 'unknown'
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity by the estimates it is made of; ``relative``: its limit is a share of it."""
+
+    label: str
+    estimates: tuple[str, ...]
+    relative: bool
+    of_two_wheels: bool = False
+
+    def limit(self, config: Config) -> float:
+        """Return the largest sigma that is good enough, a share of the value or rad."""
+        if self.estimates[0] == 'track_width':
+            # no verdict.* asks for it: what the method states it by
+            return TRACK_WIDTH.determined_share
+        return config.verdict.max_scale_sigma if self.relative else config.verdict.max_yaw_sigma
+
+
+QUANTITIES = {
+    'scale': Quantity('scale', ('scale_factor',), True),
+    'yaw': Quantity('yaw', ('yaw_mounting_angle',), False),
+    'pitch': Quantity('pitch', ('pitch_mounting_angle',), False),
+    'left_right': Quantity('left and right wheel', ('scale_factor_left', 'scale_factor_right'),
+                           True, True),
+    'track_width': Quantity('track width', ('track_width',), True, True),
+}
+
+
+def nothing_known() -> dict[str, str]:
+    """Return every quantity as unknown."""
+    return dict.fromkeys(QUANTITIES, UNKNOWN)
+
+
+def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
+                lost: bool = False) -> dict[str, str]:
+    """
+    Return the values within their limits for a leg that ends now.
+
+    Unknown before the first look; a track width that is configured is not asked of the drive.
+    ``lost``: the leg would be rejected, and nothing of it is.
+    """
+    ok = nothing_known()
+    if forecast is None:
+        return ok | dict.fromkeys(('scale', 'yaw', 'pitch'), NO) if lost else ok
+    for name, quantity in QUANTITIES.items():
+        if quantity.of_two_wheels and (not two_wheels or forecast.wheels is None):
+            continue
+        good = NO if lost else _within(forecast.sigma(name), quantity.limit(config))
+        if good == NO and _given(name, config):
+            good = UNKNOWN
+        ok[name] = good
+    return ok
+
+
+def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str, str]:
+    """Return the values of a result that meet their limits; none for a rejected one."""
+    doubted = {ABOUT[r.code] for r in calibration.reasons
+               if r.code in ABOUT and r.code.gravity is not Verdict.ACCEPTED}
+    return of_estimates(calibration.estimates, config, two_wheels,
+                        calibration.verdict is not Verdict.REJECTED, doubted)
+
+
+def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
+                 doubted: Set[str] = frozenset()) -> dict[str, str]:
+    """
+    Return the estimates within their limits.
+
+    valid : False: no value is usable.   doubted : names of estimates with a reason against
+    their use.
+    """
+    ok = nothing_known()
+    for name, quantity in QUANTITIES.items():
+        found = [estimates.get(part) for part in quantity.estimates]
+        if quantity.of_two_wheels and not two_wheels and not any(
+                e is not None and e.value is not None for e in found):
+            continue
+        sigma = max((_share(e, quantity.relative) for e in found), default=math.inf)
+        good = _within(sigma, quantity.limit(config))
+        if not valid or doubted & set(quantity.estimates):
+            good = NO
+        elif good == NO and _given(name, config):
+            good = UNKNOWN
+        ok[name] = good
+    return ok
+
+
+def as_keys(ok: dict[str, str]) -> dict[str, str]:
+    """Return the keys of ``~/status``."""
+    return {f'{name}_ok': value for name, value in ok.items()}
+
+
+def words(ok: dict[str, str]) -> str:
+    """Return it for people, empty where nothing is known."""
+    parts = []
+    for value, text in ((YES, 'OK'), (NO, 'not OK')):
+        labels = [QUANTITIES[name].label for name, v in ok.items() if v == value]
+        if labels:
+            parts.append(f'{text}: {", ".join(labels)}')
+    return '; '.join(parts)
+
+
+def _given(name: str, config: Config) -> bool:
+    return name == 'track_width' and config.odometer.track_width > 0
+
+
+def _share(estimate: Estimate | None, relative: bool) -> float:
+    """Return the sigma of an estimate against its limit's unit, infinite where it has none."""
+    if estimate is None or estimate.value is None or estimate.sigma is None:
+        return math.inf
+    if relative:
+        return estimate.sigma / abs(estimate.value) if estimate.value else math.inf
+    return estimate.sigma
+
+
+def _within(sigma: float | None, limit: float) -> str:
+    return YES if sigma is not None and sigma <= limit else NO

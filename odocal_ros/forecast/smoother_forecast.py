@@ -1,0 +1,163 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the running estimate makes foreseen: which sigma counts, how far to drive, and what."""
+
+from collections.abc import Callable
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from odocal_ros.calib.budget import PARAMETERS
+from odocal_ros.calib.choice import ABOUT, choose, deciding
+from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.data.leg import Leg
+from odocal_ros.errors import OdocalError
+from odocal_ros.forecast.forecast import (
+    FARTHEST_M,
+    Forecast,
+    Prospect,
+    sources_of,
+    WheelsForecast,
+)
+from odocal_ros.forecast.smoother_so_far import Running, SmootherSoFar
+from odocal_ros.reasons import Verdict
+from odocal_ros.settings.config import Config
+
+ONLY = ('smoother',)
+SCALE, YAW, PITCH = PARAMETERS
+# physical: m/s^2 of an ordinary stop and start, m/s that one would do it from at least
+STOP_FORCE, STOP_SPEED = 1.5, 5.0
+# physical: path length is proportional to sigma to the power of minus this: for white errors of
+# fixes, with slow
+PATH_POWER, PATH_POWER_SLOW = 1.0, 2.0
+MOST_STOPS = 50    # judgement: more stops and starts nobody does
+
+
+def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
+         wanted: Callable[[], bool]) -> Running | None:
+    """
+    Return the smoother's running estimate, None where it says nothing yet or is not asked.
+
+    leg : the data so far.   wanted : called between passes; if False, Abandoned is raised.
+
+    Raises
+    ------
+    OdocalError
+        There is no forecast yet, and the smoother is the only method.
+
+    """
+    if smoother is None or 'smoother' not in deciding(config.method):
+        return None
+    try:
+        return smoother.look(leg, config, wanted)
+    except OdocalError:
+        if deciding(config.method) == ONLY:
+            raise
+        return None
+
+
+def gives_all(running: Running | None) -> bool:
+    """Return True if scale, yaw and pitch of the result will come from the smoother."""
+    return running is not None and running.method.verdict is not Verdict.REJECTED and all(
+        running.method.estimates[name].value is not None for name in PARAMETERS)
+
+
+def nothing_foreseen(config: Config) -> Forecast:
+    """Return a forecast with the required accuracies only."""
+    return Forecast(Prospect(None, config.verdict.max_scale_sigma, None),
+                    Prospect(None, config.verdict.max_yaw_sigma, None))
+
+
+def without_force(forecast: Forecast) -> Forecast:
+    """Return a forecast without what only an accelerometer determines."""
+    yaw = forecast.yaw
+    if yaw.sigma is None and not yaw.why:
+        yaw = replace(yaw, why='not determined without an accelerometer or an external heading')
+    return replace(forecast, yaw=yaw, pitch=None)
+
+
+def with_running(forecast: Forecast, running: Running, config: Config) -> Forecast:
+    """Return an forecast with a running estimate, where the result will be by it."""
+    method = running.method
+    faults = [r for r in method.reasons
+              if r.code.gravity is Verdict.REJECTED and r.code not in ABOUT]
+    if faults:      # its values are of no use then
+        return replace(forecast, faults=tuple(faults))
+    if method.verdict is not Verdict.REJECTED:
+        forecast = replace(forecast, methods=forecast.methods | {'smoother': method})
+    given, _ = choose(forecast.methods, config.method)
+    by = {name: e.method for name, e in given.items() if e.value is not None}
+    scale, yaw, pitch = forecast.scale, forecast.yaw, forecast.pitch
+    if by.get(SCALE) == 'smoother' or scale.sigma is None:
+        scale = _scale(running, scale.asked)
+    known = np.isfinite(running.sigmas)      # no angle without an accelerometer
+    if known[1] and (by.get(YAW) == 'smoother' or yaw.sigma is None):
+        yaw = _yaw(running, yaw.asked)
+    if known[2] and (by.get(PITCH) == 'smoother' or pitch is None):
+        pitch = float(running.sigmas[2])
+    return replace(forecast, scale=scale, yaw=yaw, pitch=pitch, wheels=_wheels(method))
+
+
+def _wheels(method: MethodResult) -> WheelsForecast | None:
+    """Return the running estimate of two wheels, None for one counter."""
+    if 'track_width' not in method.estimates:
+        return None
+    left, right, width = (_relative(method.estimates[name]) for name in (
+        'scale_factor_left', 'scale_factor_right', 'track_width'))
+    return WheelsForecast(None if left is None or right is None else max(left, right), width)
+
+
+def _relative(e: Estimate) -> float | None:
+    return None if e.value is None or e.sigma is None else e.sigma / abs(e.value)
+
+
+def _scale(running: Running, asked: float) -> Prospect:
+    e = running.method.estimates[SCALE]
+    sigma = float(running.sigmas[0])
+    slow = _slow_share(running)
+    power = PATH_POWER_SLOW * slow + PATH_POWER * (1 - slow)
+    metres = _metres(running, sigma / asked, power)
+    now = '' if e.value is None or e.sigma is None else _digits(e.value, e.sigma)
+    if now and e.unit != '1':
+        now += f' {e.unit}'
+    return Prospect(sigma, asked, metres, sources_of(running.method, SCALE),
+                    f'even {FARTHEST_M / 1000:.0f} km more do not reach the limit', now)
+
+
+def _slow_share(running: Running) -> float:
+    """Return the share of the slow fix errors in what the fixes add to the scale's variance."""
+    by = {s.name: float((s.effects[0]**2).sum()) for s in running.method.sources
+          if s.name in ('fixes', 'slow_fix_errors')}
+    total = sum(by.values())
+    return by.get('slow_fix_errors', 0.0) / total if total else 0.0
+
+
+def _yaw(running: Running, asked: float) -> Prospect:
+    """Return the prospect of the yaw, which accelerations along or across determine."""
+    e = running.method.estimates[YAW]
+    sigma = float(running.sigmas[1])
+    ratio, lack = sigma / asked, ''
+    if ratio > 1:
+        one = 2 * STOP_FORCE * max(running.speed, STOP_SPEED)
+        stops = math.ceil(max(running.agility, one / 2) * (ratio**2 - 1) / one)
+        often = 'often' if stops > MOST_STOPS else f'{stops} time{"s" * (stops > 1)}'
+        lack = f'for the yaw: stop and start {often}, or make as many turns'
+    now = '' if e.value is None or e.sigma is None else _digits(
+        math.degrees(e.value), math.degrees(e.sigma))
+    return Prospect(sigma, asked, _metres(running, ratio, 2.0),
+                    sources_of(running.method, YAW), '', now, lack)
+
+
+def _metres(running: Running, ratio: float, power: float) -> float | None:
+    """Return the metres more that make a sigma so many times better, driven as so far."""
+    metres = running.distance * (max(ratio, 1.0)**power - 1)
+    return metres if metres <= FARTHEST_M else None
+
+
+def _digits(value: float, sigma: float) -> str:
+    """Return a value to a tenth of its sigma, no more than eight digits of it."""
+    size = max(abs(value), sigma)
+    places = math.floor(math.log10(size)) - math.floor(math.log10(sigma)) + 2
+    return f'{value:.{min(max(places, 1), 8)}g}'

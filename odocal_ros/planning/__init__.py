@@ -1,4 +1,0 @@
-# Copyright 2026 odocal_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
-
-"""Prediction of a planned drive."""

@@ -1,0 +1,108 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A leg as the methods use it: its screened rows, where its fixes lie, how far a count reaches."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import medians
+from odocal_ros.nav.dead_reckoning import Origin, rough_scale
+from odocal_ros.nav.earth import rate_without_north
+from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.nominal import nominal_scale
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """A leg made usable: rising times since the start mark, SI, body frame."""
+
+    t_stop: float                      # s, the stop mark
+    t_imu: NDArray[np.float64]         # (n,)
+    w_b: NDArray[np.float64]           # (n, 3) rad/s
+    f_b: NDArray[np.float64]           # (n, 3) m/s^2
+    q_ni: NDArray[np.float64]          # (n, 4) orientation as sent, of frame i
+    yaw_variance: NDArray[np.float64]  # (n,) rad^2, NaN: no orientation
+    C_bi: NDArray[np.float64]          # (3, 3) nominal mounting rotation
+    travel: Travel                     # mean of the wheels
+    travels: tuple[Travel, ...]        # of each of several wheels; () of one, or of unknown sides
+    doubt_t: NDArray[np.float64]       # (d,) s, times of uncertain travel (resets, gaps)
+    doubt_sigma: NDArray[np.float64]   # (d,) its sigma, scale units
+    t_fix: NDArray[np.float64]         # (k,)
+    geodetic: NDArray[np.float64]      # (k, 3) latitude, longitude rad, height m (NaN: none)
+    covariance_n: NDArray[np.float64]  # (k, 3, 3) m^2
+    t_heading: NDArray[np.float64]     # (h,)
+    q_heading: NDArray[np.float64]     # (h, 4)
+    heading_variance: NDArray[np.float64]  # (h,) rad^2
+    t_velocity: NDArray[np.float64]    # (v,)
+    velocity_n: NDArray[np.float64]    # (v, 3) m/s of the antenna, ENU where it is
+    velocity_variance: NDArray[np.float64]  # (v, 3) (m/s)^2, 0 or less: unknown
+    fixes_rejected: int
+    scale_unit: str
+    felt: bool = True                  # False: f_b is made up, no accelerometer is there
+    local: bool = False                # True: fixes are positions in a local frame
+
+    @cached_property
+    def usual_f_b(self) -> Floats:
+        """Return the median of the specific force, which shows what is up: (3,) m/s^2."""
+        return medians(self.f_b)
+
+    @property
+    def least_motion(self) -> float:
+        """Return the distance over which positions surely move, m."""
+        return LOCAL_MOVES if self.local else GNSS_MOVES
+
+    def mirrored(self, spans: Floats) -> 'Inputs':
+        """Return them with the counts in spans, (m, 2) s, reversed."""
+        if not len(spans):
+            return self
+        return replace(self, travel=self.travel.mirrored(spans),
+                       travels=tuple(one.mirrored(spans) for one in self.travels))
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """
+    Fixes in metres, and the scale as far as it is known.
+
+    origin : of n.   fixes_n : (k, 3) m, NaN up where a fix has no height.   fix_sigma : m, usual
+    1 sigma of an axis in the plane, NaN without fixes.   nominal : K0, metres per unit of travel,
+    0 unknown.   rough : by the fixes, K0 where they move too little.
+    """
+
+    origin: Origin
+    fixes_n: NDArray[np.float64]
+    fix_sigma: float
+    nominal: float
+    rough: float
+
+
+def place(inputs: Inputs, config: Config) -> Placed:
+    """
+    Return the fix positions of screened inputs and the metres per count.
+
+    inputs : Inputs.   config : Config, for the nominal scale and the latitude of a local frame.
+    """
+    nominal = nominal_scale(config, inputs.scale_unit)
+    if not len(inputs.t_fix):
+        return Placed(Origin(0.0, 0.0, 0.0), np.empty((0, 3)), np.nan, nominal, nominal)
+    origin = origin_amid(inputs.t_fix, inputs.geodetic)
+    if inputs.local:
+        latitude = np.deg2rad(config.reference.latitude_deg)
+        origin = replace(origin, local=rate_without_north(float(latitude)))
+    geodetic = inputs.geodetic.copy()
+    lost = np.isnan(geodetic[:, 2])
+    geodetic[lost, 2] = origin.height
+    fixes_n = origin.to_n(geodetic)
+    fixes_n[lost, 2] = np.nan
+    sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
+    rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma,
+                        inputs.least_motion) or nominal
+    return Placed(origin, fixes_n, sigma, nominal, rough)

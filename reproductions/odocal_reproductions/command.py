@@ -1,0 +1,30 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What both commands share: the option --plot, and where a picture goes."""
+
+import argparse
+from pathlib import Path
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.output.pictures import PICTURES
+
+
+def add_outputs(parser: argparse.ArgumentParser, drawn: str) -> None:
+    """Declare --json and --plot."""
+    parser.add_argument('--json', action='store_true', help='print one JSON object instead')
+    parser.add_argument('--plot', metavar='FILE', help=f'draw {drawn}: .png, .svg or .pdf')
+
+
+def picture_of(args: argparse.Namespace) -> Path | None:
+    """Return the file to draw into, None without --plot; check that it can be drawn."""
+    if args.plot is None:
+        return None
+    path = Path(args.plot)
+    if path.suffix.lower() not in PICTURES:
+        raise BadUsage(f'--plot {path}: required: a name that ends in {", ".join(PICTURES)}')
+    if not path.parent.is_dir():
+        raise BadUsage(f'--plot {path}: no folder {path.parent}; create it first')
+    if path.is_dir():
+        raise BadUsage(f'--plot {path}: is a folder; required: a file')
+    return path

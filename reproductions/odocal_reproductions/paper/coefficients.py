@@ -1,0 +1,70 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tables 1 and 2 of Shi et al. 2015: coefficients of the error equations, and their weight."""
+
+import numpy as np
+
+from odocal_reproductions.paper.cells import Cell, TABLE_1, TABLE_2
+from odocal_reproductions.paper.error_model import coefficients, PAPER_RADIUS, STATES
+
+# definition: the errors as Shi et al. 2015 has them
+DRIFT = np.deg2rad(0.01) / 3600    # rad/s, 0.01 deg/h
+LEVEL, HEADING = np.deg2rad(0.5 / 60), np.deg2rad(3.6 / 60)    # 0.5', 3.6'
+# sizes of the errors that table 2 multiplies with: rad, rad/s
+SIZES = {'dL': 10.0 / PAPER_RADIUS, 'phi_E': LEVEL, 'phi_N': LEVEL, 'phi_U': HEADING,
+         'eps_E': DRIFT, 'eps_N': DRIFT, 'eps_U': DRIFT}
+OWN_DRIFT = {'phi_E': 'eps_E', 'phi_N': 'eps_N', 'phi_U': 'eps_U'}
+
+REMARKS_1 = {
+    ('phi_E', 'phi_N'): 'misprint: (15) has vE/R for vE tan L/R',
+    ('phi_U', 'phi_U'): 'misprint: without the tan L of (17)',
+    ('dlam', 'dL'): 'misprint: (19), (23) lack vE, the figure has it',
+}
+MISSING = 'as in table 1: tan L is missing'
+REMARKS_2 = {
+    ('phi_N', 'dL'): 'misprint: a slip of a decade, 7.5e-11',
+    ('phi_U', 'phi_U'): MISSING,
+    ('phi_E', 'phi_N'): MISSING,
+}
+ROUNDED = 'inputs rounded to two digits first'
+CUT = 'cut, not rounded'
+
+
+def table_1() -> dict[str, dict[str, Cell]]:
+    """Return the coefficient of each error in the rate of each state: {rate of: {by: Cell}}."""
+    latitude = np.deg2rad(40.0)
+    velocity_n = (14.0, 14.0, 0.0)    # m/s, east, north, up
+    F = coefficients(latitude, 0.0, velocity_n, PAPER_RADIUS)
+
+    def entry(row: str, column: str) -> float:
+        return -1.0 if OWN_DRIFT.get(row) == column else float(
+            F[STATES.index(row), STATES.index(column)])
+
+    def cell(row: str, column: str, printed: float) -> Cell:
+        value = entry(row, column)
+        cut = '' if float(f'{abs(value):.1e}') == printed else CUT
+        return _cell(printed, value, REMARKS_1.get((row, column), cut))
+
+    return {row: {column: cell(row, column, printed) for column, printed in cells.items()}
+            for row, cells in TABLE_1.items()}
+
+
+def table_2() -> dict[str, dict[str, Cell]]:
+    """Return table 1 times the sizes of the errors, 1/s and rad/s."""
+    first = table_1()
+
+    def cell(row: str, column: str, printed: float) -> Cell:
+        own = first[row][column]
+        value = own.value * SIZES[column] * own.sign
+        remark = REMARKS_2.get((row, column), '')
+        if not remark and abs(printed / abs(value) - 1) > 0.02:
+            remark = ROUNDED
+        return _cell(printed, value, remark)
+
+    return {row: {column: cell(row, column, printed) for column, printed in cells.items()}
+            for row, cells in TABLE_2.items()}
+
+
+def _cell(printed: float, value: float, remark: str) -> Cell:
+    return Cell(printed, abs(value), sign=1 if value > 0 else -1, remark=remark)

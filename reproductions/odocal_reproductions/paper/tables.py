@@ -1,0 +1,120 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tables 3 and 4 of Shi et al. 2015 from the simulated drive, and all four as one."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from odocal_reproductions.paper.cells import Cell, CONVENTION, TABLE_3, TABLE_4
+from odocal_reproductions.paper.coefficients import DRIFT, HEADING, table_1, table_2
+from odocal_reproductions.paper.drive import Growth, GYRO_NOISE, Outcome, PaperDrive, SOURCES
+from odocal_reproductions.paper.error_forms import SpeedProfile
+
+SCALE_REMARK = ('the same within 2e-11 in every printed row, not explained by plane or tilt: a '
+                "constant of the paper's numerics, not a target")
+FORMULA_REMARK = ("printed dK is the sphere's R in (30), (31) and the ellipsoid's C0 and C in "
+                  '(13), (14): phi_U / 2 times 0.0059')
+SIGN_REMARK = '(30)-(33) are printed with the sign reversed against (27), (28)'
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """
+    A row of table 3.
+
+    yaw_deg, scale : ours beside the printed ones, deg and relative to K.
+    model_deg : yaw error by the linear error model, deg.
+    noise_sigmas : printed less ours in sigmas of the yaw error by gyro noise; None: not printed.
+    """
+
+    yaw_deg: Cell
+    scale: Cell
+    model_deg: float
+    noise_sigmas: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class PaperTables:
+    """
+    The four tables, and what they were made of.
+
+    noise_deg : 1 sigma of the yaw error by the paper's gyro noise over the drive, deg.
+    sigma_deg : 1 sigma of the yaw that the pipeline itself states for the drive, deg.
+    """
+
+    table_1: dict[str, dict[str, Cell]]
+    table_2: dict[str, dict[str, Cell]]
+    table_3: dict[str, Row]
+    table_4: dict[str, dict[str, dict[str, Cell]]]
+    outcomes: dict[str, Outcome]
+    growths: dict[str, Growth]
+    noise_deg: float
+    sigma_deg: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the output of --json."""
+        third = {source: {
+            'yaw_deg': row.yaw_deg.as_dict() | {'model': row.model_deg,
+                                                'noise_sigmas': row.noise_sigmas},
+            'scale': row.scale.as_dict()} for source, row in self.table_3.items()}
+        return {
+            'error_convention': CONVENTION,
+            'gyro_noise_yaw_sigma_deg': self.noise_deg,
+            'stated_yaw_sigma_deg': self.sigma_deg,
+            'tables': {'1': _plain(self.table_1), '2': _plain(self.table_2), '3': third,
+                       '4': _plain(self.table_4)}}
+
+
+def _plain(table: Any) -> Any:
+    """Return cells, and tables of them in each other, as --json has them."""
+    return table.as_dict() if isinstance(table, Cell) else {k: _plain(v) for k, v in table.items()}
+
+
+def compute() -> PaperTables:
+    """Return the four tables; the drive of section 3 goes through the pipeline eight times."""
+    drive = PaperDrive()
+    outcomes = {source: drive.outcome(source) for source in SOURCES}
+    growths = {source: drive.growth(source) for source in SOURCES}
+    profile = drive.profile()
+    noise_deg = float(np.rad2deg(profile.noise_sigma(GYRO_NOISE)))
+    third = {source: _row(source, outcomes[source], growths[source], noise_deg)
+             for source in SOURCES}
+    return PaperTables(table_1(), table_2(), third, _table_4(third, profile), outcomes, growths,
+                       noise_deg, float(np.rad2deg(outcomes['all'].yaw_sigma)))
+
+
+def _row(source: str, outcome: Outcome, growth: Growth, noise_deg: float) -> Row:
+    printed_scale, printed_yaw = TABLE_3[source]
+    yaw = float(np.rad2deg(outcome.yaw))
+    sigmas, remark = None, ''
+    if printed_yaw is not None:
+        sigmas = (printed_yaw + yaw) / noise_deg
+        if abs(yaw) < noise_deg:
+            remark = 'below the gyro noise of the paper: not significant'
+    return Row(Cell(printed_yaw, yaw, sense=-1, remark=remark),
+               Cell(printed_scale, outcome.scale, remark=SCALE_REMARK if printed_scale else ''),
+               float(np.rad2deg(growth.yaw[-1])), sigmas)
+
+
+def _table_4(third: dict[str, Row],
+             profile: SpeedProfile) -> dict[str, dict[str, dict[str, Cell]]]:
+    formula = {'eps_z': profile.heading_and_drift(0.0, DRIFT),
+               'phi_U0': profile.heading_and_drift(HEADING, 0.0)}
+
+    def line(source: str, name: str) -> dict[str, Cell]:
+        if name == 'simulated':
+            yaw_deg, scale = third[source].yaw_deg.value, third[source].scale.value
+            remarks = '', SCALE_REMARK
+        else:
+            dalpha, scale = formula[source]
+            scale = round(scale, 20)      # below is round-off of a variance that is nothing
+            yaw_deg, remarks = float(np.rad2deg(dalpha)), (SIGN_REMARK, FORMULA_REMARK)
+        printed_scale, printed_yaw = TABLE_4[source][name]
+        return {'yaw_deg': Cell(printed_yaw, yaw_deg, sense=-1, remark=remarks[0]),
+                'scale': Cell(printed_scale, scale, remark=remarks[1])}
+
+    return {source: {name: line(source, name) for name in lines}
+            for source, lines in TABLE_4.items()}

@@ -1,0 +1,77 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""odocal patent: the embodiment of CN104359492A, printed beside computed."""
+
+import argparse
+import math
+from typing import Any, TYPE_CHECKING
+
+from odocal_reproductions.command import add_outputs, picture_of
+from odocal_ros.offline.say import say
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.wheel_search.planar import PlanarLeg
+
+FIXES = ('white', 'correlated', 'rtk')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument('--fix-noise', default='white', choices=FIXES,
+                        help='errors of the simulated fixes (default white, 1.5 m)')
+    parser.add_argument('--seed', type=int, default=1, help='of the simulated drive (default 1)')
+    add_outputs(parser, 'the distances of all combinations and of each line')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate, compute, print, draw; return 0."""
+    picture = picture_of(args)
+    from odocal_reproductions.patent.embodiment import embodiment, FOUND, RADIUS
+    from odocal_reproductions.patent.text import text_of
+    leg = driven(args.fix_noise, args.seed)
+    table = embodiment(leg, RADIUS, FOUND)
+    if picture is not None:
+        from odocal_reproductions.patent.plot import draw
+        draw(table, picture)
+    if args.json:
+        import json
+        say(json.dumps({'fix_noise': args.fix_noise, 'seed': args.seed} | table.as_dict(),
+                       indent=2, allow_nan=False))
+    else:
+        say(text_of(table, args.fix_noise, FOUND), end='')
+        if picture is not None:
+            say(f'\n{picture}: the distances of all combinations and of each line')
+    return 0
+
+
+def driven(fix_noise: str, seed: int, **more: Any) -> 'PlanarLeg':
+    """
+    Return the embodiment's drive in the plane: ten minutes of town, off by what it finds.
+
+    more : options of the simulation that replace these.
+    """
+    from odocal_reproductions.patent.embodiment import FOUND, RADIUS
+    from odocal_ros.pipeline.patent_run import planar_of
+    from odocal_ros.pipeline.prepare import prepare
+    from odocal_ros.screening.screen import screen
+    from odocal_ros.settings.config import Config, with_settings
+    from odocal_ros.sim.scenarios import SimOptions, simulate
+    left, right = RADIUS + FOUND[0], RADIUS + FOUND[1]
+    options: dict[str, Any] = {
+        'scenario': 'town', 'seed': seed, 'imu_grade': 'tactical', 'odometer': 'angle',
+        'two_wheels': True, 'scale': 2 / (1 / left + 1 / right),
+        'wheel_difference': right / left - 1, 'yaw': 0.0, 'pitch': 0.0, 'nominal_scale': RADIUS,
+        'fix_noise': fix_noise}
+    drive = simulate(SimOptions(**options | more))
+    # the track is to be turned counter-clockwise: the heading, clockwise, is given too large
+    config = with_settings(Config(), {
+        'imu.grade': 'tactical', 'wheels.radius': RADIUS, 'alignment.heading_source': 'fixed',
+        'alignment.heading': drive.truth.heading + math.radians(FOUND[2])})
+    leg = drive.leg()
+    inputs, _ = screen(leg, config)
+    prepared, _ = prepare(leg, inputs, config)
+    assert prepared is not None     # a drive made for it
+    planar = planar_of(prepared, 0.0)
+    assert planar is not None
+    return planar

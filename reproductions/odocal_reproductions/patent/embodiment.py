@@ -1,0 +1,179 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The embodiment of CN104359492A as given: radii +-0.03 m in seven levels, heading +-1 deg in nine.
+
+It lists seven combinations that an orthogonal array is said to have chosen, and names as best one
+that is not among them. No orthogonal array for 7 x 7 x 9 levels is smaller than all 441
+combinations; here a nearly balanced one of 81 stands beside all of them, the refined optimum and
+least squares. Errors are what is to be added: true radius = nominal radius + error, and the track
+is to be turned counter-clockwise by the heading error.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.wheel_search.arrays import bose, full_factorial, next_prime_power
+from odocal_ros.calib.wheel_search.criteria import score
+from odocal_ros.calib.wheel_search.direct import least_squares, LeastSquares
+from odocal_ros.calib.wheel_search.planar import PlanarLeg
+from odocal_ros.calib.wheel_search.space import sets_of, Space
+from odocal_ros.calib.wheel_search.surface import refine, Refined
+from odocal_ros.data.arrays import Floats, Ints
+
+LEVELS = (7, 7, 9)    # definition: of the patent's embodiment
+RADIUS_STEP = 0.01      # m, definition: of the patent's embodiment
+# definition: left radius, right radius, m; heading, deg: as printed
+PRINTED = ((-0.03, -0.03, 1.0), (0.0, 0.0, 0.25), (0.02, 0.02, -1.0), (0.0, -0.03, 0.25),
+           (0.03, -0.03, -1.0), (0.03, 0.0, 0.25), (-0.03, 0.03, -1.0))
+FOUND = (-0.01, 0.01, 0.25)     # printed as best, with 21.76 m at most and 13.24 m in the mean
+RADIUS = 0.3                    # m, judgement: the patent states none
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    One line of the table.
+
+    left, right : m, error of the radius.   heading_deg : error.   criteria : as Scores.row.
+    """
+
+    name: str
+    left: float
+    right: float
+    heading_deg: float
+    criteria: dict[str, float | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Embodiment:
+    """
+    The table and what stands behind it.
+
+    imbalance : of the array of 81, see ``imbalance``.   least : rows of an orthogonal array.
+    small, whole : the rows of the best of 81 and of all 441 among ``rows``.
+    refined : by surfaces inside the range.   direct : by least squares, in no range.   radius :
+    m, nominal, of both wheels.
+    grid : (7, 7) m, least mean distance over the headings, by left and right radius of all 441.
+    """
+
+    rows: tuple[Row, ...]
+    imbalance: float
+    least: int
+    small: Row
+    whole: Row
+    refined: Refined
+    direct: LeastSquares
+    radius: float
+    grid: NDArray[np.float64]
+
+    @property
+    def sigma_radius(self) -> float:
+        """Return the formal sigma of right less left radius by positions, m."""
+        return self.direct.sigma_difference * self.radius
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the output of ``odocal patent --json``."""
+        return {'radius': self.radius, 'rows': [vars(row) for row in self.rows],
+                'imbalance': self.imbalance, 'orthogonal_rows': self.least,
+                'response_surface': {'iterations': self.refined.iterations,
+                                     'settled': self.refined.settled,
+                                     'on_edge': self.refined.on_edge},
+                'least_squares': {'condition_number': float(self.direct.condition),
+                                  'correlation': float(self.direct.correlation[0, 1]),
+                                  'sigma_right_less_left_m': float(self.sigma_radius)},
+                'told_apart': self.separable}
+
+    @property
+    def separable(self) -> bool:
+        """Return True if the fixes constrain left against right better than the range does."""
+        return bool(self.sigma_radius <= np.sqrt(2) * 3 * RADIUS_STEP / 2)
+
+
+def imbalance(rows: Ints, levels: tuple[int, ...]) -> float:
+    """Return the largest deviation from equal counts over all pairs of levels."""
+    worst = 0.0
+    for a, b in combinations(range(len(levels)), 2):
+        cells = levels[a] * levels[b]
+        counts = np.bincount(rows[:, a] * levels[b] + rows[:, b], minlength=cells)
+        worst = max(worst, float(np.abs(counts - len(rows) / cells).max()))
+    return worst
+
+
+def least_rows(levels: tuple[int, ...]) -> int:
+    """Return the number of rows that an orthogonal array's must be a multiple of."""
+    return math.lcm(*(a * b for a, b in combinations(levels, 2))) if len(levels) > 1 \
+        else int(levels[0])
+
+
+def nearly_balanced(levels: tuple[int, ...]) -> Ints:
+    """
+    Return a small array for unlike numbers of levels, by dummy levels.
+
+    An orthogonal array of the next prime power is folded: columns with fewer levels let some of
+    them stand for two, spread evenly around the middle. Each pair of levels is still met.
+    """
+    q = next_prime_power(max(*levels, len(levels) - 1))
+    rows = bose(q, len(levels))
+    for column, n in enumerate(levels):
+        fold = np.rint((np.arange(q) + 0.5) * n / q - 0.5).astype(np.int64)
+        rows[:, column] = np.clip(fold, 0, n - 1)[rows[:, column]]
+    return rows
+
+
+def embodiment(leg: PlanarLeg, radius: float = RADIUS,
+               truth: tuple[float, float, float] | None = None) -> Embodiment:
+    """
+    Run the embodiment on a leg.
+
+    leg : its start values belong to wheels of the nominal radius.   radius : nominal radius of
+    both wheels, m.   truth : (left, right, heading) true errors, m and deg, for a line of their
+    own.
+    """
+    heading_step = np.deg2rad(0.25)
+    half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * heading_step])
+    array = nearly_balanced(LEVELS)     # 81 rows
+    small, whole = (_levels(rows, half) for rows in (array, full_factorial(LEVELS)))
+    (x_small, _), (x_whole, means) = (_best(leg, x) for x in (small, whole))
+    step = 2 * half / (np.array(LEVELS) - 1)
+    spaces = Space(held=False), Space(held=True)
+    refined, together = (
+        refine(lambda x: score(leg, sets_of(leg, x), course=False).loss, x_small, step, half,
+               space, widen=False) for space in spaces)
+    direct, direct_together = (least_squares(leg, x_small, space) for space in spaces)
+
+    def row(name: str, x: Floats) -> Row:
+        criteria = score(leg, sets_of(leg, x)).row(0)
+        left, right = (float(r) for r in x[:2] * radius)
+        return Row(name, left, right, float(np.rad2deg(x[2])), criteria)
+
+    def given(name: str, errors: tuple[float, float, float]) -> Row:
+        return row(name, np.array([errors[0] / radius, errors[1] / radius,
+                                   np.deg2rad(errors[2])]))
+
+    best = row(f'best of {len(small)}', x_small), row(f'best of all {len(whole)}', x_whole)
+    rows = [given('start values', (0.0, 0.0, 0.0))]
+    rows += [given(f'printed {k}', errors) for k, errors in enumerate(PRINTED, 1)]
+    rows += [given('printed as best', FOUND), *best,
+             row('response surface', refined.x), row('  wheels together', together.x),
+             row('least squares', direct.x), row('  wheels together', direct_together.x)]
+    rows += [] if truth is None else [given('truth', truth)]
+    return Embodiment(tuple(rows), imbalance(array, LEVELS), least_rows(LEVELS), *best, refined,
+                      direct, radius, means.reshape(LEVELS).min(axis=2))
+
+
+def _levels(rows: Ints, half: Floats) -> Floats:
+    x: Floats = (2 * rows / (np.array(LEVELS) - 1) - 1) * half
+    return x
+
+
+def _best(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
+    """Return the row with the least mean distance, ties by the largest; and all mean distances."""
+    scores = score(leg, sets_of(leg, x), course=False)
+    return x[np.lexsort((scores.max, scores.mean))[0]], scores.mean

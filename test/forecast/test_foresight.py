@@ -1,0 +1,518 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What is foreseen of a leg while it is recorded: cells, sigmas, metres, words, and no harm."""
+
+from dataclasses import fields, replace
+import math
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
+from odocal_ros.errors import OdocalError
+from odocal_ros.forecast import foresight
+from odocal_ros.forecast.forecast import as_keys, Forecast, Prospect
+from odocal_ros.forecast.foresight import Abandoned, DriveSoFar, forecast_of
+from odocal_ros.forecast.leg_so_far import faults_in_cells
+from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
+from odocal_ros.live import running_estimate as watch
+from odocal_ros.live.guidance import hint
+from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
+from odocal_ros.live.session import Session
+from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.worker import Worker
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+pytestmark = pytest.mark.slow
+SECOND = 1_000_000_000
+HEADING = 0.003         # rad
+
+
+def imu_rows(t, yaw_rate):
+    n = len(t)
+    stamps = SECOND + np.round(np.asarray(t) * 1e9).astype(np.int64)
+    w_i = np.stack([np.zeros(n), np.zeros(n), yaw_rate], -1)
+    return ImuSamples(stamps, stamps, w_i, np.tile([0.0, 0.0, 9.81], (n, 1)), np.zeros((n, 4)),
+                      np.full(n, np.nan))
+
+
+def odometer_rows(t, value):
+    stamps = SECOND + np.round(np.asarray(t) * 1e9).astype(np.int64)
+    return OdometerSamples(stamps, stamps, value)
+
+
+def fed(form, slot, rows, chop):
+    thinned = ThinnedLeg(form)
+    for first in range(0, len(rows.stamp_ns), chop):
+        thinned.feed(slot, take(rows, slice(first, first + chop)))
+    return thinned
+
+
+def turned(leg):
+    t = (leg.imu.stamp_ns - leg.imu.stamp_ns[0]) * 1e-9
+    return float(np.trapezoid(leg.imu.w_i[:, 2], t) if hasattr(np, 'trapezoid')
+                 else np.trapz(leg.imu.w_i[:, 2], t))
+
+
+# cells
+
+def test_work_does_not_grow_with_the_leg_and_no_turn_is_lost():
+    t = np.arange(0.0, 4 * 3600.0, 0.05)          # four hours, the longest leg there may be
+    rate = np.where((t % 60) < 3, 0.5, 0.0)       # 3 s turns, one a minute
+    leg = fed(None, 'imu', imu_rows(t, rate), 12_000).leg(SECOND)
+    assert MOST_CELLS / 2 < len(leg.imu.stamp_ns) <= MOST_CELLS
+    # the cells are 1.6 s wide by then: a trapezoid misses at most a cell at either end
+    assert turned(leg) == pytest.approx(1.5 * 240, abs=2 * 0.5 * 1.6)
+    assert (np.diff(leg.imu.stamp_ns) > 0).all()
+
+
+def test_vibration_is_no_turn():
+    t = np.arange(0.0, 300.0, 0.005)
+    leg = fed(None, 'imu', imu_rows(t, np.sin(2 * np.pi * 10.03 * t)), 1000).leg(SECOND)
+    # 10.03 Hz seen every 0.1 s is a slow wave: picked rows would turn by 1 / (pi 0.03) = 10 rad;
+    # of a cell's mean sinc(1.003) = 0.3 % is left
+    assert abs(np.cumsum(leg.imu.w_i[:, 2] * 0.1)).max() < 0.1
+
+
+@pytest.mark.parametrize(('form', 'sent'), [
+    (OdometerForm('cumulative', 256, 'm/pulse'), lambda n: (15 * np.arange(n)) % 256),
+    (OdometerForm('cumulative', 2**64, 'm/pulse'), lambda n: 2**63 - 700 + 15 * np.arange(
+        n, dtype=np.uint64)),
+    (OdometerForm('increment', 2**16, 'm/pulse'), lambda n: np.full(n, 15)),
+])
+def test_counts_never_roll_over_however_the_blocks_are_cut(form, sent):
+    t = np.arange(0.0, 10.0, 0.01)
+    value = sent(len(t)).astype(np.uint64).view(np.int64)
+    legs = [fed(form, 'odometer', odometer_rows(t, value), chop).leg(SECOND)
+            for chop in (1, 7, len(t))]
+    for leg in legs:
+        assert leg.form == OdometerForm('cumulative', 2**64, 'm/pulse')
+        rows = leg.odometer
+        assert np.diff(rows.value) == pytest.approx(150)    # 0.1 s of 1500 counts a second
+        assert np.diff(rows.stamp_ns) == pytest.approx(SECOND // 10)
+        for f in fields(rows):
+            assert (getattr(rows, f.name) == getattr(legs[0].odometer, f.name)).all()
+
+
+def test_speeds_are_averaged_and_rows_without_a_figure_left_out():
+    form = OdometerForm('rate', 0, '1')
+    t = np.arange(0.0, 10.0, 0.01)
+    value = 10.0 + np.sin(2 * np.pi * 10 * t)
+    value[500] = np.nan
+    rows = fed(form, 'odometer', odometer_rows(t, value), 33).leg(SECOND).odometer
+    # one row of ten less moves the mean of that cell by at most 1 / 9
+    assert rows.value == pytest.approx(np.full(len(rows.value), 10.0), abs=0.12)
+
+
+# the estimate
+
+@pytest.fixture(scope='module')
+def drive():
+    return simulate(SimOptions(scenario='straight', duration=300.0, imu_rate=50.0, seed=3,
+                               imu_grade='tactical', fix_noise='white', fix_sigma=0.5))
+
+
+@pytest.fixture(scope='module')
+def config(drive):
+    return with_settings(Config(), {
+        'imu.grade': 'tactical', 'gnss.correlation_time': 0.0, 'alignment.heading_source': 'fixed',
+        'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': HEADING})
+
+
+def sketched(drive, t_stop):
+    """Return the thinned of a drive up to a time after the start mark, s."""
+    whole = drive.leg()
+    thinned = ThinnedLeg(whole.form)
+    for slot in ('imu', 'odometer', 'fix'):
+        rows = getattr(whole, slot)
+        thinned.feed(slot, take(rows, rows.stamp_ns <= whole.start_ns + t_stop * SECOND))
+    return thinned, whole.start_ns
+
+
+def foreseen(drive, config, t_stop, **more):
+    thinned, start_ns = sketched(drive, t_stop)
+    return forecast_of(thinned.leg(start_ns), thinned.fix_rate(), config, **more)
+
+
+def test_a_leg_at_its_end_is_foreseen_as_it_comes_out(drive, config):
+    leg = drive.leg()
+    result = calibrate(leg, config).methods['two_point'].estimates
+    forecast = foreseen(drive, config, (leg.stop_ns - leg.start_ns) / SECOND)
+    scale, yaw = result['scale_factor'], result['yaw_mounting_angle']
+    # the rough scale is good to a per cent, and the fix sigma there scatters by 5 % from residuals
+    assert forecast.scale.sigma == pytest.approx(scale.sigma / scale.value, rel=0.1)
+    assert forecast.yaw.sigma == pytest.approx(yaw.sigma, rel=0.05)
+    assert forecast.yaw.sources[0] == ('initial_heading', pytest.approx(HEADING))
+    assert {name for name, _ in forecast.scale.sources} >= {'fix_start', 'fix_end'}
+
+
+def test_the_metres_foreseen_are_those_it_takes(drive, config):
+    t_now = 100.0
+    first = foreseen(drive, config, t_now)
+    asked = first.scale.sigma / 1.6
+    strict = with_settings(config, {'verdict.max_scale_sigma': asked})
+    metres = foreseen(drive, strict, t_now).scale.metres
+    speed = drive.truth.distance / 240.0            # driven in about the middle 240 s
+    later = [foreseen(drive, strict, t_now + share * metres / speed) for share in (0.5, 1.5)]
+    assert later[0].scale.metres > 0 < metres
+    assert later[0].scale.sigma > asked
+    assert (later[1].scale.metres, later[1].scale.sigma <= asked) == (0.0, True)
+    assert later[0].scale.metres < 0.8 * metres
+
+
+def test_a_yaw_asked_better_than_its_heading_is_never_there(drive, config):
+    asked = with_settings(config, {'verdict.max_yaw_sigma': 0.9 * HEADING})
+    yaw = foreseen(drive, asked, 150.0).yaw
+    assert yaw.metres is None
+    assert yaw.words('yaw', 'deg', math.degrees(1)) == (
+        'yaw: limited by the heading uncertainty (0.17 deg)')
+
+
+def test_the_only_heading_is_the_course(drive, config):
+    course = with_settings(config, {'alignment.heading_source': 'course'})
+    yaw = foreseen(drive, course, 150.0).yaw
+    assert (yaw.sigma, yaw.metres) == (None, None)
+    assert 'not separable from the course over ground' in yaw.why
+
+
+def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
+    """10 s after a mark set in motion; with another 15 s of such driving the smoother tells it."""
+    whole = drive.leg()
+    start_ns = whole.start_ns + 100 * SECOND
+    thinned = ThinnedLeg(whole.form)
+    for slot in ('imu', 'odometer', 'fix'):
+        rows = getattr(whole, slot)
+        thinned.feed(slot, take(rows, np.abs(rows.stamp_ns - start_ns - 4 * SECOND) < 6 * SECOND))
+    config = with_settings(Config(), {'odometer.nominal_scale': drive.truth.scale})
+    leg = thinned.leg(start_ns)
+    told = forecast_of(leg, thinned.fix_rate(), config, smoother=SmootherSoFar())
+    assert told.methods == {}
+    assert 'yaw is not determined yet' in told.words()
+    assert told.lacks == ['drive on with stops, starts and turns']
+    assert not told.complete
+    still = replace(leg, imu=replace(leg.imu, f_i=np.zeros_like(leg.imu.f_i)))    # none to come
+    never = forecast_of(still, thinned.fix_rate(), config, smoother=SmootherSoFar())
+    assert 'yaw: not separable from the course over ground' in never.words()
+
+
+def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
+    auto = with_settings(config, {'alignment.heading_source': 'auto',
+                                  'alignment.heading': math.nan})
+    thinned, start_ns = sketched(drive, 150.0)
+    leg = thinned.leg(start_ns)
+    n = len(leg.imu.stamp_ns)
+    told = replace(leg, imu=replace(leg.imu, yaw_variance=np.full(n, 0.004**2),
+                                    q_ni=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))))
+    forecast = forecast_of(told, thinned.fix_rate(), auto)
+    assert forecast.yaw.sources[0] == ('initial_heading', pytest.approx(0.004))
+
+
+def test_nothing_is_foreseen_of_a_vehicle_at_rest(drive, config):
+    with pytest.raises(OdocalError):
+        foreseen(drive, config, -5.0)
+
+
+def test_no_sigma_is_foreseen_before_a_count_is_known_in_metres(drive, config):
+    with pytest.raises(OdocalError, match='not known yet'):
+        foreseen(drive, config, 6.0)
+    known = with_settings(config, {'odometer.nominal_scale': drive.truth.scale})
+    assert foreseen(drive, known, 6.0).scale.sigma > 0.01    # 0.3 m fixes 10 m apart
+
+
+def test_a_drive_goes_on_from_here_at_its_own_speed():
+    t = np.arange(0.0, 61.0)
+    speed = np.where((t < 10) | (t > 50), 0.0, 8.0)
+    bend = np.where(t > 30, np.pi / 2, 0.0)
+    drive = DriveSoFar(t, speed, bend, np.zeros(61))
+    more = drive.lengthened(400.0)
+    assert more.distance - drive.distance == pytest.approx(400.0)
+    assert more.duration - drive.duration == pytest.approx(50.0)
+    assert more.standstills(2.0)[-1] == pytest.approx((101.0, 110.0))
+    onward = (more.t > 50.0) & (more.t < 100.0)
+    assert more.yaw[onward] == pytest.approx(np.pi / 2)
+
+
+def test_a_prediction_is_made_from_few_rows_and_keeps_its_stops(drive, config, monkeypatch):
+    seen = []
+
+    def counted(planned, sigmas):
+        seen.append(planned)
+        return predict(planned, sigmas)
+
+    predict = foresight.predict
+    monkeypatch.setattr(foresight, 'predict', counted)
+    monkeypatch.setattr(foresight, 'DRIVE_ROWS', 100)
+    sparse = foreseen(drive, config, 270.0)
+    assert len(seen[0].t) <= 100 + 2 * 100      # a rest of 10 s is put on in steps of 0.1 s
+    monkeypatch.setattr(foresight, 'DRIVE_ROWS', 100_000)
+    dense = foreseen(drive, config, 270.0)
+    assert len(seen[-1].t) > 10 * len(seen[0].t)
+    assert seen[0].standstills(2.0) == seen[-1].standstills(2.0)
+    assert sparse.scale.sigma == pytest.approx(dense.scale.sigma, rel=0.02)
+    assert sparse.yaw.sigma == pytest.approx(dense.yaw.sigma, rel=0.02)
+
+
+def test_a_look_gives_up_at_its_next_step_once_the_leg_is_over(drive, config):
+    strict, asked = with_settings(config, {'verdict.max_scale_sigma': 1e-9}), []
+
+    def wanted():
+        asked.append(True)
+        return len(asked) < 3
+
+    with pytest.raises(Abandoned):
+        foreseen(drive, strict, 150.0, wanted=wanted)
+    assert len(asked) == 3
+
+
+# the watch
+
+class Log:
+    def __init__(self):
+        self.lines = []
+
+    def debug(self, text):
+        self.lines.append(text)
+
+
+def watched(drive, config, worker, log):
+    leg = drive.leg()
+    recorder, look = LegRecorder(), RunningEstimate(worker, log)
+    recorder.form = leg.form
+    half = leg.start_ns + 150 * SECOND
+    for slot in ('imu', 'odometer', 'fix'):
+        rows = getattr(leg, slot)
+        recorder.feed(slot, take(rows, rows.stamp_ns <= leg.start_ns))
+    look.begin(recorder, leg.start_ns, config)
+    for slot in ('imu', 'odometer', 'fix'):
+        rows = getattr(leg, slot)
+        for first_ns in range(leg.start_ns, half, 10 * SECOND):
+            look.feed(slot, take(rows, (rows.stamp_ns > first_ns)
+                                 & (rows.stamp_ns <= first_ns + 10 * SECOND)))
+    return look, half
+
+
+def finished(worker):
+    """Wait for all the jobs so far."""
+    done = []
+    worker.submit(lambda: None, lambda *_: done.append(True))
+    deadline = time.monotonic() + 20.0
+    while not done and time.monotonic() < deadline:
+        time.sleep(0.001)       # a loop without a rest keeps the interpreter from the worker
+        worker.poll()
+    assert done
+
+
+@pytest.fixture
+def worker():
+    one = Worker()
+    yield one
+    one.close()
+
+
+def test_the_watch_foresees_what_its_thinned_does(drive, config, worker):
+    log = Log()
+    look, now_ns = watched(drive, config, worker, log)
+    look.look(drive.leg().start_ns + LOOK_PERIOD_NS - 1)
+    finished(worker)
+    assert look.forecast is None                      # too early
+    look.look(now_ns)
+    finished(worker)
+    expected = foreseen(drive, config, 150.0, smoother=SmootherSoFar())
+    assert log.lines == []
+    assert look.forecast.scale.sigma == pytest.approx(expected.scale.sigma)
+    assert look.forecast.yaw.sigma == pytest.approx(expected.yaw.sigma)
+
+
+def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypatch):
+    def fail(*_):
+        raise ValueError('a bug')
+
+    monkeypatch.setattr(watch, 'forecast_of', fail)
+    log = Log()
+    look, now_ns = watched(drive, config, worker, log)
+    look.look(now_ns)
+    finished(worker)
+    assert look.forecast is None
+    line, = log.lines
+    assert 'a bug' in line
+    monkeypatch.undo()
+    look.look(now_ns + LOOK_PERIOD_NS)
+    finished(worker)
+    assert look.forecast is not None
+
+
+def test_a_leg_that_ended_meanwhile_leaves_no_forecast(drive, config, worker):
+    log = Log()
+    look, now_ns = watched(drive, config, worker, log)
+    look.look(now_ns)
+    look.end()
+    finished(worker)
+    assert (look.forecast, log.lines) == (None, [])
+    look.look(now_ns + LOOK_PERIOD_NS)
+    finished(worker)
+    assert look.forecast is None
+
+
+def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
+    looks = []
+
+    def dear(*args):
+        looks.append(1)
+        return Forecast(GOOD, GOOD), (), 1.0, None    # a second of CPU
+
+    monkeypatch.setattr(watch, '_look', dear)
+    clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(watch, 'time', clock)
+    look, now_ns = watched(drive, config, worker, Log())
+    for _ in range(320):
+        clock.now += 1.0
+        now_ns += LOOK_PERIOD_NS
+        look.look(now_ns)
+        finished(worker)
+    # the first comes with imports and goes free, the others 60 s apart: at 1, 2, 62, ... 302 s
+    assert len(looks) == 7
+
+
+# two wheels
+
+@pytest.fixture(scope='module')
+def two():
+    return simulate(SimOptions(scenario='town', duration=240.0, two_wheels=True, imu_rate=50.0,
+                               seed=4, imu_grade='tactical'))
+
+
+
+
+def looked_at(made, t_stop, **settings):
+    """Return what is foreseen after so many seconds of a drive."""
+    whole = made.leg()
+    thinned = ThinnedLeg(whole.form)
+    for slot in ('imu', 'odometer', 'odometer_right', 'fix'):
+        rows = getattr(whole, slot)
+        thinned.feed(slot, take(rows, rows.stamp_ns <= whole.start_ns + t_stop * SECOND))
+    config = with_settings(Config(), {'imu.grade': made.options.imu_grade} | settings)
+    return forecast_of(thinned.leg(whole.start_ns), thinned.fix_rate(), config,
+                       smoother=SmootherSoFar())
+
+
+@pytest.mark.parametrize('method', ['smoother', 'auto', 'wheels'])
+def test_two_wheels_are_foreseen_as_they_come_out(two, method):
+    whole = two.leg()
+    found = calibrate(whole, with_settings(Config(), {
+        'method': method, 'imu.grade': 'tactical'})).methods['smoother'].estimates
+    forecast = looked_at(two, (whole.stop_ns - whole.start_ns) / SECOND, method=method)
+    left, right, width = (found[name] for name in (
+        'scale_factor_left', 'scale_factor_right', 'track_width'))
+    # the thinned has a tenth of the rows: their noise is judged anew
+    assert forecast.wheels.left_right == pytest.approx(
+        max(e.sigma / e.value for e in (left, right)), rel=0.25)
+    assert forecast.wheels.track_width == pytest.approx(width.sigma / width.value, rel=0.5)
+    assert forecast.estimates['scale_factor_left'].value == pytest.approx(
+        left.value, abs=left.sigma)
+
+
+def test_a_method_of_one_travel_and_a_single_counter_foresee_no_wheels(two, drive):
+    assert looked_at(two, 100.0, method='two_point').wheels is None
+    assert looked_at(drive, 100.0, method='smoother').wheels is None
+
+
+@pytest.mark.parametrize('method', ['smoother', 'auto'])
+def test_without_an_accelerometer_the_scale_is_foreseen_and_no_angle(two, method):
+    still = replace(two, imu=replace(two.imu, f_i=np.zeros_like(two.imu.f_i)))
+    forecast = looked_at(still, 200.0, method=method)
+    assert 0.0 < forecast.scale.sigma < 0.01
+    assert forecast.wheels.left_right < 0.01
+    assert (forecast.yaw.sigma, forecast.pitch) == (None, None)
+    assert forecast.yaw.why
+    assert not any(forecast.estimates[name].value for name in (
+        'yaw_mounting_angle', 'pitch_mounting_angle'))
+
+
+def test_swapped_wheels_are_said_while_it_is_driven(two):
+    leg = two.leg()
+    swapped = replace(leg, odometer=leg.odometer_right, odometer_right=leg.odometer)
+    found = faults_in_cells(swapped, with_settings(Config(), {
+        'odometer.track_width': 1.6, 'imu.grade': 'tactical'}))
+    assert found[0].code is Code.WHEELS_SWAPPED
+    assert 'Swap odometer.left' in found[0].remedy
+
+
+# what is said
+
+GOOD = Prospect(430e-6, 1e-3, 0.0, (('fix_end', 3e-4), ('fix_start', 2.5e-4)))
+MORE = Prospect(1820e-6, 1e-3, 231.0)
+YAW = Prospect(0.005, 0.0087, 0.0)
+NO_YAW = Prospect(None, 0.0087, None, (), 'limited by the heading uncertainty (1 deg)')
+
+
+def test_a_coarse_scale_is_said_in_per_cent():
+    assert Prospect(0.138, 1e-3, 2108.0, now='1.02').words('scale', 'ppm', 1e6) == (
+        'scale 1.02 +- 13.8 % so far; drive 2200 m more for the limit of 0.1 %')
+    assert Prospect(0.0099, 1e-3, 0.0).words('scale', 'ppm', 1e6) == (
+        'OK: scale 9900 ppm (limit 1000)')
+
+
+def said(forecast, **more):
+    session = Session()
+    session.start(1, Config())
+    known = {'distance_m': 300.0, 'max_speed': 10.0, 'forecast': forecast}
+    return hint(SessionView(session, Config(), **known | more))
+
+
+@pytest.mark.parametrize(('forecast', 'still_s', 'text'), [
+    (None, 0.0, 'stand still 10 s at the end point, then call ~/stop_leg'),
+    (None, 5.0, 'stand still 5 s more, then call ~/stop_leg'),
+    (None, 10.0, 'call ~/stop_leg'),
+    (Forecast(MORE, YAW), 5.0, 'scale uncertainty so far: 1820 ppm; drive 240 m more for the '
+     'limit of 1000 ppm; OK: yaw 0.286 deg (limit 0.498)'),
+    (Forecast(GOOD, YAW), 10.0, 'OK: scale 430 ppm (limit 1000); OK: yaw 0.286 deg (limit '
+     '0.498); call ~/stop_leg'),
+    (Forecast(GOOD, NO_YAW), 0.0, 'OK: scale 430 ppm (limit 1000); yaw: limited by the heading '
+     'uncertainty (1 deg); stand still 10 s at the end point, then call ~/stop_leg'),
+    (Forecast(replace(MORE, metres=None, why='even 20 km more do not reach the limit'), YAW),
+     10.0, 'scale 1820 ppm: even 20 km more do not reach the limit; OK: yaw 0.286 deg (limit '
+     '0.498); call ~/stop_leg'),
+    (Forecast(replace(MORE, sigma=None), NO_YAW), 0.0, 'scale is not determined yet; drive 240 m '
+     'more for the limit of 1000 ppm; yaw: limited by the heading uncertainty (1 deg)'),
+])
+def test_the_hint_says_what_is_enough_and_what_more_it_takes(forecast, still_s, text):
+    assert said(forecast, still_s=still_s) == text
+
+
+def test_the_least_leg_comes_first():
+    assert said(Forecast(GOOD, YAW), distance_m=60.0, max_speed=1.0) == (
+        'drive 40 m more, faster than 2.78 m/s (10 km/h); then stand still 10 s and call '
+        '~/stop_leg')
+
+
+def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():
+    keys = as_keys(Forecast(GOOD, NO_YAW))
+    running = {key: keys.pop(key) for key in list(keys) if key.startswith('estimate_')}
+    assert running.pop('estimate_method') == ''
+    assert len(running) == 7
+    assert all(math.isnan(value) for value in running.values())
+    assert keys == {
+        'predicted_scale_sigma_ppm': pytest.approx(430.0), 'metres_to_go_scale': 0.0,
+        'largest_error_source_scale': 'fix_end',
+        'predicted_scale_sources_ppm': 'fix_end 300, fix_start 250',
+        'predicted_yaw_sigma_deg': '', 'metres_to_go_yaw': '', 'largest_error_source_yaw': '',
+        'predicted_yaw_sources_deg': ''}
+    none = as_keys(None)
+    assert set(none) == set(keys) | set(running) | {'estimate_method'}
+    assert {none[key] for key in keys} == {''}
+
+
+def test_an_estimate_is_never_of_a_time_to_come():
+    forecast = Forecast(GOOD, GOOD, until_ns=1_750_000_671_800_000_000)
+    assert forecast.age_s(forecast.until_ns + 2_500_000_000) == pytest.approx(2.5)
+    # wild stamps, or none: -1750000671.8 s stood in the status
+    for stamp_ns in (0, forecast.until_ns - 1):
+        assert math.isnan(forecast.age_s(stamp_ns))

@@ -1,0 +1,114 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What would reject a leg is said while it is driven, as the result will have it."""
+
+from dataclasses import replace
+
+from drives import changed, drive, held_up, seconds, settings
+import numpy as np
+import pytest
+
+from odocal_ros.data.samples import take
+from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps
+from odocal_ros.forecast.thinned_leg import ThinnedLeg
+from odocal_ros.pipeline.calibrate import calibrate, faults, screened
+from odocal_ros.reasons import Code, Verdict
+from odocal_ros.screening.screen import screen
+
+pytestmark = pytest.mark.core
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='town', duration=180.0, imu_grade='industrial', seed=4)
+
+
+def without(samples, leg, begin_s, end_s):
+    t = seconds(leg, samples)
+    return take(samples, (t < begin_s) | (t >= end_s))
+
+
+def reversed_counter(leg):
+    return replace(leg, odometer=changed(leg.odometer, value=lambda v: -v))
+
+
+def reset_counter(leg):
+    half = len(leg.odometer.value) // 3
+    return replace(leg, odometer=changed(
+        leg.odometer, value=lambda v: v - np.where(np.arange(len(v)) > half, v[half], 0)))
+
+
+def gap(leg):
+    return replace(leg, imu=without(leg.imu, leg, 40.0, 43.0))
+
+
+def dead_counter(leg):
+    return replace(leg, odometer=changed(leg.odometer, value=lambda v: v * 0))
+
+
+def in_g(leg):
+    return replace(leg, imu=changed(leg.imu, f_i=lambda f: f / 9.80665))
+
+
+def sound(leg):
+    return leg
+
+
+def sketched(leg):
+    """Return the leg as the node's cells have it."""
+    thinned = ThinnedLeg(leg.form)
+    for slot in ('imu', 'odometer', 'fix'):
+        thinned.feed(slot, getattr(leg, slot))
+    return thinned.leg(leg.start_ns)
+
+
+@pytest.mark.parametrize('wrong', [reversed_counter, reset_counter, gap, dead_counter, in_g,
+                                   sound])
+def test_the_faults_so_far_are_those_of_the_result(made, wrong):
+    leg, config = wrong(made.leg()), settings(made)
+    result = calibrate(leg, config)
+    # a slip is what a method makes of the hole
+    lowering = {r.code for r in result.reasons
+                if r.code.gravity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
+    assert {r.code for r in faults(leg, screened(leg, config), config)} == lowering
+    assert {r.code for r in faults_in_cells(sketched(leg), config)} == lowering
+    assert (lowering == set()) == (wrong is sound)
+
+
+def test_late_rows_are_put_back_so_far_as_in_the_result(made):
+    leg = made.leg()
+    late = replace(leg, odometer=held_up(leg.odometer, how_long_s=0.4)[0])
+    wanted = screen(late, settings(made))[0].travel
+    thinned = ThinnedLeg(leg.form)
+    sent_ns = late.odometer.stamp_ns
+    for begin in np.arange(sent_ns[0], sent_ns[-1] + 1, 5 * 10**9):       # look by look
+        thinned.feed('odometer', take(late.odometer, (sent_ns >= begin)
+                                     & (sent_ns < begin + 5 * 10**9)))
+    thinned.feed('imu', leg.imu)
+    cells = thinned.leg(leg.start_ns).odometer
+    count = np.interp(seconds(leg, cells), wanted.t, wanted.s)
+    # a row is 0.05 s; as sent, cells are off by up to 0.4 s of driving
+    speed = np.gradient(wanted.s, wanted.t).max()
+    base = late.odometer.value[0]
+    off = cells.value - base - (count - wanted.s[0])
+    assert np.abs(off - np.median(off)).max() < 0.05 * speed
+    raw = np.interp(seconds(leg, cells), seconds(leg, late.odometer), late.odometer.value - base)
+    assert np.abs(raw - (count - wanted.s[0])).max() > 0.2 * speed
+
+
+def test_a_gap_of_the_imu_is_seen_at_once_and_stays(made):
+    leg = made.leg()
+    gaps, limit = ImuGaps(leg.start_ns, 0.5), 0.5
+    rows = without(without(leg.imu, leg, -100.0, 0.0), leg, 40.0, 43.0)
+    t = seconds(leg, rows)
+    gaps.feed(take(rows, t < 40.0))
+    assert gaps.reasons() == ()
+    assert gaps.reasons(silent_s=0.9) == ()         # a busy machine is no gap
+    assert gaps.reasons(silent_s=0.95)[0].code is Code.IMU_GAP      # within a second
+    for row in np.flatnonzero(t >= 40.0):
+        gaps.feed(take(rows, slice(row, row + 1)))
+    told, = gaps.reasons()
+    whole = replace(leg, imu=without(leg.imu, leg, 40.0, 43.0), stop_ns=int(rows.stamp_ns[-1]))
+    result = calibrate(whole, settings(made, leg__max_gap=limit))
+    assert told in result.reasons                    # to the last digit

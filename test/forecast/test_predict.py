@@ -1,0 +1,316 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Predicted sigmas against closed forms, against the pipeline, and against drives disturbed."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+
+from odocal_ros.errors import BadConfig, BadUsage
+from odocal_ros.forecast.leg_profile import fix_figures, profile_of
+from odocal_ros.forecast.planned_drive import from_rates, PlannedDrive
+from odocal_ros.forecast.predict import metres_to_go, predict, Sigmas
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.earth import A
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.sim.motion import attitude
+from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions, simulate
+from odocal_ros.sim.truth import settings
+
+pytestmark = pytest.mark.slow
+SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
+HEADING = math.radians(0.06)
+DEG = math.degrees(1.0)
+
+
+def config(**changes):
+    names = {'grade': 'imu.grade', 'correlation': 'gnss.correlation_time'}
+    base = {'method': 'two_point', 'imu.grade': 'navigation', 'gnss.correlation_time': 0.0,
+            'alignment.heading_source': 'fixed', 'alignment.heading_sigma': HEADING}
+    return with_settings(Config(), base | {names.get(k, k.replace('__', '.')): v
+                                           for k, v in changes.items()})
+
+
+def paper_drive(rest=30.0):
+    """Return the paper leg: 300 s still, 0.5 m/s2 for 40 s, 20 m/s for 520 s, down in 40 s."""
+    t = np.arange(0.0, 900.0 + rest + 0.05, 0.1)
+    return from_rates(t, np.interp(t, [300, 340, 860, 900], [0, 20, 20, 0]), np.zeros_like(t))
+
+
+def planned(options):
+    motion = motion_of(options)
+    t = np.arange(0.0, motion.duration + 1e-9, 0.1)
+    return from_rates(t, motion.speed(t), motion.yaw_rate(t), options.heading,
+                      latitude=options.latitude, longitude=options.longitude,
+                      height=options.height)
+
+
+def row(prediction, source):
+    return prediction.method.details['budget'][source]
+
+
+def test_white_end_fixes_give_root_two_sigma_over_the_chord():
+    drive = paper_drive(rest=300.0)
+    result = predict(drive, Sigmas(config=config(), fix=2.0, fix_rate=4.0))
+    # 1200 fixes at each mark, one more or less where the span is cut
+    expected = math.sqrt(2) * 2.0 / math.sqrt(1200) / 11_200
+    assert result.distance == pytest.approx(11_200, rel=1e-9)
+    # 1/2400 from the count; the other sources (height 0.03, second order 0.01 ppm) are nothing
+    assert result.sigma(SCALE) == pytest.approx(expected, rel=1e-3)
+    for source in ('fix_start', 'fix_end'):
+        assert row(result, source)[YAW] == pytest.approx(expected / math.sqrt(2), rel=1e-3)
+
+
+def test_correlated_fixes_leave_what_a_gauss_markov_mean_leaves():
+    result = predict(paper_drive(), Sigmas(config=config(correlation=60.0), fix=2.0))
+    for source, rest in (('fix_start', 300.0), ('fix_end', 30.0)):
+        x = rest / 60.0
+        left = 2 * (x - 1 + math.exp(-x)) / x**2        # mean over T of exp(-dt / tau)
+        # 150 and more samples of the double integral: its sum errs by less than 1 %
+        assert row(result, source)[SCALE] == pytest.approx(
+            2.0 * math.sqrt(left) / 11_200, rel=0.01)
+
+
+def test_gyro_noise_is_the_integral_of_what_is_still_to_drive():
+    result = predict(paper_drive(), Sigmas(config=config()))
+    t = np.linspace(0.0, 600.0, 60_001)
+    v = np.interp(t, [0, 40, 560, 600], [0, 20, 20, 0])
+    way = np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) / 2 * 0.01)])
+    q = (math.radians(0.001) / 60)**2
+    integral = np.sum(((1 - way / way[-1])**2)[:-1]) * 0.01
+    # the sum on 0.1 s against that on 0.01 s: of first order, 0.1 / 200 at most
+    assert row(result, 'gyro_noise')[YAW] == pytest.approx(math.sqrt(q * integral), rel=1e-3)
+    assert row(result, 'gyro_noise')[YAW] * DEG == pytest.approx(2.4e-4, abs=0.05e-4)
+
+
+def test_a_bias_about_the_vertical_turns_by_the_mean_time_of_the_way():
+    result = predict(paper_drive(), Sigmas(config=config()))
+    # the trapezoid of speed is symmetric: its way lies 300 s after the start on the mean
+    sigma = result.alignment.gyro_bias_sigma[2]
+    assert row(result, 'gyro_bias_z')[YAW] == pytest.approx(sigma * 300.0, rel=1e-6)
+    # method.md 1.6: 0.01 deg/h make 8.33e-4 deg
+    assert math.radians(0.01) / 3600 / sigma * row(result, 'gyro_bias_z')[YAW] * DEG == \
+        pytest.approx(8.33e-4, abs=0.005e-4)
+    assert row(result, 'gyro_bias_x')[YAW] < 1e-9 * sigma * 300.0
+
+
+def test_the_heading_goes_into_the_yaw_as_it_is():
+    result = predict(paper_drive(), Sigmas(config=config()))
+    assert row(result, 'initial_heading')[YAW] == pytest.approx(HEADING, rel=1e-9)
+    assert row(result, 'initial_heading')['shared'] is True
+    assert row(result, 'projection') == {SCALE: 0.0, YAW: 0.0, PITCH: 0.0, 'shared': False}
+
+
+@pytest.mark.parametrize('scenario', ['paper', 'straight', 'town'])
+@pytest.mark.parametrize('source', ['fixed', 'gyrocompass'])
+def test_the_prediction_is_the_sigma_of_the_result(scenario, source):
+    grade = 'navigation' if source == 'gyrocompass' else 'tactical'
+    options = resolved(SimOptions(scenario=scenario, imu_grade=grade, imu_rate=20.0,
+                                  odometer_rate=20.0, fix_rate=4.0, seed=5, pitch=0.0))
+    drive = simulate(options)
+    groups = settings(drive, HEADING if source == 'fixed' else None)
+    settled = with_settings(Config(), {
+        f'{group}.{name}': value for group, values in groups.items()
+        for name, value in values.items()} | {
+        'gnss.correlation_time': 0.0, 'alignment.heading_source': source})
+    result = calibrate(drive.leg(), settled).methods['two_point']
+    predicted = predict(planned(options), Sigmas(config=settled, fix_rate=4.0,
+                                                 quantum=options.scale))
+    scale = result.estimates[SCALE]
+    # a standstill is found up to 0.5 s short at each moving end: 20 s (town) give 2.5 % fewer
+    # fixes and 1.3 % more sigma; the gyro noise measured at rest (300 values) strays by 4 %,
+    # three axes' largest by as much again, but makes a quarter of the variance at most
+    assert predicted.sigma(SCALE) == pytest.approx(scale.sigma / scale.value, rel=0.03)
+    for name in (YAW, PITCH):
+        assert predicted.sigma(name) == pytest.approx(result.estimates[name].sigma, rel=0.03)
+    assert set(row_names(predicted)) == set(result.details['budget'])
+
+
+def row_names(predicted):
+    return predicted.method.details['budget']
+
+
+def leg_from_motion(**changes):
+    """Return a drive without any noise and its leg, marked 100 s after it stood."""
+    drive = simulate(resolved(SimOptions(scenario='town', imu_grade='perfect', fix_sigma=0.0,
+                                         imu_rate=50.0, odometer='angle', seed=8, **changes)))
+    leg = drive.leg()
+    return drive, replace(leg, start_ns=leg.start_ns + 100 * 10**9)
+
+
+def test_budget_rows_of_gyro_bias_are_what_a_bias_does():
+    drive, leg = leg_from_motion()
+    t_align = -100.0
+    state = drive.motion.at(np.array([(leg.start_ns - drive.options.start_ns) * 1e-9 + t_align]))
+    C_nb = (attitude(state) @ matrix_from_rpy(
+        [drive.options.roll, drive.options.pitch, drive.options.yaw]))[0]
+    sigma = 1e-6
+    settled = config(odometer__nominal_scale=0.3)
+
+    def solved(bias):
+        aligned = Alignment(t_align, C_nb, bias, 1e-4, HEADING, np.full(3, sigma), 1e-9, 1e-12,
+                            'heading_topic', True, (t_align - 20.0, t_align))
+        method = calibrate(leg, settled, aligned).methods['two_point']
+        e = method.estimates
+        return np.array([math.log(e[SCALE].value), e[YAW].value, e[PITCH].value]), method
+
+    sources = {s.name: s.effects for s in solved(np.zeros(3))[1].sources}
+    for axis, name in enumerate('xyz'):
+        step = sigma * np.eye(3)[axis]
+        slope = (solved(step)[0] - solved(-step)[0]) / 2
+        # the budget leaves out the Earth's turn: 0.034 rad in the 470 s of the leg, half of it on
+        # the mean, which is how far an error comes off its axis
+        assert sources[f'gyro_bias_{name}'][:, 0] == pytest.approx(
+            slope, rel=1e-3, abs=0.017 * np.abs(slope).max())
+
+
+def test_budget_row_of_the_odometer_delay_is_what_a_delay_does():
+    late = 0.05
+    found = []
+    for delay in (0.0, late):
+        _, leg = leg_from_motion(odometer_delay=delay)
+        method = calibrate(leg, config(alignment__heading=0.8, odometer__nominal_scale=0.3,
+                                       odometer__time_sigma=late)).methods['two_point']
+        e = method.estimates
+        found.append(np.array([math.log(e[SCALE].value), e[YAW].value]))
+        effects = next(s.effects for s in method.sources if s.name == 'odometer_delay')[:2, 0]
+    moved = found[1] - found[0]
+    assert np.abs(moved).min() > 1e-5           # the drive turns: there is something to see
+    # speed at the marks is taken over a second; up to 1 m/s2 of 10 m/s
+    assert effects * np.sign(effects[1] * moved[1]) == pytest.approx(
+        moved, rel=0.1, abs=0.1 * np.abs(moved).max())
+
+
+def test_fixes_without_height_cost_what_the_height_not_taken_costs():
+    drive = simulate(resolved(SimOptions(scenario='straight', imu_grade='perfect', fix_sigma=0.0,
+                                         imu_rate=20.0, height=500.0, pitch=0.0)))
+    leg = drive.leg()
+    blind = replace(leg, fix=replace(leg.fix, height=np.full_like(leg.fix.height, np.nan)))
+    settled = config(alignment__heading=drive.truth.heading, odometer__nominal_scale=0.02)
+    results = [calibrate(x, settled).methods['two_point'] for x in (leg, blind)]
+    scales = [r.estimates[SCALE].value for r in results]
+    # at 500 m the chord is longer by 500 / R; R lies within 0.4 % of the semi-major axis
+    assert scales[0] / scales[1] - 1 == pytest.approx(500.0 / A, rel=0.01)
+    budgets = [r.details['budget']['height'][SCALE] / s
+               for r, s in zip(results, scales, strict=True)]
+    assert budgets[1] == pytest.approx(500.0 / A, rel=0.01)
+    assert budgets[0] < 1e-2 * budgets[1]
+
+
+def test_a_recorded_leg_predicts_itself():
+    drive = simulate(SimOptions(scenario='town', imu_grade='tactical', imu_rate=50.0, seed=3))
+    settled = with_settings(Config(), {
+        'imu.grade': 'tactical', 'gnss.correlation_time': 0.0, 'alignment.heading_source': 'fixed',
+        'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': HEADING})
+    leg = drive.leg()
+    result = calibrate(leg, settled).methods['two_point'].estimates
+    inputs, _ = screen(leg, settled)
+    predicted = predict(profile_of(inputs, settled), Sigmas(
+        config=settled, quantum=0.0213, **fix_figures(inputs)))
+    # the rough scale is good to a per cent: noise of the fixes lengthens chords of 20 m
+    assert predicted.distance == pytest.approx(drive.truth.distance, rel=0.01)
+    # as above, and speeds smoothed over a second
+    assert predicted.sigma(SCALE) == pytest.approx(
+        result[SCALE].sigma / result[SCALE].value, rel=0.05)
+    assert predicted.sigma(YAW) == pytest.approx(result[YAW].sigma, rel=0.03)
+
+
+def test_metres_to_go_are_enough_and_no_more_than_needed():
+    drive, sigmas = paper_drive(), Sigmas(config=config(correlation=60.0))
+    asked = predict(drive, sigmas).sigma(SCALE) / 1.5
+    metres = metres_to_go(drive, sigmas, SCALE, asked)
+    assert predict(drive.lengthened(metres), sigmas).sigma(SCALE) <= asked
+    assert predict(drive.lengthened(0.97 * metres), sigmas).sigma(SCALE) > asked
+    # fixes alone make it: the sigma falls as the way grows
+    assert metres == pytest.approx(0.5 * 11_200, rel=0.03)
+    assert metres_to_go(drive, sigmas, SCALE, 1.0) == 0.0
+    assert metres_to_go(drive, sigmas, YAW, 0.9 * HEADING) is None
+
+
+def test_what_is_said_of_a_drive_that_cannot_carry_the_method():
+    t = np.arange(0.0, 200.1, 0.1)
+    speed = np.interp(t, [20, 30, 170, 180], [0, 10, 10, 0])
+    around = from_rates(t, speed, np.where((t > 96) & (t < 104), math.pi / 8, 0.0))
+    result = predict(around, Sigmas(config=config()))
+    assert Code.CHORD_TOO_SHORT in {r.code for r in result.reasons}
+    assert result.sigma(SCALE) is None
+    no_heading = predict(paper_drive(), Sigmas(config=Config()))
+    assert Code.YAW_NOT_SEPARABLE in {r.code for r in no_heading.reasons}
+    assert no_heading.sigma(YAW) is None
+    assert no_heading.sigma(SCALE) > 0
+    moving = from_rates(t, np.full_like(t, 10.0), np.zeros_like(t))
+    result = predict(moving, Sigmas(config=config()))
+    assert Code.NO_STANDSTILL in {r.code for r in result.reasons}
+    # start and end as fast: the latency cancels, the fixes are those of a second each side
+    assert result.standing == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(('change', 'words'), [
+    ({'fix': 0.0}, 'fix sigma 0'), ({'fix': -1.0}, 'fix sigma -1'),
+    ({'fix': math.nan}, 'fix sigma nan'), ({'fix_up': 0.0}, 'height sigma of the fixes 0'),
+    ({'fix_rate': 0.0}, 'fix rate 0'), ({'quantum': -0.1}, 'size of a count -0.1')])
+def test_impossible_sigmas_are_refused(change, words):
+    with pytest.raises(BadConfig, match=words):
+        Sigmas(**change)
+
+
+def test_a_heading_known_exactly_and_an_unknown_grade_are_refused():
+    with pytest.raises(BadConfig, match='heading sigma 0'):
+        Sigmas(config=config(alignment__heading_sigma=0.0))
+    with pytest.raises(BadConfig, match='not one of consumer, industrial, tactical, navigation'):
+        config(grade='best')
+
+
+def test_impossible_drives_are_refused():
+    t = np.arange(0.0, 100.0, 0.1)
+    with pytest.raises(BadUsage, match='never moves'):
+        from_rates(t, np.zeros_like(t), np.zeros_like(t))
+    with pytest.raises(BadUsage, match='not finite'):
+        PlannedDrive(t, np.full_like(t, np.nan), t, t)
+    with pytest.raises(BadUsage, match='increasing times'):
+        PlannedDrive(t[::-1], t, t, t)
+    with pytest.raises(BadUsage, match='one speed, yaw and slope for each time'):
+        PlannedDrive(t, t[1:], t, t)
+    short = from_rates(t[:11], np.full(11, 5.0), np.zeros(11))
+    with pytest.raises(BadUsage, match='less than one fix interval'):
+        predict(short, Sigmas(config=config(), fix_rate=0.5))
+
+
+def test_changes_of_a_drive_change_what_they_say():
+    drive = paper_drive()
+    longer = drive.lengthened(1000.0)
+    assert longer.distance == pytest.approx(12_200, rel=1e-9)
+    assert longer.duration - drive.duration == pytest.approx(50.0)
+    rested = drive.standing_longer(60.0)
+    assert rested.distance == pytest.approx(drive.distance, rel=1e-9)
+    before, after = (predict(d, Sigmas(config=config())).standing for d in (drive, rested))
+    assert np.subtract(after, before) == pytest.approx([60.0, 60.0], abs=1e-6)
+    other = predict(drive.turned_around(), Sigmas(config=config()))
+    assert other.sigma(SCALE) == pytest.approx(
+        predict(drive, Sigmas(config=config())).sigma(SCALE), rel=1e-3)
+    half = drive.until(300.0, 20.0)
+    assert half.distance == pytest.approx(20 * 300 - 400, rel=1e-2)
+    assert predict(half, Sigmas(config=config())).standing[1] == pytest.approx(20.0, abs=0.2)
+
+
+def test_a_recorded_leg_turns_as_it_was_driven_whatever_the_gyro_reads_at_rest():
+    drive = simulate(SimOptions(scenario='town', imu_grade='consumer', imu_rate=50.0, seed=4))
+    assert abs(drive.truth.gyro_bias[2]) * 500.0 > 0.1         # rad: there is a bias to take out
+    leg = drive.leg()
+    config = with_settings(Config(), {'imu.grade': 'consumer'})
+    profile = profile_of(screen(leg, config)[0], config)
+    t = (leg.start_ns - drive.options.start_ns) * 1e-9 + profile.t
+    true = drive.motion.at(t).yaw
+    turned, truly = profile.yaw - profile.yaw[0], true - true[0]
+    # noise over 20 s at rest leaves 2e-5 rad/s of the bias, 0.012 rad in ten minutes; five of that
+    np.testing.assert_allclose(turned, truly, atol=0.06)
+    # and the first course by fixes of 1.5 m over kilometres: a milliradian, the bow of above on it
+    off = np.median(profile.yaw - true)
+    assert abs((off + math.pi) % (2 * math.pi) - math.pi) < 0.06

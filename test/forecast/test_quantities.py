@@ -1,0 +1,284 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Which quantities are good enough, what a drive can tell, and what is said of it."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip('diagnostic_msgs', reason='no ROS here: pip install odocal_ros[ros]')
+
+from odocal_ros.calib.result import Calibration, Estimate
+from odocal_ros.data.samples import HeadingSamples
+from odocal_ros.forecast import ability as ability_module, quantities
+from odocal_ros.forecast.ability import ability, Received, stated_variance
+from odocal_ros.forecast.forecast import better, Forecast, Prospect, WheelsForecast
+from odocal_ros.live import answers
+from odocal_ros.live.guidance import hint, manoeuvres, quantities_ok, seconds_to_stand, TURNS
+from odocal_ros.live.restored import Restored
+from odocal_ros.live.session import Session
+from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.status import level
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config, with_settings
+
+pytestmark = pytest.mark.core
+CONFIG = Config()
+GOOD, BAD = Prospect(1e-4, 1e-3, 0.0), Prospect(2e-3, 1e-3, 300.0)
+YAW, NO_YAW = Prospect(0.005, 0.0087, 0.0), Prospect(None, 0.0087, None, (), 'not told')
+NONE = {'heading_topic': math.inf, 'imu_orientation': math.inf}
+
+
+def estimates(**sigmas):
+    """Return estimates of value 1, one for each sigma; None: not determined."""
+    return {name: Estimate(None if s is None else 1.0, s, '1') for name, s in sigmas.items()}
+
+
+WHOLE = estimates(scale_factor=1e-4, yaw_mounting_angle=0.002, pitch_mounting_angle=0.003,
+                  scale_factor_left=2e-4, scale_factor_right=3e-4, track_width=0.01)
+
+
+def result(values=None, *codes):
+    return Calibration(tuple(Reason(c, 'seen') for c in codes), values or WHOLE, {}, ())
+
+
+def ok(forecast=None, calibration=None, two_wheels=True, config=CONFIG):
+    if forecast is not None:
+        found = quantities.of_forecast(forecast, config, two_wheels)
+    else:
+        found = quantities.of_calibration(calibration, config, two_wheels)
+    return ' '.join(found.values())
+
+
+# order: scale, yaw, pitch, left and right, track width
+
+def test_a_result_within_its_limits_is_good_and_each_limit_counts_by_itself():
+    assert ok(calibration=result()) == 'yes yes yes yes yes'
+    for names, position in ((('scale_factor',), 0), (('yaw_mounting_angle',), 1),
+                            (('pitch_mounting_angle',), 2), (('scale_factor_left',), 3),
+                            (('scale_factor_right',), 3), (('track_width',), 4)):
+        for worse in (Estimate(1.0, 0.06, '1'), Estimate(None, None, '1')):
+            found = ok(calibration=result(WHOLE | dict.fromkeys(names, worse))).split()
+            assert found.pop(position) == 'no'
+            assert found == ['yes'] * 4
+
+
+def test_limits_are_those_of_the_settings_and_relative_where_the_value_is_not_one():
+    values = WHOLE | {'scale_factor': Estimate(0.02, 1.9e-5, 'm/pulse')}    # 950 ppm
+    assert ok(calibration=result(values)).startswith('yes')
+    tight = with_settings(CONFIG, {'verdict.max_scale_sigma': 9e-4})
+    assert ok(calibration=result(values), config=tight).startswith('no')
+
+
+def test_a_reason_against_a_value_and_a_rejection_make_it_not_good():
+    assert ok(calibration=result(None, Code.YAW_FAR_FROM_NOMINAL)) == 'yes no yes yes yes'
+    assert ok(calibration=result(None, Code.COVARIANCE_UNKNOWN)) == 'yes yes yes yes yes'
+    assert ok(calibration=result(None, Code.LEG_TOO_SHORT)) == 'no no no no no'
+
+
+def test_one_counter_says_nothing_of_two_wheels():
+    one = {n: e for n, e in WHOLE.items() if '_left' not in n and '_right' not in n
+           and n != 'track_width'}
+    assert ok(calibration=result(one), two_wheels=False) == 'yes yes yes unknown unknown'
+    assert ok(Forecast(GOOD, YAW, 0.001), two_wheels=False) == 'yes yes yes unknown unknown'
+
+
+def test_a_configured_track_width_is_not_asked_of_the_drive():
+    given = with_settings(CONFIG, {'odometer.track_width': 1.6})
+    bare = WHOLE | {'track_width': Estimate(None, None, 'm')}
+    assert ok(calibration=result(bare), config=given).endswith('yes unknown')
+    assert ok(Forecast(GOOD, YAW, 0.001, WheelsForecast(1e-4, None)), config=given).endswith(
+        'yes unknown')
+    assert ok(calibration=result(), config=given).endswith('yes yes')
+
+
+@pytest.mark.parametrize(('forecast', 'found'), [
+    (Forecast(GOOD, YAW, 0.001, WheelsForecast(2e-4, 0.01)), 'yes yes yes yes yes'),
+    (Forecast(BAD, NO_YAW, None, WheelsForecast(None, None)), 'no no no no no'),
+    (Forecast(GOOD, YAW, 0.01, WheelsForecast(2e-3, 0.06)), 'yes yes no no no'),
+    (Forecast(GOOD, YAW, 0.001), 'yes yes yes unknown unknown'),
+])
+def test_a_leg_that_is_recorded_is_judged_by_its_forecast(forecast, found):
+    assert ok(forecast) == found
+    assert set(quantities.of_forecast(None, CONFIG, True).values()) == {'unknown'}
+
+
+def test_of_a_leg_that_is_cut_each_quantity_is_of_the_better_part():
+    begun = Forecast(BAD, NO_YAW, None, until_ns=2, estimates=estimates(scale_factor=None))
+    done = Forecast(GOOD, NO_YAW, 0.002, until_ns=1, estimates=estimates(
+        scale_factor=1e-4, yaw_mounting_angle=0.02))
+    told = better(done, begun)
+    assert ok(told) == 'yes no yes unknown unknown'
+    assert told.scale.metres == 0.0            # enough is enough
+    assert {name: e.sigma for name, e in told.estimates.items()} == {
+        'scale_factor': 1e-4, 'yaw_mounting_angle': 0.02}
+    assert told.until_ns == 2
+    # what is over goes no further: metres are those of the part that goes on
+    coarse = Forecast(Prospect(5e-3, 1e-3, 700.0), YAW, until_ns=3)
+    assert better(begun, coarse).scale == replace(BAD, metres=700.0)
+    assert better(begun, coarse).yaw == YAW
+    assert better(None, begun) is better(begun, None) is begun
+    assert better(None, None) is None
+
+
+def recording(**known):
+    session = Session()
+    session.start(1, CONFIG)
+    return SessionView(session, CONFIG, **({'two_wheels': True} | known))
+
+
+def test_each_state_is_judged_by_what_it_has():
+    now = recording(forecast=Forecast(GOOD, NO_YAW))
+    assert quantities_ok(now)['scale'] == 'yes'
+    session = now.session
+    session.stop(2)
+    assert set(quantities_ok(now).values()) == {'unknown'}
+    session.finish(None, result())
+    assert set(quantities_ok(now).values()) == {'yes'}
+    session.start(3, CONFIG)
+    assert set(quantities_ok(replace(now, forecast=None)).values()) == {'unknown'}
+    session.cancel()
+    assert set(quantities_ok(now).values()) == {'yes'}
+    fresh = SessionView(Session(), CONFIG)
+    assert set(quantities_ok(fresh).values()) == {'unknown'}
+    fresh.session.restored = Restored(WHOLE, 2, True, '2026-01-02T03:04:05Z')
+    assert quantities_ok(fresh)['scale'] == 'yes'
+    fresh.session.restored = Restored(WHOLE, 2, False, '2026-01-02T03:04:05Z')
+    assert quantities_ok(fresh)['scale'] == 'no'
+
+
+# what is to be driven
+
+def test_two_wheels_ask_for_turns_and_for_a_straight_stretch():
+    far = {'distance_m': 500.0, 'max_speed': 10.0}
+    assert manoeuvres(recording(**far)) == [TURNS]           # before the first look
+    assert manoeuvres(recording(**far, two_wheels=False)) == []
+    apart = Forecast(GOOD, YAW, 0.001, WheelsForecast(2e-4, None))
+    assert manoeuvres(recording(**far, forecast=apart)) == [TURNS]
+    neither = replace(apart, wheels=WheelsForecast(2e-3, None))
+    assert hint(recording(**far, forecast=neither, still_s=10.0)) == (
+        'OK: scale 100 ppm (limit 1000); OK: yaw 0.286 deg (limit 0.498); drive straight at '
+        'speed until left and right wheel are separable; for the track width: turn by 90 deg in '
+        'total or more; call ~/stop_leg')
+    both = replace(apart, wheels=WheelsForecast(2e-4, 0.01))
+    assert manoeuvres(recording(**far, forecast=both)) == []
+
+
+def test_a_configured_width_or_the_mean_of_both_asks_for_no_turn():
+    for settings in ({'odometer.track_width': 1.6}, {'method': 'two_point'}):
+        session = Session()
+        session.start(1, with_settings(CONFIG, settings))
+        assert manoeuvres(SessionView(session, session.config, two_wheels=True,
+                                    max_speed=10.0)) == []
+
+
+def test_a_leg_that_would_be_rejected_is_said_before_all_else():
+    enough = Forecast(GOOD, YAW, 0.001)
+    dead = (Reason(Code.WHEEL_DEAD, 'the left'),)
+    now = recording(forecast=enough, distance_m=500.0, faults=dead, missing=['no IMU for 3 s'])
+    assert hint(now).startswith('call ~/cancel_leg and start again: the leg would be rejected: '
+                                'WHEEL_DEAD: the left. Check the sensor')
+    assert hint(now).endswith('; no IMU for 3 s')
+    assert set(quantities_ok(now).values()) == {'no', 'unknown'}
+    assert (level(now), level(recording(forecast=enough))) == (b'\x02', b'\x00')
+    # a caution is no reason to drive again: it is said, and the rest as before
+    doubt = (Reason(Code.COUNTER_RESET, 'by -70'),)
+    told = hint(recording(forecast=enough, distance_m=500.0, max_speed=10.0, two_wheels=False,
+                          faults=doubt))
+    assert told.startswith('COUNTER_RESET: by -70; OK: ')
+    assert level(recording(faults=doubt)) == b'\x01'
+
+
+def test_seconds_to_stand():
+    assert seconds_to_stand(SessionView(Session(), CONFIG, still_s=3.0)) == 7.0
+    assert seconds_to_stand(recording(still_s=12.0)) == 0.0
+    now = recording(still_s=3.0)
+    now.session.stop(2)
+    assert seconds_to_stand(now) == 0.0
+
+
+# what a drive can tell as configured
+
+@pytest.mark.parametrize(('settings', 'received', 'said'), [
+    ({}, {}, 'observable: the scale and the pitch; not observable: the yaw (the only heading is '
+     'the course over ground, which includes it: set alignment.heading_source)'),
+    ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002}, {},
+     'observable: the scale, the yaw (from the configured heading, 0.11 deg) and the pitch'),
+    ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.02}, {'height': False},
+     'observable: the scale; not observable: the yaw to 0.5 deg (the configured heading has an '
+     'uncertainty of 1.1 deg); the pitch (fixes without height)'),
+    ({}, {'variances': NONE | {'heading_topic': 0.001**2}},
+     'observable: the scale, the yaw (from the heading topic, 0.057 deg) and the pitch'),
+    ({'imu.grade': 'navigation'}, {'rested_s': 600.0},
+     'observable: the scale, the yaw (from the gyrocompass, '),
+    ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002}, {'two_wheels': True},
+     'observable: the scale, the yaw (from the configured heading, 0.11 deg), the pitch, left '
+     'and right wheel and the track width (in turns)'),
+    ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002, 'odometer.track_width': 1.6},
+     {'two_wheels': True, 'rested_s': 1.0},
+     'observable: the scale, the yaw (from the configured heading, 0.11 deg), the pitch and left '
+     'and right wheel; level and gyro bias are estimated from the drive, because it starts '
+     'without a standstill'),
+    ({'method': 'two_point', 'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002},
+     {'two_wheels': True}, 'observable: the scale, the yaw (from the configured heading, 0.11 '
+     'deg) and the pitch; not observable: left and right wheel separately (method two_point uses '
+     'their mean)'),
+])
+def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, received, said):
+    monkeypatch.setattr(ability_module, 'METHODS', ('two_point',))
+    known = Received(**({'variances': NONE, 'rested_s': 30.0} | received))
+    text = ability(with_settings(CONFIG, settings), known).words()
+    assert text.startswith(said) if said.endswith(', ') else text == said
+
+
+def test_the_smoother_needs_no_heading_from_outside(monkeypatch):
+    monkeypatch.setattr(ability_module, 'METHODS', ('two_point', 'smoother'))
+    can = ability(with_settings(CONFIG, {'method': 'smoother'}), Received(NONE, 30.0)).can
+    assert 'the yaw (from stops, starts and turns)' in can
+    only = with_settings(CONFIG, {'method': 'two_point'})
+    assert len(ability(only, Received(NONE, 30.0)).cannot) == 1
+
+
+def test_an_orientation_without_a_variance_or_a_unit_length_is_none():
+    def sent(x, variance):
+        """Return four orientations, of length x."""
+        rows, q = np.arange(4), np.tile(np.multiply([0.0, 0.0, 0.0, 1.0], x), (4, 1))
+        return HeadingSamples(rows, rows, q, np.array(variance))
+
+    assert stated_variance(sent(1.0, [0.1, 0.3, 0.2, np.nan])) == pytest.approx(0.2)
+    assert stated_variance(sent(0.0, [0.0] * 4)) == math.inf
+    assert stated_variance(sent(1e200, [0.1] * 4)) == math.inf      # whose square is no number
+    assert stated_variance(sent(1.0, [np.nan] * 4)) == math.inf
+
+
+# answers
+
+def test_an_answer_has_values_quantities_reasons_and_what_to_do_next():
+    success, text = answers.outcome(result(None, Code.YAW_FAR_FROM_NOMINAL), (), 0,
+                                    'OK: scale; not OK: yaw', 'drive another leg')
+    assert success
+    assert text == (
+        'caution: scale factor 1.00000 ± 0.00010, left 1.00000 ± 0.00020, right 1.00000 ± '
+        '0.00030, track width 1.000 ± 0.010, yaw mounting +57.30 ± 0.11 deg, pitch mounting '
+        '+57.30 ± 0.17 deg; 0 of 0 legs good. OK: scale; not OK: yaw. YAW_FAR_FROM_NOMINAL: seen. '
+        'Check imu.mounting_rpy, imu.nominal_yaw and the heading source. Next: drive another leg')
+    remedy = Code.YAW_FAR_FROM_NOMINAL.remedy
+    again = answers.outcome(result(None, Code.YAW_FAR_FROM_NOMINAL), advice=remedy)[1]
+    assert again.count(remedy) == 1
+
+
+def test_a_restored_result_is_said_to_be_one():
+    kept = Restored(estimates(scale_factor=1e-4, yaw_mounting_angle=None), 2, True,
+                    '2026-01-02T03:04:05Z')
+    success, text = answers.restored(kept, 'm/pulse', 'OK: scale')
+    assert success
+    assert text == (
+        'no leg is running; restored result of 2026-01-02T03:04:05Z: scale factor 1.00000 ± '
+        '0.00010 m/pulse (1.00000 ± 0.00010 pulses/m), yaw mounting not determined, pitch '
+        'mounting not determined; from 2 legs. OK: scale. Next: drive a leg to update it')
+    success, text = answers.restored(replace(kept, valid=False), '', '')
+    assert not success
+    assert 'which was rejected' in text
