@@ -18,6 +18,7 @@ from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, Settin
 from odocal_ros.library.listener import Listener
 from odocal_ros.library.marks import mark_positions, with_marks
 from odocal_ros.messages.decode import make_reader, Reader
+from odocal_ros.messages.transforms import with_static
 from odocal_ros.outside.limits import is_file
 from odocal_ros.outside.names import one_line
 from odocal_ros.reasons import Reason
@@ -160,7 +161,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
         digest = beside.submit(bag_sha256, bag)
         recorder = LegRecorder()
         with hearer.phase(f'reading {name}') as progress:
-            bag.read(readers, recorder.feed, progress)
+            bag.read(with_static(readers, bag.topics), recorder.feed, progress)
         recorder.form = readers[chosen['odometer']].form or recorder.form
         if 'odometer_right' in chosen:
             recorder.form_right = readers[chosen['odometer_right']].form

@@ -10,7 +10,7 @@ from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, VELOCITY
+from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, TRANSFORMS, VELOCITY
 from odocal_ros.settings.config import Config
 
 OPTION = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic',
@@ -172,7 +172,7 @@ def _may_serve(msgtype: str, slot: str) -> bool:
     if slot in ('odometer', 'odometer_right'):
         return full_type(msgtype) not in (IMU, FIX)
     return full_type(msgtype) in SENSORS[slot] or slot == 'fix' and full_type(
-        msgtype) in LOCAL_TYPES
+        msgtype) in (*LOCAL_TYPES, TRANSFORMS)
 
 
 def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: str) -> str:
@@ -190,7 +190,7 @@ def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: s
     types = tuple(_types(slot, config))
     if slot == 'fix':
         return (f'no {_label(slot)} in the bag: a topic of {" or ".join(types)}, or a '
-                f'nav_msgs/msg/Odometry that is named with {OPTION[slot]}')
+                f'{TRANSFORMS} or nav_msgs/msg/Odometry that is named with {OPTION[slot]}')
     what = ' or '.join(types) if len(types) < 3 else 'an odometer type'
     beside = ' besides the IMU' if slot == 'heading' else ''
     return f'no {_label(slot)} (a topic of {what}{beside}) in the bag'

@@ -16,6 +16,7 @@ from odocal_ros.data.samples import Samples, take
 from odocal_ros.foresee.ability import Received
 from odocal_ros.foresee.progress import Progress
 from odocal_ros.live.inputs import Inputs
+from odocal_ros.live.static_transforms import StaticTransforms
 from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.config import Config
 
@@ -32,7 +33,8 @@ class Recording:
     """
 
     def __init__(self, node: Node, config: Config,
-                 remember: Callable[[Input, list[bytes], list[int]], None]) -> None:
+                 remember: Callable[[Input | StaticTransforms, list[bytes], list[int]], None]
+                 ) -> None:
         self.inputs = Inputs(node, config)
         self.recorder = LegRecorder()
         self._remember = remember
@@ -50,6 +52,13 @@ class Recording:
 
     def pump(self, config: Config, found_scale: float) -> None:
         """Decode what has come since the last call, in blocks."""
+        static = self.inputs.static_transforms()
+        if static is not None:
+            raws, sent_ns = static.take()
+            if raws:
+                for slot, block in static.decode(raws, sent_ns):
+                    self.recorder.feed(slot, block)
+                self._remember(static, raws, sent_ns)
         for source in self.inputs.by_slot.values():
             raws, sent_ns = source.take()
             if not raws:

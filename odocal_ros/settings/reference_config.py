@@ -24,6 +24,9 @@ class ReferenceConfig:
     default_sigma: float = setting(0.05, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of '
                                    'positions in a local frame without a covariance: the first '
                                    'value of the estimate.')
+    frames: tuple[str, ...] = setting(('map', 'base_link'), item=str, ro=True, about=(
+        'With TF as position reference: the fixed frame, and the frame of the tracked point on '
+        'the robot.'))
     points: tuple[float, ...] = setting((), 'm', -1e4, 1e4, many=True, about=(
         'Points on the floor where the robot stands at the marks: x and y of each, in the order '
         'of the marks; after the last point the list starts again.'))
