@@ -63,6 +63,8 @@ def raws(*series):
 
 MOVING = raws((T_MAP, corrections, 'odom', 'map'), (T_ODOM, driven, 'base_link', 'odom'))
 SLOW = raws((T_ODOM, corrections, 'odom', 'map'), (T_MAP, driven, 'base_link', 'odom'))
+THREE = raws((T_ODOM, corrections, 'odom', 'map'), (T_MAP, driven, 'base_link', 'odom'),
+              (T_MAP + 0.07, driven, 'prism', 'base_link'))
 STATIC = message(one(0.0, ARM, Rotation.from_euler('Z', 1.0), 'prism', 'base_link'))
 
 
@@ -110,7 +112,7 @@ def test_a_chain_is_that_of_another_program():
 
 @pytest.mark.parametrize('block', [1, 7, 100])
 @pytest.mark.parametrize('static_after', [0, 3])
-@pytest.mark.parametrize('moving', [MOVING, SLOW], ids=['fast', 'slow'])
+@pytest.mark.parametrize('moving', [MOVING, SLOW, THREE], ids=['fast', 'slow', 'three'])
 def test_blocks_and_the_arrival_of_static_transforms_leave_no_trace(block, static_after, moving):
     plain = read(reader(), moving)
     others = read(reader(), moving, block=block, static_after=static_after)
