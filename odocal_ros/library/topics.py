@@ -31,7 +31,8 @@ SENSORS = {'imu': (IMU,), 'heading': (IMU,), 'fix': REFERENCES, 'fix_velocity': 
 Topics = dict[str, TopicInfo]
 
 
-def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> dict[str, str]:
+def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
+                  marked: bool = False) -> dict[str, str]:
     """
     Return slot -> topic.
 
@@ -43,6 +44,8 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
         Required inputs, and the type of the odometer.
     overrides : dict
         Slot -> topic, as the user named them.
+    marked : bool
+        The positions are those of marks.
 
     Raises
     ------
@@ -53,11 +56,11 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
     """
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     _check_reference(chosen)
-    if config.reference.marks and 'fix' in chosen:
+    if marked and 'fix' in chosen:
         raise BadUsage(f'--fix-topic {chosen["fix"]}: marks (reference.marks) replace fixes; omit '
                        'one of them')
     troubles: list[str] = []
-    for slot in wanted(config):
+    for slot in wanted(config, marked):
         if slot in chosen:
             continue
         found = candidates(topics, slot, config, chosen)
@@ -72,9 +75,10 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
     return chosen
 
 
-def wanted(config: Config) -> tuple[str, ...]:
+def wanted(config: Config, marked: bool = False) -> tuple[str, ...]:
     """Return the slots to fill; odometers and heading first, for what they leave to others."""
-    surveyed = config.reference.start and config.reference.end or config.reference.marks
+    surveyed = config.reference.start and config.reference.end or (
+        config.reference.marks or marked)
     return (*(('odometer_right',) if config.odometer.own_topics else ()), 'odometer',
             *(('heading',) if config.alignment.heading_source in ('auto', 'heading_topic')
               else ()),

@@ -35,7 +35,7 @@ class Inputs:
 
     def _check_reference(self) -> None:
         """Refuse one topic as both odometer and reference: its scale would be exactly 1."""
-        fix = self.by_slot['fix'].topic
+        fix = self.by_slot['fix'].topic if 'fix' in self.by_slot else None
         for slot in ('odometer', 'odometer_right'):
             if slot in self.by_slot and self.by_slot[slot].topic == fix:
                 raise BadUsage(f'{fix} is both {slot} and fix: an odometer cannot be calibrated '
@@ -65,7 +65,7 @@ class Inputs:
 
     def static_transforms(self) -> StaticTransforms | None:
         """Return the topic of static transforms, if the reference is TF."""
-        return self.by_slot['fix'].static
+        return self.by_slot['fix'].static if 'fix' in self.by_slot else None
 
     def begin_leg(self) -> None:
         """Count lost messages from here on."""
@@ -104,6 +104,8 @@ def _wanted(config: Config) -> dict[str, tuple[str, ...]]:
     odometer: tuple[str, ...] = () if config.odometer.type == 'auto' else (config.odometer.type,)
     wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer,
                                           'fix': REFERENCES}
+    if config.reference.points:     # the positions are those of marks
+        del wanted['fix']
     if config.odometer.own_topics:
         wanted['odometer_right'] = odometer
     if config.gnss.use_velocity:

@@ -12,7 +12,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 
 from odocal_ros.data.leg import LegRecorder, WHEELS
-from odocal_ros.data.samples import Samples, take
+from odocal_ros.data.samples import FixSamples, LOCAL, Samples, take
 from odocal_ros.foresee.ability import Received
 from odocal_ros.foresee.progress import Progress
 from odocal_ros.live.inputs import Inputs
@@ -75,6 +75,19 @@ class Recording:
                     self.tap(slot, block)
             if not self.time_jumped:     # of another time: no sample of a leg before it
                 self._remember(source, raws, sent_ns)
+
+    def add_marks(self, block: FixSamples, config: Config) -> None:
+        """Take the positions of a mark, as those of a topic."""
+        self.recorder.feed('fix', block)
+        self.progress.feed('fix', block, config, self.inputs.form, 0.0)
+        if self.tap is not None:
+            self.tap('fix', block)
+
+    @property
+    def local(self) -> bool:
+        """Return True if the positions are in a local frame."""
+        fix = self.inputs.by_slot.get('fix')
+        return fix is None or fix.health.fix_status == LOCAL
 
     def look_around(self, config: Config) -> None:
         """Look for publishers of topics that are silent."""
