@@ -25,6 +25,7 @@ Packages data       samples and legs         settings   settings and IMU grades
          pipeline   one pure function from leg to result
          planning   prediction of a planned drive; foresee: prediction during a leg
          apply      dead reckoning with a calibration, sample by sample
+         pattern    patterns that a robot drives for a calibration
          sim        drives with known truth  output     result files, report, printed text
          live       the nodes; the only user of rclpy
          library    the functions behind the commands, for any program

@@ -32,11 +32,12 @@ ROOMS = {
     'pipeline': 'calib data nav patent screening settings',
     'planning': 'calib data nav screening settings',
     'foresee': 'calib data nav pipeline planning screening settings',
+    'pattern': 'settings',
     'apply': 'calib data nav screening settings',
     'sim': 'data nav settings',
     'paper': 'calib data nav pipeline settings sim',
     'output': 'calib data nav outside paper patent pipeline settings',
-    'live': 'apply bagio calib data foresee messages output outside pipeline settings',
+    'live': 'apply bagio calib data foresee messages output outside pattern pipeline settings',
     'library': 'bagio calib data messages nav output outside pipeline planning screening settings '
                'sim',
     'offline': 'bagio calib data library messages nav output outside paper patent pipeline '
