@@ -124,6 +124,7 @@ setup(
     entry_points={
         'console_scripts': [
             'calibrator = odocal_ros.live.start:calibrator',
+            'drive_pattern = odocal_ros.live.start:drive_pattern',
             'odocal = odocal_ros.offline.cli:main',
             'odometry = odocal_ros.live.start:odometry',
         ],

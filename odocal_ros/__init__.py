@@ -24,6 +24,7 @@ Packages data       samples and legs         settings   settings and IMU grades
          pipeline   one pure function from leg to result
          forecast   the sigmas that a drive will give: planned, or as far as it is driven
          apply      dead reckoning with a calibration, sample by sample
+         pattern    patterns that a robot drives for a calibration
          sim        drives with known truth  output     result files, report, printed text
          live       the nodes; the only user of rclpy
          library    the functions behind the commands, for any program

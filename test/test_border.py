@@ -30,10 +30,11 @@ ROOMS = {
     'calib': 'data nav screening settings',
     'pipeline': 'calib data nav screening settings',
     'forecast': 'calib data nav pipeline screening settings',
+    'pattern': 'settings',
     'apply': 'calib data nav screening settings',
     'sim': 'data nav settings',
     'output': 'calib data nav outside pipeline settings',
-    'live': 'apply bagio calib data forecast messages output outside pipeline settings',
+    'live': 'apply bagio calib data forecast messages output outside pattern pipeline settings',
     'library': 'bagio calib data forecast messages nav output outside pipeline screening settings '
                'sim',
     'offline': 'bagio calib data forecast library messages nav output outside pipeline '

@@ -81,7 +81,7 @@ def test_the_wheel_holds_the_package_and_its_files(distributions):
         'package.xml', *(name for name in repository_files()
                          if name.startswith(('config/', 'launch/')))}
     assert set(re.findall(r'^(\w+) = odocal_ros', entries, re.MULTILINE)) >= {
-        'calibrator', 'odocal', 'odometry'}
+        'calibrator', 'drive_pattern', 'odocal', 'odometry'}
     assert {'fleet', 'ros', 'tables', 'watch'} <= set(about.get_all('Provides-Extra'))
     assert about['Description-Content-Type'] == 'text/markdown'
 

@@ -196,9 +196,9 @@ def environment_of(installed) -> dict[str, str]:
     return clean_environment(PYTHONPATH=str(site))
 
 
-def test_colcon_puts_both_commands_where_ros2_run_looks(installed):
+def test_colcon_puts_the_commands_where_ros2_run_looks(installed):
     assert {p.name for p in (installed / 'lib' / 'odocal_ros').iterdir()} == {
-        'calibrator', 'odocal', 'odometry'}
+        'calibrator', 'drive_pattern', 'odocal', 'odometry'}
     share = installed / 'share'
     assert (share / 'ament_index' / 'resource_index' / 'packages' / 'odocal_ros').exists()
     assert (share / 'odocal_ros' / 'package.xml').exists()

@@ -36,7 +36,7 @@ def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(settings_page, 'pages', lambda: fresh(tmp_path))
     monkeypatch.setattr('sys.argv', ['settings_page'])
     assert settings_page.main() == 1
-    assert capsys.readouterr().out.count('stale: ') == 4
+    assert capsys.readouterr().out.count('stale: ') == 5
     monkeypatch.setattr('sys.argv', ['settings_page', '--write'])
     assert settings_page.main() == 0
     assert (tmp_path / 'docs' / 'settings.md').read_text() == whole

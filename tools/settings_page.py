@@ -15,6 +15,7 @@ import textwrap
 
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import Config, SETTINGS, settings_of
+from odocal_ros.settings.pattern_config import PatternConfig
 from odocal_ros.settings.setting import Setting
 from tools.reasons_page import reasons_md
 
@@ -39,7 +40,10 @@ NODES = {
                                             'change.', 'calibrator')),
     'odometry': (ApplyConfig, YAML_HEAD.format('the node odometry', 'It takes it by '
                                                '--params-file, beside the calibration.yaml. Keep '
-                                               'the lines you change.', 'odometry'))}
+                                               'the lines you change.', 'odometry')),
+    'drive_pattern': (PatternConfig, YAML_HEAD.format(
+        'the node drive_pattern', 'It takes it by --params-file. Keep the lines you change.',
+        'drive_pattern'))}
 TYPES = {'bool': 'bool', 'int': 'int', 'float': 'double', 'str': 'string', 'floats': 'double[]',
          'strs': 'string[]'}
 

@@ -54,7 +54,7 @@ def marked_legs(bag: Bag) -> list[tuple[int, int]]:
     The stop is 0 where the bag ends before it.
     """
     legs = []
-    for values in _last_marks(bag):
+    for values in leg_statuses(bag):
         start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
         if values.get('leg_event') not in DROPPED and start > 0:
             legs.append((start, stop))
@@ -74,11 +74,11 @@ def open_ended(spans: Spans, marks: Sequence[tuple[int, int]]) -> list[tuple[Rea
 
 def dropped_legs(bag: Bag) -> bool:
     """Return True if the operator cancelled or undid a leg that is marked in the bag."""
-    return any(values.get('leg_event') in DROPPED for values in _last_marks(bag))
+    return any(values.get('leg_event') in DROPPED for values in leg_statuses(bag))
 
 
-def _last_marks(bag: Bag) -> list[dict[str, str]]:
-    """Return the last that was said of each leg."""
+def leg_statuses(bag: Bag) -> list[dict[str, str]]:
+    """Return the last status of each leg in a bag."""
     last: dict[tuple[str, int], dict[str, str]] = {}
     for topic in bag.topics.values():
         if topic.msgtype != STATUS_TYPE:

@@ -195,13 +195,14 @@ def from_bag(path: Path, config: Config,
     from odocal_ros.library.legs import find_legs, marked_legs
     from odocal_ros.library.topics import choose_topics
     from odocal_ros.messages.decode import make_reader
+    from odocal_ros.messages.transforms import with_static
     from odocal_ros.screening.screen import screen
     with open_bag(path) as bag:
         chosen = choose_topics(bag.topics, config, topics)
         readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)
                    for slot, topic in chosen.items()}
         recorder = LegRecorder()
-        bag.read(readers, recorder.feed, None)
+        bag.read(with_static(readers, bag.topics), recorder.feed, None)
         recorder.form = readers[chosen['odometer']].form or recorder.form
         if 'odometer_right' in chosen:
             recorder.form_right = readers[chosen['odometer_right']].form

@@ -16,10 +16,12 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, LegSpan, Settings
 from odocal_ros.library.legs import dropped_legs, find_legs, marked_legs
 from odocal_ros.library.listener import Listener
-from odocal_ros.library.marks import mark_positions, with_marks
+from odocal_ros.library.marks import check_still, marks_of
 from odocal_ros.messages.decode import make_reader, Reader
+from odocal_ros.messages.transforms import with_static
 from odocal_ros.outside.limits import is_file
 from odocal_ros.outside.names import one_line
+from odocal_ros.pipeline.floor_marks import mark_positions, with_marks
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
@@ -110,7 +112,7 @@ def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
     """Return slot -> topic of a bag, and topic -> reader; named ones precede a journal's."""
     from odocal_ros.library.topics import choose_topics, local_reference
     named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
-    chosen = choose_topics(bag.topics, config, named)
+    chosen = choose_topics(bag.topics, config, named, bool(marks_of(config, bag)))
     said = local_reference(bag.topics, chosen, named)
     if said and hearer:
         hearer.note(said)
@@ -144,10 +146,13 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
     hearer = hearer or Listener()
     path = Path(path)
     journal = journal_notes(path)
-    settings = with_marks(config_of(config, journal.settings if journal else None))
+    settings = config_of(config, journal.settings if journal else None)
     # the hash costs as long as reading the file: beside the decoding, which holds one core
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
         name = one_line(bag.name)
+        floor_marks = marks_of(settings, bag)
+        if floor_marks:
+            settings = with_marks(settings)
         if journal:
             hearer.note(f'{bag.name} is a journal: settings and topics come from '
                           f'{journal.path}; options take precedence')
@@ -155,12 +160,14 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
         digest = beside.submit(bag_sha256, bag)
         recorder = LegRecorder()
         with hearer.phase(f'reading {name}') as progress:
-            bag.read(readers, recorder.feed, progress)
+            bag.read(with_static(readers, bag.topics), recorder.feed, progress)
         recorder.form = readers[chosen['odometer']].form or recorder.form
         if 'odometer_right' in chosen:
             recorder.form_right = readers[chosen['odometer_right']].form
-        if settings.reference.marks:
-            recorder.feed('fix', mark_positions(settings, recorder, bag.start_ns))
+        if settings.reference.marks:        # those of a node were tested when they were set
+            check_still(floor_marks, recorder, bag.start_ns)
+        if floor_marks:
+            recorder.feed('fix', mark_positions(settings, floor_marks))
         marks = marked_legs(bag)
         for note in bag.notes:
             if isinstance(note, str):

@@ -10,7 +10,7 @@ from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, VELOCITY
+from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, TRANSFORMS, VELOCITY
 from odocal_ros.settings.config import Config
 
 OPTION = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic',
@@ -31,7 +31,8 @@ SENSORS = {'imu': (IMU,), 'heading': (IMU,), 'fix': REFERENCES, 'fix_velocity': 
 Topics = dict[str, TopicInfo]
 
 
-def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> dict[str, str]:
+def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
+                  marked: bool = False) -> dict[str, str]:
     """
     Return slot -> topic.
 
@@ -43,6 +44,8 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
         Required inputs, and the type of the odometer.
     overrides : dict
         Slot -> topic, as the user named them.
+    marked : bool
+        The positions are those of marks.
 
     Raises
     ------
@@ -53,11 +56,11 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
     """
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     _check_reference(chosen)
-    if config.reference.marks and 'fix' in chosen:
+    if marked and 'fix' in chosen:
         raise BadUsage(f'--fix-topic {chosen["fix"]}: marks (reference.marks) replace fixes; omit '
                        'one of them')
     troubles: list[str] = []
-    for slot in wanted(config):
+    for slot in wanted(config, marked):
         if slot in chosen:
             continue
         found = candidates(topics, slot, config, chosen)
@@ -72,9 +75,10 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
     return chosen
 
 
-def wanted(config: Config) -> tuple[str, ...]:
+def wanted(config: Config, marked: bool = False) -> tuple[str, ...]:
     """Return the slots to fill; odometers and heading first, for what they leave to others."""
-    surveyed = config.reference.start and config.reference.end or config.reference.marks
+    surveyed = config.reference.start and config.reference.end or (
+        config.reference.marks or marked)
     return (*(('odometer_right',) if config.odometer.own_topics else ()), 'odometer',
             *(('heading',) if config.alignment.heading_source in ('auto', 'heading_topic')
               else ()),
@@ -172,7 +176,7 @@ def _may_serve(msgtype: str, slot: str) -> bool:
     if slot in ('odometer', 'odometer_right'):
         return full_type(msgtype) not in (IMU, FIX)
     return full_type(msgtype) in SENSORS[slot] or slot == 'fix' and full_type(
-        msgtype) in LOCAL_TYPES
+        msgtype) in (*LOCAL_TYPES, TRANSFORMS)
 
 
 def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: str) -> str:
@@ -190,7 +194,7 @@ def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: s
     types = tuple(_types(slot, config))
     if slot == 'fix':
         return (f'no {_label(slot)} in the bag: a topic of {" or ".join(types)}, or a '
-                f'nav_msgs/msg/Odometry that is named with {OPTION[slot]}')
+                f'{TRANSFORMS} or nav_msgs/msg/Odometry that is named with {OPTION[slot]}')
     what = ' or '.join(types) if len(types) < 3 else 'an odometer type'
     beside = ' besides the IMU' if slot == 'heading' else ''
     return f'no {_label(slot)} (a topic of {what}{beside}) in the bag'

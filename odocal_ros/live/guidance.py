@@ -15,6 +15,7 @@ from odocal_ros.reasons import Reason, Verdict
 
 KMH = 3.6    # definition: km/h in a m/s
 FORECAST_OLD_S = 15.0    # judgement: age from which what is foreseen is said to be old
+FEWEST_MARKS = 2         # judgement: marks after which the operator knows
 DRIVE = 'drive '
 STRAIGHT = 'drive straight at speed until left and right wheel are separable'
 TURNS = 'for the track width: turn by 90 deg in total or more'
@@ -88,6 +89,8 @@ def manoeuvres(now: SessionView) -> list[str]:
     wants, least = [], now.leg.min_speed
     if now.max_speed < least:
         wants.append(f'{DRIVE}faster than {least:.3g} m/s ({KMH * least:.0f} km/h)')
+    if now.config.reference.points and len(now.session.marks_of_leg()) < FEWEST_MARKS:
+        wants.append('call ~/mark at rest on each point')
     if now.two_wheels and 'smoother' in deciding(now.session.config.method):
         wants += _of_two_wheels(now)
     return wants + (now.forecast.lacks if now.forecast else [])

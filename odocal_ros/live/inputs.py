@@ -7,12 +7,13 @@ from rclpy.node import Node
 
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.errors import BadUsage
+from odocal_ros.live.static_transforms import StaticTransforms
 from odocal_ros.live.topic_input import Input
-from odocal_ros.messages.sensor_types import LOCAL_TYPES
+from odocal_ros.messages.sensor_types import LOCAL_TYPES, TRANSFORMS
 from odocal_ros.settings.config import Config
 
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
-REFERENCES = (FIX, *LOCAL_TYPES)
+REFERENCES = (FIX, *LOCAL_TYPES, TRANSFORMS)
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
 
 LOOK_AROUND_S = 1.0     # judgement: between two looks for publishers
@@ -34,7 +35,7 @@ class Inputs:
 
     def _check_reference(self) -> None:
         """Refuse one topic as both odometer and reference: its scale would be exactly 1."""
-        fix = self.by_slot['fix'].topic
+        fix = self.by_slot['fix'].topic if 'fix' in self.by_slot else None
         for slot in ('odometer', 'odometer_right'):
             if slot in self.by_slot and self.by_slot[slot].topic == fix:
                 raise BadUsage(f'{fix} is both {slot} and fix: an odometer cannot be calibrated '
@@ -61,6 +62,10 @@ class Inputs:
     def missing(self, config: Config) -> list[str]:
         """Return the causes why a leg cannot start, one line per missing topic."""
         return [one.why() for one in self.required(config) if not one.flowing()]
+
+    def static_transforms(self) -> StaticTransforms | None:
+        """Return the topic of static transforms, if the reference is TF."""
+        return self.by_slot['fix'].static if 'fix' in self.by_slot else None
 
     def begin_leg(self) -> None:
         """Count lost messages from here on."""
@@ -99,6 +104,8 @@ def _wanted(config: Config) -> dict[str, tuple[str, ...]]:
     odometer: tuple[str, ...] = () if config.odometer.type == 'auto' else (config.odometer.type,)
     wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer,
                                           'fix': REFERENCES}
+    if config.reference.points:     # the positions are those of marks
+        del wanted['fix']
     if config.odometer.own_topics:
         wanted['odometer_right'] = odometer
     if config.gnss.use_velocity:

@@ -22,6 +22,7 @@ from odocal_ros.live.journal_writer import JournalWriter, Received
 from odocal_ros.live.recording import PREROLL_MARGIN_S
 from odocal_ros.live.result_files import output_root
 from odocal_ros.live.session import Session
+from odocal_ros.live.static_transforms import StaticTransforms
 from odocal_ros.live.topic_input import Input
 from odocal_ros.outside.names import for_shell
 from odocal_ros.outside.yaml_text import parameters
@@ -71,7 +72,8 @@ class Journal:
         """Return the folder of the newest leg."""
         return self._writer.folder if self._limit else ''
 
-    def remember(self, source: Input, raws: list[bytes], sent_ns: list[int]) -> None:
+    def remember(self, source: Input | StaticTransforms, raws: list[bytes],
+                 sent_ns: list[int]) -> None:
         """Take messages of a topic as the recorder got them."""
         if not self._limit:
             return
@@ -81,7 +83,7 @@ class Journal:
                 source.topic, source.msgtype, message_class(source.msgtype))
         received.raws += raws
         received.sent_ns += sent_ns
-        received.newest_ns = source.health.newest_ns
+        received.newest_ns = source.newest_ns
 
     def tick(self, config: Config, busy: bool) -> None:
         """Hand over what has come if it is time to; join a leg's files once nobody waits."""

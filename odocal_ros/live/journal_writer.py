@@ -15,6 +15,7 @@ from odocal_ros.bagio.chunks import Chunk, pack
 from odocal_ros.live.definitions import definition_of
 from odocal_ros.live.journal_leg import in_order, LegJournal, Plan
 
+ALWAYS_NS = 1      # definition: stamp of messages that hold at all times
 PREROLL_BYTES = 256 * 2**20    # judgement: 1 kHz for 600 s are 55 MB
 
 
@@ -56,8 +57,9 @@ class PreRoll:
         return in_order({slot: [chunk for _, chunk in held] for slot, held in self._held.items()})
 
     def clear(self) -> None:
-        """Forget everything."""
-        self._held, self.size = {}, 0
+        """Forget all but what holds at all times."""
+        self._held = {slot: held for slot, held in self._held.items() if held[-1][0] == ALWAYS_NS}
+        self.size = sum(chunk.size for held in self._held.values() for _, chunk in held)
 
 
 class JournalWriter:

@@ -34,6 +34,7 @@ from odocal_ros.live.session import Session, State
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.live.worker import FILES_GRACE_S, JOB_GRACE_S, Worker
 from odocal_ros.outside.names import for_shell
+from odocal_ros.pipeline.floor_marks import with_marks
 from odocal_ros.settings.config import Config
 
 LATE_TOPIC_S = 1.0   # judgement: a topic later than that at the stop mark is not waited for
@@ -128,6 +129,7 @@ class LegCompletion:
         else:
             self._log.warning('time jumped: all samples so far are dropped')
         self._recording.start_anew()
+        self.session.marks.clear()
         self._journal.start_anew()
 
     def view(self) -> SessionView:
@@ -184,7 +186,9 @@ class LegCompletion:
     def _begin_leg(self, mark_ns: int, by_itself: bool = False) -> str:
         """Open a leg at a mark and return what there is to say."""
         session = self.session
-        session.start(mark_ns, self._config(), by_itself)
+        config = self._config()
+        session.start(mark_ns, with_marks(config) if config.reference.points else config,
+                      by_itself)
         self._recording.inputs.begin_leg()
         self._journal.begin(session, self._recording.inputs.topics)
         if not by_itself:

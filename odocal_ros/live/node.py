@@ -27,6 +27,7 @@ from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.topic_input import TOPICS
 from odocal_ros.output.stored import known_imu
+from odocal_ros.pipeline.floor_marks import check_points
 
 # tuned by benchmarks/live_load.py: s between turns, and while somebody waits for an answer. Of
 # 0.05 s all would cost twice as much; a queue holds 25 of 0.2 s
@@ -41,13 +42,14 @@ subscribes   imu/data, odometer, fix; fix_velocity and heading if published; if 
              odometer_right
              (another name: -r odometer:=/your/topic)
 services     ~/start_leg before a drive and ~/stop_leg after it, which answers with the result;
+             ~/mark on each point of reference.points;
              ~/cancel_leg, ~/undo_leg, ~/reset, ~/save   (all std_srvs/srv/Trigger)
 publishes    ~/status: missing inputs and what to do next; /diagnostics; ~/path/...; the
              result as parameters result.*
 settings     parameters, all described in config/calibrator.yaml:
              'calibrator --ros-args --params-file calibrator.yaml', or one by one
              'calibrator --ros-args -p odometer.nominal_scale:=0.02'"""
-SERVICES = ('start_leg', 'stop_leg', 'cancel_leg', 'undo_leg', 'reset', 'save')
+SERVICES = ('start_leg', 'stop_leg', 'mark', 'cancel_leg', 'undo_leg', 'reset', 'save')
 
 
 class Calibrator(SettledNode):
@@ -67,6 +69,8 @@ class Calibrator(SettledNode):
     def _build(self) -> None:
         self.config = params.declare(self)
         known_imu(self.config)      # refused at once, not after the first leg
+        if self.config.reference.points:
+            check_points(self.config)
         params.declare_results(self)
         params.check_qos(self, map(self.resolve_topic_name, TOPICS.values()))
         self.publishing = Publishing(self)

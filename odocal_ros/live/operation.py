@@ -14,6 +14,11 @@ from odocal_ros.live.automatic_way import AutomaticWay
 from odocal_ros.live.computing import PATIENCE_S
 from odocal_ros.live.guidance import after_result, hint, quantities_ok
 from odocal_ros.live.session import Refused, State
+from odocal_ros.pipeline.floor_marks import mark_positions, place_of, WITHIN
+
+# the positions of a mark reach WITHIN to both sides, and another 0.5 s for the odometer's delay.
+# Judgement
+MARK_STILL_S = 2 * WITHIN + 0.5
 
 
 class Operation(AutomaticWay):
@@ -34,6 +39,26 @@ class Operation(AutomaticWay):
         if session.state is State.RECORDING:      # one that nobody asked for
             self._drop_leg(f'leg {session.leg_id} is replaced by a started by the operator')
         return True, self._begin_leg(mark_ns)
+
+    def mark(self) -> tuple[bool, str]:
+        """Note that the robot stands on the next point of ``reference.points``."""
+        session, newest_ns = self.session, self._mark_ns()
+        if not self._config().reference.points:
+            raise Refused('reference.points is empty: set x and y of each point, and restart the '
+                          'node')
+        still_s = self._recording.progress.still_s()
+        if session.state is State.RECORDING and still_s < MARK_STILL_S:
+            raise Refused(f'the wheels have stood for {still_s:.1f} s, required: '
+                          f'{MARK_STILL_S:g} s; stand on the point and call again')
+        delay_s = self._recording.inputs.by_slot['imu'].health.delay_s
+        mark = session.mark(newest_ns - round(WITHIN * 1e9), newest_ns + round(delay_s * 1e9))
+        self._recording.add_marks(mark_positions(session.config, [mark]), session.config)
+        self.show_status()
+        x, y = place_of(session.config, mark.point)
+        text = (f'mark {len(session.marks_of_leg())} of leg {session.leg_id}: point '
+                f'{mark.point + 1}, x {x:g} m, y {y:g} m')
+        self._log.info(text)
+        return True, text
 
     def stop_leg(self) -> tuple[bool, str] | Future:
         """End the leg; the answer carries the result, a provisional one where it takes long."""

@@ -17,7 +17,6 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import Float64, String
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.data.samples import LOCAL
 from odocal_ros.live import jobs, params, result_files as outputs
 from odocal_ros.live.guidance import action_first
 from odocal_ros.live.recording import Recording
@@ -100,7 +99,7 @@ class Publishing:
             rates_hz=recording.rates_hz(), results=self.results(),
             max_speed=progress.max_speed(), still_s=progress.still_s(),
             two_wheels=recording.two_wheels(), received=recording.received(),
-            local=recording.inputs.by_slot['fix'].health.fix_status == LOCAL,
+            local=recording.local,
             restored=known['session'].restored_since(), **known)
 
     def show_status(self, now: SessionView) -> DiagnosticArray:

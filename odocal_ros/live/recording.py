@@ -12,10 +12,11 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 
 from odocal_ros.data.leg import LegRecorder, WHEELS
-from odocal_ros.data.samples import Samples, take
+from odocal_ros.data.samples import FixSamples, LOCAL, Samples, take
 from odocal_ros.forecast.ability import Received
 from odocal_ros.forecast.progress import Progress
 from odocal_ros.live.inputs import Inputs
+from odocal_ros.live.static_transforms import StaticTransforms
 from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.config import Config
 
@@ -32,7 +33,8 @@ class Recording:
     """
 
     def __init__(self, node: Node, config: Config,
-                 remember: Callable[[Input, list[bytes], list[int]], None]) -> None:
+                 remember: Callable[[Input | StaticTransforms, list[bytes], list[int]], None]
+                 ) -> None:
         self.inputs = Inputs(node, config)
         self.recorder = LegRecorder()
         self._remember = remember
@@ -50,6 +52,13 @@ class Recording:
 
     def pump(self, config: Config, found_scale: float) -> None:
         """Decode what has come since the last call, in blocks."""
+        static = self.inputs.static_transforms()
+        if static is not None:
+            raws, sent_ns = static.take()
+            if raws:
+                for slot, block in static.decode(raws, sent_ns):
+                    self.recorder.feed(slot, block)
+                self._remember(static, raws, sent_ns)
         for source in self.inputs.by_slot.values():
             raws, sent_ns = source.take()
             if not raws:
@@ -66,6 +75,19 @@ class Recording:
                     self.tap(slot, block)
             if not self.time_jumped:     # of another time: no sample of a leg before it
                 self._remember(source, raws, sent_ns)
+
+    def add_marks(self, block: FixSamples, config: Config) -> None:
+        """Take the positions of a mark, as those of a topic."""
+        self.recorder.feed('fix', block)
+        self.progress.feed('fix', block, config, self.inputs.form, 0.0)
+        if self.tap is not None:
+            self.tap('fix', block)
+
+    @property
+    def local(self) -> bool:
+        """Return True if the positions are in a local frame."""
+        fix = self.inputs.by_slot.get('fix')
+        return fix is None or fix.health.fix_status == LOCAL
 
     def look_around(self, config: Config) -> None:
         """Look for publishers of topics that are silent."""

@@ -14,6 +14,7 @@ from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.restored import Restored
+from odocal_ros.pipeline.floor_marks import FloorMark, next_point
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
@@ -68,6 +69,7 @@ class Session:
         self.by_itself = False      # the leg last started: by leg.automatic
         self.unused: Reason | None = None      # why the last such leg does not count
         self.carried: Carried | None = None    # of legs that are not kept, or before this session
+        self.marks: list[FloorMark] = []       # with the pre-roll of the leg last started
         self._last_id = 0
 
     @property
@@ -94,6 +96,21 @@ class Session:
         self.config, self.by_itself = config, by_itself
         self.state, self.event, self.trouble = State.RECORDING, 'started', ''
         self.lost = ''
+        first_ns = mark_ns - round(config.leg.preroll * 1e9)
+        self.marks = [mark for mark in self.marks if mark.stamp_ns >= first_ns]
+
+    def marks_of_leg(self) -> list[FloorMark]:
+        """Return the marks of the leg last started."""
+        return [mark for mark in self.marks if mark.stamp_ns >= self.start_ns]
+
+    def mark(self, stamp_ns: int, received_ns: int) -> FloorMark:
+        """Note that the robot stands on the next point of the running leg."""
+        if self.state is not State.RECORDING:
+            raise Refused('no leg is running: call ~/start_leg first, then ~/mark on each point')
+        point = next_point(self.config, len(self.marks_of_leg()))
+        mark = FloorMark(stamp_ns, point, received_ns)
+        self.marks.append(mark)
+        return mark
 
     def stop(self, mark_ns: int) -> None:
         """End the open leg at a mark; it is computed next."""

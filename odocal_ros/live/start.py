@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The commands calibrator and odometry: start a node, or print the missing requirement."""
+"""The commands calibrator, odometry, drive_pattern: start a node, or print what is missing."""
 
 from importlib import import_module
 import sys
@@ -15,6 +15,11 @@ def calibrator() -> int:
 def odometry() -> int:
     """Run the node odometry; 2 without ROS 2."""
     return _run('odometry', 'odocal_ros.live.odometry')
+
+
+def drive_pattern() -> int:
+    """Run the node drive_pattern; 2 without ROS 2."""
+    return _run('drive_pattern', 'odocal_ros.live.drive_pattern')
 
 
 def _run(command: str, module: str) -> int:

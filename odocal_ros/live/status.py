@@ -57,6 +57,7 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
     keys = {
         'state': now.state, 'leg_id': session.leg_id, 'leg_start_ns': session.start_ns,
         'leg_stop_ns': session.stop_ns, 'leg_event': session.event,
+        'marks': ','.join(map(str, session.marks)),
         'distance_m': now.distance_m, 'duration_s': now.duration_s,
         'imu_rate_hz': now.rates_hz.get('imu', 0.0),
         'odometer_rate_hz': now.rates_hz.get('odometer', 0.0),

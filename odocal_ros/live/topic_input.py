@@ -21,9 +21,12 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.live.definitions import message_class
 from odocal_ros.live.health import Health
+from odocal_ros.live.static_transforms import StaticTransforms
 from odocal_ros.live.waiting_messages import WaitingMessages
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES
+from odocal_ros.messages.sensor_types import TRANSFORMS
+from odocal_ros.messages.transforms import TransformReader
 from odocal_ros.outside.names import one_line, said_by
 from odocal_ros.settings.config import Config
 
@@ -64,6 +67,7 @@ class Input:
         self._deserialize: Callable[[bytes], Any] | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.waiting = WaitingMessages(node)
+        self.static: StaticTransforms | None = None     # the topic beside a TF reference
 
     def check(self, config: Config) -> None:
         """Raise OdocalError where the type the operator wrote cannot be read, at start-up."""
@@ -80,8 +84,8 @@ class Input:
     def _same(self) -> list[str]:
         """Return topics that others publish with a type that would serve, the nearest first."""
         wanted, own = set(self.allowed or TYPES), {p.topic_name for p in self._node.publishers}
-        if self.slot == 'fix':      # most are the wheel odometry
-            wanted.discard('nav_msgs/msg/Odometry')
+        if self.slot == 'fix':      # most contain the wheel odometry
+            wanted -= {'nav_msgs/msg/Odometry', TRANSFORMS}
         names = [name for name, types in self._node.get_topic_names_and_types()
                  if wanted & set(types) and name not in own
                  and self._node.count_publishers(name)]
@@ -138,6 +142,8 @@ class Input:
         self._deserialize = partial(deserialize_message, message_type=kind)
         self.waiting.subscribe(kind, self.name, qos)
         self.reader, self.msgtype, self.trouble = reader, msgtype, ''
+        if isinstance(reader, TransformReader):
+            self.static = StaticTransforms(self._node, self.topic, kind, reader.static)
         self._node.get_logger().info(
             f'{self.slot}: {msgtype} on {self.topic}, '
             f'{"reliable" if reliable else "best effort"}')
@@ -177,6 +183,11 @@ class Input:
             if slot == self.slot:
                 self.sound = self.health.decoded(block, max_gap_s)
         return pairs
+
+    @property
+    def newest_ns(self) -> int:
+        """Return the newest stamp, ns, 0 before the first."""
+        return self.health.newest_ns
 
     def flowing(self) -> bool:
         """Return True if usable messages arrive."""

@@ -23,7 +23,7 @@ from odocal_ros.messages.fields import MessageView, View
 from odocal_ros.messages.frames import FrameFilter
 from odocal_ros.messages.odometer_types import OdometerPlan
 from odocal_ros.messages.raws import Raws, Table
-from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan
+from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan, TRANSFORMS
 from odocal_ros.messages.tables import tables
 from odocal_ros.settings.config import Config
 
@@ -209,6 +209,9 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
     msgtype = full_type(msgtype)
     if slot in WHEELS:
         return Reader(slot, msgtype, OdometerPlan(slot, msgtype, config))
+    if slot == 'fix' and msgtype == TRANSFORMS:
+        from odocal_ros.messages.transforms import TransformReader
+        return TransformReader(config)
     reader = Reader(slot, msgtype, sensor_plan(slot, msgtype, config))
     if slot == 'imu':
         reader.frames = FrameFilter(msgtype, config.imu.frame_id)

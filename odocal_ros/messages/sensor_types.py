@@ -28,6 +28,7 @@ from odocal_ros.settings.levels import RAD_PER_DEG
 IMU = 'sensor_msgs/msg/Imu'
 FIX = 'sensor_msgs/msg/NavSatFix'
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, Samples]]
 Build = Callable[..., Samples]        # of stamps, arrivals and a slot's columns
 # format: block of the position in a 6 x 6 covariance, row by row
@@ -127,7 +128,7 @@ def sensor_plan(slot: str, msgtype: str, config: Config) -> SensorPlan:
         return SensorPlan(slot, LOCAL_TYPES[msgtype], local_fixes(config.reference.latitude_deg))
     if (slot, msgtype) not in SENSORS:
         types = [other for own, other in SENSORS if own == slot]
-        types += LOCAL_TYPES if slot == 'fix' else []
+        types += (*LOCAL_TYPES, TRANSFORMS) if slot == 'fix' else ()
         raise BadData(f'{slot}: messages of type {msgtype} cannot be used; give a topic of type '
                       f'{" or ".join(types)}')
     return SensorPlan(slot, *SENSORS[slot, msgtype])

@@ -21,6 +21,7 @@ from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Deserialize, make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import IMU, Pairs
+from odocal_ros.messages.transforms import with_static
 from odocal_ros.offline import survey
 from odocal_ros.offline.fix_path import fix_path, FixPath, Match
 from odocal_ros.offline.inspection_drive import look
@@ -80,7 +81,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     """
     taps, refused = _taps(bag, config, overrides)
     search = searched(bag.topics, taps, overrides.values())
-    bag.read({**taps, **search}, print)       # a tap gives nothing on
+    bag.read({**taps, **search, **_static(taps, bag)}, print)       # a tap gives nothing on
     mapping, config = likely_mapping(bag.topics, config, overrides)
     turn = _turn(taps[mapping['imu']]) if mapping.get('imu') in taps else None
     fixes = fix_path(taps[mapping['fix']].recorder.rows('fix'), config.gnss) if mapping.get(
@@ -161,6 +162,19 @@ def _taps(bag: Bag, config: Config,
         except OdocalError as error:
             refused[name] = str(error)
     return taps, refused
+
+
+def _static(taps: dict[str, _Tap], bag: Bag) -> dict[str, _Tap]:
+    """Return the taps of static transforms; what they make known is of the TF topic beside."""
+    found = {}
+    readers = {name: tap.reader for name, tap in taps.items()}
+    for name, reader in with_static(readers, bag.topics).items():
+        if name in taps:
+            tap = taps[name]
+        else:
+            found[name] = _Tap(reader)
+            found[name].recorder = tap.recorder
+    return found
 
 
 def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[str, Any]:

@@ -24,9 +24,13 @@ class ReferenceConfig:
     default_sigma: float = setting(0.05, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of '
                                    'positions in a local frame without a covariance: the first '
                                    'value of the estimate.')
-    points: tuple[float, ...] = setting((), 'm', -1e4, 1e4, many=True, about=(
+    frames: tuple[str, ...] = setting(('map', 'base_link'), item=str, ro=True, about=(
+        'With TF as position reference: the fixed frame, and the frame of the tracked point on '
+        'the robot.'))
+    points: tuple[float, ...] = setting((), 'm', -1e4, 1e4, ro=True, many=True, about=(
         'Points on the floor where the robot stands at the marks: x and y of each, in the order '
-        'of the marks; after the last point the list starts again.'))
+        'of the marks; after the last point the list starts again. The node then uses ~/mark '
+        'instead of the topic fix.'))
     points_sigma: float = setting(0.005, 'm', 1e-4, 1.0, about='Uncertainty of points and of '
                                   'the robot on them, each axis.')
     marks: tuple[float, ...] = setting((), 's', 0.0, 1e6, many=True, about=(

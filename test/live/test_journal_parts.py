@@ -163,6 +163,17 @@ def test_the_preroll_reaches_back_far_enough_and_no_further():
     assert (preroll.chunks(), preroll.size) == ([], 0)
 
 
+def test_static_transforms_stay_in_the_preroll():
+    preroll = PreRoll()
+    for k in (0, 500):
+        preroll.feed('fix_static', journal_writer.ALWAYS_NS, chunk(k, 100), SECOND)
+        preroll.feed('imu', k * SECOND, chunk(k, 100), SECOND)
+    assert len(preroll.chunks()) == 3
+    preroll.clear()     # time jumped back; nobody sends them again
+    assert len(preroll.chunks()) == 2
+    assert preroll.size == sum(c.size for c in preroll.chunks())
+
+
 def test_the_preroll_is_bounded_in_bytes(monkeypatch):
     monkeypatch.setattr(journal_writer, 'PREROLL_BYTES', 1_050_000)
     preroll = PreRoll()

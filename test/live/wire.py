@@ -16,7 +16,7 @@ from player import part, Player, Sent
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'fuzz'))
 import mutations
 
-SERVICES = ('start_leg', 'stop_leg', 'cancel_leg', 'undo_leg', 'reset', 'save')
+SERVICES = ('start_leg', 'stop_leg', 'mark', 'cancel_leg', 'undo_leg', 'reset', 'save')
 BEFORE_S, START_S, STOP_S, LAST_S = 30.0, 60.0, 170.0, 174.0    # of the drive
 SIGMAS = 5.0
 BAD_WORDS = ('Traceback', 'RuntimeWarning', 'nternal error', ' broke: ')

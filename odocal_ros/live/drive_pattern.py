@@ -1,0 +1,203 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The node that drives a robot along a pattern, between ``~/start`` and whatever stops it."""
+
+import math
+import signal
+import sys
+import time
+from typing import Any
+
+from geometry_msgs.msg import Twist, TwistStamped
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.executors import Executor
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from odocal_ros.errors import BadConfig
+from odocal_ros.live import params
+from odocal_ros.live.definitions import message_class
+from odocal_ros.live.process import run, SettledNode
+from odocal_ros.pattern.follow import command, moved, Pose, Progress, why_stop
+from odocal_ros.pattern.route import Piece, rectangle_of, route_of
+from odocal_ros.settings.config import settings_of
+from odocal_ros.settings.pattern_config import PatternConfig
+
+PERIOD_S = 0.05       # judgement: base controllers stop after 0.2 s or more without a command
+ZEROS = 20            # judgement: commands of zero, since one may be lost
+STUCK_S = 2.0         # judgement: twice what the slowest robot needs to be seen to move
+LAST_ZEROS, LAST_PERIOD_S = 5, 0.02       # judgement: of a node that must end
+HELP = """\
+usage: drive_pattern --ros-args -p speed:=M_PER_S -p 'rectangle:=[X, Y, X, Y]' [-p NAME:=VALUE]
+
+Drives a robot along a pattern inside a rectangle, for a calibration (a ROS 2 node). It moves the
+robot after ~/start only. Keep an emergency stop at hand.
+
+subscribes   pose (geometry_msgs/PoseStamped, or pose_type), bumper (std_msgs/Bool)
+publishes    cmd_vel (geometry_msgs/Twist, or TwistStamped with stamped)
+services     ~/start, ~/stop   (std_srvs/srv/Trigger)
+settings     parameters, all described in config/drive_pattern.yaml"""
+
+
+class DrivePattern(SettledNode):
+    """Joins poses, ``pattern.follow`` and commands; it sends nothing unless it drives or stops."""
+
+    def __init__(self, node_name: str = 'drive_pattern', **kwargs: Any) -> None:
+        super().__init__(node_name, **kwargs)
+
+    def _build(self) -> None:
+        self.config: PatternConfig = params.declare(self, PatternConfig)
+        if math.isnan(self.config.speed):
+            raise BadConfig('speed is not set; required: the speed limit, m/s: -p speed:=0.2')
+        self._rectangle = rectangle_of(self.config)
+        route_of(self.config, self._rectangle[:2])      # refused at once, not at ~/start
+        self._pose: Pose | None = None
+        self._pose_at = -math.inf       # all times: s, of the steady clock
+        self._bumped = self._ending = False
+        self._route: tuple[Piece, ...] = ()     # empty: the robot is not driven
+        self._progress, self._begun, self._zeros = Progress(), 0.0, 0
+        self._moved: tuple[Pose, float] | None = None      # where and when the robot last moved
+        sensor = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self.create_subscription(message_class(self.config.pose_type), 'pose', self._take_pose,
+                                 sensor)
+        self.create_subscription(Bool, 'bumper', self._take_bumper, sensor)
+        self._publisher = self.create_publisher(TwistStamped if self.config.stamped else Twist,
+                                                'cmd_vel', 1)
+        self.create_service(Trigger, '~/start', self._start)
+        self.create_service(Trigger, '~/stop', self._stop)
+        self.add_on_set_parameters_callback(self._refuse)
+        # on the steady clock: a paused or missing /clock must not keep the robot driving
+        self.create_timer(PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info(f'ready: {self.config.pattern} in the rectangle {self._rectangle}, '
+                               f'at most {self.config.speed:g} m/s; call ~/start')
+
+    def spin(self, executor: Executor) -> None:
+        """Handle what comes until a signal; the robot is stopped before the context ends."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._end)
+        while self.context.ok() and not self._ending:
+            executor.spin_once(timeout_sec=PERIOD_S)
+
+    def destroy_node(self) -> None:
+        """Stop the robot, and end."""
+        if getattr(self, '_route', ()) or getattr(self, '_zeros', 0):
+            self._halt('the node ends')
+            for _ in range(LAST_ZEROS if self.context.ok() else 0):
+                self._send(0.0, 0.0)
+                time.sleep(LAST_PERIOD_S)
+        super().destroy_node()  # type: ignore[no-untyped-call]
+
+    def _end(self, *_: object) -> None:
+        self._ending = True
+
+    def _take_pose(self, message: Any) -> None:
+        here = message.pose if hasattr(message.pose, 'position') else message.pose.pose
+        q = here.orientation
+        heading = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
+        self._pose = here.position.x, here.position.y, heading
+        self._pose_at = time.monotonic()
+
+    def _take_bumper(self, message: Bool) -> None:
+        self._bumped = message.data
+        if self._route:
+            self._tick()        # at once
+
+    def _why_stop(self) -> str:
+        now = time.monotonic()
+        driven_s = now - self._begun if self._route else 0.0
+        return why_stop(self._pose, now - self._pose_at, self._rectangle, self._bumped,
+                        driven_s, self.config.timeout)
+
+    def _start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        why = 'the robot is driven already' if self._route else self._why_stop()
+        others = self.count_publishers(self._publisher.topic_name) - 1
+        if not why and others:
+            why = (f'{self._publisher.topic_name} has {others} other publisher'
+                   f'{"s" * (others != 1)}: end the other node, or remap one of them')
+        if why:
+            self.get_logger().warning(f'~/start refused: {why}')
+            response.success, response.message = False, why
+            return response
+        assert self._pose is not None
+        self._route = route_of(self.config, self._pose[:2])
+        self._progress, self._begun, self._zeros = Progress(), time.monotonic(), 0
+        self._moved = None
+        response.success = True
+        response.message = (f'driving: {self.config.pattern}, '
+                            f'{sum(piece.length for piece in self._route):.1f} m')
+        self.get_logger().info(response.message)
+        return response
+
+    def _stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = True
+        response.message = 'stopped' if self._route else 'the robot was not driven; stopped'
+        self._halt('~/stop')
+        return response
+
+    def _halt(self, why: str) -> None:
+        """Stop the robot: a command of zero now, and more with the next turns."""
+        if self._route:
+            self.get_logger().info(f'stopped: {why}')
+        self._route, self._zeros = (), ZEROS
+        if self.context.ok():
+            self._send(0.0, 0.0)
+
+    def _tick(self) -> None:
+        """Send a command while the robot is driven; then zeros, then nothing."""
+        if not self._route:
+            if self._zeros:
+                self._zeros -= 1
+                self._send(0.0, 0.0)
+            return
+        if why := self._why_stop():
+            self._halt(why)
+            return
+        assert self._pose is not None
+        speed, rate, self._progress = command(self._route, self._progress, self._pose,
+                                              time.monotonic(), self.config)
+        if self._progress.piece == len(self._route):
+            self._halt('the pattern is complete')
+            return
+        if self._stuck(speed or rate):
+            self._halt(f'the pose has not changed for {STUCK_S:g} s: the wheels are blocked, or '
+                       'the position is frozen')
+            return
+        self._send(speed, rate)
+
+    def _stuck(self, asked: float) -> bool:
+        """Return True if the robot has been asked to move for long and does not."""
+        pose, now = self._pose, time.monotonic()
+        assert pose is not None
+        if not asked or self._moved is None or moved(self._moved[0], pose):
+            self._moved = pose, now
+        return now - self._moved[1] > STUCK_S
+
+    def _send(self, speed: float, rate: float) -> None:
+        twist = Twist()
+        twist.linear.x, twist.angular.z = float(speed), float(rate)
+        if not self.config.stamped:
+            self._publisher.publish(twist)
+            return
+        stamped = TwistStamped(twist=twist)
+        stamped.header.stamp = self.get_clock().now().to_msg()
+        stamped.header.frame_id = 'base_link'
+        self._publisher.publish(stamped)
+
+    def _refuse(self, parameters: list[Parameter]) -> SetParametersResult:
+        ours = [p.name for p in parameters if p.name in settings_of(PatternConfig)]
+        return SetParametersResult(successful=not ours, reason=(
+            f'{ours[0]} is only read at start-up: restart the node with it') if ours else '')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until it must stop; see ``process.run``."""
+    return run('drive_pattern', HELP, DrivePattern, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

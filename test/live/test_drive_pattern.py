@@ -1,0 +1,192 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The node drive_pattern over DDS, with a robot that does as told: it drives, and it stops."""
+
+import contextlib
+import math
+import signal
+import threading
+import time
+
+from bench import Client, given, NodeProcess, wait_for
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+import pytest
+from std_msgs.msg import Bool
+
+BOX = (-1.0, -1.0, 2.0, 1.0)
+SETTINGS = {'speed': 1.0, 'rectangle': f'[{", ".join(map(str, BOX))}]', 'pattern': 'straight',
+            'margin': 0.4, 'turn_rate': 3.0, 'acceleration': 2.0, 'rest': 0.1}
+STEP_S = 0.02
+
+
+class Robot:
+    """A unicycle in a thread; it stands while nobody has sent a command for 0.5 s."""
+
+    def __init__(self, client: Client, kind: type = Twist) -> None:
+        self.pose = [0.0, 0.0, 0.0]
+        self.track: list[tuple[float, float]] = []
+        self.commands: list[tuple[float, float]] = []
+        self.blind = self.frozen = False
+        self._at, self._over = 0.0, threading.Event()
+        self._publisher = client.node.create_publisher(PoseStamped, 'pose', 1)
+        self._bumper = client.node.create_publisher(Bool, 'bumper', 1)
+        client.node.create_subscription(kind, 'cmd_vel', self._take, 10)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _take(self, message) -> None:
+        twist = getattr(message, 'twist', message)
+        self.commands.append((twist.linear.x, twist.angular.z))
+        self._at = time.monotonic()
+
+    def _run(self) -> None:
+        while not self._over.wait(STEP_S):
+            fresh = self.commands and time.monotonic() - self._at < 0.5
+            speed, rate = self.commands[-1] if fresh and not self.frozen else (0.0, 0.0)
+            x, y, heading = self.pose
+            middle = heading + rate * STEP_S / 2
+            self.pose = [x + speed * STEP_S * math.cos(middle),
+                         y + speed * STEP_S * math.sin(middle), heading + rate * STEP_S]
+            self.track.append(tuple(self.pose[:2]))
+            if not self.blind:
+                self._show()
+
+    def _show(self) -> None:
+        message = PoseStamped()
+        message.pose.position.x, message.pose.position.y = self.pose[:2]
+        message.pose.orientation.z = math.sin(self.pose[2] / 2)
+        message.pose.orientation.w = math.cos(self.pose[2] / 2)
+        self._publisher.publish(message)
+
+    def bump(self, pressed: bool) -> None:
+        """Press the bumper, or let it go."""
+        wait_for(self._bumper.get_subscription_count, 'the node at the bumper')
+        self._bumper.publish(Bool(data=pressed))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._over.set()
+        self._thread.join()
+
+
+@contextlib.contextmanager
+def driven(kind=Twist, **settings):
+    """Yield node, client and robot, which drives; all end."""
+    client = Client('drive_pattern')
+    robot = Robot(client, kind)
+    node = NodeProcess(*given(SETTINGS | settings), module='drive_pattern')
+    try:
+        wait_for(lambda: 'ready: ' in node.text, 'the node')
+        wait_for(lambda: client.call('start').success, 'a start')
+        wait_for(lambda: (robot.commands or [(0.0, 0.0)])[-1] != (0.0, 0.0), 'a command')
+        yield node, client, robot
+    finally:
+        node.end()
+        robot.close()
+        client.close()
+
+
+def stopped(node, robot, why, within_s):
+    """Check that the node stops the robot in time, by several zeros, and then is silent."""
+    began = time.monotonic()
+    wait_for(lambda: f'stopped: {why}' in node.text, f'the stop by {why}')
+    assert time.monotonic() - began < within_s
+    wait_for(lambda: robot.commands[-5:] == [(0.0, 0.0)] * 5, 'zeros')
+    time.sleep(1.5)
+    count = len(robot.commands)
+    time.sleep(0.3)
+    assert len(robot.commands) == count
+    assert robot.commands[-10:] == [(0.0, 0.0)] * 10
+
+
+def test_a_pattern_is_driven_to_its_end_inside_the_rectangle():
+    with driven() as (node, client, robot):
+        assert not client.call('start').success     # it is driven already
+        stopped(node, robot, 'the pattern is complete', 60)
+        x, y = zip(*robot.track, strict=True)
+        # late commands: 0.1 s at 1 m/s
+        assert BOX[0] + 0.2 < min(x) < BOX[0] + 0.5 < BOX[2] - 0.5 < max(x) < BOX[2] - 0.2
+        assert BOX[1] + 0.2 < min(y) < max(y) < BOX[3] - 0.2
+        assert max(speed for speed, _ in robot.commands) <= 1.0
+        assert max(abs(rate) for _, rate in robot.commands) <= 3.0
+
+
+def test_the_service_stops():
+    with driven(kind=TwistStamped, stamped='true') as (node, client, robot):
+        assert client.call('stop').message == 'stopped'
+        stopped(node, robot, '~/stop', 5)
+        assert 'was not driven' in client.call('stop').message
+
+
+def test_a_lost_pose_stops():
+    with driven() as (node, client, robot):
+        robot.blind = True
+        stopped(node, robot, 'no pose for 0.5 s', 5)
+        answer = client.call('start')
+        assert (answer.success, answer.message) == (False, 'no pose for 0.5 s')
+
+
+def test_the_bumper_stops():
+    with driven() as (node, client, robot):
+        robot.bump(True)
+        stopped(node, robot, 'the bumper is pressed', 5)
+        assert client.call('start').message == 'the bumper is pressed'
+        robot.bump(False)
+        wait_for(lambda: client.call('start').success, 'a start after the bumper')
+
+
+def test_outside_the_rectangle_the_robot_stops():
+    with driven() as (node, client, robot):
+        robot.pose[1] = 1.2
+        stopped(node, robot, 'the robot is outside the rectangle, at x', 5)
+        assert 'outside the rectangle' in client.call('start').message
+
+
+def test_a_pose_that_does_not_change_stops():
+    with driven() as (node, _, robot):
+        robot.frozen = True
+        stopped(node, robot, 'the pose has not changed for 2 s', 10)
+
+
+def test_a_timeout_stops():
+    with driven(timeout=1.0) as (node, _, robot):
+        stopped(node, robot, 'timeout of 1 s', 5)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_node_that_ends_stops_the_robot(number):
+    with driven() as (node, _, robot):
+        assert node.end(number) == 0
+        assert 'stopped: the node ends' in node.text
+        wait_for(lambda: robot.commands[-3:] == [(0.0, 0.0)] * 3, 'zeros')
+        assert 'Traceback' not in node.text
+
+
+def test_another_publisher_of_commands_is_refused():
+    client = Client('drive_pattern')
+    robot = Robot(client)
+    other = client.node.create_publisher(Twist, 'cmd_vel', 1)
+    node = NodeProcess(*given(SETTINGS), module='drive_pattern')
+    try:
+        wait_for(lambda: 'ready: ' in node.text, 'the node')
+        wait_for(lambda: client.call('start').message == (
+            '/cmd_vel has 1 other publisher: end the other node, or remap one of them'), 'refusal')
+        assert not robot.commands        # nothing is sent before a start
+        client.node.destroy_publisher(other)
+    finally:
+        node.end()
+        robot.close()
+        client.close()
+
+
+@pytest.mark.parametrize(('settings', 'message'), [
+    ({}, 'speed is not set; required: the speed limit, m/s: -p speed:=0.2'),
+    ({'speed': 0.2}, 'rectangle has 0 values; required'),
+    ({'speed': 0.2, 'rectangle': '[0.0, 0.0, 1.0, 1.0]'}, 'the pattern has 0.00 m, required'),
+    ({'speed': 9.0}, 'speed')])
+def test_what_must_be_set(settings, message):
+    node = NodeProcess(*given(settings or {'pattern': 'square'}), module='drive_pattern')
+    assert node.wait() == 1
+    assert message in node.text
+    assert 'Traceback' not in node.text

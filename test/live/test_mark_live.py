@@ -1,0 +1,115 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""~/mark over DDS: a square from point to point; its journal replays to the same bits."""
+
+from bench import given, wait_for
+from kills import replayed, same_result
+from player import part, playing_to, sent_of, stopped
+import pytest
+
+from odocal_ros.bagio import encode
+from odocal_ros.errors import BadUsage
+from odocal_ros.library.calibrate_bag import calibrate_bag
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 20.0
+POINTS = (0, 0, 4, 0, 4, 4, 0, 4, 0, 0, 4, 0, 4, -4, 0, -4, 0, 0)
+TIMES = (5.0, *(20.5 + 17.0 * k for k in range(8)))     # in the middle of 3 s at rest
+SETTINGS = {'odometer.left': 'left', 'odometer.right': 'right', 'leg.preroll': 20.0,
+            'verdict.max_scale_sigma': 0.005}
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Simulate a robot with two joints that drives a square both ways."""
+    return simulate(SimOptions(scenario='square', odometer='angle', imu_rate=50.0))
+
+
+@pytest.fixture(scope='module')
+def session(drive, tmp_path_factory):
+    """Drive the square, with a mark at each point; keep what the node said."""
+    wheels = dict(zip(('left', 'right'), drive.wheels, strict=True))
+    topics = {'imu': encode.imu('imu/data', drive.imu),
+              'odometer': encode.joints('odometer', wheels)}
+    sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)),
+                  key=lambda one: one.stamp_ns)
+    settings = SETTINGS | {
+        'output.directory': tmp_path_factory.mktemp('marked'),
+        'odometer.nominal_scale': drive.options.nominal_scale,
+        'reference.points': f'[{", ".join(f"{x}.0" for x in POINTS)}]'}
+    types = {slot: topic.msgtype for slot, topic in topics.items()}
+    with playing_to(types, *given(settings)) as (node, client, player):
+        at, answers = 0.0, []
+
+        def play_to(time):
+            nonlocal at
+            player.play(part(sent, at, time), SPEED)
+            at = time
+            wait_for(lambda: client.status.get('duration_s') and client.status, 'a status')
+        play_to(3.0)
+        client.until(state='idle')
+        early = client.call('mark')
+        client.start()
+        for time in TIMES:
+            play_to(time + 1.3)
+            answers.append(client.call('mark'))
+            if len(answers) == 2:
+                second = client.until(state='recording')
+            if len(answers) == 1:
+                first = client.until(state='recording')
+                play_to(14.0)
+                turning = client.call('mark')
+        seen = stopped(client, player, part(sent, at, at + 3.0), SPEED)
+        seen.first, seen.second = first, second
+        seen.node, seen.early, seen.turning, seen.answers = node, early, turning, answers
+        yield seen
+
+
+def test_a_mark_is_refused_without_a_leg_and_while_the_wheels_turn(session):
+    assert not session.early.success
+    assert 'call ~/start_leg first, then ~/mark on each point' in session.early.message
+    assert not session.turning.success
+    assert 'stand on the point and call again' in session.turning.message
+
+
+def test_the_answers_name_the_points(session):
+    assert all(answer.success for answer in session.answers)
+    said = [answer.message for answer in session.answers]
+    assert said[0] == 'mark 1 of leg 1: point 1, x 0 m, y 0 m'
+    assert said[7] == 'mark 8 of leg 1: point 8, x 0 m, y -4 m'
+    assert len(session.status['marks'].split(',')) == len(TIMES)
+
+
+def test_the_hint_asks_for_marks(session):
+    assert 'call ~/mark at rest on each point, ' in session.first['hint']
+    assert 'call ~/mark' not in session.second['hint']
+
+
+def test_the_leg_finds_both_wheels_and_the_track_width(session, drive):
+    assert session.stop.success, session.stop.message
+    result = session.live['result']
+    for name, true in (('scale_factor_left', drive.truth.wheel_scales[0]),
+                       ('scale_factor_right', drive.truth.wheel_scales[1]),
+                       ('track_width', drive.options.track_width)):
+        found = result[name]
+        assert abs(found['value'] - true) < 3 * found['sigma'] < 3 * 3e-3 * true, name
+    assert 'LOCAL_FRAME' in {r['code'] for r in session.live['legs'][0]['reasons']}
+
+
+def test_its_journal_replays_to_the_last_bit(session):
+    code, offline, said = replayed(session.journal)
+    assert code == 0, said
+    same_result(session.live, offline, 'config')
+    for here, there in zip(session.live['legs'], offline['legs'], strict=True):
+        assert here | {'bag': session.journal.name} == there
+
+
+def test_marks_as_options_precede_those_of_the_node(session):
+    with pytest.raises(BadUsage, match='--mark 14: the odometer has no data there'):
+        calibrate_bag(session.journal, config={'reference.marks': [14.0]})
+
+
+def test_the_points_of_a_replay_are_those_of_the_recording(session):
+    with pytest.raises(BadUsage, match='a mark of point [2-9], reference.points has 1: use'):
+        calibrate_bag(session.journal, config={'reference.points': [0.0, 0.0]})
