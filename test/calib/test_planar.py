@@ -9,8 +9,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.calib.planar.drive import Run, Wheels
-from odocal_ros.calib.planar.fit import fit, Known, LEVELS, noise_path
+from odocal_ros.calib.planar.drive import Wheels
+from odocal_ros.calib.planar.fit import fit, LEVELS, noise_path
+from odocal_ros.calib.planar.problem import Known, Run
 
 LEFT, RIGHT, WIDTH = 0.0352, 0.0349, 0.31     # m/rad, m
 STEP = 0.1      # s
@@ -116,7 +117,7 @@ def test_sigma_is_the_bound_of_a_straight_run():
     level = {name: sigma**2 for name, sigma in found.levels.items()}
     student = 6 / 8         # information of Student's distribution
     variance = (level['white'] / student * (0.01**2 + 0.02**2)
-                + 2 * level['drift'] * (1 - np.exp(-path.sum() / known.drift_length))
+                + 2 * level['drift'] / student * (1 - np.exp(-path.sum() / known.drift_length))
                 + level['along'] * path.sum())
     mean = np.array([0.5, 0.5])
     sigma = np.sqrt(mean @ found.covariance[:2, :2] @ mean)

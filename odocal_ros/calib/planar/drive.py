@@ -3,13 +3,13 @@
 
 """Kinematics: body increments of a robot from the increments of its wheels."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.settings.config import DIFFERENTIAL, MECANUM, SKID
 
-DRIVES = ('differential', 'skid', 'mecanum')
 # judgement: the turn of a mecanum robot by sideways motion, by unequal wheels, 1 sigma
 CROSS_SIGMA = 0.05
 
@@ -20,18 +20,18 @@ class Wheels:
     Increments of the wheels in n intervals, in scale units.
 
     left, right : (n,) mean of the wheels of a side.   lateral : (n,) sideways motion of a mecanum
-    robot, (-fl + fr + rl - rr) / 4; zero of others.   kind : one of DRIVES.
+    robot, (-fl + fr + rl - rr) / 4; zero of others.   kind : as odometer.drive.
     """
 
     left: Floats
     right: Floats
     lateral: Floats
-    kind: str = 'differential'
+    kind: str = DIFFERENTIAL
 
     @property
     def names(self) -> tuple[str, ...]:
         """Return the constants in the order of ``increments``."""
-        return ('left', 'right', 'curvature', *{'skid': ('arc',), 'mecanum': ('lateral', 'cross')}
+        return ('left', 'right', 'curvature', *{SKID: ('arc',), MECANUM: ('lateral', 'cross')}
                 .get(self.kind, ()))
 
     @property
@@ -65,13 +65,13 @@ class Wheels:
         """
         left, right, zero = self.left, self.right, np.zeros_like(self.left)
         apart = c[1] * right - c[0] * left
-        share = self.straightness if self.kind == 'skid' else zero
-        by = c[2] + (c[3] * share if self.kind == 'skid' else zero)
+        share = self.straightness if self.kind == SKID else zero
+        by = c[2] + (c[3] * share if self.kind == SKID else zero)
         forward, side, turn = (c[0] * left + c[1] * right) / 2, zero, apart * by
         J = [(left / 2, zero, -left * by), (right / 2, zero, right * by), (zero, zero, apart)]
-        if self.kind == 'skid':
+        if self.kind == SKID:
             J.append((zero, zero, apart * share))
-        if self.kind == 'mecanum':
+        if self.kind == MECANUM:
             side, turn = c[3] * self.lateral, turn + c[4] * self.lateral
             J += [(zero, self.lateral, zero), (zero, zero, self.lateral)]
         return np.stack([forward, side, turn], -1), np.stack([np.stack(j, -1) for j in J], -1)
@@ -85,15 +85,15 @@ class Wheels:
         """
         n, m = len(self.left), len(self.names)
         scale, share = (c[0] + c[1]) / 2, self.straightness
-        by = np.full(n, c[2]) + (c[3] * share if self.kind == 'skid' else 0.0)
+        by = np.full(n, c[2]) + (c[3] * share if self.kind == SKID else 0.0)
         J = np.zeros((n, 3, m))
         J[:, 0, :2] = 0.5
-        J[:, 1, 3 if self.kind == 'mecanum' else slice(0, 2)] = (
-            1.0 if self.kind == 'mecanum' else 0.5)
+        J[:, 1, 3 if self.kind == MECANUM else slice(0, 2)] = (
+            1.0 if self.kind == MECANUM else 0.5)
         J[:, 2, :2], J[:, 2, 2] = by[:, None] / 2, scale
-        if self.kind == 'skid':
+        if self.kind == SKID:
             J[:, 2, 3] = scale * share
-        side = c[3] if self.kind == 'mecanum' else scale
+        side = c[3] if self.kind == MECANUM else scale
         return np.stack([np.full(n, scale), np.full(n, side), by * scale], -1), J
 
     def prior(self, left: float, right: float, width: float) -> tuple[Floats, Floats]:
@@ -105,21 +105,3 @@ class Wheels:
         sigma = {'left': wide * scale, 'right': wide * scale, 'curvature': 1 / width,
                  'arc': 1 / width, 'lateral': scale, 'cross': CROSS_SIGMA * scale / width}
         return (np.array([value[n] for n in self.names]), np.array([sigma[n] for n in self.names]))
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """
-    A run on n + 1 nodes in time.
-
-    t : (n + 1,) s.   wheels : increments between nodes.   node : (k,) nodes with a position.
-    position : (k, 2) m.   sigma : (k,) m, white error as stated.   gyro : (n,) rad, integral of
-    the turn rate about the up axis; empty without a gyro.
-    """
-
-    t: Floats
-    wheels: Wheels
-    node: Ints
-    position: Floats
-    sigma: Floats
-    gyro: Floats = field(default_factory=lambda: np.empty(0))

@@ -8,24 +8,30 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from odocal_ros.calib.planar.drive import Run
+from odocal_ros.calib.planar.problem import Run
 from odocal_ros.data.arrays import Complexes, Floats, Ints
 
 # m, 7.5 % from one to the next, and right over left wheel less 1. Judgement: of robots
 WIDTHS = np.geomspace(0.05, 3.0, 58)
 RATIOS = np.linspace(-0.03, 0.03, 13)
 MINIMA, ALIKE = 5, 1.3     # judgement: minima compared, and costs that do not differ
-# m of wheel path in which a dead-reckoned path is compared: several moves with turns between
+SWAPPED = 0.3              # judgement: of the cost, if mirrored
+# m of wheel path in which a dead-reckoned path is compared. Judgement: several moves and turns
 WINDOW = 6.0
 
 
 class First(NamedTuple):
-    """First values: scale factors of both sides, track width m, headings of nodes (n + 1,) rad."""
+    """
+    First values: scale factors of both sides, track width m, headings of nodes (n + 1,) rad.
+
+    swapped : the mirrored positions fit better, so left and right are swapped.
+    """
 
     left: float
     right: float
     width: float
     heading: Floats
+    swapped: bool
 
 
 def first_values(run: Run, width: float = 0.0) -> First:
@@ -42,12 +48,14 @@ def first_values(run: Run, width: float = 0.0) -> First:
     rough = _rough(z, s)
     windows = _windows(s * rough)
 
-    def aligned(x: Floats) -> tuple[float, Complexes, Floats]:
+    def aligned(x: Floats, z: Complexes = z) -> tuple[float, Complexes, Floats]:
         turn = np.append(0.0, np.cumsum((1 + x[1] / 2) * run.wheels.right
                                         - (1 - x[1] / 2) * run.wheels.left))
         turn *= rough / np.exp(x[0])
         return (*_aligned(run, z, turn, windows), turn)
-    costs = np.array([[aligned(np.array([np.log(w), r]))[0] for r in RATIOS] for w in WIDTHS])
+    grid = [[np.array([np.log(w), r]) for r in RATIOS] for w in WIDTHS]
+    costs, mirrored = (np.array([[aligned(x, own)[0] for x in row] for row in grid])
+                       for own in (z, z.conj()))
     least = costs.min(axis=1)
     padded = np.pad(least, 1, constant_values=np.inf)
     minima = np.flatnonzero((least <= padded[:-2]) & (least <= padded[2:]))
@@ -65,7 +73,8 @@ def first_values(run: Run, width: float = 0.0) -> First:
     heading = turn + np.interp(np.arange(len(turn)), middle, np.unwrap(np.angle(factor)))
     scale = float(np.median(np.abs(factor)))
     return First(scale * (1 - x[1] / 2), scale * (1 + x[1] / 2),
-                 float(np.exp(x[0])) * scale / rough, heading)
+                 float(np.exp(x[0])) * scale / rough, heading,
+                 bool(mirrored.min() < SWAPPED * costs.min()))
 
 
 def _rough(z: Complexes, s: Floats) -> float:
