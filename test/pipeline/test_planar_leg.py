@@ -113,8 +113,9 @@ def test_wheels_of_another_run_are_rejected():
     leg = replace(made.leg(), odometer=other.leg().odometer,
                   odometer_right=other.leg().odometer_right)
     found = calibrate(leg, config)
-    assert found.verdict is Verdict.REJECTED
-    assert not any(r.code is Code.METHOD_FAILED for r in found.methods['planar'].reasons)
+    codes = {r.code for r in found.methods['planar'].reasons}
+    assert Code.NOT_CONVERGED in codes
+    assert Code.METHOD_FAILED not in codes
 
 
 def test_controllers_of_each_drive():
