@@ -13,7 +13,7 @@ import numpy as np
 
 from odocal_ros.calib.planar.chain import Equations, Rows, Solved
 from odocal_ros.calib.planar.problem import Fit, Known, Run
-from odocal_ros.calib.planar.start import first_values
+from odocal_ros.calib.planar.start import First, first_values
 from odocal_ros.data.arrays import Floats
 
 # first levels and medians of their hyperpriors, variances. Judgement: wheels slip by millimetres
@@ -38,23 +38,13 @@ CONVERGED = 0.02    # sigmas of a constant, and of the logarithm of a level
 def fit(run: Run, known: Known) -> Fit:
     """Return the estimate of a run."""
     at_first = first_values(run, known.width)
-    left, right, width = at_first[:3]
-    scale = (left + right) / 2
-    n = len(run.t)
-    at = run.t[run.node]
-    state = np.zeros((n, 5))
-    state[:, 0], state[:, 1] = (np.interp(run.t, at, axis) for axis in run.position.T)
-    state[:, 2] = at_first.heading
-    value, sigma = run.wheels.prior(left, right, width)
-    more = [(known.offset[0], known.offset_sigma), (known.offset[1], known.offset_sigma),
-            (0.0, known.delay_sigma)]
-    more += [(0.0, known.gyro_scale_sigma), (0.0, known.gyro_bias_sigma)] * bool(len(run.gyro))
-    c = np.append(value, [v for v, _ in more])
-    mean, prior = c.copy(), np.append(sigma, [s for _, s in more])**-2.0
+    scale = (at_first.left + at_first.right) / 2
+    state, c, prior = _begin(run, known, at_first)
+    mean, n = c.copy(), len(state)
     theta, passes, converged = dict(LEVELS), 0, False
-    student = {'white': np.ones(len(at)), 'drift': np.ones(n)}
+    student = {'white': np.ones(len(run.node)), 'drift': np.ones(n)}
     metres = noise_path(run, scale)
-    first = np.array([scale, scale, scale / width])
+    first = np.array([scale, scale, scale / at_first.width])
     while passes < MOST_PASSES and not converged:
         passes += 1
         rows = _rows(run, known, state, c, metres, first, student)
@@ -82,6 +72,20 @@ def fit(run: Run, known: Known) -> Fit:
     return Fit(names, c, covariance, state[:, :3],
                {name: float(np.sqrt(theta[name])) for name in FREE}, passes, converged,
                at_first.swapped)
+
+
+def _begin(run: Run, known: Known, at_first: First) -> tuple[Floats, Floats, Floats]:
+    """Return first states (n + 1, 5) and constants (m,), and the information of priors (m,)."""
+    state = np.zeros((len(run.t), 5))
+    state[:, 0], state[:, 1] = (np.interp(run.t, run.t[run.node], axis)
+                                for axis in run.position.T)
+    state[:, 2] = at_first.heading
+    value, sigma = run.wheels.prior(at_first.left, at_first.right, at_first.width)
+    more = [(known.offset[0], known.offset_sigma), (known.offset[1], known.offset_sigma),
+            (0.0, known.delay_sigma)]
+    more += [(0.0, known.gyro_scale_sigma), (0.0, known.gyro_bias_sigma)] * bool(len(run.gyro))
+    return (state, np.append(value, [v for v, _ in more]),
+            np.append(sigma, [s for _, s in more])**-2.0)
 
 
 def noise_path(run: Run, scale: float) -> Floats:
