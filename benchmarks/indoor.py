@@ -17,6 +17,10 @@ Printed by kind for the scale of the mean (wheel radius), the ratio of right to 
 width, yaw and pitch of the IMU: in how many drives that are not rejected it is given, the share
 within 1.96 sigma, the rms and the largest of error over sigma, the largest of accepted drives, and
 the median sigma; verdicts; in how many drives each reason was given.
+
+Kinds ROBOT_REFERENCE have no IMU: ``wheels`` is the differential robot, ``skid`` slides in turns
+and ``mecanum`` has four wheels and moves sideways (sim/robot_wheels.py). Their values: width is
+that on the spot (of mecanum the rotation lever), arc at a radius of two widths.
 """
 
 from collections import Counter
@@ -31,11 +35,17 @@ from zoo import configured
 from zoo_table import print_errors
 
 FIRST_SEED, SEEDS_A_KIND = 93_000_000, 1_000_000
-KINDS = ('mocap', 'total_station', 'slam', 'amcl')
+REFERENCES = ('mocap', 'total_station', 'slam', 'amcl')
+# planar estimator: what SimOptions has of each, without an IMU
+PLANAR = {'wheels': {}, 'skid': {'drive': 'skid'}, 'mecanum': {'drive': 'mecanum'}}
+SHORTEST = {'wheels': 30.0, 'skid': 30.0, 'mecanum': 70.0}     # s
+KINDS = (*REFERENCES, *(f'{robot}_{reference}' for robot in PLANAR
+                        for reference in ('mocap', 'slam')))
 GRADES = ('consumer', 'industrial')
 IMU_EFFECTS = ('triads', 'g_sensitivity', 'bias', 'temperature', 'vibration', 'imu_stamps')
 SLIP = 1e-3     # m/sqrt(s) of each wheel
 FIGURES = (('scale', 'ppm', 1e6), ('ratio', 'ppm', 1e6), ('width', 'ppm', 1e6),
+           ('arc', 'ppm', 1e6), ('lateral', 'ppm', 1e6),
            ('yaw', 'mdeg', 1e3 * 180 / math.pi), ('pitch', 'mdeg', 1e3 * 180 / math.pi))
 
 
@@ -50,9 +60,12 @@ def options_of(seed):
            'wheel_difference': float(rng.normal(0, 0.01)),
            'imu_lever_arm': tuple(map(float, rng.normal(0, 0.05, 3))),
            'scale': 8.9e-5 * (1 + 0.03 * float(rng.standard_normal()))}
+    robot, _, reference = KINDS[e].rpartition('_') if e >= len(REFERENCES) else ('', '', KINDS[e])
+    if robot:       # the first sideways move of a mecanum robot ends within a minute
+        own |= PLANAR[robot] | {'imu': False, 'duration': max(own['duration'], SHORTEST[robot])}
     return drawn(seed, 'indoor', GRADES[k % 2], IMU_EFFECTS, **own, nominal_scale=8.9e-5,
                  slope=0.0, odometer_lever_arm=(0.0, 0.0, 0.0), antenna_lever_arm=(0.0, 0.0, 0.0),
-                 slip_walk=SLIP, reference=KINDS[e],
+                 slip_walk=SLIP, reference=reference,
                  **dict.fromkeys(('fix_rate', 'fix_noise', 'fix_sigma')))[0]
 
 
@@ -60,30 +73,46 @@ def run_drive(seed):
     """Draw, drive, calibrate; return a row."""
     from odocal_ros.pipeline.calibrate import calibrate, combine
     from odocal_ros.settings.config import with_settings
+    from odocal_ros.sim.robot_wheels import effective_width, SIDEWAYS
     from odocal_ros.sim.scenarios import simulate
     drive = simulate(options_of(seed))
     config = with_settings(configured(drive), {'odometer.track_width': 0.0})
     calibration = combine([calibrate(drive.leg(), config)], config)
-    row = {'seed': seed, 'kind': drive.options.reference, 'grade': drive.options.imu_grade,
-           'duration': drive.options.duration, 'distance': drive.truth.distance,
+    row = {'seed': seed, 'kind': KINDS[(seed - FIRST_SEED) // SEEDS_A_KIND],
+           'grade': drive.options.imu_grade, 'duration': drive.options.duration,
+           'distance': drive.truth.distance,
            'verdict': calibration.verdict.value,
            'codes': sorted({r.code.name for r in calibration.reasons})}
     truth, found = drive.truth, calibration.estimates
+    width = effective_width(drive.options)
+    arc = effective_width(drive.options, 2 * width)
+    lateral = SIDEWAYS * truth.scale
     for key, name, true, size in (
             ('scale', 'scale_factor', truth.scale, truth.scale),
-            ('width', 'track_width', drive.options.track_width, drive.options.track_width),
+            ('width', 'track_width', width, width),
+            ('width', 'rotation_lever', width / 2, width / 2),
+            ('arc', 'track_width_arc', arc, arc),
+            ('lateral', 'lateral_scale_factor', lateral, lateral),
             ('yaw', 'yaw_mounting_angle', truth.yaw, 1.0),
             ('pitch', 'pitch_mounting_angle', truth.pitch, 1.0)):
         if name in found and found[name].value is not None:
             row |= {f'{key}_error': (found[name].value - true) / size,
                     f'{key}_sigma': found[name].sigma / size}
     left, right = (found.get(f'scale_factor_{side}') for side in ('left', 'right'))
-    if left is not None and left.value is not None:
+    if left is not None and left.value is not None and len(truth.wheel_scales) == 2:
         true = truth.wheel_scales[1] / truth.wheel_scales[0]
-        wheels = calibration.legs[0].methods['smoother'].details['wheels']
         row |= {'ratio_error': right.value / left.value / true - 1,
-                'ratio_sigma': 2 * wheels['left']['ratio_sigma']}
+                'ratio_sigma': _ratio_sigma(calibration.legs[0].methods, left, right)}
     return row
+
+
+def _ratio_sigma(methods, left, right):
+    """Return the sigma of right over left."""
+    if 'smoother' in methods:
+        return 2 * methods['smoother'].details['wheels']['left']['ratio_sigma']
+    a, b = left.sigma / left.value, right.sigma / right.value
+    rho = methods['planar'].details['correlation']['scale_factor_left,scale_factor_right']
+    return (a**2 + b**2 - 2 * rho * a * b)**0.5
 
 
 def table(rows):

@@ -30,7 +30,9 @@ class Code(Enum):
     """A reason code: (gravity, remedy)."""
 
     # the data that came
-    NO_IMU = REJECT, 'Check the IMU topic and its QoS, or name the topic with --imu-topic.'
+    NO_IMU = REJECT, ('Check the IMU topic and its QoS, or name the topic with --imu-topic. A '
+                      'robot without an IMU: set odometer.left and odometer.right, or '
+                      'odometer.wheels.')
     NO_ACCELEROMETER = CAUTION, ('Yaw and pitch need an IMU that publishes acceleration. Drive '
                                  'on level ground: unmodelled slopes bias the scale.')
     NO_ODOMETER = REJECT, 'Check the odometer topic and odometer.type, or use --odometer-topic.'

@@ -157,19 +157,31 @@ def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch
 def test_the_walk_through_a_room_prints_what_the_page_says(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     lines = [shlex.split(line)[1:] for page, line in all_commands('odocal') if page == INDOOR]
-    assert [words[0] for words in lines] == ['simulate', 'inspect', 'replay', 'simulate', 'replay']
+    assert [words[0] for words in lines] == ['simulate', 'inspect', 'replay'] + [
+        'simulate', 'replay'] * 4
     shown = [text for language, text in fenced(page_of(INDOOR)) if language == 'text']
+    # blocks of the page after the replay of each bag
+    count = {'robot': 2, 'square': 1, 'wheels': 1, 'skid': 1, 'mecanum': 2}
+    assert len(shown) == sum(count.values())
     for words in lines:
         capfd.readouterr()
         assert cli.main(words) == 0
         out, _ = capfd.readouterr()
         if words[0] == 'replay':
-            of_run = shown[:2] if words[1] == 'robot' else shown[2:]
+            of_run = [shown.pop(0) for _ in range(count[words[1]])]
             assert all('\n'.join(text) in out for text in of_run), out
     made = yaml.safe_load((tmp_path / 'truth.yaml').read_text())
     true = f'{made["scale"]["value"]:g} m/pulse, ' + ', '.join(
         f'{x:.8f}' for x in made['scale']['wheels'])
     assert f'True values: {true.replace("8.9e-05", "0.000089")}, 0.3 m' in page_of(INDOOR)
+    robots = {name: yaml.safe_load((tmp_path / f'{name}.truth.yaml').read_text())
+              for name in ('skid', 'mecanum')}
+    skid, mecanum = (robots[name]['robot'] for name in robots)
+    assert (f'True values: {skid["track_width"]:g} m and {skid["track_width_arc"]:.3f} m'
+            in page_of(INDOOR))
+    assert (f'True values: {robots["mecanum"]["scale"]["value"]:g}, '
+            f'{mecanum["track_width"] / 2:g} and {mecanum["lateral_scale_factor"]:g}'
+            in page_of(INDOOR))
 
 
 def test_the_figures_of_the_page_are_those_that_are_drawn():

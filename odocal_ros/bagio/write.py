@@ -26,8 +26,8 @@ def drive_topics(drive: Any) -> list[Topic]:
     """Return a simulated drive's topics under the names that the node listens to."""
     reference = drive.reference
     position = () if reference.encoder == 'fix' else (drive.positions(),)
-    topics = [encode.imu('/imu/data', drive.imu),
-              getattr(encode, reference.encoder)(reference.topic, drive.fix, *position)]
+    topics = [encode.imu('/imu/data', drive.imu)] if len(drive.imu.stamp_ns) else []
+    topics.append(getattr(encode, reference.encoder)(reference.topic, drive.fix, *position))
     kind, left, right = drive.options.odometer, drive.odometer, drive.odometer_right
     if kind == 'angle':
         topics.append(encode.joints('/joint_states', dict(zip(

@@ -9,6 +9,7 @@ from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.reasons import Code, Reason, Verdict
 
 ORDER = ('smoother', 'two_point')
+PLANAR = 'planar'        # the only method of legs that the others cannot compute
 ALWAYS = 'two_point'     # the operator's own marks: computed and shown whatever is asked
 BY = {'patent': 'smoother', 'wheels': 'smoother'}     # asked for: the method that decides then
 # what the smoother refuses end points do not know either: they have but the accelerometer's level
@@ -55,7 +56,8 @@ def choose(methods: Mapping[str, MethodResult],
         The methods that gave any, or all that were asked where none is usable.
 
     """
-    found = [methods[name] for name in deciding(asked) if name in methods]
+    found = [methods[name] for name in dict.fromkeys((*deciding(asked), PLANAR))
+             if name in methods]
     usable = [m for m in found if m.verdict is not Verdict.REJECTED] or found
     estimates: dict[str, Estimate] = {}
     for method in usable:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from odocal_ros.calib.border import Border, SCATTER_POINTS
 from odocal_ros.calib.linked_legs import LinkedLegs
@@ -124,6 +123,7 @@ def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
     By restricted likelihood, with a half-Cauchy prior whose scale is the usual sigma (Gelman
     2006).
     """
+    from scipy.interpolate import CubicSpline
     between, told, weights = dict(usual), dict[str, Floats](), dict[str, Floats]()
     fine = np.linspace(SCATTER_GRID[0], SCATTER_GRID[-1], 301)
     for _ in range(2):      # sweeps: the scatter of one hardly depends on that of another

@@ -174,7 +174,8 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
                 hearer.note(note)
         with hearer.phase(f'checksum of {name}'):
             sha256 = digest.result()
-        frame = readers[chosen['imu']].frame or bag.frame(chosen['imu'])
+        imu = chosen.get('imu', '')
+        frame = readers[imu].frame or bag.frame(imu) if imu else ''
         return Recording(
             name, sha256, chosen, frame, bag.start_ns, bag.end_ns,
             tuple(marks), bool(journal and not marks and dropped_legs(bag)),

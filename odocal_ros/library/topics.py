@@ -11,7 +11,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, TRANSFORMS, VELOCITY
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, DIFFERENTIAL, SIDES
 
 OPTION = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic',
           'odometer_right': '--odometer-right-topic', 'heading': '--heading-topic',
@@ -66,7 +66,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
         found = candidates(topics, slot, config, chosen)
         if len(found) == 1:
             chosen[slot] = found[0]
-        elif not _optional(slot, config):
+        elif not _optional(slot, config, found):
             troubles.append(_trouble(topics, slot, found, config, chosen.get('fix', '')))
     if troubles:
         raise BadUsage('; '.join(troubles) + (
@@ -135,8 +135,15 @@ def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str,
             f'({topics[fix].msgtype}); another one: {OPTION["fix"]}')
 
 
-def _optional(slot: str, config: Config) -> bool:
-    """Return True if a leg does not need a slot whose topic is ambiguous."""
+def imu_needed(config: Config) -> bool:
+    """Return False for several wheels, which are sufficient on a level floor."""
+    return len(config.odometer.keys) < len(SIDES) and config.odometer.drive == DIFFERENTIAL
+
+
+def _optional(slot: str, config: Config, found: list[str]) -> bool:
+    """Return True if a leg does not need a slot whose topic is missing or ambiguous."""
+    if slot == 'imu':
+        return not found and not imu_needed(config)
     return slot == 'fix_velocity' or (
         slot == 'heading' and config.alignment.heading_source != 'heading_topic')
 

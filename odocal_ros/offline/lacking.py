@@ -6,6 +6,7 @@
 import math
 from typing import Any
 
+from odocal_ros.library.topics import imu_needed
 from odocal_ros.offline.inspection_drive import closed
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -15,7 +16,8 @@ def lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> l
     """Return the reasons for data that a calibration would miss."""
     out = [Reason(code, f'no topic for the {word}') for slot, code, word in (
         ('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER, 'odometer'),
-        ('fix', Code.NO_FIX, 'fixes')) if slot not in mapping]
+        ('fix', Code.NO_FIX, 'fixes'))
+        if slot not in mapping and (slot != 'imu' or imu_needed(config))]
     drive = found['drive']
     if not drive:
         return out

@@ -89,6 +89,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--two-wheels', action='store_true', default=None, help='left and right odometer')
     add('--wheels', type=int, metavar='N', help='number of wheels, 1 to 8 (default 1; indoor '
         '2); more than 2 are joints of one JointState')
+    add('--drive', metavar='KIND', help='of a robot (indoor, square): differential (default), '
+        'skid or mecanum (4 wheels, sideways moves)')
+    add('--no-imu', action='store_const', const=False, dest='imu', help='a robot without an IMU')
     add('--front-fixed', action='store_const', const=False, dest='front_steers',
         help='the front ones of more than 2 wheels do not steer')
     add('--reference', metavar='KIND', help='fix (NavSatFix on /fix, default), or positions in a '
@@ -143,7 +146,7 @@ def _span(text: str) -> tuple[float, float]:
 def options_of(args: argparse.Namespace) -> 'SimOptions':
     """Return the SimOptions that parsed arguments ask for."""
     from odocal_ros.sim.options import SimOptions
-    plain = ['scenario', 'seed', 'imu_grade', 'odometer', 'two_wheels', 'wheels',
+    plain = ['scenario', 'seed', 'imu', 'imu_grade', 'odometer', 'drive', 'two_wheels', 'wheels',
              'front_steers', 'reference', 'fix_noise', 'slip_walk', *NUMBERS]
     given = {name: getattr(args, name) for name in plain if getattr(args, name) is not None}
     for name in DEGREES:

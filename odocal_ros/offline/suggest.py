@@ -7,7 +7,14 @@ from collections.abc import Collection
 
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.topics import candidates, choose_topics, named, OPTION, wanted
+from odocal_ros.library.topics import (
+    candidates,
+    choose_topics,
+    imu_needed,
+    named,
+    OPTION,
+    wanted,
+)
 from odocal_ros.messages.sensor_types import FIX
 from odocal_ros.outside.names import for_shell
 from odocal_ros.settings.config import Config, with_settings
@@ -77,7 +84,8 @@ def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str,
 def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
             mapping: dict[str, str], extra: list[str]) -> str:
     """Return the suggested replay command; '' if an input is missing."""
-    if not {'imu', 'odometer', 'fix'} <= mapping.keys():
+    needed = {'odometer', 'fix'} | ({'imu'} if imu_needed(config) else set())
+    if not needed <= mapping.keys():
         return ''
     words = ['odocal', 'replay', path]
     for slot, topic in mapping.items():

@@ -11,7 +11,7 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.output.figures import inverse, known, with_sigma
 from odocal_ros.output.file_head import head
 from odocal_ros.outside.yaml_text import parameters
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM, SKID
 from odocal_ros.settings.nominal import nominal_scale
 
 CONTROLLERS = 'ros2_controllers.yaml'
@@ -27,13 +27,7 @@ MICRO = 1e6    # definition: millionths in 1
 def controllers(calibration: Calibration, config: Config,
                 content: dict[str, Any]) -> dict[str, str]:
     """Return the file by name, nothing when no value of it was determined."""
-    blocks = {}
-    multipliers = _multipliers(calibration, config)
-    if multipliers:
-        blocks['diff_drive_controller'] = multipliers
-    radius = wheel_radius(calibration, config)
-    if radius is not None:
-        blocks |= {name: {key: radius} for name, key in RADIUS.items()}
+    blocks = _blocks(calibration, config)
     if not blocks:
         return {}
     lines = [head(calibration, content).rstrip(),
@@ -45,6 +39,22 @@ def controllers(calibration: Calibration, config: Config,
              '# Older releases call the radius rear_wheels_radius or rear_wheel_radius.']
     text = '\n'.join(lines) + '\n'
     return {CONTROLLERS: text + ''.join(parameters(v, name) for name, v in blocks.items())}
+
+
+def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any]]:
+    """Return the parameters by controller, of those that fit the drive."""
+    radius = wheel_radius(calibration, config)
+    if config.odometer.drive == MECANUM:
+        lever = known(calibration.estimates, 'rotation_lever').value
+        found = {'wheels_radius': radius, 'sum_of_robot_center_projection_on_X_Y_axis': lever}
+        own = {key: value for key, value in found.items() if value is not None}
+        return {'mecanum_drive_controller': {'kinematics': own}} if own else {}
+    multipliers = _multipliers(calibration, config)
+    blocks: dict[str, dict[str, Any]] = (
+        {'diff_drive_controller': multipliers} if multipliers else {})
+    if radius is not None and config.odometer.drive == DIFFERENTIAL:
+        blocks |= {name: {key: radius} for name, key in RADIUS.items()}
+    return blocks
 
 
 def _multipliers(calibration: Calibration, config: Config) -> dict[str, float]:
@@ -62,6 +72,8 @@ def _multipliers(calibration: Calibration, config: Config) -> dict[str, float]:
     width = known(estimates, 'track_width')
     if width.value is not None and width.sigma and config.odometer.track_width:
         out['wheel_separation_multiplier'] = width.value / config.odometer.track_width
+    elif width.value is not None and config.odometer.drive == SKID:
+        out['wheel_separation'] = width.value       # in place of the distance of the wheels
     return out
 
 

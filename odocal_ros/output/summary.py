@@ -9,7 +9,7 @@ import textwrap
 
 import numpy as np
 
-from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.calib.choice import leg_estimates, PLANAR
 from odocal_ros.calib.result import (
     AS_SENT,
     Calibration,
@@ -92,7 +92,7 @@ def values_in_words(estimates: dict[str, Estimate]) -> str:
         wheel = known(estimates, name)
         if wheel.value is not None:
             parts.append(f'{word} {with_unit(wheel)}')
-    for name, word in ANGLES.items():
+    for name, word in _angles_of(estimates).items():
         angle = known(estimates, name)
         parts.append(f'{word} mounting ' + (
             'not determined' if angle.value is None else
@@ -125,7 +125,7 @@ def _values(calibration: Calibration, width: int) -> list[str]:
     if sent.value is not None:
         lines.append(_line('  of speed as sent', _scale_text(sent)))
     lines.append(_path_ratio(calibration, scale))
-    for name, word in ANGLES.items():
+    for name, word in _angles_of(estimates).items():
         lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name), width)))
     lines += _largest_errors(calibration, width)
     wheels = _wheels(estimates)
@@ -151,6 +151,11 @@ def _values(calibration: Calibration, width: int) -> list[str]:
                         for angle in calibration.imu_rotation_rpy)
         lines.append(_line('IMU on the vehicle', f'roll, pitch, yaw {rpy} deg'))
     return [line for line in lines if line]
+
+
+def _angles_of(estimates: dict[str, Estimate]) -> dict[str, str]:
+    """Return the mounting angles that the method can have: the planar one has none."""
+    return {} if known(estimates, 'scale_factor').method == PLANAR else ANGLES
 
 
 def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:

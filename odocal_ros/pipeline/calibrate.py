@@ -23,6 +23,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.pipeline.leg_run import leg_result, run_leg
 from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.inputs import Inputs
@@ -63,6 +64,8 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
 
     """
     progress, config = progress or (lambda stage: None), settings_by_frame(leg.fix, config)
+    if is_planar(leg, config):
+        return planar_leg(leg, config, notes, progress)
     seen = screened(leg, config, notes)
     inputs = seen.inputs
 

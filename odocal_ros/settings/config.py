@@ -31,6 +31,7 @@ GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
 NAN = math.nan
 SIDES = ('left', 'right')     # names of two wheels
+DRIVES = DIFFERENTIAL, SKID, MECANUM = 'differential', 'skid', 'mecanum'
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +65,9 @@ class OdometerConfig:
                         "'topic' if it has its own topic.")
     right: str = setting('', ro=True, about='Right one of two wheels: joint name, array index, or '
                          "'topic' (odometer_right).")
+    drive: str = setting(DIFFERENTIAL, choices=DRIVES, ro=True, about='Kinematics: differential '
+                         '(cars too), skid (wheels or tracks that slide in turns) or mecanum '
+                         '(four odometer.wheels: front left, front right, rear left, rear right).')
     track_width: float = setting(0.0, 'm', 0.0, 20.0, about='Distance between the left and the '
                                  'right wheel; 0: unknown.')
 

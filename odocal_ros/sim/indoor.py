@@ -34,6 +34,12 @@ def stretches(duration: float, rng: np.random.Generator) -> list[Stretch]:
     return found
 
 
+def sideways(found: list[Stretch]) -> list[tuple[list[Piece], list[Piece], list[Piece]]]:
+    """Return stretches of a mecanum robot: every third move is to the left, with its turns."""
+    return [(hold(sum(d for d, _ in speed)), rate, speed) if k % 3 == 2 else
+            (speed, rate, hold(sum(d for d, _ in speed))) for k, (speed, rate) in enumerate(found)]
+
+
 def square() -> list[Stretch]:
     """
     Return a square of 4 m to the left, and one to the right, with stops at the corners.

@@ -9,6 +9,7 @@ import math
 from typing import Any
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.settings.config import DIFFERENTIAL, DRIVES, MECANUM
 from odocal_ros.settings.grades import Grade, GRADES
 from odocal_ros.sim.real import NONE3, Real, Vector
 from odocal_ros.sim.references import REFERENCES
@@ -40,6 +41,7 @@ class SimOptions:
     heading: float = math.radians(45.0)    # of the vehicle at the start, clockwise from north
     slope: float = 0.0                     # rad, steepest part of hills of 1 km length
 
+    imu: bool = True                       # False: the robot has none
     imu_grade: str = BY_SCENARIO
     imu_rate: float = 100.0                # Hz
     yaw: float = BY_SCENARIO   # rad, yaw mounting angle
@@ -58,6 +60,7 @@ class SimOptions:
     scale: float = BY_SCENARIO   # m/pulse, 1 or m/rad: the true value
     nominal_scale: float = BY_SCENARIO   # K0, configured by the operator
     speed_noise: float = 0.0               # m/s, white, of kind speed
+    drive: str = DIFFERENTIAL              # of a robot: or skid, mecanum (4 wheels)
     two_wheels: bool = False               # as wheels = 2
     wheels: int = BY_SCENARIO              # more than 2: joints of one JointState
     wheel_difference: float = 0.004        # K_right / K_left - 1; of more wheels 1 sigma each
@@ -161,6 +164,11 @@ def resolved(options: SimOptions) -> SimOptions:
     defaults |= REFERENCES[options.reference or defaults['reference']].usual
     options = _filled(options, defaults)
     _choice('--fix-noise', options.fix_noise, FIX_NOISES)
+    _choice('--drive', options.drive, DRIVES)
+    if options.drive != DIFFERENTIAL:
+        _choice(f'--drive {options.drive}: --scenario', options.scenario, ROBOTS)
+        options = replace(options, front_steers=False, wheelbase=options.track_width,
+                          wheels=4 if options.drive == MECANUM else options.wheels)
     if options.wheel_count > MOST_OWN_TOPICS and options.odometer == 'counts':
         options = replace(options, odometer='angle')
     scale, nominal = (INDOOR_SCALES if options.scenario in ROBOTS else SCALES)[options.odometer]

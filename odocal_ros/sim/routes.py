@@ -3,7 +3,7 @@
 
 """Named routes: speed and turn rate by time. Stops, ramps, turns; nothing of sensors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -15,10 +15,11 @@ from odocal_ros.sim.profile import chain, hold, Piece, Profile, ramp, turn
 
 @dataclass(frozen=True)
 class Route:
-    """Speed (m/s) and yaw rate (rad/s) by time, s."""
+    """Speed (m/s), yaw rate (rad/s) and velocity to the left (m/s) by time, s."""
 
     speed: Profile
     yaw_rate: Profile
+    side: Profile | None = None
 
 
 def paper(duration: float, rng: np.random.Generator) -> Route:
@@ -148,6 +149,15 @@ def square(duration: float, rng: np.random.Generator) -> Route:
     """Return a square of 4 m in both directions, as of UMBmark, with turns on the spot."""
     rest = _rest('square', duration, 10 + 8 * 17, least=5.0)
     return _route([*small.square(), (hold(rest), hold(rest))])
+
+
+def mecanum(duration: float, rng: np.random.Generator) -> Route:
+    """Return the moves of ``indoor``, every third one sideways."""
+    _rest('indoor', duration, 2 * small.STILL, least=math.ceil(3 * small.LONGEST))
+    parts = small.sideways(small.stretches(duration, rng))
+    route = _route([(speed, rate) for speed, rate, _ in parts])
+    side = chain([piece for _, _, pieces in parts for piece in pieces])
+    return replace(route, side=_clean(side.integral()))
 
 
 def _town_cycle(rng: np.random.Generator,

@@ -15,6 +15,7 @@ from odocal_ros.data.samples import (
     HeadingSamples,
     ImuSamples,
     no_heading,
+    no_imu,
     no_odometer,
     OdometerForm,
     OdometerSamples,
@@ -24,15 +25,16 @@ from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.local_frame import local_fixes
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.settings.config import MECANUM
 from odocal_ros.sim import body, real_wheels, sensors
 from odocal_ros.sim.housing import own_angles
-from odocal_ros.sim.motion import attitude, Motion, Start
+from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Profile
 from odocal_ros.sim.references import Reference, REFERENCES
 from odocal_ros.sim.road import Hills
-from odocal_ros.sim.routes import Route, ROUTES
+from odocal_ros.sim.routes import mecanum, Route, ROUTES
 from odocal_ros.sim.vehicle_wheels import wheels_of
 from odocal_ros.sim.velocity import velocity
 
@@ -129,7 +131,8 @@ class Drive:
 
 def motion_of(options: SimOptions) -> Motion:
     """Return the true motion of resolved options."""
-    route = ROUTES[options.scenario](options.duration, stream(options.seed, 'route'))
+    make = mecanum if options.drive == MECANUM else ROUTES[options.scenario]
+    route = make(options.duration, stream(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))
     real = options.real
@@ -139,7 +142,9 @@ def motion_of(options: SimOptions) -> Motion:
             if real.cross_slope or real.banking else None)
     if lean:
         more['lean'] = lean
-    if options.sway or real.sideslip or lean:
+    if route.side is not None:
+        more['sway'] = route.side, STEADY
+    elif options.sway or real.sideslip or lean:
         more['sway'] = _sway(route, options, lean)
     if real.squat or real.body_roll or real.wheelbase or lean:
         roll, pitch = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll, hills,
@@ -203,7 +208,7 @@ def simulate(options: SimOptions | None = None) -> Drive:
     imu = sensors.imu(motion, options)
     return Drive(
         options=options, motion=motion, truth=_truth(motion, options, imu),
-        form=FORMS[options.odometer], imu=imu,
+        form=FORMS[options.odometer], imu=imu if options.imu else no_imu(),
         wheels=tuple(sensors.odometers(motion, options)),
         fix=sensors.fixes(motion, options),
         heading=(no_heading() if options.heading_sigma is None

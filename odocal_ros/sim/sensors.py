@@ -23,12 +23,14 @@ from odocal_ros.nav.rotations import (
     quat_from_rotvec,
     quat_multiply,
 )
+from odocal_ros.settings.config import DIFFERENTIAL, MECANUM
 from odocal_ros.sim import body, real_fixes, real_imu, real_wheels
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
 from odocal_ros.sim.options import SIM_GRADES, SimOptions
 from odocal_ros.sim.real import NONE3
 from odocal_ros.sim.references import drift, REFERENCES, stationary_sigma
+from odocal_ros.sim.robot_wheels import robot_path
 from odocal_ros.sim.vehicle_wheels import SimWheel, steered_path, wheels_of
 
 # s from the first IMU sample, so that no two topics sample together
@@ -151,7 +153,9 @@ def _reading(state: State, options: SimOptions, wheel: SimWheel,
         rate = (contact_speed(state, arm, lean) + pulled + np.gradient(spun, state.t)) / grown
         sent = real_wheels.low_passed(rate + noise, state.t, real.speed_filter)
         return real_wheels.coarse(sent / scale, real)
-    rolled = contact_travel(state, arm, lean) + spun + real_wheels.tyre_slip(state, real)
+    path = (contact_travel(state, arm, lean) if options.drive == DIFFERENTIAL else
+            robot_path(state, options, wheel))
+    rolled = path + spun + real_wheels.tyre_slip(state, real)
     if wheel.steered:
         rolled = rolled + steered_path(state, arm)
     if np.ndim(grown):
@@ -168,6 +172,8 @@ def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
     """Return the metres a wheel has spun beyond the ground by each time: (n,)."""
     spun = np.zeros(len(state.t))
     moving = (np.abs(state.speed) > AT_REST) | (np.abs(state.yaw_rate) > AT_REST)
+    if options.drive == MECANUM:
+        moving |= np.abs(state.sway[:, 0]) > AT_REST
     steps = np.diff(state.t, prepend=state.t[:1]) * moving
     if options.slip_walk:
         walk = stream(options.seed, f'slip walk {side}')

@@ -7,9 +7,10 @@ from dataclasses import asdict
 import math
 from typing import Any
 
-from odocal_ros.settings.config import SIDES
+from odocal_ros.settings.config import DIFFERENTIAL, MECANUM, SIDES
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
+from odocal_ros.sim.robot_wheels import effective_width, SIDEWAYS
 from odocal_ros.sim.scenarios import Drive
 from odocal_ros.sim.vehicle_wheels import wheels_of
 
@@ -28,6 +29,7 @@ def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
                   'unit': drive.form.scale_unit, 'nominal': options.nominal_scale,
                   'wheels': list(truth.wheel_scales)},
         **_wheels(drive),
+        **_robot(options),
         'yaw_mounting_deg': {'value': math.degrees(truth.yaw)},
         'pitch_mounting_deg': {'value': math.degrees(truth.pitch)},
         # above by the IMU's own axes, here by its housing: equal for perpendicular axes
@@ -56,8 +58,8 @@ def _topics(drive: Drive) -> dict[str, Any]:
         odometer = '/joint_states'
     elif len(drive.wheels) > 1:
         odometer = {'left': '/odometer/left', 'right': '/odometer/right'}
-    topics = {'imu_topic': '/imu/data', 'odometer_topic': odometer,
-              'fix_topic': drive.reference.topic}
+    topics = {'imu_topic': '/imu/data'} if drive.options.imu else {}
+    topics |= {'odometer_topic': odometer, 'fix_topic': drive.reference.topic}
     return topics | ({'heading_topic': '/heading'} if len(drive.heading.stamp_ns) else {})
 
 
@@ -68,6 +70,19 @@ def _wheels(drive: Drive) -> dict[str, Any]:
                                     'steered': wheel.steered}
                        for wheel, scale in zip(wheels, drive.truth.wheel_scales, strict=True)}
             } if len(wheels) > 1 else {}
+
+
+def _robot(options: SimOptions) -> dict[str, Any]:
+    """Return the truth of a robot that slides or moves sideways."""
+    if options.drive == DIFFERENTIAL:
+        return {}
+    width = effective_width(options)
+    found = {'track_width': width}
+    if options.drive == MECANUM:
+        found |= {'lateral_scale_factor': SIDEWAYS * options.scale}
+    else:
+        found |= {'track_width_arc': effective_width(options, 2 * width)}
+    return {'robot': found}
 
 
 def _plain(value: Any) -> Any:
@@ -95,6 +110,10 @@ def settings(drive: Drive,
     grade = options.real.told_grade or options.imu_grade
     odometer: dict[str, Any] = {'nominal_scale': float(options.nominal_scale),
                       'lever_arm': _told_arm(options, 'odometer')}
+    if options.drive != DIFFERENTIAL:
+        odometer['drive'] = options.drive
+    if options.drive != DIFFERENTIAL:
+        odometer['drive'] = options.drive
     if options.wheel_count > len(SIDES):
         odometer['wheels'] = list(drive.joints)
     elif options.wheel_count > 1:

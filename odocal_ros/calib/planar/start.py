@@ -1,0 +1,113 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""First values of a planar fit: scale, track width and headings without knowing any of them."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from odocal_ros.calib.planar.problem import Run
+from odocal_ros.data.arrays import Complexes, Floats, Ints
+
+# m, 7.5 % from one to the next, and right over left wheel less 1. Judgement: of robots
+WIDTHS = np.geomspace(0.05, 3.0, 58)
+RATIOS = np.linspace(-0.03, 0.03, 13)
+MINIMA, ALIKE = 5, 1.3     # judgement: minima compared, and costs that do not differ
+SWAPPED = 0.3              # judgement: of the cost, if mirrored
+# m of wheel path in which a dead-reckoned path is compared. Judgement: several moves and turns
+WINDOW = 6.0
+
+
+class First(NamedTuple):
+    """
+    First values: scale factors of both sides, track width m, headings of nodes (n + 1,) rad.
+
+    swapped : the mirrored positions fit better, so left and right are swapped.
+    """
+
+    left: float
+    right: float
+    width: float
+    heading: Floats
+    swapped: bool
+
+
+def first_values(run: Run, width: float = 0.0) -> First:
+    """
+    Return the first values of a run; width : m, as configured, 0 unknown.
+
+    Dead-reckoned paths for each of WIDTHS and RATIOS, in windows of WINDOW, are rotated and scaled
+    onto the positions. Turns on the spot by 90 deg and by 450 deg look the same: of several
+    minima that fit about equally well the one nearest to the configured width is taken, without
+    one the largest, which has the smallest turns.
+    """
+    z = run.position[:, 0] + 1j * run.position[:, 1]
+    s = np.append(0.0, np.cumsum(run.wheels.path))[run.node]
+    rough = _rough(z, s)
+    windows = _windows(s * rough)
+
+    def aligned(x: Floats, z: Complexes = z) -> tuple[float, Complexes, Floats]:
+        turn = np.append(0.0, np.cumsum((1 + x[1] / 2) * run.wheels.right
+                                        - (1 - x[1] / 2) * run.wheels.left))
+        turn *= rough / np.exp(x[0])
+        return (*_aligned(run, z, turn, windows), turn)
+    grid = [[np.array([np.log(w), r]) for r in RATIOS] for w in WIDTHS]
+    costs, mirrored = (np.array([[aligned(x, own)[0] for x in row] for row in grid])
+                       for own in (z, z.conj()))
+    least = costs.min(axis=1)
+    padded = np.pad(least, 1, constant_values=np.inf)
+    minima = np.flatnonzero((least <= padded[:-2]) & (least <= padded[2:]))
+    found = []
+    for k in minima[np.argsort(least[minima])][:MINIMA]:
+        guess = np.array([np.log(WIDTHS[k]), RATIOS[np.argmin(costs[k])]])
+        better = minimize(lambda x: aligned(x)[0], guess, method='Nelder-Mead', options={
+            'initial_simplex': guess + [[0, 0], [0.04, 0], [0, 0.003]], 'maxfev': 80})
+        found.append((better.fun, better.x))
+    limit = ALIKE * min(cost for cost, _ in found) + len(z) * 1e-6      # (1 mm)^2 each
+    near = np.log(width or WIDTHS[-1])
+    x = min((x for cost, x in found if cost <= limit), key=lambda x: abs(x[0] - near))
+    _, factor, turn = aligned(x)
+    middle = run.node[windows.sum(axis=1) // 2]
+    heading = turn + np.interp(np.arange(len(turn)), middle, np.unwrap(np.angle(factor)))
+    scale = float(np.median(np.abs(factor)))
+    return First(scale * (1 - x[1] / 2), scale * (1 + x[1] / 2),
+                 float(np.exp(x[0])) * scale / rough, heading,
+                 bool(mirrored.min() < SWAPPED * costs.min()))
+
+
+def _rough(z: Complexes, s: Floats) -> float:
+    """Return metres per unit: the median over straight lines between positions."""
+    step = max(float(s[-1] - s[0]) / 200, 1e-12)
+    at = np.unique(np.searchsorted(s, np.arange(s[0], s[-1], step)))
+    ratio = np.abs(np.diff(z[at])) / np.diff(s[at])
+    return float(np.percentile(ratio, 75))
+
+
+def _windows(s: Floats) -> Ints:
+    """Return first and last + 1 position of each window: (w, 2)."""
+    begins = np.arange(s[0], max(s[-1] - WINDOW / 2, s[0] + 1e-9), WINDOW / 2)
+    spans = np.stack([np.searchsorted(s, begins), np.searchsorted(s, begins + WINDOW)], -1)
+    fewest = 3
+    spans = spans[spans[:, 1] - spans[:, 0] >= fewest]
+    return spans if len(spans) else np.array([[0, len(s)]])
+
+
+def _aligned(run: Run, z: Complexes, turn: Floats, windows: Ints) -> tuple[float, Complexes]:
+    """Return the sum of squared residuals of windows, m^2, and scale and rotation of each."""
+    w, middle = run.wheels, (turn[1:] + turn[:-1]) / 2
+    step = ((w.left + w.right) / 2 + 1j * w.lateral) * np.exp(1j * middle)
+    path = np.append(0.0, np.cumsum(step))[run.node]
+    count = np.diff(windows, axis=1)[:, 0]
+
+    def sums(x: Complexes) -> Complexes:
+        total = np.append(0.0, np.cumsum(x))
+        out: Complexes = total[windows[:, 1]] - total[windows[:, 0]]
+        return out
+    x, y = path - path.mean(), z - z.mean()
+    power = (sums(np.abs(x)**2) - np.abs(sums(x))**2 / count).real
+    target = (sums(np.abs(y)**2) - np.abs(sums(y))**2 / count).real
+    cross = sums(x.conj() * y) - sums(x).conj() * sums(y) / count
+    factor = cross / np.maximum(power, 1e-30)
+    return float((target - np.abs(factor)**2 * power).sum()), factor

@@ -1,0 +1,158 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A leg for the planar estimator: wheels without an IMU, skid steering, mecanum wheels."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.calib.choice import PLANAR
+from odocal_ros.calib.failed import failed, raised_if_wild
+from odocal_ros.calib.planar.drive import Wheels
+from odocal_ros.calib.planar.problem import Fit, Known, Run
+from odocal_ros.calib.planar.result import refused, result_of
+from odocal_ros.calib.result import LegResult, MethodResult
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.leg import Leg
+from odocal_ros.errors import OdocalError
+from odocal_ros.nav.integral import integral_at
+from odocal_ros.pipeline.leg_run import leg_result
+from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.screening.screen import Inputs, screen
+from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM
+from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.nominal import nominal_scale
+
+LEAST_NODE, MOST_NODES = 0.1, 20_000      # s between nodes, judgement: 0.1 rad of a turn
+FEWEST_POSITIONS = 10       # judgement: as for other methods
+MECANUM_WHEELS = 4     # definition
+# rad/sqrt(s), judgement: tilt and vibration of a robot, which the grade does not have
+GYRO_LEAST = 1e-3
+# codes of an IMU that the planar estimator can do without
+OF_IMU = {Code.NO_IMU, Code.NO_ACCELEROMETER, Code.IMU_GAP, Code.LOCAL_FRAME}
+
+
+def is_planar(leg: Leg, config: Config) -> bool:
+    """Return True for a leg of the planar estimator: several wheels and no IMU, or its drives."""
+    several = len(leg.wheel_slots) > 1
+    return config.odometer.drive != DIFFERENTIAL or several and not len(leg.imu.stamp_ns)
+
+
+def planar_leg(leg: Leg, config: Config, notes: Sequence[Reason],
+               progress: Callable[[Stage], None]) -> LegResult:
+    """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
+    inputs, found = screen(leg, config, judged=False)
+    reasons = [*notes, *(r for r in found if r.code not in OF_IMU)]
+    progress(Stage(PLANAR))
+    run, lacking = _run_of(inputs, config)
+    if run is None:
+        methods = {PLANAR: refused(lacking, inputs.scale_unit)}
+        return leg_result(leg, inputs, (*reasons, *lacking), methods, deciding=(PLANAR,))
+    method, more = _guarded(run, inputs, config)
+    return leg_result(leg, inputs, reasons, {PLANAR: method}, deciding=(PLANAR,), **more)
+
+
+def _guarded(run: Run, inputs: Inputs, config: Config) -> tuple[MethodResult, dict[str, Any]]:
+    """Return the method's result and what a report draws; what breaks costs the method alone."""
+    from odocal_ros.calib.planar.fit import fit
+    unit = inputs.scale_unit
+
+    def unknown(why: Reason) -> MethodResult:
+        return refused([why], unit)
+    try:
+        with raised_if_wild():
+            found = fit(run, _known(run, inputs, config))
+            method = result_of(found, unit, nominal_scale(config, unit), config)
+            return method, _tracks(run, found)
+    except (FloatingPointError, np.linalg.LinAlgError) as error:
+        return unknown(Reason(Code.NOT_CONVERGED, f'{PLANAR} diverged ({error}). Likely cause: '
+                              'the wheels do not belong to the positions')), {}
+    except (OdocalError, MemoryError):
+        raise
+    except Exception as error:
+        return failed(unknown, PLANAR, error), {}
+
+
+def _run_of(inputs: Inputs, config: Config) -> tuple[Run | None, list[Reason]]:
+    """Return the run on nodes, or None and why."""
+    travels, kind = inputs.travels, config.odometer.drive
+    needed = MECANUM_WHEELS if kind == MECANUM else 2
+    even = len(travels) % 2 == 0 and len(travels) >= needed
+    if not even or kind == MECANUM and len(travels) != MECANUM_WHEELS:
+        return None, [Reason(Code.NO_ODOMETER, f'{kind} drive: {max(len(travels), 1)} wheels with '
+                             f'known sides; required: {needed}',
+                             'Name the wheels in odometer.wheels, left before right of each axle '
+                             'from front to rear.')]
+    low = max(0.0, *(one.t[0] for one in travels))
+    high = min(inputs.t_stop, *(one.t[-1] for one in travels))
+    inside = np.flatnonzero((inputs.t_fix >= low) & (inputs.t_fix <= high))
+    if len(inside) < FEWEST_POSITIONS:
+        return None, [Reason(Code.NO_FIX, f'{len(inside)} positions while the wheels have data; '
+                             f'required: {FEWEST_POSITIONS}')]
+    t, node, used = _nodes(inputs.t_fix[inside])
+    used = inside[used]
+    place = np.nan_to_num(inputs.geodetic)
+    position = origin_amid(inputs.t_fix, inputs.geodetic).to_n(place[used])[:, :2]
+    covariance = inputs.covariance_n[used]
+    sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
+    steps = np.array([np.diff(one.at(t)) for one in travels])
+    left, right = steps[::2].mean(axis=0), steps[1::2].mean(axis=0)
+    lateral = (steps[1] - steps[0] + steps[2] - steps[3]) / 4 if kind == MECANUM else 0 * left
+    if not (np.abs(left) + np.abs(right)).any():
+        return None, [Reason(Code.ODOMETER_STILL, 'the wheels do not turn during the leg')]
+    return Run(t, Wheels(left, right, lateral, kind), node, position, sigma,
+               _gyro(inputs, t)), []
+
+
+def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
+    """Return times of nodes, those with a position, and the positions: at most one each 0.1 s."""
+    gap = max(LEAST_NODE, float(t_fix[-1] - t_fix[0]) / MOST_NODES)
+    slot = np.floor((t_fix - t_fix[0]) / gap + 1e-6)
+    used = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0)
+    kept = t_fix[used]
+    parts = np.maximum(np.ceil(np.diff(kept) / (1.5 * gap)), 1).astype(np.int64)
+    first = np.repeat(np.append(0, np.cumsum(parts)[:-1]), parts)
+    share = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)
+    t = np.append(np.repeat(kept[:-1], parts) + share * np.repeat(np.diff(kept), parts), kept[-1])
+    return t, np.append(0, np.cumsum(parts)), used
+
+
+def _gyro(inputs: Inputs, t: Floats) -> Floats:
+    """Return the integral of the turn rate about the up axis in each interval, () without."""
+    if not inputs.felt or len(inputs.t_imu) < 2 or inputs.t_imu[0] > t[0] \
+            or inputs.t_imu[-1] < t[-1]:
+        return np.empty(0)
+    up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
+    out: Floats = np.diff(integral_at(t, inputs.t_imu, inputs.w_b @ up_b))
+    return out
+
+
+def _known(run: Run, inputs: Inputs, config: Config) -> Known:
+    """Return the priors of the constants by the settings."""
+    antenna, odometer = config.gnss.lever_arm, config.odometer.lever_arm
+    known: dict[str, Any] = {
+        'width': config.odometer.track_width * (run.wheels.kind != MECANUM), 'offset_sigma': max(
+            config.gnss.lever_arm_sigma, 1e-3), 'delay_sigma': config.gnss.time_sigma,
+        'offset': (antenna[0] - odometer[0], antenna[1] - odometer[1])}
+    if len(run.gyro):
+        grade = grade_of(config.imu)
+        known |= {'gyro_noise': max(grade.gyro_noise, GYRO_LEAST),
+                  'gyro_scale_sigma': max(grade.gyro_scale_error, 1e-6),
+                  'gyro_bias_sigma': max(grade.gyro_bias, 1e-6)}
+    if config.gnss.correlation_time > 0:
+        moved = np.linalg.norm(np.diff(run.position, axis=0), axis=1).sum()
+        known['drift_length'] = config.gnss.correlation_time * moved / (run.t[-1] - run.t[0])
+    return Known(**known)
+
+
+def _tracks(run: Run, found: Fit) -> dict[str, Any]:
+    """Return distance, the path of the fit and the positions, for reports."""
+    pose = found.pose
+    flat = np.column_stack([pose[:, :2], np.zeros(len(pose))])
+    step = np.linalg.norm(np.diff(pose[:, :2], axis=0), axis=1)
+    return {'distance': float(step.sum()), 'track_n': flat,
+            'reference_n': np.column_stack([run.position, np.zeros(len(run.position))])}

@@ -1,0 +1,153 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The planar estimate: closed forms, truth within sigma, the bound by the information."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.calib.planar.drive import Wheels
+from odocal_ros.calib.planar.fit import fit, LEVELS, noise_path
+from odocal_ros.calib.planar.problem import Known, Run
+
+LEFT, RIGHT, WIDTH = 0.0352, 0.0349, 0.31     # m/rad, m
+STEP = 0.1      # s
+
+
+def body(moves):
+    """Return body increments (n, 3) of moves (forward m, left m, turn rad), 0.1 m or rad each."""
+    parts = [np.zeros((20, 3))]
+    for move in moves:
+        n = max(2, round(float(np.abs(move).max()) / 0.1))
+        parts += [np.tile(np.array(move) / n, (n, 1)), np.zeros((5, 3))]
+    return np.concatenate(parts)
+
+
+def run_of(d, kind='differential', arc=0.0, lateral=0.03, slip=0.0, noise=1e-4, every=1, rng=None):
+    """Return a Run of body increments; slip m/sqrt(m) of each wheel, noise m of positions."""
+    turn = np.append(0.0, np.cumsum(d[:, 2])) + 0.3
+    chord = (d[:, 0] + 1j * d[:, 1]) * np.sinc(d[:, 2] / (2 * np.pi))
+    z = np.append(0.0, np.cumsum(chord * np.exp(1j * (turn[1:] + turn[:-1]) / 2)))
+    lateral_counts = d[:, 1] / lateral
+    apart = d[:, 2] * WIDTH
+    for _ in range(50 * bool(arc)):     # the width depends on the wheels
+        straight = Wheels((d[:, 0] - apart / 2) / LEFT, (d[:, 0] + apart / 2) / RIGHT, 0 * apart,
+                          'skid').straightness
+        apart = d[:, 2] / (1 / WIDTH + arc * straight)
+    metres = np.stack([d[:, 0] - apart / 2, d[:, 0] + apart / 2])
+    if slip:
+        metres = metres + slip * np.sqrt(np.abs(metres)) * rng.standard_normal(metres.shape)
+    left, right = metres / np.array([[LEFT], [RIGHT]])
+    node = np.arange(0, len(z), every)
+    position = np.stack([z.real, z.imag], -1)[node]
+    if rng is not None:
+        position = position + noise * rng.standard_normal(position.shape)
+    return Run(STEP * np.arange(len(z)), Wheels(left, right, lateral_counts, kind), node, position,
+               np.full(len(node), noise))
+
+
+SQUARES = [m for side in (1, -1) for _ in range(4) for m in ((2, 0, 0), (0, 0, side * np.pi / 2))]
+SQUARES += [(2, 0, 0)]
+
+
+def value(found, name):
+    """Return value and sigma of a constant."""
+    i = found.names.index(name)
+    return found.value[i], np.sqrt(found.covariance[i, i])
+
+
+def test_umbmark_squares_give_ratio_and_width_exactly():
+    """No noise: squares in both directions, where ratio and width act differently."""
+    found = fit(run_of(body(SQUARES)), Known())
+    assert found.converged
+    assert_allclose(found.value[:3], (LEFT, RIGHT, 1 / WIDTH), rtol=2e-7)
+    assert_allclose(found.value[3:6], 0.0, atol=2e-7)
+
+
+def test_offset_of_the_tracked_point_is_estimated_exactly():
+    """A point 0.1 m ahead and 0.05 m right of the axle moves as the robot turns."""
+    run = run_of(body(SQUARES))
+    psi = np.append(0.0, np.cumsum(body(SQUARES)[:, 2])) + 0.3
+    arm = (0.1 - 0.05j) * np.exp(1j * psi)
+    run = replace(run, position=run.position + np.stack([arm.real, arm.imag], -1))
+    found = fit(run, Known())
+    assert_allclose(found.value[3:5], (0.1, -0.05), atol=1e-5)
+    assert_allclose(found.value[2], 1 / WIDTH, rtol=1e-5)
+
+
+def test_mecanum_straight_sideways_and_turn_are_exact():
+    """Each motion has its own constant; the run has all three."""
+    moves = [(2, 0, 0), (0, 1.5, 0), (0, 0, 2), (-1, 0, 0), (0, -1, 0), (0, 0, -1.5), (1, 1, 0)]
+    found = fit(run_of(body(moves * 2), 'mecanum', lateral=0.031), Known())
+    assert_allclose(found.value[:4], (LEFT, RIGHT, 1 / WIDTH, 0.031), rtol=1e-6)
+    assert abs(value(found, 'cross')[0]) < 1e-6
+
+
+def test_width_of_skid_steering_on_the_spot_and_on_arcs_is_exact():
+    """Turns on the spot and arcs of two radii: the width changes by a third."""
+    moves = SQUARES + [(2, 0, 1.2), (1.5, 0, -0.8), (2, 0, -2.0), (1, 0, 2.0)]
+    found = fit(run_of(body(moves), 'skid', arc=1.0), Known())
+    assert_allclose(found.value[:4], (LEFT, RIGHT, 1 / WIDTH, 1.0), rtol=1e-5)
+
+
+def test_gyro_scale_and_bias_are_exact():
+    """The gyro reads 2 % too much and drifts by 0.01 rad/s."""
+    run = run_of(body(SQUARES))
+    turn = body(SQUARES)[:, 2]
+    found = fit(replace(run, gyro=1.02 * turn + 0.01 * STEP), Known())
+    assert_allclose(1 + value(found, 'gyro_scale')[0], 1 / 1.02, rtol=1e-5)
+    assert_allclose(value(found, 'gyro_bias')[0], 0.01 / 1.02, rtol=1e-3)
+
+
+def test_sigma_is_the_bound_of_a_straight_run():
+    """
+    Positions at both ends only, and a gyro that says straight: one equation for the scale.
+
+    Variance of the distance: two white errors, the change of the drift, slip along the path.
+    """
+    run = run_of(body([(8, 0, 0)]))
+    run = replace(run, node=run.node[[0, -1]], position=run.position[[0, -1]],
+                  sigma=np.array([0.01, 0.02]), gyro=np.zeros(len(run.t) - 1))
+    known = Known(offset_sigma=1e-6, delay_sigma=1e-6, gyro_noise=1e-6, gyro_bias_sigma=1e-6)
+    found = fit(run, known)
+    path = noise_path(run, LEFT)
+    level = {name: sigma**2 for name, sigma in found.levels.items()}
+    student = 6 / 8         # information of Student's distribution
+    variance = (level['white'] / student * (0.01**2 + 0.02**2)
+                + 2 * level['drift'] / student * (1 - np.exp(-path.sum() / known.drift_length))
+                + level['along'] * path.sum())
+    mean = np.array([0.5, 0.5])
+    sigma = np.sqrt(mean @ found.covariance[:2, :2] @ mean)
+    # prior of each factor, 0.35
+    information = 8**2 / variance + 2 / 0.35**2
+    assert_allclose(sigma / LEFT, information**-0.5, rtol=2e-2)
+    assert level['along'] == pytest.approx(LEVELS['along'], rel=0.5)
+
+
+@pytest.mark.parametrize('kind', ['differential', 'skid', 'mecanum'])
+def test_truth_is_within_sigma(kind):
+    """Ten runs with slip and noise: the rms of error over sigma is that of ten draws."""
+    sideways = [(0, 1, 0), (0, -1.2, 0)] * (kind == 'mecanum')
+    arcs = [(2, 0, 1.2), (2, 0, -1.5)]
+    off = []
+    for seed in range(10):
+        rng = np.random.default_rng(100 + seed)
+        d = body((SQUARES + arcs + sideways) * 2)
+        found = fit(run_of(d, kind, arc=0.5 * (kind == 'skid'), slip=3e-3, noise=0.005, every=2,
+                           rng=rng), Known())
+        truth = {'left': LEFT, 'right': RIGHT, 'curvature': 1 / WIDTH, 'arc': 0.5,
+                 'lateral': 0.03, 'cross': 0.0}
+        off.append([(value(found, n)[0] - truth[n]) / value(found, n)[1]
+                    for n in run_names(found)])
+    rms = np.sqrt(np.mean(np.square(off), axis=0))
+    # the rms of 10 is 1 +- 0.22; left and right are nearly one draw
+    assert (rms < 1.6).all(), rms
+    assert (rms > 0.4).all(), rms
+
+
+def run_names(found):
+    """Return the constants of the wheels."""
+    return found.names[:found.names.index('ahead')]
