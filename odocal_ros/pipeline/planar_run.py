@@ -22,7 +22,8 @@ from odocal_ros.pipeline.leg_run import leg_result
 from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
-from odocal_ros.screening.screen import Inputs, screen
+from odocal_ros.screening.inputs import Inputs
+from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.nominal import nominal_scale
