@@ -39,9 +39,7 @@ def peak_of_a_pass(duration):
     return len(state.t), peak
 
 
-def test_a_longer_leg_costs_a_pass_little(monkeypatch):
-    # what is made of a short leg is kept, what is made of a long one is not
-    monkeypatch.setattr('odocal_ros.calib.smoother.chain.SHORT_LEG', 0)
+def test_a_longer_leg_costs_a_pass_little():
     # whole blocks of 64 intervals both times: what is worked in at a time is the same
     (few, small), (many, large) = peak_of_a_pass(384.0), peak_of_a_pass(1152.0)
     assert many - few > 700

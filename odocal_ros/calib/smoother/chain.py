@@ -13,9 +13,8 @@ An hour has thousands of blocks. The equations, their elimination and the covari
 memory in turn, which is in mapped files for long legs.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -27,7 +26,6 @@ from odocal_ros.errors import OdocalError
 
 Floats = NDArray[np.float64]
 LET_GO_AFTER = 512          # judgement: intervals between releases of mapped memory
-SHORT_LEG = 1200            # judgement: intervals up to which all joint marginals are stored
 
 
 class NotPositive(OdocalError):
@@ -151,13 +149,6 @@ class JointMarginals:
 
     def of(self, rows: Ints) -> Floats:
         """Return the covariances of the intervals of an index array: (r, 2n + m, 2n + m)."""
-        return self._made(rows) if len(self) > SHORT_LEG else self._whole[rows]
-
-    @cached_property
-    def _whole(self) -> Floats:
-        return self._made(np.arange(len(self)))
-
-    def _made(self, rows: Ints) -> Floats:
         n, size = self._own.shape[1], self._across.shape[2] + self._own.shape[1]
         out = np.empty((len(rows), size, size))
         across, after = self._across[rows], self._across[rows + 1][:, :, n:]
@@ -173,18 +164,35 @@ class JointMarginals:
         own = [np.einsum('kii->ki', self._own[rows]) for rows in blocks(len(self._own))]
         return np.concatenate(own)
 
-    def blocks(self) -> Iterator[tuple[slice, Floats]]:
-        """Yield slices of intervals and their covariances."""
-        for rows in blocks(len(self)):
-            at = np.arange(rows.start, rows.stop)
-            yield rows, self._made(at) if len(self) > SHORT_LEG else self._whole[rows]
+    def with_next(self) -> Floats:
+        """Return the covariance of each unknown with itself in the next block: (N - 1, n)."""
+        n = self._own.shape[1]
+        return np.concatenate([np.einsum('kii->ki', self._across[rows, :, :n])
+                               for rows in blocks(len(self))])
 
-    def entries(self, i: Sequence[int] | Ints, j: Sequence[int] | Ints) -> Floats:
-        """Return the entries of index arrays i, j of each interval: (N - 1, len(i))."""
-        out = np.empty((len(i), len(self)))
-        for rows, block in self.blocks():
-            out[:, rows] = block[:, i, j].T
-        return out.T
+    def variances_of(self, rows: Ints | slice, own: Floats, border: Floats,
+                     ahead: Floats | None = None, of: slice = slice(None)) -> Floats:
+        """
+        Return the variances of sums over the unknowns of some intervals: (k, c).
+
+        own, border : (k, n, c), (k, m, c) factors of block and border.   ahead : (k, a, c) of the
+        unknowns ``of`` of the next block.
+        """
+        n, across = own.shape[1], self._across[rows]
+        by_own = self._own[rows] @ own + 2 * (across[:, :, n:] @ border)
+        by_border = self._corner @ border
+        if ahead is not None:
+            ends = slice(rows.start + 1, rows.stop + 1) if isinstance(rows, slice) else rows + 1
+            by_own += 2 * (across[:, :, :n][:, :, of] @ ahead)
+            by_ahead = self._own[ends][:, of, of] @ ahead
+            by_ahead += 2 * (self._across[ends][:, of, n:] @ border)
+        out: Floats = (own * by_own).sum(axis=1) + (border * by_border).sum(axis=1)
+        return out if ahead is None else out + (ahead * by_ahead).sum(axis=1)
+
+    def blocks(self) -> Iterator[Floats]:
+        """Yield the covariances of some intervals after others: (k, 2n + m, 2n + m)."""
+        for rows in blocks(len(self)):
+            yield self.of(np.arange(rows.start, rows.stop))
 
 
 def blocks(n: int) -> Iterator[slice]:

@@ -129,7 +129,7 @@ class Factor:
     def all_with_wanted(self, marginals: JointMarginals) -> Floats:
         """Return the cross-covariance for all intervals: (K, 3, 2n + M)."""
         # copies: a view of a few rows would keep the whole block in memory
-        return np.concatenate([self.with_wanted(block).copy() for _, block in marginals.blocks()])
+        return np.concatenate([self.with_wanted(block).copy() for block in marginals.blocks()])
 
 
 class ChunkedSum:

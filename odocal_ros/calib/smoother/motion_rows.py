@@ -190,17 +190,19 @@ class MotionRows(Factor):
         """
         if self._found is None or self._found[0]() is not marginals:
             estimates, variances = np.empty((2, len(self.r), len(self.noise.component)))
-            for rows, block in marginals.blocks():
+            n = self.n
+            for rows in blocks(len(self.r)):
                 A, Y = self._units(rows)
                 estimates[rows] = np.einsum('kic,ki->kc', A, self.r[rows])
-                variances[rows] = (A**2).sum(axis=1) - (Y * (block @ Y)).sum(axis=1)
+                variances[rows] = (A**2).sum(axis=1) - marginals.variances_of(
+                    rows, Y[:, :n], Y[:, 2 * n:], Y[:, n:2 * n])
             self._found = ref(marginals), estimates, variances
         return self._found[1:]
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         """Yield the effects of the unit noises of each level."""
         units, given = [], []
-        for rows, block in marginals.blocks():
+        for rows, block in zip(blocks(len(self.r)), marginals.blocks(), strict=True):
             cross = self.with_wanted(block)
             units.append(cross @ self._units(rows)[1])
             given.append(cross @ np.swapaxes(self.J[rows], 1, 2)

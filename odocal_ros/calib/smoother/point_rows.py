@@ -182,7 +182,7 @@ class PointRows(Factor):
         """Return the quadratic sum and its expectation for each level."""
         if len(self.k) < FEWEST_JUDGED:
             return {}
-        taken = np.concatenate([self._taken(marginals.of(present), gather)
+        taken = np.concatenate([self._taken(marginals, present, gather)
                                 for present, gather in self._intervals()])
         known = np.broadcast_to(self.known(), self.r.shape)
         r2 = np.where(known, self.r, 0.0)**2 * self.per_effective
@@ -210,16 +210,12 @@ class PointRows(Factor):
         out.border[:, columns] += border.sum
         out.square[columns, columns] += np.einsum('kdi,kdi->i', q, q)
 
-    def _taken(self, block: Floats, gather: Gather) -> Floats:
+    def _taken(self, marginals: JointMarginals, present: Ints, gather: Gather) -> Floats:
         """Return the part of the row variances that the unknowns fit: (k, most, d)."""
-        (own, end), J = self._columns(), gather(self.J)
-        taken = ((J @ block[:, own[:, None], own]) * J).sum(axis=2)
-        if self.J_end is not None:
-            B = gather(self.J_end)
-            taken = taken + 2 * ((J @ block[:, own[:, None], end]) * B).sum(axis=2)
-            taken = taken + ((B @ block[:, end[:, None], end]) * B).sum(axis=2)
-        out: Floats = taken.reshape(len(block), -1, self.r.shape[1])
-        return out
+        J = np.swapaxes(gather(self.J), 1, 2)
+        end = None if self.J_end is None else np.swapaxes(gather(self.J_end), 1, 2)
+        taken = marginals.variances_of(present, J[:, :self.n], J[:, self.n:], end, SLOW)
+        return taken.reshape(len(present), -1, self.r.shape[1])
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         """Yield the effect of a unit error of each row."""

@@ -106,9 +106,8 @@ class SlowError(Factor):
 
     def _variances(self, marginals: JointMarginals) -> tuple[Floats, Floats, Floats]:
         """Return covariances: of the value before, with that after, of driving noise: (K, 3)."""
-        i, n, a = np.arange(SLOW.start, SLOW.stop), self.n, self.decay
-        both_ends = marginals.entries(np.r_[i, i, n + i], np.r_[i, n + i, n + i])
-        before, both, after = np.split(both_ends, 3, axis=1)
+        own, both, a = marginals.variances()[:, SLOW], marginals.with_next()[:, SLOW], self.decay
+        before, after = own[:-1], own[1:]
         return before, both, after + a**2 * before - 2 * a * both
 
     def jumps(self, marginals: JointMarginals) -> Floats:

@@ -56,8 +56,7 @@ class TravelError(Factor):
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """Return the quadratic sum and its expectation for the level, in motion."""
         e, moving = self.variance, ~self.still
-        last = marginals[-1][self.n + E, self.n + E]
-        spread = np.append(marginals.entries([E], [E])[:, 0], last)
+        spread = marginals.variances()[:, E]
         x = self.state.travel_error[moving]
         return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
 
