@@ -32,8 +32,8 @@ WEIGHTS = {Verdict.REJECTED: 'rejects', Verdict.CAUTION: 'caution', Verdict.ACCE
 MEANINGS: dict[str, dict[Code, str]] = {
     'Input data': {
         Code.NO_IMU: 'There is no usable IMU message between the marks, or all turn rates are '
-        'zero. Without turn rates there is no track, except with two or more wheels on a level floor '
-        '([indoor.md](indoor.md)).',
+        'zero. Without turn rates there is no track, except with two or more wheels on a level '
+        'floor ([indoor.md](indoor.md)).',
         Code.NO_ACCELEROMETER: 'Every acceleration of the IMU is zero, NaN, or marked as missing '
         '(`linear_acceleration_covariance[0]` of -1), as for a yaw rate from a bus. The scale is '
         'estimated from gyro, odometer and fixes, with 0.05 % in its sigma for unmodelled '
