@@ -20,7 +20,7 @@ from odocal_ros.data.arrays import Floats
 # in a metre, robots by less to the side; references: of the levels of a SLAM
 LEVELS = {'along': 2e-3**2, 'side': 1e-3**2, 'turn': 4e-3**2, 'spin': 4e-3**2, 'drift': 1e-2**2,
           'white': 1.0, 'gyro': 1.0}
-FREE = tuple(LEVELS)[:-1]       # the level of the gyro is its specification
+ESTIMATED = tuple(LEVELS)[:-1]       # the level of the gyro is its specification
 # of the logarithm of a variance, judgement
 WIDE, SPREAD = 3.0, dict.fromkeys(('along', 'turn', 'spin'), 1.0)
 # of Student's distribution of white errors and of the steps of correlated ones, for outliers and
@@ -70,7 +70,7 @@ def fit(run: Run, known: Known) -> Fit:
     names = (*run.wheels.names, 'ahead', 'left_of', 'delay',
              *(('gyro_scale', 'gyro_bias') if len(run.gyro) else ()))
     return Fit(names, c, covariance, state[:, :3],
-               {name: float(np.sqrt(theta[name])) for name in FREE}, passes, converged,
+               {name: float(np.sqrt(theta[name])) for name in ESTIMATED}, passes, converged,
                at_first.swapped)
 
 
@@ -119,7 +119,7 @@ def _level_steps(parts: dict[str, Equations], left: dict[str, Rows], theta: dict
     determinant by the logarithm of its weight.
     """
     steps, h, whole = {}, 1e-3, solved.log_determinant()
-    for name in FREE:
+    for name in ESTIMATED:
         other = _solved(parts, theta | {name: theta[name] * np.exp(-h)}, prior, 0 * prior)
         freedom = left[name].count - (other.log_determinant() - whole) / h
         chi2 = left[name].square() / theta[name]
