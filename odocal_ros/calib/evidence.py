@@ -3,7 +3,7 @@
 
 """What a person looks at to trust a leg: tracks, residuals, speed, scale by section, fixes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from odocal_ros.calib.drive import rate_over_second
 from odocal_ros.calib.marks import MarkFix, Path
 from odocal_ros.calib.sections import Sections, sections
 from odocal_ros.calib.speed_scale import NO_BINS, speed_scale, SpeedScale
+from odocal_ros.calib.window_scale import NO_WINDOWS, window_scale
 from odocal_ros.data.arrays import Bools, Complexes, Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row, chunks
@@ -55,6 +56,8 @@ class Evidence:
     gaps: tuple[tuple[str, float, float], ...] = ()   # of Imu and odometer: which, begin, end
     t_fit: float = np.inf                # s: what comes after it was kept back from the fit
     by_speed: SpeedScale = SpeedScale(NO_BINS)     # of the odometer as sent
+    # (w, 4) as window_scale
+    by_window: Floats = field(default_factory=lambda: NO_WINDOWS)
 
 
 def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools, pin: MarkFix,
@@ -99,7 +102,8 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
         sections=sections(fix_distance, fixed_n, fix_n, sigma),
         t_excluded=t_out[x], excluded_because=tuple(because[i] for i in x),
         fixes=len(t_fix), excluded=len(because), gaps=_gaps(inputs, span, config),
-        t_fit=t_fit, by_speed=speed_scale(t_fix, fix_n, fixed_n, fix_distance, inputs.travel))
+        t_fit=t_fit, by_speed=speed_scale(t_fix, fix_n, fixed_n, fix_distance, inputs.travel),
+        by_window=window_scale(t_fix, fix_n, fixed_n))
 
 
 def _gaps(inputs: Inputs, span: tuple[float, float],

@@ -11,7 +11,7 @@ import numpy as np
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.output.plots_speed import by_speed
+from odocal_ros.output.plots_speed import by_speed, by_window
 from odocal_ros.output.plots_svg import (
     BAND,
     BLUE,
@@ -62,6 +62,8 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
         figures.append(_sections(found, name, scale_sigma))
     if len(found.by_speed.bins):
         figures.append(by_speed(found.by_speed, name))
+    if len(found.by_window):
+        figures.append(by_window(found.by_window, name))
     figures.append(_motion(found, name))
     if len(found.t_fix) or len(found.t_excluded):
         figures.append(_fixes(found, name))

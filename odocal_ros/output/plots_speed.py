@@ -1,13 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The figure of the scale against speed, with the fit of factor, offset and lag."""
+"""The figures of the scale against speed, with a fit, and against the length of the window."""
 
 from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.speed_scale import SpeedScale
+from odocal_ros.data.arrays import Floats
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.plots_svg import BLUE, Drawing, GREY, key, RED, sheet, svg
 
@@ -48,3 +49,20 @@ def by_speed(found: SpeedScale, name: str) -> Drawing:
     says = ('Path length by the fixes over the odometer as sent, each point a group of sections '
             f'of a few seconds. A constant factor is a level line. {fit}.')
     return 'Scale against speed', says, svg(figure, f'{name}-by-speed', says)
+
+
+def by_window(found: Floats, name: str) -> Drawing:
+    """Return the figure of the scale by windows of a leg, as ``by_speed``; found : (w, 4)."""
+    length, excess, sigma, _ = found.T
+    figure, (ax,) = sheet(2.7)
+    ax.axhline(0.0, color=GREY, linewidth=0.8, linestyle='--')
+    ax.errorbar(length, 100 * excess, 100 * sigma, fmt='o-', color=BLUE, markersize=4.5,
+                capsize=3, linewidth=1.1)
+    ax.set(xscale='log', xlabel='length of the window, s', ylabel='fixes / track - 1, %')
+    ax.set_xticks(length, [f'{x:g}' for x in length], minor=False)
+    ax.set_xticks([], minor=True)
+    says = ('Displacement by the fixes over that of the calibrated track, in windows of seconds '
+            'to minutes, ± their scatter over eight parts of the leg. A level line at 0: errors '
+            'of the fixes do not depend on the motion. Short windows that differ: the fixes '
+            'contain an odometer, the receiver filters, or the fixes are late.')
+    return 'Scale against the length of the window', says, svg(figure, f'{name}-by-window', says)

@@ -22,7 +22,7 @@ from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.output import plots_compare, report
 from odocal_ros.output.files import as_json, write_results
 from odocal_ros.output.plots import _biases, leg_figures
-from odocal_ros.output.plots_speed import by_speed
+from odocal_ros.output.plots_speed import by_speed, by_window
 from odocal_ros.output.plots_svg import look
 from odocal_ros.output.report import report_html, report_or_why
 from odocal_ros.settings.config import Config, with_settings
@@ -391,6 +391,15 @@ def test_the_scale_against_speed_is_drawn_with_its_fit(good):
     assert drawn.startswith('<svg')
     with look():
         assert 'No fit: the speed varies too little' in by_speed(SpeedScale(bins), 'leg1')[1]
+
+
+def test_the_scale_against_the_length_of_the_window_is_drawn():
+    found = np.array([[2.0, 4e-3, 1e-3, 300], [20.0, 1e-3, 1e-3, 30], [200.0, 0.0, 1e-3, 12]])
+    with look():
+        title, says, drawn = by_window(found, 'leg1')
+    assert title == 'Scale against the length of the window'
+    assert 'the fixes contain an odometer' in says
+    assert all(f'>{length}<' in drawn for length in (2, 20, 200))
 
 
 def test_a_panel_without_data_is_not_drawn():
