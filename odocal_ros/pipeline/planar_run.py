@@ -31,6 +31,8 @@ from odocal_ros.settings.nominal import nominal_scale
 LEAST_NODE, MOST_NODES = 0.1, 20_000      # s between nodes, judgement: 0.1 rad of a turn
 FEWEST_POSITIONS = 10       # judgement: as for other methods
 MECANUM_WHEELS = 4     # definition
+# m and sigmas of a height between places for a slope, judgement: longer than a room is high
+SLOPE_LENGTH, SLOPE_SIGMAS = 5.0, 30.0
 # rad/sqrt(s), judgement: tilt and vibration of a robot, which the grade does not have
 GYRO_LEAST = 1e-3
 # codes of an IMU that the planar estimator can do without
@@ -67,11 +69,13 @@ def _guarded(run: Run, inputs: Inputs, config: Config) -> tuple[MethodResult, di
     try:
         with raised_if_wild():
             found = fit(run, _known(run, inputs, config))
-            method = result_of(found, unit, nominal_scale(config, unit), config)
+            method = result_of(found, unit, nominal_scale(config, unit), config,
+                               shortened_by_slopes(inputs))
             return method, _tracks(run, found)
     except (FloatingPointError, np.linalg.LinAlgError) as error:
         return unknown(Reason(Code.NOT_CONVERGED, f'{PLANAR} diverged ({error}). Likely cause: '
-                              'the wheels do not belong to the positions')), {}
+                              'the wheels do not belong to the positions, or the '
+                              'positions are too inaccurate for a drive without an IMU')), {}
     except (OdocalError, MemoryError):
         raise
     except Exception as error:
@@ -107,6 +111,23 @@ def _run_of(inputs: Inputs, config: Config) -> tuple[Run | None, list[Reason]]:
         return None, [Reason(Code.ODOMETER_STILL, 'the wheels do not turn during the leg')]
     return Run(t, Wheels(left, right, lateral, kind), node, position, sigma,
                _gyro(inputs, t)), []
+
+
+def shortened_by_slopes(inputs: Inputs) -> float:
+    """Return by how much slopes shorten the path, relative: mean slope^2 / 2, less its noise."""
+    have = ~np.isnan(inputs.geodetic[:, 2])
+    if have.sum() < FEWEST_POSITIONS:
+        return 0.0
+    place = origin_amid(inputs.t_fix[have], inputs.geodetic[have]).to_n(inputs.geodetic[have])
+    variance = np.median(np.einsum('kii->ki', inputs.covariance_n[have]), axis=0)
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(place[:, :2], axis=0).T)))
+    length = max(SLOPE_LENGTH, SLOPE_SIGMAS * float(np.sqrt(variance[2])))
+    ends = np.searchsorted(path, np.arange(0.0, path[-1], length))
+    run = np.hypot(*np.diff(place[ends, :2], axis=0).T)
+    straight = run > length / 2      # judgement: else it turned back, or the path is noise
+    slope = np.diff(place[ends, 2])[straight] / run[straight]
+    noise = 2 * variance[2] / np.maximum(run[straight], 1e-9)**2
+    return float(max(np.mean(slope**2 - noise), 0.0) / 2) if straight.any() else 0.0
 
 
 def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:

@@ -4,6 +4,7 @@
 """Robots without an IMU, with skid steering and with mecanum wheels, from samples to a result."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import foreign_keys
 import numpy as np
@@ -11,7 +12,9 @@ import pytest
 import yaml
 
 from odocal_ros.output.controller_files import controllers
+from odocal_ros.pipeline import planar_run
 from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.pipeline.planar_run import shortened_by_slopes
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.robot_wheels import effective_width, SIDEWAYS
@@ -151,3 +154,37 @@ def test_two_legs_are_combined():
     both = combine(results, config).estimates
     for name in ('scale_factor', 'track_width'):
         assert both[name].sigma < min(r.methods['planar'].estimates[name].sigma for r in results)
+
+
+def heights(height, sigma=0.02, noise=0.0):
+    """Return fixes on a straight of 2 km, m by m, with heights of the distance."""
+    way = np.arange(0.0, 2000.0)
+    up = height(way) + noise * np.random.default_rng(0).standard_normal(len(way))
+    geodetic = np.column_stack([0.8 + way / 6.36e6, np.full(len(way), 0.2), up])
+    return SimpleNamespace(t_fix=way, geodetic=geodetic, covariance_n=np.tile(
+        np.diag([1e-4, 1e-4, sigma**2]), (len(way), 1, 1)))
+
+
+def test_slopes_shorten_the_path_by_half_their_square():
+    """Up and down by 5 %; 300 m of hills of 3 % by sine; noise alone; no heights."""
+    shortened = shortened_by_slopes
+    of_noise = (0.02 / 5)**2        # of two heights, 5 m apart
+    assert shortened(heights(lambda x: 0.05 * np.abs(x - 1000.0))) == pytest.approx(
+        0.05**2 / 2 - of_noise, rel=0.01)
+    hills = heights(lambda x: 0.03 * 300 / (2 * np.pi) * np.sin(2 * np.pi * x / 300))
+    assert shortened(hills) == pytest.approx(0.03**2 / 4 - of_noise, rel=0.02)
+    # 33 slopes over 60 m, of 4.7 % noise each: the mean square, 2.2e-3, is good to a quarter
+    assert shortened(heights(lambda x: 0 * x, 2.0, 2.0)) < 2.2e-3 / 2 * 0.5
+    assert shortened(heights(lambda x: np.nan * x)) == 0.0
+
+
+def test_slopes_are_in_the_sigma_of_the_scale(monkeypatch):
+    made, config = driven()
+    level = calibrate(made.leg(), config).methods['planar']
+    monkeypatch.setattr(planar_run, 'shortened_by_slopes', lambda inputs: 1e-3)
+    sloping = calibrate(made.leg(), config).methods['planar']
+    a, b = (m.estimates['scale_factor'] for m in (level, sloping))
+    assert b.sigma == pytest.approx(np.hypot(a.sigma, 1e-3 * a.value))
+    assert 'slopes' in {s.name for s in sloping.sources} - {s.name for s in level.sources}
+    assert Code.MODEL_MISMATCH in {r.code for r in sloping.reasons}
+    assert level.estimates['track_width'].sigma == sloping.estimates['track_width'].sigma

@@ -27,7 +27,7 @@ ARC = 0.75      # definition: straightness on a radius of twice the track width
 # Judgement, by measurement on 12 simulated runs with another law: the rms of error over sigma is
 # 3.6 without it, now 0.69
 LAW, MOST_ARC = 0.15, 0.05
-LAW_SOURCE, FIT_SOURCE = 'width_by_radius', 'positions_and_wheel_noise'
+LAW_SOURCE, FIT_SOURCE, SLOPES = 'width_by_radius', 'positions_and_wheel_noise', 'slopes'
 WHEEL_NOISE, MOST_NOISE = ('along', 'turn', 'spin'), 0.1     # m/sqrt(m), judgement: of slip
 TURNS = 'turns on the spot in both directions, each followed by a straight of a metre or more'
 Constants = dict[str, float]
@@ -63,8 +63,13 @@ QUANTITIES = {
 }
 
 
-def result_of(fit: Fit, unit: str, nominal: float, config: Config) -> MethodResult:
-    """Return the result of a fit.   unit, nominal : of the scale factor."""
+def result_of(fit: Fit, unit: str, nominal: float, config: Config,
+              slopes: float = 0.0) -> MethodResult:
+    """
+    Return the result of a fit.
+
+    unit, nominal : of the scale factor.   slopes : by how much they shorten the path, relative.
+    """
     c = dict(zip(fit.names, fit.value.tolist(), strict=True))
     estimates, effects, laws, reasons = unknown(unit), {}, {}, _doubts(fit)
     # what a fit that moves on may still change
@@ -75,12 +80,13 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config) -> MethodResu
             continue
         value, effect = quantity.value(c), _gradient(quantity, fit) @ root
         own = unit if 'scale' in name else 'm'
-        law = LAW * abs(value - 1 / c['curvature']) * (quantity.needs == 'arc')
+        law = slopes * value if 'scale' in name else LAW * abs(
+            value - 1 / c['curvature']) * (quantity.needs == 'arc')
         sigma = float(np.hypot(np.linalg.norm(effect), law))
         if value > 0 and sigma < quantity.most * value:
             estimates[name] = Estimate(value, sigma, own)
             unit_of = value if name.startswith('scale_factor') else 1.0
-            effects[name], laws[name] = effect / unit_of, law
+            effects[name], laws[name] = effect / unit_of, law / unit_of
         else:
             estimates[name] = Estimate(None, None, own)
             reasons.append(Reason(
@@ -88,13 +94,19 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config) -> MethodResu
                 f'{100 * sigma / abs(value):.1f} %; the limit is {100 * quantity.most:.0f} %',
                 f'Repeat the run with {quantity.lacks}.'))
     scale = estimates['scale_factor']
+    if scale.value and slopes > np.linalg.norm(effects['scale_factor']):
+        reasons.append(Reason(
+            Code.MODEL_MISMATCH, f'the ground is not level: slopes shorten the path by '
+            f'{100 * slopes:.2g} %, which is added to the sigma',
+            'Drive on level ground, or record an IMU.'))
     if scale.value is not None and scale.sigma is not None and nominal:
         estimates['scale_ratio'] = Estimate(scale.value / nominal, scale.sigma / nominal, '1')
     names = tuple(name for name in QUANTITIES if name in estimates)
     sources = [Source(FIT_SOURCE, np.array([effects.get(name, 0 * root[0]) for name in names]))]
-    if any(laws.values()):
-        sources.append(Source(LAW_SOURCE, np.array([[laws.get(name, 0.0)] for name in names]),
-                              True))
+    for source, scales in ((LAW_SOURCE, False), (SLOPES, True)):
+        own_laws = [laws.get(name, 0.0) * (('scale' in name) == scales) for name in names]
+        if any(own_laws):
+            sources.append(Source(source, np.array(own_laws)[:, None], True))
     return MethodResult(PLANAR, (*reasons, *judge(estimates, nominal, config)), estimates, names,
                         tuple(sources), _details(fit, estimates, names, sources))
 
