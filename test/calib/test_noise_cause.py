@@ -92,7 +92,7 @@ def test_a_quantised_sensor_is_named_beside_another_cause():
 
 @pytest.mark.parametrize(('name', 'tyres'), [('odometer_delay', False), ('scale_factor', True)])
 def test_legs_that_differ_in_a_delay_blame_no_tyre(name, tyres):
-    found = SimpleNamespace(deviation=np.array([[9.0], [-9.0]]), names=[name], spread=[name],
+    found = SimpleNamespace(deviation=np.array([[9.0], [-9.0]]), names=[name], disputed=[name],
                             factor=1.0)
     reason, = _disputed(found, [1, 2])
     assert ('tyre' in reason.remedy) == tyres

@@ -75,9 +75,11 @@ class Solved:
         self._band = cholesky_banded(_banded(whole('diagonal'), whole('off')))
         B, g = whole('border').reshape(n * s, -1), whole('gradient').ravel()
         X = cho_solve_banded((self._band, False), np.column_stack([B, g]))
-        self.information = whole('constant') + np.diag(prior) - B.T @ X[:, :-1]
+        # not by BLAS: its threads would add the parts of a long sum in any order
+        taken = np.einsum('ki,kj->ij', B, X)
+        self.information = whole('constant') + np.diag(prior) - taken[:, :-1]
         self.constants = np.linalg.solve(
-            self.information, -(whole('slope') + slope) + B.T @ X[:, -1])
+            self.information, -(whole('slope') + slope) + taken[:, -1])
         self.step = (-X[:, -1] - X[:, :-1] @ self.constants).reshape(n, s)
 
     def log_determinant(self) -> float:
