@@ -49,8 +49,8 @@ def driven(tmp_path_factory):
         seen.truth = made.truth.scale
         player = Player.connected(client, types, TOPICS)
         # others belong to runs of their own: test_mark_live.py, test_drive_pattern.py
-        calls = [call for call in dict.fromkeys(map(tuple, of('service', 'call')))
-                 if call[0] in LEG]
+        kinds = dict(of('service', 'call'))
+        calls = [(name, kinds[name]) for name in LEG]
         # standing; driving to the next stop, and a little on: a leg ends with its last message
         stretches = [(45, 60, 60), (60, 117, 119)]
         for (name, kind), (begin, mark, end) in zip(calls, stretches, strict=True):
