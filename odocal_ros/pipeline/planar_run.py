@@ -32,7 +32,7 @@ LEAST_NODE, MOST_NODES = 0.1, 20_000      # s between nodes, judgement: 0.1 rad 
 FEWEST_POSITIONS = 10       # judgement: as for other methods
 MECANUM_WHEELS = 4     # definition
 # m and sigmas of a height between places for a slope, judgement: longer than a room is high
-SLOPE_LENGTH, SLOPE_SIGMAS = 5.0, 30.0
+SLOPE_LENGTH, HEIGHT_SIGMAS = 5.0, 30.0
 # rad/sqrt(s), judgement: tilt and vibration of a robot, which the grade does not have
 GYRO_LEAST = 1e-3
 # codes of an IMU that the planar estimator can do without
@@ -121,7 +121,7 @@ def shortened_by_slopes(inputs: Inputs) -> float:
     place = origin_amid(inputs.t_fix[have], inputs.geodetic[have]).to_n(inputs.geodetic[have])
     variance = np.median(np.einsum('kii->ki', inputs.covariance_n[have]), axis=0)
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(place[:, :2], axis=0).T)))
-    length = max(SLOPE_LENGTH, SLOPE_SIGMAS * float(np.sqrt(variance[2])))
+    length = max(SLOPE_LENGTH, HEIGHT_SIGMAS * float(np.sqrt(variance[2])))
     ends = np.searchsorted(path, np.arange(0.0, path[-1], length))
     run = np.hypot(*np.diff(place[ends, :2], axis=0).T)
     straight = run > length / 2      # judgement: else it turned back, or the path is noise
