@@ -4,6 +4,10 @@
 """Robots without an IMU, with skid steering and with mecanum wheels, from samples to a result."""
 
 from dataclasses import replace
+import os
+from pathlib import Path
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import foreign_keys
@@ -21,6 +25,8 @@ from odocal_ros.sim.robot_wheels import effective_width, SIDEWAYS
 from odocal_ros.sim.scenarios import SimOptions, simulate
 from odocal_ros.sim.truth import settings
 
+ROOT = Path(__file__).resolve().parents[2]
+TEST = ROOT / 'test'
 SIGMAS = 3.5      # one of the values below in 2000 is beyond it
 
 
@@ -188,3 +194,17 @@ def test_slopes_are_in_the_sigma_of_the_scale(monkeypatch):
     assert 'slopes' in {s.name for s in sloping.sources} - {s.name for s in level.sources}
     assert Code.MODEL_MISMATCH in {r.code for r in sloping.reasons}
     assert level.estimates['track_width'].sigma == sloping.estimates['track_width'].sigma
+
+
+def test_a_result_is_the_same_for_any_number_of_threads():
+    """Threads of BLAS must not show in the last bit: node and replay may have others."""
+    program = ('import sys; sys.path[:0] = ["test/pipeline"]; import test_planar_leg as t\n'
+               'made, config = t.driven("skid", imu=True, imu_grade="industrial", duration=80.0)\n'
+               'found = t.calibrate(made.leg(), config).methods["planar"].estimates\n'
+               'print([(e.value, e.sigma) for e in found.values()])')
+    said = {subprocess.run([sys.executable, '-c', program], check=True, capture_output=True,
+                           cwd=ROOT, text=True, env=os.environ | {
+                               'OPENBLAS_NUM_THREADS': threads, 'PYTHONPATH': f'{ROOT}:{TEST}'}
+                           ).stdout for threads in ('1', '2')}
+    assert len(said) == 1
+    assert 'nan' not in said.pop()

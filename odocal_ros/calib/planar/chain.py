@@ -6,7 +6,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from odocal_ros.data.arrays import Floats, Ints
 
@@ -75,16 +75,24 @@ class Solved:
         self._band = cholesky_banded(_banded(whole('diagonal'), whole('off')))
         B, g = whole('border').reshape(n * s, -1), whole('gradient').ravel()
         X = cho_solve_banded((self._band, False), np.column_stack([B, g]))
-        # not by BLAS: its threads would add the parts of a long sum in any order
+        # not by BLAS: its sums depend on the number of threads and on the place in memory
         taken = np.einsum('ki,kj->ij', B, X)
         self.information = whole('constant') + np.diag(prior) - taken[:, :-1]
-        self.constants = np.linalg.solve(
-            self.information, -(whole('slope') + slope) + taken[:, -1])
-        self.step = (-X[:, -1] - X[:, :-1] @ self.constants).reshape(n, s)
+        self._root = cho_factor(self.information, lower=True)
+        self.constants = cho_solve(self._root, -(whole('slope') + slope) + taken[:, -1])
+        self.step = (-X[:, -1] - np.einsum('ij,j->i', X[:, :-1], self.constants)).reshape(n, s)
+
+    @property
+    def covariance(self) -> Floats:
+        """Return that of the constants: (m, m)."""
+        out: Floats = cho_solve(self._root, np.eye(len(self.constants)))
+        return (out + out.T) / 2
 
     def log_determinant(self) -> float:
         """Return that of all equations."""
-        return float(2 * np.log(self._band[-1]).sum() + np.linalg.slogdet(self.information)[1])
+        # a copy: the last bits of logarithms of a row with gaps depend on its place in memory
+        own = np.log(self._band[-1].copy()).sum()
+        return float(2 * (own + np.log(np.diag(self._root[0])).sum()))
 
 
 def _banded(diagonal: Floats, off: Floats) -> Floats:

@@ -58,7 +58,7 @@ def fit(run: Run, known: Known) -> Fit:
             student[name] = (FREEDOM + 2) / (FREEDOM + off)
         for name, by in step.items():
             theta[name] *= float(np.exp(by))
-        sigma = np.sqrt(np.diag(np.linalg.inv(solved.information)))
+        sigma = np.sqrt(np.diag(solved.covariance))
         converged = bool((np.abs(solved.constants) < CONVERGED * sigma).all()
                          and max(map(abs, step.values())) < CONVERGED)
     # weights of the information of Student's distribution, which has 3/4 of a normal one
@@ -66,10 +66,9 @@ def fit(run: Run, known: Known) -> Fit:
                for name, weight in student.items()}
     rows = _rows(run, known, state, c, metres, first, student)
     solved = _solved({name: Equations(r, n) for name, r in rows.items()}, theta, prior, 0 * prior)
-    covariance = np.linalg.inv(solved.information)
     names = (*run.wheels.names, 'ahead', 'left_of', 'delay',
              *(('gyro_scale', 'gyro_bias') if len(run.gyro) else ()))
-    return Fit(names, c, covariance, state[:, :3],
+    return Fit(names, c, solved.covariance, state[:, :3],
                {name: float(np.sqrt(theta[name])) for name in ESTIMATED}, passes, converged,
                at_first.swapped)
 
@@ -106,7 +105,7 @@ def _after(rows: Rows, solved: Solved) -> Floats:
     step = np.append(solved.step, np.zeros((1, solved.step.shape[1])), axis=0)
     out: Floats = (rows.value + (rows.here @ step[rows.node][:, :, None])[:, :, 0]
                    + (rows.ahead @ step[rows.node + 1][:, :, None])[:, :, 0]
-                   + rows.constant @ solved.constants)
+                   + np.einsum('kqm,m->kq', rows.constant, solved.constants))
     return out
 
 
