@@ -26,7 +26,7 @@ class Border:
     a lever arm is the whole one.   information : (m, m), semidefinite.   pull : (m,).
     centre, sigma : (m,) of the priors, inf where there is none.   used : (m,) the sigmas, those
     widened that the leg contradicts, and those of imperfections by the sizes it found.
-    told : of combined legs, by name: log likelihood of the scatter between them (S38), (g,).
+    evidence : of combined legs, by name: log likelihood of the scatter between them (S38), (g,).
     """
 
     names: tuple[str, ...]
@@ -36,7 +36,7 @@ class Border:
     centre: Floats
     sigma: Floats
     used: Floats
-    told: dict[str, Floats] = field(default_factory=dict)
+    evidence: dict[str, Floats] = field(default_factory=dict)
 
     def widened(self, factor: float) -> 'Border':
         """Return what data are worth whose sigmas are too small by a factor."""
@@ -91,7 +91,7 @@ class Border:
         return Border(tuple(n for n in self.names if n in names), self.value[at],
                       D[np.ix_(at, at)], free.pull[at] - D[np.ix_(at, ~at)] @ off[~at],
                       self.centre[at], self.sigma[at], self.used[at],
-                      {n: told for n, told in self.told.items() if n in names})
+                      {n: evidence for n, evidence in self.evidence.items() if n in names})
 
     def turned(self, name: str, about: float) -> 'Border':
         """Return the border with an angle, rad, given within half a turn of another."""

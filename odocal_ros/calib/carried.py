@@ -12,7 +12,7 @@ import numpy as np
 from odocal_ros.calib.border import Border, SCATTER_POINTS
 from odocal_ros.data.arrays import Floats
 
-NUMBERS = [f for f in fields(Border) if f.name not in ('names', 'told')]
+NUMBERS = [f for f in fields(Border) if f.name not in ('names', 'evidence')]
 NOTHING = {'sigma': np.inf, 'used': np.inf}      # for a null in a file
 
 
@@ -49,7 +49,7 @@ class Carried:
         """Return it as calibration.json has it."""
         border = {f.name: np.asarray(getattr(self.border, f.name)).tolist() for f in NUMBERS}
         border |= {'names': list(self.border.names),
-                   'told': {n: told.tolist() for n, told in self.border.told.items()}}
+                   'evidence': {n: x.tolist() for n, x in self.border.evidence.items()}}
         return {'unit': self.unit, 'first_ns': self.first_ns, 'last_ns': self.last_ns,
                 'legs': self.legs, 'border': border}
 
@@ -71,9 +71,9 @@ def carried_from(content: dict[str, Any]) -> Carried:
         numbers = {f.name: _array(entry[f.name], (m, m) if f.name == 'information' else (m,),
                                   NOTHING.get(f.name, np.nan))
                    for f in NUMBERS}
-        told = {str(n): _array(x, (SCATTER_POINTS,), np.nan)
-                for n, x in dict(entry.get('told', {})).items()}
-        return Carried(Border(names, **numbers, told=told), str(content['unit']),
+        evidence = {str(n): _array(x, (SCATTER_POINTS,), np.nan)
+                for n, x in dict(entry.get('evidence', {})).items()}
+        return Carried(Border(names, **numbers, evidence=evidence), str(content['unit']),
                        int(content['first_ns']), int(content['last_ns']), int(content['legs']))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f'carried: {error}') from None

@@ -82,14 +82,14 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
     drives = legs.joined(same)
     scatter = _scatter(drives, usual)
     # the constants of a single leg are its own
-    alone = len(drives.borders) == 1 and not borders[0].told
+    alone = len(drives.borders) == 1 and not borders[0].evidence
     between = {} if alone else scatter.sigmas
     left, rest = (apart + of_legs - of_drives for apart, of_legs, of_drives in zip(
         drives.disagreement(between), (chi2, freedom), drives.disagreement(), strict=True))
     factor = float(np.sqrt(left / rest)) if rest and deviate(left, rest) > Z95 else 1.0
     where = drives.place(len(drives.borders) - 1)
     x, C = drives.solve() if alone else _averaged(drives, scatter, usual)
-    carried = drives.carried(x[where], scatter.sigmas, scatter.told).widened(factor)
+    carried = drives.carried(x[where], scatter.sigmas, scatter.evidence).widened(factor)
     return Joint(legs.names, x[where], C[np.ix_(where, where)] * factor**2, legs.sigma, legs.used,
                  chi2, freedom, legs.deviations(), carried, between,
                  _disputed(legs, between, usual), factor, bent)
@@ -107,12 +107,13 @@ class Scatter:
     """
     How much constants scatter between legs, by name.
 
-    sigmas : the mean of its logarithm.   told : (g,) log likelihood at the points of SCATTER_GRID.
+    sigmas : the mean of its logarithm.   evidence : (g,) log likelihood at the points of
+    SCATTER_GRID.
     weights : (g,) of these points.
     """
 
     sigmas: dict[str, float]
-    told: dict[str, Floats]
+    evidence: dict[str, Floats]
     weights: dict[str, Floats]
 
 
@@ -124,20 +125,21 @@ def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
     2006).
     """
     from scipy.interpolate import CubicSpline
-    between, told, weights = dict(usual), dict[str, Floats](), dict[str, Floats]()
+    between, evidence, weights = dict(usual), dict[str, Floats](), dict[str, Floats]()
     fine = np.linspace(SCATTER_GRID[0], SCATTER_GRID[-1], 301)
     for _ in range(2):      # sweeps: the scatter of one hardly depends on that of another
         for name, size in usual.items():
             own = np.array([legs.log_likelihood({**between, name: size * float(np.exp(off))})
                             for off in SCATTER_GRID])
-            told[name] = own - own.max() + legs.told(name, len(own))
-            odds = CubicSpline(SCATTER_GRID, told[name])(fine) + fine - np.log1p(np.exp(2 * fine))
+            evidence[name] = own - own.max() + legs.evidence(name, len(own))
+            odds = CubicSpline(SCATTER_GRID, evidence[name])(fine)
+            odds = odds + fine - np.log1p(np.exp(2 * fine))
             weight = np.exp(odds - odds.max())
             weight /= weight.sum()
             between[name] = size * float(np.exp(weight @ fine))
             weights[name] = np.array([weight @ np.interp(fine, SCATTER_GRID, node)
                                       for node in np.eye(len(own))])
-    return Scatter(between, told, weights)
+    return Scatter(between, evidence, weights)
 
 
 def _averaged(legs: LinkedLegs, scatter: Scatter,

@@ -107,7 +107,7 @@ class LinkedLegs:
         b = np.concatenate([b, centre])
         out = -(b @ b - ((b @ Q)**2).sum()) / 2 - np.log(np.abs(np.diag(R))).sum()
         for border in self.borders:
-            if not border.told:
+            if not border.evidence:
                 own = border.information[np.ix_(at, at)] * np.multiply.outer(size, size)
                 out -= np.linalg.slogdet(np.eye(len(at)) + own)[1] / 2
         return float(out)
@@ -120,21 +120,21 @@ class LinkedLegs:
         return prior, self.centre[held] / self.used[held]
 
     def carried(self, value: Floats, spread: dict[str, float],
-                told: dict[str, Floats]) -> Border:
+                evidence: dict[str, Floats]) -> Border:
         """
         Return what all legs tell, of the last leg's constants, where those are ``value``.
 
-        told : what they tell of the scatter between legs.
+        evidence : on the scatter between legs.
         """
         A, b = self.system(spread)
         rows, b = _left(A, b, self.place(len(self.borders) - 1))
         rows = rows / self.unit
         return Border(self.names, value, rows.T @ rows, rows.T @ (b - rows @ value),
-                      self.centre, self.sigma, self.used, told)
+                      self.centre, self.sigma, self.used, evidence)
 
-    def told(self, name: str, points: int) -> Floats:
-        """Return what combined legs tell of the scatter of a constant: (points,)."""
-        out: Floats = sum((border.told[name] for border in self.borders if name in border.told),
+    def evidence(self, name: str, points: int) -> Floats:
+        """Return the evidence of combined legs on the scatter of a constant: (points,)."""
+        out: Floats = sum((b.evidence[name] for b in self.borders if name in b.evidence),
                           np.zeros(points))
         return out
 
@@ -176,7 +176,7 @@ class LinkedLegs:
 
 def _scattering(border: Border, spread: dict[str, float] | None) -> Border:
     """Return the border of a leg whose constants scatter; combined legs tell their mean."""
-    return border.loosened(spread) if spread and not border.told else border
+    return border.loosened(spread) if spread and not border.evidence else border
 
 
 def _left(A: Floats, b: Floats, keep: Ints) -> tuple[Floats, Floats]:
@@ -202,4 +202,4 @@ def _on(border: Border, names: tuple[str, ...]) -> Border:
         return out
     # a prior that a leg does not have is none that it has widened
     return Border(names, on(border.value, 0.0), D, on(border.pull, 0.0), on(border.centre, 0.0),
-                  on(border.sigma, 0.0), on(border.used, 0.0), border.told)
+                  on(border.sigma, 0.0), on(border.used, 0.0), border.evidence)

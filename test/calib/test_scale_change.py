@@ -198,8 +198,8 @@ def test_what_combined_legs_tell_of_the_scatter_goes_on(session):
         a, b = found.estimates[name], whole.estimates[name]
         assert a.value == pytest.approx(b.value, abs=0.1 * b.sigma), name
         assert a.sigma == pytest.approx(b.sigma, rel=0.1), name
-    told = found.carried.border.told
-    assert set(told) == {'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'}
+    evidence = found.carried.border.evidence
+    assert set(evidence) == {'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'}
 
 
 def test_legs_folded_into_what_is_carried_count_as_before(session, monkeypatch):
