@@ -53,7 +53,7 @@ def rotvec_from_quat(q: Floats) -> Floats:
     q = np.where(q[..., 3:] < 0, -q, q)
     sine = np.linalg.norm(q[..., :3], axis=-1)
     small = sine < 1e-9
-    size = np.where(small, 2.0, 2 * np.arctan2(sine, q[..., 3]) / np.where(small, 1.0, sine))
+    size = np.where(small, 2.0, 2 * arctan2(sine, q[..., 3]) / np.where(small, 1.0, sine))
     return q[..., :3] * size[..., None]
 
 

@@ -17,6 +17,7 @@ from odocal_ros.nav.rotations import (
     quat_from_matrix,
     quat_from_rotvec,
     quat_multiply,
+    rotvec_from_quat,
     rpy_from_matrix,
     skew,
     transpose,
@@ -153,3 +154,15 @@ def test_the_yaw_of_a_quaternion_is_that_of_its_matrix_to_the_last_bit(phi):
     q = 1.7 * quat_from_rotvec(np.array([phi, -2 * phi, [0.1, 0.2, 3.0]]))
     C = matrix_from_quat(q)
     np.testing.assert_array_equal(yaw_from_quat(q), arctan2(C[:, 1, 0], C[:, 0, 0]))
+
+
+def test_a_rotation_vector_does_not_depend_on_where_the_quaternions_lie():
+    """With numpy 1.26 and AVX-512 it did, and five fits of a drive gave two or three results."""
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(1001, 4))
+    q /= np.linalg.norm(q, axis=1)[:, None]
+    held, seen = [], set()
+    for _ in range(200):
+        held = [*held[-50:], bytearray(int(rng.integers(60_000)))]      # move what comes after
+        seen.add(rotvec_from_quat(q.copy()).tobytes())
+    assert len(seen) == 1

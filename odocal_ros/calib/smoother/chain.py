@@ -254,7 +254,7 @@ def solve(normal: Normal) -> Solved:
             raise NotPositive(f'keyframe {k} of {N} is not constrained')
         W = wide[k]
         X, _ = dpotrs(root, W, lower=1)
-        logdet += 2 * np.log(root.diagonal()).sum()
+        logdet += 2 * np.log(root.diagonal().copy()).sum()
         corner -= W[:, n:].T @ X[:, n:]
         if k + 1 < N:
             E = W[:, :n].T
@@ -268,7 +268,7 @@ def solve(normal: Normal) -> Solved:
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
         raise NotPositive('the constants are not determined')
-    logdet += 2 * np.log(root.diagonal()).sum()
+    logdet += 2 * np.log(root.diagonal().copy()).sum()
     reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
     c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
     covariance = dpotrs(root, np.eye(m), lower=1)[0]

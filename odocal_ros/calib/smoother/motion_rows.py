@@ -82,7 +82,7 @@ class MotionRows(Factor):
             scale = 1 / np.sqrt(np.einsum('kii->ki', Q))
             root = np.linalg.cholesky(Q * scale[:, :, None] * scale[:, None, :])
             self.whiten[rows] = np.linalg.inv(root) * scale[:, None, :]
-            logs[rows] = np.log(np.einsum('kii->ki', self.whiten[rows]))
+            logs[rows] = np.log(np.einsum('kii->ki', self.whiten[rows]).copy())     # see arctan2
             self.r[rows] = np.einsum('kij,kj->ki', self.whiten[rows], self.raw[rows])
         self.log_R = -2 * logs.sum()
 
