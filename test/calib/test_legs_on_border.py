@@ -177,6 +177,18 @@ def test_a_leg_without_information_changes_nothing(toy):
                                    pytest.approx(b.chi2, rel=1e-6))
 
 
+def test_sections_of_one_leg_are_one_leg(toy):
+    """With a scatter between legs, which they do not have: as without any."""
+    still = np.zeros(LEGS - 1)
+    whole = of(toy.borders(), still)
+    found = joint(toy.borders(), still, 'k', usual=USUAL, same=[True] * (LEGS - 1))
+    assert apart(found.value, whole.value, whole.covariance) < 1e-6
+    assert found.covariance == pytest.approx(whole.covariance, rel=1e-6)
+    assert (found.chi2, found.freedom) == (whole.chi2, whole.freedom)
+    scattered = of(toy.borders(), still, USUAL)
+    assert scattered.covariance[4, 4] > 1.001 * whole.covariance[4, 4]
+
+
 def test_chi_square_has_its_mean_and_variance():
     rng = np.random.default_rng(2)
     small = Toy(rng, states=6, rows=60)
