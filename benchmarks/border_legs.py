@@ -15,7 +15,8 @@ a quarter of an hour apart. Leg j of vehicle k has seed 61_000_000 + 100 k + j.
 
 Printed for scale, yaw and pitch: median stated sigma and RMS of error over sigma of one leg, of
 all legs on their border and, for comparison, of the mean of the same legs weighted by variances
-(as ``two_point`` is combined); chi-square of the legs over its freedom; what they disagree on.
+(as ``two_point`` is combined); chi-square of the legs over its freedom; the sigma by which
+constants scatter between them.
 Rows are kept in the file: an interrupted run continues where it stopped.
 """
 
@@ -107,7 +108,9 @@ def table(rows):
             title = ''
     of = [r['disagreement'] for r in rows]
     print('chi2 / freedom:', ', '.join(f'{d["chi2"]:.0f}/{d["freedom"]}' for d in of))
-    print('between legs:', [d['between_legs'] for d in of if d['between_legs']] or 'nothing')
+    for name, (text, by) in NAMES.items():
+        scatter = [d['between_legs'][name] * by for d in of if name in d['between_legs']]
+        print(f'between legs, {text}:', ', '.join(f'{x:.1f}' for x in scatter) or 'nothing')
 
 
 def main():
