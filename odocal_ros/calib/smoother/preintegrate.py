@@ -40,7 +40,7 @@ from odocal_ros.nav.rotations import (
 from odocal_ros.nav.strapdown import prefix_product
 
 Floats = NDArray[np.float64]
-# tuned: arrays of 2048 to 4096 steps stay in the cache, 256 take twice the time
+# judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
 STEPS_AT_A_TIME = 2048
 
 
