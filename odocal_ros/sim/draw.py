@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.sim import draw_imu, draw_road
+from odocal_ros.sim.draw_effects import EFFECTS, RARE
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.zoo import GRADES, plain, ROWS, SIZES, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')
-EFFECTS = draw_imu.EFFECTS | draw_road.EFFECTS     # all are part of a drawn vehicle
-RARE = draw_road.RARE
 ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each asks for an odometer of its own
 
 
