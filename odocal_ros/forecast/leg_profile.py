@@ -8,6 +8,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPEED
+from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.inputs import Inputs, place, Placed
 from odocal_ros.settings.config import Config
@@ -74,9 +75,7 @@ def _yaw(inputs: Inputs, spans: Floats, t: Floats) -> Floats:
     at_rest = np.any([(t_imu >= a) & (t_imu <= b) for a, b in spans], axis=0) if len(spans) \
         else np.zeros(len(t_imu), bool)
     w = w - (w[at_rest].mean() if at_rest.any() else 0.0)
-    turned = np.concatenate([[0.0], np.cumsum((w[:-1] + w[1:]) / 2 * np.diff(t_imu))])
-    yaw: Floats = np.interp(t, t_imu, turned)
-    return yaw
+    return np.interp(t, t_imu, running_integral(t_imu, w))
 
 
 def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n: Floats) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import runs
 from odocal_ros.errors import BadUsage
+from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.rotations import matrix_from_rpy
 
 REST_SPEED = 1e-6     # m/s, judgement: below it a planned drive stands
@@ -62,8 +63,7 @@ class PlannedDrive:
     @property
     def travel(self) -> NDArray[np.float64]:
         """Return the signed travel at each time, 0 at the start mark, (m,) m."""
-        s = np.concatenate([[0.0], np.cumsum(
-            (self.speed[:-1] + self.speed[1:]) / 2 * np.diff(self.t))])
+        s = running_integral(self.t, self.speed)
         path_length: Floats = s - np.interp(0.0, self.t, s)
         return path_length
 
@@ -129,8 +129,8 @@ def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.p
     it is not given.
     """
     t, speed, yaw_rate = (np.asarray(x, dtype=float) for x in (t, speed, yaw_rate))
-    turned = np.concatenate([[0.0], np.cumsum((yaw_rate[:-1] + yaw_rate[1:]) / 2 * np.diff(t))])
-    return marked(t, speed, np.pi / 2 - heading + turned, more.pop('slope', np.zeros_like(t)),
+    yaw = np.pi / 2 - heading + running_integral(t, yaw_rate)
+    return marked(t, speed, yaw, more.pop('slope', np.zeros_like(t)),
                   **more)
 
 

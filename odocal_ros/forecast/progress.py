@@ -16,8 +16,8 @@ from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples
 from odocal_ros.forecast.ability import Received, stated_variance
 from odocal_ros.forecast.clocks_so_far import Clocks
 from odocal_ros.nav.earth import radii
-from odocal_ros.screening.force import felt
-from odocal_ros.screening.odometer_steps import Steps
+from odocal_ros.screening.leg_kind import felt
+from odocal_ros.screening.odometer_care import Steps
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import FASTEST
 from odocal_ros.settings.nominal import nominal_scale

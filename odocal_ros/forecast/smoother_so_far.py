@@ -26,9 +26,8 @@ from odocal_ros.forecast.leg_so_far import screened_in_cells
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.reasons import Reason
-from odocal_ros.screening.facing import axes_reasons, facing
+from odocal_ros.screening.facing import axes_reasons, facing, UNUSABLE
 from odocal_ros.screening.inputs import place
-from odocal_ros.screening.sanity import UNUSABLE
 from odocal_ros.settings.config import Config
 
 DRIVING_SPEED = 0.5    # m/s; judgement: slower steps between keyframes do not count

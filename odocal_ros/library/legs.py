@@ -17,7 +17,7 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs, place
-from odocal_ros.screening.local_frame import settings_by_frame
+from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 

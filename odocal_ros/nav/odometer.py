@@ -112,16 +112,23 @@ def mean_travel(travels: Sequence[Travel]) -> Travel:
     return Travel(t, s - (s[0] if len(s) else 0.0), first.quantum / np.sqrt(len(travels)))
 
 
+def without_rollover(step: Values, modulus: int) -> Values:
+    """
+    Return steps of a counter (n,) with its rollovers undone.
+
+    modulus : span of the counter in counts, 0 for floats. Integers of 64 bits wrap by themselves.
+    """
+    half = modulus // 2
+    return (step + half) % modulus - half if 0 < modulus < 2**63 else step
+
+
 def _counter_steps(t: Floats, value: Values, modulus: int,
                    name: str) -> tuple[Floats, tuple[Reason, ...]]:
     """Return steps of a counter as floats, rollover undone, resets bridged; and what was found."""
     whole = np.issubdtype(value.dtype, np.integer)
-    raw = step = np.diff(value)                    # integers wrap at 2^64
-    if whole and 0 < modulus < 2**63:
-        half = modulus // 2
-        step = (raw + half) % modulus - half
-    rolled = step != raw
-    step = step.astype(float)
+    raw = np.diff(value)
+    counted = without_rollover(raw, modulus)
+    rolled, step = counted != raw, counted.astype(float)
     resets = _resets(t, step, whole)
     reasons: tuple[Reason, ...] = ()
     if resets.any():

@@ -32,8 +32,8 @@ from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.force import TILT_SIGMA
 from odocal_ros.screening.inputs import Inputs
+from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
 

@@ -26,10 +26,10 @@ from odocal_ros.pipeline.method_run import Stage
 from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.facing import imu_sanity, UNUSABLE
 from odocal_ros.screening.inputs import Inputs
-from odocal_ros.screening.local_frame import settings_by_frame
+from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
-from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 

@@ -148,8 +148,7 @@ def _gyro(inputs: Inputs, t: Floats) -> Floats:
     if not inputs.felt or len(inputs.t_imu) < 2 or inputs.t_imu[0] > t[0] \
             or inputs.t_imu[-1] < t[-1]:
         return np.empty(0)
-    up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
-    rate = np.einsum('ij,j->i', inputs.w_b, up_b)       # by BLAS it depends on its threads
+    rate = np.einsum('ij,j->i', inputs.w_b, inputs.up_b)       # by BLAS it depends on its threads
     out: Floats = np.diff(integral_at(t, inputs.t_imu, rate))
     return out
 

@@ -118,8 +118,7 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
 
 def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ...]:
     """Return the reason for a gyro that does not turn with the fixes or with gravity."""
-    up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
-    ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ up_b, inputs.w_b),
+    ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)
     scale_or_sign = gyro_reasons(ratio, config.imu.gyro_scale)
     if any(r.code is Code.GYRO_SIGN for r in scale_or_sign):

@@ -71,9 +71,8 @@ class PreparedLeg(Placed):
     def level_path(self, t: Floats) -> Floats:
         """Return travel along the gyro's heading on level ground, but for a rotation: (n, 2)."""
         inputs, epochs = self.inputs, self.track.t
-        up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
         turned = integral_at(epochs, inputs.t_imu, by_row(
-            lambda w_b: (w_b - self.alignment.gyro_bias) @ up_b, inputs.w_b))
+            lambda w_b: (w_b - self.alignment.gyro_bias) @ inputs.up_b, inputs.w_b))
         path = level_track(self.track.s, turned)
         return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
 

@@ -67,7 +67,7 @@ def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """
     Return a method's result as it was, or of an IMU without force: hills in, no angles.
 
-    ``screening/force.py`` says why.
+    ``screening/leg_kind.py`` says why.
     """
     if prepared.inputs.felt:
         return method

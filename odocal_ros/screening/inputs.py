@@ -55,6 +55,11 @@ class Inputs:
         return medians(self.f_b)
 
     @property
+    def up_b(self) -> Floats:
+        """Return the direction of the usual specific force: (3,) unit vector."""
+        return self.usual_f_b / np.linalg.norm(self.usual_f_b)
+
+    @property
     def least_motion(self) -> float:
         """Return the distance over which positions surely move, m."""
         return LOCAL_MOVES if self.local else GNSS_MOVES

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.integral import running_integral
 from odocal_ros.settings.config import MECANUM, SIDES, SKID
 from odocal_ros.sim.motion import contact_speed, State, turn_rate
 from odocal_ros.sim.noise import stream
@@ -75,8 +76,7 @@ def steered_path(state: State, arm: Floats) -> Floats:
     x, y, z = arm
     along = contact_speed(state, (0.0, y, z))
     more = np.copysign(np.hypot(along, x * turn_rate(state)) - np.abs(along), along)
-    steps = np.diff(state.t) * (more[1:] + more[:-1]) / 2
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return running_integral(state.t, more)
 
 
 def effective_width(options: SimOptions, radius: float = 0.0) -> float:
@@ -98,8 +98,7 @@ def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
     """Return the metres that a wheel of skid steering or a mecanum wheel has rolled: (n,)."""
     side = -1.0 if wheel.name.split('_joint')[0].removesuffix('_wheel').endswith(SIDES[0]) else 1.0
     if options.drive == MECANUM:
-        steps = np.diff(state.t) * (state.sway[1:, 0] + state.sway[:-1, 0]) / 2
-        lateral = np.append(0.0, np.cumsum(steps)) / SIDEWAYS
+        lateral = running_integral(state.t, state.sway[:, 0]) / SIDEWAYS
         rollers = side if wheel.name.startswith('front') else -side
         return (state.travel + rollers * lateral
                 + side * effective_width(options) / 2 * state.turned)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.reasons import Code
-from odocal_ros.screening.dead_reckoned import reckoned
+from odocal_ros.screening.fix_screen import reckoned
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
