@@ -116,7 +116,7 @@ def without_rollover(step: Values, modulus: int) -> Values:
     """
     Return steps of a counter (n,) with its rollovers undone.
 
-    modulus : span of the counter in counts, 0 for floats. Integers of 64 bits wrap by themselves.
+    modulus : span of the counter in counts, 0 for floats. 64 bits wrap in the subtraction.
     """
     half = modulus // 2
     return (step + half) % modulus - half if 0 < modulus < 2**63 else step

@@ -12,11 +12,9 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
-from odocal_ros.pipeline.coarse_odometer import held_steps
-from odocal_ros.pipeline.delay_note import delay_notes
+from odocal_ros.pipeline.beyond_model import delay_notes, held, held_steps, upright
 from odocal_ros.pipeline.method_run import MethodRun, Passed
 from odocal_ros.pipeline.prepared import PreparedLeg
-from odocal_ros.pipeline.scale_error import held, upright
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.inputs import Inputs

@@ -20,7 +20,7 @@ from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.align import align
-from odocal_ros.pipeline.coarse_odometer import coarse_reasons
+from odocal_ros.pipeline.beyond_model import coarse_reasons
 from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import axles_of

@@ -28,6 +28,10 @@ from odocal_ros.settings.levels import RAD_PER_DEG
 BIN_S = 1.0                        # s, judgement: accelerations are compared as means over it
 FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain is known to a sixth
 WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
+AXES = 'xyz'
+# nothing follows from such an IMU; what is computed all the same says it in other words
+UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
+MAX_RATE = 8.0                  # rad/s, physical: no vehicle on wheels turns so fast
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +152,6 @@ def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]
         return ()
     return (Reason(Code.IMU_AXES, f'accelerations point {direction} in the IMU frame '
                    f'(yaw mounting {seen}): the body frame is not forward-left-up'),)
-
-
-AXES = 'xyz'
-# nothing follows from such an IMU; what is computed all the same says it in other words
-UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
-MAX_RATE = 8.0                  # rad/s, physical: no vehicle on wheels turns so fast
 
 
 def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,

@@ -33,6 +33,17 @@ DISPLACEMENT_WINDOW = 10.0
 # relative to the displacements between fixes. Judgement: errors of wheel speeds are a few per
 # cent, errors from wrong axes, units and frames are far larger
 MOST_UNLIKE = 0.1
+COMPARED_EVERY = 1.0     # s between the fixes that are compared: judgement
+MOVED_LEAST = 1.0        # m in this time, judgement: displacements then have a direction
+# judgement: smooth is a quarter of the median, or half of it where gyro and odometer add 3 cm
+SMOOTH_LIMIT, FINE_SHARE, FINE_LIMIT = 0.25, 0.5, 0.03
+# judgement: of so many seconds this share is smooth; of white noise three times in 10^8 (a
+# quarter), or in 10^4 (half)
+SMOOTH_ROWS, SMOOTH_SHARE = 10, 0.7
+# medians and m: a jump. Judgement: white noise exceeds three medians once in 500 seconds, after a
+# smooth section
+JUMP_SIZE, SHORTEST_JUMP = 3.0, 0.5
+SPANS_SAID = 3           # judgement: spans in a reason
 
 
 def usable_fixes(fix: FixSamples, sent: int,
@@ -189,19 +200,6 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
     return (Reason(Code.VELOCITY_UNUSABLE, 'GNSS velocity contradicts the fixes and is not '
                    f'used: displacements between fixes are {abs(z):.2f} times those from the '
                    f'velocity, rotated by {np.degrees(np.angle(z)):+.0f} deg'),)
-
-
-COMPARED_EVERY = 1.0     # s between the fixes that are compared: judgement
-MOVED_LEAST = 1.0        # m in this time, judgement: displacements then have a direction
-# judgement: smooth is a quarter of the median, or half of it where gyro and odometer add 3 cm
-SMOOTH_LIMIT, FINE_SHARE, FINE_LIMIT = 0.25, 0.5, 0.03
-# judgement: of so many seconds this share is smooth; of white noise three times in 10^8 (a
-# quarter), or in 10^4 (half)
-SMOOTH_ROWS, SMOOTH_SHARE = 10, 0.7
-# medians and m: a jump. Judgement: white noise exceeds three medians once in 500 seconds, after a
-# smooth section
-JUMP_SIZE, SHORTEST_JUMP = 3.0, 0.5
-SPANS_SAID = 3           # judgement: spans in a reason
 
 
 def reckoned(t_fix: Floats, fixes_n: Floats, path: Floats, turned: Callable[[Floats], Floats],

@@ -22,6 +22,8 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond, speed_glitches
 
 STEPS_BESIDE = 5    # judgement: steps next to a jump or gap that give the speed there
+# counts, rad, m: less is not called motion
+STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
 def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -173,10 +175,6 @@ def _stall(step: Floats, j: int) -> int:
 
 def _usual(rate: Floats) -> float:
     return float(np.median(rate)) if len(rate) else 0.0
-
-
-# counts, rad, m: less is not called motion
-STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
 class Steps:

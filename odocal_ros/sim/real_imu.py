@@ -17,6 +17,10 @@ from odocal_ros.sim.noise import gauss_markov, stream
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 
+# physical: Hz, width, share: wheel hop, engine
+RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
+APART_NS = 50_000    # judgement: between the stamps of one batch
+
 
 def angles(d_b: Floats) -> tuple[float, float]:
     """Return yaw and pitch mounting angle of the forward axis in b, rad."""
@@ -45,11 +49,6 @@ def own_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
     d = np.asarray(C_vb)[0]
     R = turn_and_push(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
     return *angles(R.T @ d), *angles(d)
-
-
-# physical: Hz, width, share: wheel hop, engine
-RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
-APART_NS = 50_000    # judgement: between the stamps of one batch
 
 
 def crooked(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What would reject a leg is said while it is driven, as the result will have it."""
+"""Faults, distance and standstill of a leg while it is driven, as the result will have them."""
 
 from dataclasses import replace
 
@@ -9,14 +9,16 @@ from drives import changed, drive, held_up, seconds, settings
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import take
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps
+from odocal_ros.forecast.progress import Travel
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.core
+SECOND = 10**9
 
 
 @pytest.fixture(scope='module')
@@ -112,3 +114,21 @@ def test_a_gap_of_the_imu_is_seen_at_once_and_stays(made):
     whole = replace(leg, imu=without(leg.imu, leg, 40.0, 43.0), stop_ns=int(rows.stamp_ns[-1]))
     result = calibrate(whole, settings(made, leg__max_gap=limit))
     assert told in result.reasons                    # to the last digit
+
+
+@pytest.mark.parametrize('odd', [np.nan, np.inf, -np.inf, 1e300])
+@pytest.mark.parametrize('quantity', ['cumulative', 'rate'])
+def test_impossible_values_change_no_distance_and_no_standstill(odd, quantity):
+    t = np.arange(0, 20 * SECOND, SECOND // 10)
+    speed = np.where(t < 15 * SECOND, 2.0, 0.0)
+    value = speed if quantity == 'rate' else np.cumsum(speed) * 0.1
+    found = []
+    for bad in ([], [20, 21, 100, 190]):
+        sent = value.copy()
+        sent[bad] = odd
+        travel = Travel(OdometerForm(quantity, 0, '1'))
+        for k in range(0, len(t), 3):
+            travel.feed(take(OdometerSamples(t + SECOND, t + SECOND, sent), slice(k, k + 3)), 1.0)
+        found.append((travel.total, travel.still_s(), travel.top))
+    assert found[1] == pytest.approx(found[0], abs=0.2)
+    assert found[0][0] == pytest.approx(30.0, abs=0.3)
