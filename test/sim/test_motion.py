@@ -55,11 +55,6 @@ def test_a_jump_has_the_mean_of_its_sides():
     assert np.sum((a[1:] + a[:-1]) / 2) * 0.01 == pytest.approx(20.0, abs=1e-10)
 
 
-def test_values_hold_outside():
-    level = chain([smooth(2, 5, 7)])
-    assert level([-1, 0, 2, 3]).tolist() == [5, 5, 7, 7]
-
-
 HOME = Start(np.radians(40), 0.2, 50.0, 0.7)
 ARM = (1.5, -0.5, 1.0)
 
@@ -135,13 +130,6 @@ def test_travel_speed_and_position_belong_together():
     assert_allclose(v_e, v_n, atol=2e-6)
     assert_allclose(np.linalg.norm(v_n, axis=1), state.speed, atol=1e-14)
     assert_allclose((after.travel - before.travel) / (2 * h), state.speed, atol=1e-6)
-
-
-def test_nonholonomic_velocity_lies_along_x():
-    state = lively().at(np.linspace(0, 20, 300))
-    v_v = np.einsum('nji,nj->ni', attitude(state), velocity_n(state))
-    assert_allclose(v_v[:, 1:], 0, atol=1e-14)
-    assert_allclose(v_v[:, 0], state.speed, atol=1e-14)
 
 
 def integrate(motion, rate, arm):

@@ -93,8 +93,15 @@ def test_the_mean_count_times_the_scale_is_the_path(wheels):
     assert len(wheels_of(options)) == len({wheel.name for wheel in wheels_of(options)}) == wheels
 
 
-def test_wheels_without_steering_differ_by_the_turn_and_their_scale():
-    drive = simulate(replace(TOWN, front_steers=False))
+@pytest.mark.parametrize('wheels', [1, 2, 4])
+def test_wheels_without_steering_differ_by_the_turn_and_their_scale(wheels):
+    drive = simulate(replace(TOWN, front_steers=False, wheels=wheels, odometer='angle',
+                             odometer_lever_arm=(0.0, 0.7, 0.0)))
+    assert len(drive.wheels) == wheels
+    assert drive.truth.scale == drive.options.scale
+    if wheels == 2:
+        left, right = drive.truth.wheel_scales
+        assert right / left == pytest.approx(1 + drive.options.wheel_difference)
     state = drive.motion.at((drive.odometer.stamp_ns - drive.options.start_ns) * 1e-9)
     for wheel, samples in zip(wheels_of(drive.options), drive.wheels, strict=True):
         rolled = (samples.value - samples.value[0]) * wheel.scale
