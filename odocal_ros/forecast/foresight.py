@@ -27,9 +27,8 @@ from odocal_ros.forecast.forecast import (
     REST_FORESEEN_S,
     sources_of,
 )
-from odocal_ros.forecast.leg_profile import count_size, fix_figures, profile_of
-from odocal_ros.forecast.leg_so_far import screened_in_cells
-from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
+from odocal_ros.forecast.leg_so_far import count_size, fix_figures, profile_of, screened_in_cells
+from odocal_ros.forecast.planned_drive import inserted, PlannedDrive, REST_SPEED
 from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
 from odocal_ros.forecast.smoother_forecast import (
     gives_all,
@@ -66,11 +65,7 @@ class DriveSoFar(PlannedDrive):
         point = int(moving[-1])
         usual = float(np.median(np.abs(self.speed[moving])))
         on = np.linspace(0.0, metres / usual, 50)[1:]
-        speed, yaw, slope = (
-            np.insert(row, point + 1, np.full(len(on), value)) for row, value in (
-                (self.speed, usual), (self.yaw, self.yaw[point]), (self.slope, self.slope[point])))
-        t = np.concatenate([self.t[:point + 1], self.t[point] + on, self.t[point + 1:] + on[-1]])
-        return replace(self, t=t, speed=speed, yaw=yaw, slope=slope)
+        return inserted(self, point, on, np.full_like(on, usual), np.zeros_like(on))
 
 
 def forecast_of(leg: Leg, fix_rate: float, config: Config,

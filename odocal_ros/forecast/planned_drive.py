@@ -8,7 +8,7 @@ Manoeuvres determine what a straight run does not.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,9 @@ QUARTER = np.pi / 2    # definition: rad
 TOWN_T = np.array([0.0, 5.0, 15.0, 40.0, 50.0, 60.0])
 TOWN_SPEED = np.array([0.0, 0.0, 12.0, 12.0, 0.0, 0.0])
 TOWN_SIDES = 1.0, 1.0, -1.0, -1.0    # two to the left, then two to the right
+
+
+Drive = TypeVar('Drive', bound='PlannedDrive')
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,8 +199,7 @@ def town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
     return inserted(drive, k, *(np.concatenate(x) for x in (t, speed, turned)))
 
 
-def inserted(drive: PlannedDrive, k: int, t: Floats, speed: Floats,
-             turned: Floats) -> PlannedDrive:
+def inserted(drive: Drive, k: int, t: Floats, speed: Floats, turned: Floats) -> Drive:
     """
     Return the drive with a piece after row k; what follows comes later and turned.
 

@@ -185,7 +185,7 @@ class Progress:
 
     def __init__(self, simulated: bool = False) -> None:
         self.clocks = Clocks(simulated)
-        self._travel: dict[str, Travel] = {}
+        self._travel: Travel | None = None
         self._path = FixPath()
         self._zero = 0.0
         self._scale = 0.0
@@ -200,15 +200,14 @@ class Progress:
         self._last[slot] = block
         if slot == 'odometer' and form is not None:
             self._scale = known_scale(config, form, found_scale)
-            self._travel.setdefault(slot, Travel(form)).feed(block, self._scale)
+            self._travel = self._travel or Travel(form)
+            self._travel.feed(block, self._scale)
         elif slot == 'fix':
-            travel = self._travel.get('odometer')
-            moving = travel is not None and bool(travel.moved_ns) and travel.still_s() < STANDING_S
+            moving = bool(self._travel and self._travel.moved_ns) and self.still_s() < STANDING_S
             self._path.feed(block, config.gnss.min_status, moving)
 
     def received_before(self, preroll_s: float) -> Received:
         """Return the samples so far that determine what a leg can estimate."""
-        travel = self._travel.get('odometer')
         fix = self._last.get('fix')
         place = Received({})
         if fix is not None and np.isfinite(fix.latitude[-1]):
@@ -220,30 +219,26 @@ class Progress:
                      for name, block in sent.items()}
         imu = self._last.get('imu')
         return replace(place, variances=variances, felt=imu is None or felt(imu.f_i),
-                       rested_s=travel.rested_s(preroll_s) if travel else 0.0)
+                       rested_s=self._travel.rested_s(preroll_s) if self._travel else 0.0)
 
     def begin_leg(self) -> None:
         """Count distance and speed from here."""
         self._path = FixPath()
-        travel = self._travel.get('odometer')
-        if travel is not None:
-            self._zero, travel.top = travel.total, 0.0
+        if self._travel is not None:
+            self._zero, self._travel.top = self._travel.total, 0.0
 
     def distance_m(self) -> float:
         """Return the distance of the leg so far: odometer where its scale is known, else fixes."""
-        travel = self._travel.get('odometer')
-        if travel is not None and self._scale > 0:
-            return (travel.total - self._zero) * self._scale
+        if self._travel is not None and self._scale > 0:
+            return (self._travel.total - self._zero) * self._scale
         return self._path.total
 
     def max_speed(self) -> float:
         """Return the highest speed of the leg so far, m/s, over a second or more."""
-        travel = self._travel.get('odometer')
-        if travel is not None and self._scale > 0:
-            return travel.top * self._scale
+        if self._travel is not None and self._scale > 0:
+            return self._travel.top * self._scale
         return self._path.top
 
     def still_s(self) -> float:
         """Return the duration of the standstill by the odometer."""
-        travel = self._travel.get('odometer')
-        return travel.still_s() if travel else 0.0
+        return self._travel.still_s() if self._travel else 0.0

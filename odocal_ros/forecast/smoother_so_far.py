@@ -24,7 +24,6 @@ from odocal_ros.errors import BadData
 from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.leg_so_far import screened_in_cells
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.standstill import standstills
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.facing import axes_reasons, facing, UNUSABLE
 from odocal_ros.screening.inputs import place
@@ -103,8 +102,7 @@ class SmootherSoFar:
         if vars(placed.origin) != (self._origin and vars(self._origin)):
             self._origin = placed.origin
             self._growing.forget()
-        spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
-                            config.leg.standstill)
+        spans = inputs.standstills(placed.rough, config)
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,

@@ -18,8 +18,8 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
 from odocal_ros.nav.integral import integral_at
-from odocal_ros.pipeline.leg_run import leg_result
-from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.methods import leg_result
+from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.inputs import Inputs

@@ -18,7 +18,6 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
-from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.align import align
 from odocal_ros.pipeline.beyond_model import coarse_reasons
 from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
@@ -69,8 +68,7 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
               reasons: Sequence[Reason], alignment: Alignment | None,
               holdout: bool) -> PreparedLeg:
     """Return the leg aligned, dead reckoned, and the drive judged."""
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
-                        config.leg.standstill)
+    spans = inputs.standstills(placed.rough, config)
     about: tuple[Reason, ...] = ()
     if alignment is None:
         alignment, about = align(inputs, spans, placed.rough, placed.fixes_n, placed.origin,

@@ -20,8 +20,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
-from odocal_ros.pipeline.method_run import MethodRun, Passed, Path, Paths
-from odocal_ros.pipeline.prepared import PreparedLeg
+from odocal_ros.pipeline.prepared import MethodRun, Passed, Path, Paths, PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured, slip_check
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config

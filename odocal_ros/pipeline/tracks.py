@@ -16,8 +16,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.slip import find_slips, rounding, Slips, SPIN_WINDOW
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Track
-from odocal_ros.pipeline.method_run import Path, Paths
-from odocal_ros.pipeline.prepared import PreparedLeg
+from odocal_ros.pipeline.prepared import Path, Paths, PreparedLeg
 from odocal_ros.reasons import Code, Reason
 
 FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track

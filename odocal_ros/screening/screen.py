@@ -18,8 +18,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg, WHEELS
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_step
-from odocal_ros.nav.gaps import gaps_in_rhythm
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.nav.statistics import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
 from odocal_ros.screening.clocks import judge_clocks

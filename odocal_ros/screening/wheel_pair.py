@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import medians
-from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.statistics import robust_sigma
+from odocal_ros.nav.statistics import GAP_INTERVALS, robust_sigma
 from odocal_ros.settings.config import SIDES
 
 Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2

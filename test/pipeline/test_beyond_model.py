@@ -16,8 +16,8 @@ from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.beyond_model import delay_notes
 from odocal_ros.pipeline.calibrate import calibrate
-from odocal_ros.pipeline.method_run import MethodRun
 from odocal_ros.pipeline.methods import found_by
+from odocal_ros.pipeline.prepared import MethodRun
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
