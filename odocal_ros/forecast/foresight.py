@@ -78,11 +78,7 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
     frozen into the leg.   wanted : asked now and then; Abandoned is raised when it says no.
     smoother : that of this leg; looks go from the one before to the next.
 
-    Raises
-    ------
-    OdocalError
-        Nothing can be foreseen yet: no motion, no fixes, scale unknown.
-
+    Raises OdocalError: nothing can be foreseen yet: no motion, no fixes, scale unknown.
     """
     running = look(leg, config, smoother, wanted)
     if deciding(config.method) == ONLY or gives_all(running):     # the ends add nothing to it

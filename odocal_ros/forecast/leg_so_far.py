@@ -82,13 +82,7 @@ def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
     """
     Return a leg as a drive: speed by the odometer, direction by the gyro, first course by fixes.
 
-    Raises
-    ------
-    BadData
-        IMU, odometer or fixes are missing.
-    BadUsage
-        The vehicle did not move.
-
+    Raises BadData: IMU, odometer or fixes are missing. Raises BadUsage: the vehicle did not move.
     """
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         raise BadData('a profile needs IMU, odometer and fixes between the marks; check the bag '
@@ -123,11 +117,7 @@ def count_size(inputs: Inputs, config: Config) -> float:
     """
     Return the metres of one count of the odometer, 0 for speeds.
 
-    Raises
-    ------
-    BadData
-        The scale is not known.
-
+    Raises BadData: the scale is not known.
     """
     return inputs.travel.quantum * _placed(inputs, config).rough
 

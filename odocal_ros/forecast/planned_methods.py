@@ -37,14 +37,10 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     Return the prediction of the smoother for a drive, covariance only.
 
     The rows are those of ``smooth`` at the true states of ideal samples, the levels those of
-    ``planned_levels``, and what is said of the outcome is said by the code that says it of a fit.
+    ``planned_levels``; its reasons are by the code that gives them for a fit. Scale 1, angles 0,
+    sigmas and budget as they will be.
 
     drive, sigmas : as for ``predict``.   spacing : s between keyframes; as ``spacing_for`` has it.
-
-    Returns
-    -------
-    MethodResult named ``smoother``; scale 1, angles 0, sigmas and budget as they will be.
-
     """
     few = too_little(int(drive.duration * sigmas.fix_rate), drive.duration)
     if few:
@@ -174,11 +170,7 @@ def plan_methods(drive: PlannedDrive, sigmas: Sigmas, spacing: float | None = No
 
     drive, sigmas : as for ``predict``.   spacing : as for ``predict_smoother``.
 
-    Raises
-    ------
-    BadUsage
-        The drive is shorter than one fix interval.
-
+    Raises BadUsage: the drive is shorter than one fix interval.
     """
     asked = sigmas.config.method
     two_point = predict(drive, sigmas)

@@ -68,11 +68,7 @@ class SmootherSoFar:
         leg : the data so far: the earlier data, and more.   config : as frozen into the leg.
         wanted : asked between passes; Abandoned is raised when it says no.
 
-        Raises
-        ------
-        OdocalError
-            Too little of the drive yet, or no fit to it; the next update is a cold start.
-
+        Raises OdocalError: too little of the drive, or no fit; the next update is a cold start.
         """
         def trace(*_: object) -> None:
             if not wanted():

@@ -59,16 +59,11 @@ class Travel:
 def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool = False,
            name: str = 'the counter') -> tuple[Travel, tuple[Reason, ...]]:
     """
-    Sum an odometer's rows up to travel.
+    Return the travel of an odometer's rows, and reasons.
 
     t : (n,) times, s, rising.   value : (n,) as sent: int64 counters or float64.   form : what the
-    value means.   reversed_counts : positive values mean backwards.   name : what findings call
-    it.
-
-    Returns
-    -------
-    Travel, and what was found: rollovers (undone), resets (bridged at the speed beside them).
-
+    value means.   reversed_counts : positive values mean backwards.   name : of the counter in
+    reasons. Rollovers are undone, resets bridged at the speed beside them.
     """
     whole = np.issubdtype(value.dtype, np.integer)
     reasons: tuple[Reason, ...] = ()

@@ -43,15 +43,10 @@ Found = tuple[tuple[float, float] | None, str]      # yaw and sigma, rad; or Non
 def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats, origin: Origin,
           config: Config) -> tuple[Alignment, tuple[Reason, ...]]:
     """
-    Align a leg.
+    Return the alignment of a leg, and reasons.
 
     inputs : screened leg.   spans : (k, 2) standstills, s.   metres_per_unit : rough scale.
     fixes_n : (n, 3) fixes in n, m.   origin : where n is fixed.   config : heading source, grade.
-
-    Returns
-    -------
-    Alignment, reasons.
-
     """
     grade = grade_of(config.imu)
     if not inputs.felt:

@@ -52,18 +52,13 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
               notes: tuple[Reason, ...] = (), holdout: bool = False,
               progress: Callable[[Stage], None] | None = None) -> LegResult:
     """
-    Take one leg from samples to result.
+    Return the result of one leg; if it cannot be calibrated, its reasons say why.
 
     leg : raw samples between two marks, with pre-roll.   config : settings in force.   alignment :
     used instead of the leg's own (a simulation puts errors in it).   notes : what the door knows
     of the data already (a truncated bag).   holdout : keep the last fifth of the distance back
     from the fit and check the correction on it.   progress : called with each stage of the work,
     and with each pass of a fit.
-
-    Returns
-    -------
-    LegResult; a leg that cannot be calibrated says why in its reasons.
-
     """
     progress, config = progress or (lambda stage: None), settings_by_frame(leg.fix, config)
     if is_planar(leg, config):
@@ -187,10 +182,10 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
                     holdout: bool = False,
                     progress: Callable[[Stage], None] | None = None) -> list[LegResult]:
     """
-    Take a leg from samples to results: one, or one of each part that carries.
+    Return the results of a leg: one, or one of each part long enough to calibrate.
 
-    Arguments as for ``calibrate``. Where no part carries, or a gap is not what rejects the leg,
-    the result is that of the whole.
+    Arguments as for ``calibrate``. Where no part is long enough, or a gap is not what rejects the
+    leg, the result is that of the whole.
     """
     parts = parts_of(leg, config.leg.max_gap)
     results = []

@@ -60,15 +60,10 @@ UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
 def run_methods(names: Iterable[str], prepared: PreparedLeg,
                 begun: Callable[[str], Passed]) -> dict[str, MethodRun]:
     """
-    Run methods on a leg; what breaks in one costs this method, not the leg.
+    Return the runs of methods on a leg; an error in one costs this method, not the leg.
 
     names : in any order.   begun : called with the name of each before it runs, returns what to
     call with each pass of its fit.
-
-    Returns
-    -------
-    What each found.
-
     """
     runs = {}
     for name in names:

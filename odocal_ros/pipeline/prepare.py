@@ -36,16 +36,11 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
             alignment: Alignment | None = None,
             holdout: bool = False) -> tuple[PreparedLeg | None, tuple[Reason, ...]]:
     """
-    Prepare a leg for the methods.
+    Return a leg prepared for the methods, None if none can be run on it, and all reasons.
 
     leg, inputs, config : the leg, screened, and the settings in force.   reasons : what was found
     of it so far.   alignment : used instead of the leg's own.   holdout : keep the last fifth of
     the distance back from the fit.
-
-    Returns
-    -------
-    PreparedLeg, None where no method can be run on it, and all that was found, a tuple.
-
     """
     placed = place(inputs, config)
     let_go()

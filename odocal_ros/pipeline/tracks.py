@@ -37,14 +37,7 @@ def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimat
 
 def near(ready: PreparedLeg, path: Path, pin: MarkFix,
          between: Bools) -> tuple[Bools, tuple[Reason, ...]]:
-    """
-    Return a mask of fixes without gross outliers from a fitting path.
-
-    Returns
-    -------
-    (k,) bool, and what is to be said of the others, a tuple.
-
-    """
+    """Return a mask of fixes, (k,), without gross outliers from a fitting path, and reasons."""
     if not between.any():
         return between, ()
     off = np.hypot(*stray(path, pin, (ready.inputs.t_fix, ready.fixes_n))[:, :2].T)

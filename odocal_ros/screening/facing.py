@@ -157,17 +157,11 @@ def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]
 def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
                imu: ImuConfig) -> tuple[tuple[Reason, ...], bool]:
     """
-    Judge units and axes of an IMU.
+    Return reasons about units and axes of an IMU, and True if it must be turned over (z down).
 
     mean : (3,) specific force as it usually is (its median), m/s^2, in the configured body
     frame.   w_b : (n, 3) turn rate there, rad/s.   C_bi : (3, 3) nominal rotation configured.
-    imu : its scales are in the figures already.
-
-    Returns
-    -------
-    reasons, and whether the body frame must be turned over (z down) to be used. Of what is
-    UNUSABLE there is nothing to compute with.
-
+    imu : its scales are in the figures already. An UNUSABLE one cannot be computed with.
     """
     rest, size = medians(w_b), float(np.linalg.norm(mean))
     fast = float(np.percentile(by_row(lambda w: lengths(w - rest), w_b), 99.9,

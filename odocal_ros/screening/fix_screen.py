@@ -49,14 +49,9 @@ SPANS_SAID = 3           # judgement: spans in a reason
 def usable_fixes(fix: FixSamples, sent: int,
                  gnss: GnssConfig) -> tuple[Bools, Floats, tuple[Reason, ...]]:
     """
-    Judge the fixes of a leg.
+    Return a mask of usable fixes, (n,), all covariances, (n, 3, 3) m^2, and reasons.
 
     fix : with stamps in order.   sent : how many there were before.   gnss : limits.
-
-    Returns
-    -------
-    use : (n,) bool.   covariance_n : (n, 3, 3) m^2.   What was found.
-
     """
     no_fix = fix.status < gnss.min_status
     most_height = 1e5    # m, beyond it a fix is at no real position

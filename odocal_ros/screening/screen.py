@@ -38,15 +38,10 @@ MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not
 
 def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
     """
-    Clean a leg.
+    Return the usable arrays of a leg, empty where nothing is left, and reasons.
 
     judged : False for its motion alone: clocks, gyro and wheels that fail are not looked for, and
     orientations stay as sent.
-
-    Returns
-    -------
-    The usable arrays (empty where nothing is left) and the findings.
-
     """
     leg, unfelt = with_force(leg, config)
     leg, local = without_north(leg, config)

@@ -103,15 +103,11 @@ def _measured(value: Values, rows: Ints, middle: float, slack: float) -> tuple[f
 def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
              side: str) -> tuple[OdometerSamples, tuple[Reason, ...], Floats, Floats]:
     """
-    Return rows with hidden rollovers corrected, the reasons, and the remaining uncertainty.
+    Return rows with hidden rollovers corrected, reasons, times and sigmas of uncertain travel.
 
     t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its
-    steps, rollovers of the type's span undone.   side : whose counter it is, for people.
-
-    Returns
-    -------
-    samples; reasons; (k,) s and (k,) counts: times and sigmas of uncertain travel.
-
+    steps, rollovers of the type's span undone.   side : of the counter, in reasons. Times are (k,)
+    s, sigmas (k,) counts.
     """
     span = hidden_span(samples.value, step)
     none = np.empty(0)

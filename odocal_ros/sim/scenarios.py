@@ -197,11 +197,7 @@ def simulate(options: SimOptions | None = None) -> Drive:
     """
     Return a drive; equal options give equal drives, to the last bit.
 
-    Raises
-    ------
-    BadUsage
-        An option is unknown or out of range.
-
+    Raises BadUsage: an option is unknown or out of range.
     """
     options = resolved(options or SimOptions())
     motion = motion_of(options)

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
+from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples, take
 from odocal_ros.nav.earth import radii
 from odocal_ros.nav.rotations import (
     matrix_from_rpy,
@@ -230,9 +230,7 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
         seen &= (t < begin) | (t >= end)
     if real.drops:
         seen &= stream(options.seed, 'real drops').uniform(size=n) >= real.drops
-    return FixSamples(*(getattr(samples, name)[seen] for name in (
-        'stamp_ns', 'received_ns', 'latitude', 'longitude', 'height', 'covariance_n',
-        'covariance_type', 'status')))
+    return take(samples, seen)
 
 
 def _axes(options: SimOptions) -> Floats:
