@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 
+from cells import thinned
 from drives import changed, drive, held_up, seconds, settings
 import numpy as np
 import pytest
@@ -57,14 +58,6 @@ def sound(leg):
     return leg
 
 
-def sketched(leg):
-    """Return the leg as the node's cells have it."""
-    thinned = ThinnedLeg(leg.form)
-    for slot in ('imu', 'odometer', 'fix'):
-        thinned.feed(slot, getattr(leg, slot))
-    return thinned.leg(leg.start_ns)
-
-
 @pytest.mark.parametrize('wrong', [reversed_counter, reset_counter, gap, dead_counter, in_g,
                                    sound])
 def test_the_faults_so_far_are_those_of_the_result(made, wrong):
@@ -74,7 +67,7 @@ def test_the_faults_so_far_are_those_of_the_result(made, wrong):
     lowering = {r.code for r in result.reasons
                 if r.code.gravity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
     assert {r.code for r in faults(leg, screened(leg, config), config)} == lowering
-    assert {r.code for r in faults_in_cells(sketched(leg), config)} == lowering
+    assert {r.code for r in faults_in_cells(thinned(leg).leg(leg.start_ns), config)} == lowering
     assert (lowering == set()) == (wrong is sound)
 
 
@@ -82,13 +75,13 @@ def test_late_rows_are_put_back_so_far_as_in_the_result(made):
     leg = made.leg()
     late = replace(leg, odometer=held_up(leg.odometer, how_long_s=0.4)[0])
     wanted = screen(late, settings(made))[0].travel
-    thinned = ThinnedLeg(leg.form)
+    cells = ThinnedLeg(leg.form)
     sent_ns = late.odometer.stamp_ns
     for begin in np.arange(sent_ns[0], sent_ns[-1] + 1, 5 * 10**9):       # look by look
-        thinned.feed('odometer', take(late.odometer, (sent_ns >= begin)
-                                     & (sent_ns < begin + 5 * 10**9)))
-    thinned.feed('imu', leg.imu)
-    cells = thinned.leg(leg.start_ns).odometer
+        cells.feed('odometer', take(late.odometer, (sent_ns >= begin)
+                                   & (sent_ns < begin + 5 * 10**9)))
+    cells.feed('imu', leg.imu)
+    cells = cells.leg(leg.start_ns).odometer
     count = np.interp(seconds(leg, cells), wanted.t, wanted.s)
     # a row is 0.05 s; as sent, cells are off by up to 0.4 s of driving
     speed = np.gradient(wanted.s, wanted.t).max()
