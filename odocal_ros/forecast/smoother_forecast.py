@@ -43,11 +43,7 @@ def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
 
     leg : the data so far.   wanted : called between passes; if False, Abandoned is raised.
 
-    Raises
-    ------
-    OdocalError
-        There is no forecast yet, and the smoother is the only method.
-
+    Raises OdocalError: there is no forecast yet, and the smoother is the only method.
     """
     if smoother is None or 'smoother' not in deciding(config.method):
         return None

@@ -19,11 +19,9 @@ from odocal_ros.errors import BadData
 from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.leg_so_far import screened_in_cells
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.standstill import standstills
 from odocal_ros.reasons import Reason
-from odocal_ros.screening.facing import axes_reasons, facing
+from odocal_ros.screening.facing import axes_reasons, facing, UNUSABLE
 from odocal_ros.screening.inputs import place
-from odocal_ros.screening.sanity import UNUSABLE
 from odocal_ros.settings.config import Config
 
 
@@ -46,11 +44,7 @@ class SmootherSoFar:
         leg : the data so far: the earlier data, and more.   config : as frozen into the leg.
         wanted : asked between passes; Abandoned is raised when it says no.
 
-        Raises
-        ------
-        OdocalError
-            Too little of the drive yet, or no fit to it; the next update is a cold start.
-
+        Raises OdocalError: too little of the drive, or no fit; the next update is a cold start.
         """
         def trace(*_: object) -> None:
             if not wanted():
@@ -80,8 +74,7 @@ class SmootherSoFar:
         if vars(placed.origin) != (self._origin and vars(self._origin)):
             self._origin = placed.origin
             self._growing.forget()
-        spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
-                            config.leg.standstill)
+        spans = inputs.standstills(placed.rough, config)
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,

@@ -8,6 +8,7 @@ import math
 from types import SimpleNamespace
 import warnings
 
+from cells import thinned
 import numpy as np
 import pytest
 
@@ -22,7 +23,6 @@ from odocal_ros.forecast.forecast import Abandoned, as_keys, Forecast, Prospect
 from odocal_ros.forecast.foresight import forecast_of
 from odocal_ros.forecast.smoother_forecast import look, with_running
 from odocal_ros.forecast.smoother_so_far import SmootherSoFar
-from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.live.guidance import hint
 from odocal_ros.live.session import Session
 from odocal_ros.live.session_view import SessionView
@@ -32,7 +32,6 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
-SECOND = 1_000_000_000
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 LOOKS = (30.0, 47.0, 60.0, 95.0, 108.0, 165.0, 172.0, 240.0)    # s after the start mark
 
@@ -44,14 +43,10 @@ def drive_of(**options):
 
 def looked(drive, config, looks=LOOKS):
     """Return what each look at a growing leg gave, and the leg as sketched at the last."""
-    whole, thinned, so_far, found = drive.leg(), ThinnedLeg(drive.leg().form), SmootherSoFar(), []
-    before_ns = 0
-    for t in looks:
-        now_ns = whole.start_ns + round(t * SECOND)
-        for slot in ('imu', 'odometer', 'fix'):
-            rows = getattr(whole, slot)
-            thinned.feed(slot, take(rows, (rows.stamp_ns > before_ns) & (rows.stamp_ns <= now_ns)))
-        before_ns, leg = now_ns, thinned.leg(whole.start_ns)
+    whole, cells, so_far, found = drive.leg(), None, SmootherSoFar(), []
+    for before, now in zip((-np.inf, *looks), looks, strict=False):
+        cells = thinned(whole, now, before, cells)
+        leg = cells.leg(whole.start_ns)
         running = so_far.look(leg, config)
         found.append(SimpleNamespace(running=running, once_s=so_far.once_s, leg=leg))
     return found
