@@ -26,7 +26,14 @@ from drives import (
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import join, no_fix, no_imu, no_odometer, OdometerForm, take
+from odocal_ros.data.samples import (
+    FixSamples,
+    ImuSamples,
+    join,
+    OdometerForm,
+    OdometerSamples,
+    take,
+)
 from odocal_ros.nav.angles import yaw_from_heading
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate, combine
@@ -96,8 +103,8 @@ def test_a_speed_topic_of_nothing_but_nan():
 
 
 @pytest.mark.parametrize(('slot', 'empty', 'code'), [
-    ('imu', no_imu, Code.NO_IMU), ('odometer', no_odometer, Code.NO_ODOMETER),
-    ('fix', no_fix, Code.NO_FIX)])
+    ('imu', ImuSamples.none, Code.NO_IMU), ('odometer', OdometerSamples.none, Code.NO_ODOMETER),
+    ('fix', FixSamples.none, Code.NO_FIX)])
 def test_no_message_at_all(made, leg, slot, empty, code):
     result, _ = run(replace(leg, **{slot: empty()}), settings(made))
     assert rejecting(result) == {code}

@@ -398,7 +398,7 @@ def test_1_khz_arrives_whole_and_services_answer_meanwhile(start, connect):
 
 
 def test_each_node_has_a_folder_of_its_own_in_the_ros_home(tmp_path, monkeypatch):
-    from odocal_ros.live.result_files import output_root
+    from odocal_ros.live.filing import output_root
     from odocal_ros.settings.config import Config, with_settings
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     assert output_root(Config(), '/calibrator') == tmp_path / 'odocal/calibrator'
