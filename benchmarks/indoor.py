@@ -73,8 +73,8 @@ def run_drive(seed):
     """Draw, drive, calibrate; return a row."""
     from odocal_ros.pipeline.calibrate import calibrate, combine
     from odocal_ros.settings.config import with_settings
-    from odocal_ros.sim.robot_wheels import effective_width, SIDEWAYS
     from odocal_ros.sim.scenarios import simulate
+    from odocal_ros.sim.wheels import effective_width, SIDEWAYS
     drive = simulate(options_of(seed))
     config = with_settings(configured(drive), {'odometer.track_width': 0.0})
     calibration = combine([calibrate(drive.leg(), config)], config)

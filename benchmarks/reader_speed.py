@@ -72,15 +72,15 @@ print(clock() - began)
 """
 AUTO = TIMED + """
 from odocal_ros.offline.cli import main
-from odocal_ros.pipeline import leg_run
-run, spent = leg_run.run_methods, 0.0
+from odocal_ros.pipeline import methods
+run, spent = methods.run_methods, 0.0
 def timed(*args):
     global spent
     began = clock()
     found = run(*args)
     spent += clock() - began
     return found
-leg_run.run_methods = timed
+methods.run_methods = timed
 main(['replay', str(path), '--quiet', '--force', '--output', sys.argv[3]])
 print(spent)
 """

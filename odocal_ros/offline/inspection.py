@@ -43,7 +43,7 @@ from odocal_ros.offline.wheel_survey import (
 )
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond
-from odocal_ros.screening.local_frame import settings_by_frame
+from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config, SIDES
 
 # what only a method that begins with an alignment, or sees the ends alone, minds

@@ -28,10 +28,10 @@ from odocal_ros.offline.stretches import (
     survey_drive,
 )
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.facing import imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.inputs import Inputs
-from odocal_ros.screening.local_frame import settings_by_frame
-from odocal_ros.screening.sanity import imu_sanity, MAX_RATE
+from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG

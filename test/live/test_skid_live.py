@@ -9,8 +9,8 @@ from player import part, playing_to, sent_of, stopped
 import pytest
 
 from odocal_ros.bagio import encode
-from odocal_ros.sim.robot_wheels import effective_width
 from odocal_ros.sim.scenarios import SimOptions, simulate
+from odocal_ros.sim.wheels import effective_width
 
 SPEED = 20.0
 NAMES = {'fix': '/mocap', 'odometer': '/joint_states'}
