@@ -28,6 +28,12 @@ from odocal_ros.nav.earth import (
 from odocal_ros.nav.local_frame import GNSS_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
+from odocal_ros.nav.statistics import robust_sigma
+
+SHORT_SECTION = 2.0     # m, judgement: correlated fix errors change by less in that path
+# judgement: ratio of scales by short and long sections from which on the path folds back; noise
+# of an eighth of a chord makes the short one 1 % longer
+FOLDED = 1.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,20 +144,32 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
     Return metres per unit of travel from distances between fixes, None where nothing moves.
 
     The path is cut into equal sections, as short as possible with fixes ``least`` m and eight
-    sigmas apart, and the median of the pieces taken: good to a few per cent despite outliers,
-    for thresholds and for scales that have no nominal value.
+    sigmas apart, and the median of the sections is used: good to a few per cent despite outliers,
+    for thresholds and for scales that have no nominal value. Where the path folds back within
+    ``least`` (the lanes of a mower), shorter sections have the longer chords.
     """
     inside = (t_fix >= travel.t[0]) & (t_fix <= travel.t[-1]) if len(travel.t) else []
     if not np.any(inside):
         return None
     s, p = travel.at(t_fix[inside]), fixes_n[inside, :2]
+    scale = _by_sections(s, p, max(least, 8 * sigma))
+    if scale is None or len(s) < 5:
+        return scale
+    # of a cubic, white noise adds up to 20 times its variance
+    noise = robust_sigma(np.diff(p, 3, axis=0)) / np.sqrt(20)
+    short = _by_sections(s, p, max(SHORT_SECTION, 8 * sigma, 8 * noise))
+    return short if short is not None and short > FOLDED * scale else scale
+
+
+def _by_sections(s: Floats, p: Floats, least: float) -> float | None:
+    """Return the median of chord over travel in the shortest sections with chords of ``least``."""
     path_length = np.append(0.0, np.cumsum(np.abs(np.diff(s))))
     pieces = len(s) // 2
     while pieces and path_length[-1] > 0:
         k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], pieces + 1)))
         chord, run = np.hypot(*np.diff(p[k], axis=0).T), np.abs(np.diff(s[k]))
         onward = run > 0
-        if onward.any() and np.median(chord[onward]) >= max(least, 8 * sigma):
+        if onward.any() and np.median(chord[onward]) >= least:
             return float(np.median(chord[onward] / run[onward]))
         pieces //= 2
     return None
