@@ -30,6 +30,7 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 USUAL_LIMIT = 3.0
 # s, length of compared displacements: judgement, longer than delays of receivers
 DISPLACEMENT_WINDOW = 10.0
+VELOCITY_GAP = 2.0    # s, judgement: a longer one hides a change of speed
 # relative to the displacements between fixes. Judgement: errors of wheel speeds are a few per
 # cent, errors from wrong axes, units and frames are far larger
 MOST_UNLIKE = 0.1
@@ -185,6 +186,11 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
     path = running_integral(t, velocity_n[:, :2])
     V = np.diff(np.interp(t_fix[pick], t, path[:, 0]) + 1j * np.interp(t_fix[pick], t, path[:, 1]))
     D = np.diff(east + 1j * north)
+    # in a gap of the velocity, or of the fixes, what is between is not measured
+    gaps, at = np.append(0, np.cumsum(np.diff(t) > VELOCITY_GAP)), t_fix[pick]
+    begin, end = np.searchsorted(t, at[:-1], side='right') - 1, np.searchsorted(t, at[1:])
+    whole = (gaps[begin] == gaps[end]) & (np.diff(at) < 2 * DISPLACEMENT_WINDOW)
+    V, D = V[whole], D[whole]
     power = float((abs(V)**2).sum())
     if not power:
         return ()

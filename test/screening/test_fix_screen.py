@@ -9,6 +9,7 @@ from drives import changed, configured, settings
 import numpy as np
 import pytest
 
+from odocal_ros.data.samples import take
 from odocal_ros.reasons import Code
 from odocal_ros.screening.fix_screen import reckoned
 from odocal_ros.screening.screen import screen
@@ -94,6 +95,16 @@ def screened(drive, change, **options):
 @pytest.mark.parametrize('factor', [1.0, 1.05, 0.95])
 def test_that_of_the_fixes_is_used(drive, factor):
     assert not screened(drive, lambda v: np.multiply(v, factor, out=v))
+
+
+def test_gaps_of_the_velocity_are_not_compared(drive):
+    leg, v = drive.leg(), drive.leg().fix_velocity
+    t = (v.stamp_ns - leg.start_ns) * 1e-9
+    fast = np.linalg.norm(v.velocity_n, axis=1) > 8.0      # a line between them is no stop
+    kept = np.flatnonzero((t < 30.0) | (t > 170.0) | fast & (t % 60.0 < 15.0))
+    inputs, found = screen(replace(leg, fix_velocity=take(v, kept)), settings(drive, None))
+    assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
+    assert len(inputs.t_velocity)
 
 
 def test_wheel_speeds_units_and_axes_are_found(drive):
