@@ -45,7 +45,7 @@ def driven(vehicle, legs, grade, fixes):
     """Return the results of a vehicle's legs, when they were driven, settings and truth."""
     from smoother_legs import leg_of
 
-    from odocal_ros.calib.smoother import smooth
+    from odocal_ros.estimator import smooth
     from odocal_ros.settings.grades import GRADES
     from odocal_ros.sim.noise import stream
     seed = FIRST_SEED + 100 * vehicle
@@ -78,7 +78,7 @@ def off(method, truth):
 def run_vehicle(vehicle, legs, grade, fixes):
     """Drive, fit, combine; return a row."""
     from odocal_ros.calib.combine import combine_method
-    from odocal_ros.calib.smoother.several import combine_legs
+    from odocal_ros.estimator.several import combine_legs
     begin = time.process_time()
     results, times, config, truth = driven(vehicle, legs, grade, fixes)
     good = [(r, t) for r, t in zip(results, times, strict=True) if r.border]

@@ -96,7 +96,7 @@ def simulated(seed, **options):
 
 def true_levels(problem, drive):
     """Return the noise levels of the simulation."""
-    from odocal_ros.calib.smoother.noise import INTERVAL
+    from odocal_ros.estimator.factors.interval_noise import INTERVAL
     from odocal_ros.settings.grades import GRADES as FIGURES
     o, grade = drive.options, FIGURES[drive.options.imu_grade]
     road = dict.fromkeys(INTERVAL[4:], 0.0)
@@ -113,10 +113,10 @@ def bounds(drive, config, leg, result):
     """Return sigmas of ln K and yaw at the truth, with the fit's levels and with the true ones."""
     from smoother_legs import truth
 
-    from odocal_ros.calib.smoother import bound
-    from odocal_ros.calib.smoother.noise import Levels
-    from odocal_ros.calib.smoother.problem import Problem
-    state, problem = truth(drive, config, leg), Problem.of(leg, config)
+    from odocal_ros.estimator import bound
+    from odocal_ros.estimator.levels import Levels
+    from odocal_ros.estimator.prepare import problem_of
+    state, problem = truth(drive, config, leg), problem_of(leg, config)
     out = {}
     for name, levels in (('fit', Levels.of_roots(result.details['noise'])),
                          ('true', true_levels(problem, drive))):
@@ -145,7 +145,7 @@ def run_drive(name, seed):
     """Drive, fit, and return a row."""
     from smoother_legs import leg_of
 
-    from odocal_ros.calib.smoother import smooth
+    from odocal_ros.estimator import smooth
     drive, config = simulated(seed, **TOWN, **CELLS[name])
     leg = leg_of(drive.leg(), config)
     begin = time.process_time()

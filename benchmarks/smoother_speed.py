@@ -31,7 +31,7 @@ CELLS = {
 
 def run(name, options, seed):
     """Print one line of figures."""
-    from odocal_ros.calib.smoother import smooth, smoother_leg
+    from odocal_ros.estimator import smooth, smoother_leg
     from odocal_ros.nav.standstill import standstills
     from odocal_ros.screening.inputs import place
     from odocal_ros.screening.screen import screen

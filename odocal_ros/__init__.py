@@ -20,7 +20,8 @@ Packages data       samples and legs         settings   settings and IMU grades
          outside    input checks for names, YAML and files
          messages   bytes to samples         bagio      bags; the only user of rosbags
          screening  input checks             nav        strapdown, odometer, dead reckoning
-         calib      methods, budgets, verdict, combination of legs
+         calib      two-point and planar methods, budgets, verdict, combination of legs
+         estimator  the smoother: GNSS, IMU and odometer of a whole leg
          pipeline   one pure function from leg to result
          forecast   the sigmas that a drive will give: planned, or as far as it is driven
          apply      dead reckoning with a calibration, sample by sample

@@ -12,6 +12,7 @@ import sys
 import pytest
 
 import odocal_ros
+from odocal_ros import estimator
 from odocal_ros.offline.cli import COMMANDS
 
 pytestmark = pytest.mark.core
@@ -28,16 +29,17 @@ ROOMS = {
     'bagio': 'data messages outside',
     'screening': 'data nav settings',
     'calib': 'data nav screening settings',
-    'pipeline': 'calib data nav screening settings',
-    'forecast': 'calib data nav pipeline screening settings',
+    'estimator': 'calib data nav screening settings',
+    'pipeline': 'calib data estimator nav screening settings',
+    'forecast': 'calib data estimator nav pipeline screening settings',
     'pattern': 'settings',
     'apply': 'calib data nav screening settings',
     'sim': 'data nav settings',
-    'output': 'calib data nav outside pipeline settings',
+    'output': 'calib data estimator nav outside pipeline settings',
     'live': 'apply bagio calib data forecast messages output outside pattern pipeline settings',
-    'library': 'bagio calib data forecast messages nav output outside pipeline screening settings '
-               'sim',
-    'offline': 'bagio calib data forecast library messages nav output outside pipeline '
+    'library': 'bagio calib data estimator forecast messages nav output outside pipeline '
+               'screening settings sim',
+    'offline': 'bagio calib data estimator forecast library messages nav output outside pipeline '
                'screening settings sim',
     'fleet': 'bagio calib library nav offline outside output pipeline settings'}
 COMMON = {'errors', 'reasons'}
@@ -87,7 +89,7 @@ def test_imports_at_the_top_stay_light(module):
 def test_a_method_that_does_not_run_is_not_imported():
     probe = ('import odocal_ros.library.calibrate_bag, odocal_ros.pipeline.calibrate, '
              'odocal_ros.output.files, odocal_ros.output.stored, odocal_ros.library.legs, sys\n'
-             "rooms = ('odocal_ros.calib.smoother', 'odocal_ros.calib.wheel_search', "
+             "rooms = ('odocal_ros.estimator', 'odocal_ros.calib.wheel_search', "
              "'odocal_ros.calib.wheels.')\n"
              'print([m for m in sys.modules if m.startswith(rooms)'
              " and m != 'odocal_ros.calib.wheels.wheel_slips'])")
@@ -138,12 +140,11 @@ def test_a_room_uses_what_the_table_says(room):
 
 
 def test_the_smoother_is_asked_by_its_face_while_a_leg_runs():
-    from odocal_ros.calib import smoother
-    face = {f'odocal_ros.calib.smoother.{name}' for name in smoother.__all__}
+    face = {f'odocal_ros.estimator.{name}' for name in estimator.__all__}
     planned = ('ideal_samples', 'planned_methods')     # of a drive that nobody drives yet
     asked = {name for path in _modules() if _part(path) in ('live', 'forecast')
              and path.stem not in planned
-             for name in _imports(path) if name.startswith('odocal_ros.calib.smoother')}
+             for name in _imports(path) if name.startswith('odocal_ros.estimator')}
     assert asked
     assert asked <= face
 
@@ -159,7 +160,7 @@ def test_the_rooms_stand_in_order_and_nothing_else_lies_beside_them():
 
 def test_the_pure_parts_ask_no_clock_and_open_nothing():
     pure = [p for p in _modules() if _part(p) in (
-        'nav', 'screening', 'calib', 'pipeline', 'forecast', 'apply')
+        'nav', 'screening', 'calib', 'estimator', 'pipeline', 'forecast', 'apply')
             and p.stem != 'smoother_so_far']      # it measures how long its own passes take
     assert len(pure) > 10
     for path in pure:

@@ -15,10 +15,10 @@ import re
 import odocal_ros
 
 PACKAGE = Path(odocal_ros.__file__).parent
-ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'pipeline', 'forecast', 'apply',
-         'live')
+ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'estimator', 'pipeline', 'forecast',
+         'apply', 'live')
 # where a vector's unknowns lie: two vectors may hold the same quantity
-LAYOUTS = ('calib/smoother/state.py', 'apply/errors.py')
+LAYOUTS = ('estimator/state.py', 'apply/errors.py')
 
 
 # '# s, judgement: ...', '# statistical: ...', 'a sentence. Physical'; what is tuned says by what

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate
-from odocal_ros.calib.smoother.wheel_result import wheel_estimates
-from odocal_ros.calib.smoother.wheels import Wheel
 from odocal_ros.calib.wheels.wheel_slips import of_axles, WheelSlips
 from odocal_ros.data.inputs import WHEELS
+from odocal_ros.estimator.result.wheel_result import wheel_estimates
+from odocal_ros.estimator.result.wheels import Wheel
 from odocal_ros.output.summary import screen as printed
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict

@@ -106,7 +106,7 @@ def _load_libraries() -> None:
 
     OpenBLAS maps a buffer when it is loaded or first used, and tries for ever if that is refused.
     """
-    for name in ('odocal_ros.calib.smoother', 'odocal_ros.library.calibrate_bag'):
+    for name in ('odocal_ros.estimator', 'odocal_ros.library.calibrate_bag'):
         import_module(name)
     from scipy.linalg import cho_factor
     matrix = np.eye(128)        # larger than what OpenBLAS multiplies without a buffer

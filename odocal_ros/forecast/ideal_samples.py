@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.smoother.imu_steps import ImuSteps, keyframes
-from odocal_ros.calib.smoother.leg import BEFORE_MARK, SmootherLeg
-from odocal_ros.calib.smoother.motion import gravity_n
-from odocal_ros.calib.smoother.outside import GIVEN_HEADING_NOISE, Heading, OUTSIDE_RATE
-from odocal_ros.calib.smoother.state import M, State
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.estimator.factors.motion import gravity_n
+from odocal_ros.estimator.imu_steps import ImuSteps, keyframes
+from odocal_ros.estimator.leg import BEFORE_MARK, SmootherLeg
+from odocal_ros.estimator.outside import GIVEN_HEADING_NOISE, Heading, OUTSIDE_RATE
+from odocal_ros.estimator.state import M, State
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.nav.alignment import HEADING_LIMIT

@@ -9,18 +9,19 @@ import numpy as np
 
 from odocal_ros.calib.choice import choose, deciding, worth_saying
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.calib.smoother.chain import NotPositive, solve
-from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.estimate import Fit
-from odocal_ros.calib.smoother.imu_noise import sensor_noise
-from odocal_ros.calib.smoother.level_steps import SLIPPING
-from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.outcome import outcome
-from odocal_ros.calib.smoother.problem import Problem, SPACING
-from odocal_ros.calib.smoother.refusal import refused
-from odocal_ros.calib.smoother.slow_error import WHITE_SHARE
-from odocal_ros.calib.smoother.smoother import too_little
-from odocal_ros.calib.smoother.state import M
+from odocal_ros.estimator.chain import NotPositive, solve
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
+from odocal_ros.estimator.fit import Fit
+from odocal_ros.estimator.imu_noise import sensor_noise
+from odocal_ros.estimator.level_steps import SLIPPING
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.prepare import problem_of, SPACING
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.result.outcome import outcome
+from odocal_ros.estimator.result.refusal import refused
+from odocal_ros.estimator.smoother import too_little
+from odocal_ros.estimator.state import M
 from odocal_ros.forecast.ideal_samples import Ideal, ideal
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.forecast.predict import predict, Prediction, Sigmas
@@ -46,7 +47,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     if few:
         return refused([few], '1')
     made = ideal(drive, sigmas, spacing_for(drive) if spacing is None else spacing)
-    problem = Problem.of(made.leg, sigmas.config, made.imu)
+    problem = problem_of(made.leg, sigmas.config, made.imu)
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
         fit = _fit(problem, made, levels)

@@ -12,9 +12,9 @@ import numpy as np
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.choice import ABOUT, choose, deciding
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.calib.smoother import Running
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
+from odocal_ros.estimator import Running
 from odocal_ros.forecast.forecast import (
     FARTHEST_M,
     Forecast,

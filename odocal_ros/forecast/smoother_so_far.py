@@ -6,7 +6,9 @@
 from collections.abc import Callable, Iterable
 import time
 
-from odocal_ros.calib.smoother import (
+from odocal_ros.data.leg import Leg
+from odocal_ros.errors import BadData
+from odocal_ros.estimator import (
     GrowingFit,
     Running,
     smoother_leg,
@@ -14,8 +16,6 @@ from odocal_ros.calib.smoother import (
     too_little,
     too_little_of,
 )
-from odocal_ros.data.leg import Leg
-from odocal_ros.errors import BadData
 from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.leg_so_far import screened_in_cells
 from odocal_ros.nav.dead_reckoning import Origin

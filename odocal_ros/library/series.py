@@ -79,7 +79,7 @@ def _rows(smoothed: dict[str, Any], column: Floats) -> Floats:
 
 def _vehicle(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
     """Return the rotations from vehicle axes to n at the rows of the track: (m, 3, 3)."""
-    from odocal_ros.calib.smoother.state import C_bv
+    from odocal_ros.estimator.state import C_bv
     found = leg.methods['smoother'].estimates
     yaw, pitch = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
     C_nb = smoothed['key_C_nb']

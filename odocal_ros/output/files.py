@@ -56,7 +56,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
     if (acceptance := accept(calibration, config)) is not None:
         left['acceptance'] = acceptance.as_dict()
     if calibration.carried:
-        from odocal_ros.calib.smoother.state import ACCEL, CONSTANTS, GYRO
+        from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO
         imu_keeps = 0.1    # of their prior: changes by temperature and time
         left['imu'] = calibration.carried.only(
             (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_keeps).as_dict()

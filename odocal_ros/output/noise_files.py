@@ -16,7 +16,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import INFORMED_SHARE
 
 if TYPE_CHECKING:
-    from odocal_ros.calib.twist_noise import TwistNoise
+    from odocal_ros.estimator.result.twist_noise import TwistNoise
 
 TWIST, IMU_ERRORS = 'wheel_odometry_covariance.yaml', 'imu_errors.yaml'
 UNKNOWN = 1e6      # definition: variance of what wheels do not measure, as ROS drivers have it
@@ -25,7 +25,7 @@ UNKNOWN = 1e6      # definition: variance of what wheels do not measure, as ROS 
 def wheel_covariance(calibration: Calibration, config: Config,
                      content: dict[str, Any]) -> dict[str, str]:
     """Return the file by name; nothing without a scale factor of the smoother."""
-    from odocal_ros.calib.twist_noise import twist_noise
+    from odocal_ros.estimator.result.twist_noise import twist_noise
     noise = twist_noise(calibration)
     if noise is None:
         return {}
@@ -109,7 +109,7 @@ def imu_errors(calibration: Calibration, config: Config,
 
 def _known(details: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     """Return the errors of the IMU that a leg determined, by name."""
-    from odocal_ros.calib.smoother.state import CONSTANTS
+    from odocal_ros.estimator.state import CONSTANTS
     ratio = details.get('posterior_to_prior', {})
     found = {name: {key: details[name][key] for key in ('value', 'sigma')} for name in CONSTANTS
              if name.startswith(('gyro_', 'accelerometer_')) and name in details

@@ -122,7 +122,7 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
         numbers = [0, *(numbers or range(1, len(results)))]
         times_ns = [min(carried.last_ns, *times_ns), *times_ns]      # the scale is the last leg's
     if len(results) > 1 and all(r.border for r in results):
-        from odocal_ros.calib.smoother.several import combine_legs
+        from odocal_ros.estimator.several import combine_legs
         return combine_legs(results, times_ns, config, numbers)
     ago_ns = max(times_ns) - np.asarray(times_ns)
     walked = config.verdict.scale_drift_per_day**2 * ago_ns / DAY_NS

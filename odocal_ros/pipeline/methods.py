@@ -44,7 +44,7 @@ def _smoother(prepared: PreparedLeg, passed: Passed) -> MethodRun:
 
 
 def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
-    from odocal_ros.calib.smoother.refusal import refused
+    from odocal_ros.estimator.result.refusal import refused
     return refused((why,), inputs.scale_unit, inputs.travels)
 
 

@@ -12,12 +12,12 @@ import numpy as np
 
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.slip import slip_reasons
-from odocal_ros.calib.smoother import smooth, smoother_leg
 from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
 from odocal_ros.calib.wheel_search.search import search, SearchResult
 from odocal_ros.calib.wheel_search.space import ranges_of
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import let_go
+from odocal_ros.estimator import smooth, smoother_leg
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
 from odocal_ros.pipeline.prepared import MethodRun, Passed, Path, Paths, PreparedLeg

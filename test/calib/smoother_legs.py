@@ -8,9 +8,9 @@ from dataclasses import replace
 from drives import cached, settings
 import numpy as np
 
-from odocal_ros.calib.smoother import keyframe_times, smoother_leg
-from odocal_ros.calib.smoother.state import GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
 from odocal_ros.data.samples import VelocitySamples
+from odocal_ros.estimator import keyframe_times, smoother_leg
+from odocal_ros.estimator.state import GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
 from odocal_ros.nav.dead_reckoning import mounting_from_forward
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_rpy

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made
 
-from odocal_ros.calib.smoother import remarks, smooth
-from odocal_ros.calib.smoother.state import CONSTANTS, FAST_SPEED
+from odocal_ros.estimator import remarks, smooth
+from odocal_ros.estimator.state import CONSTANTS, FAST_SPEED
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import grade_as_seen, GRADES

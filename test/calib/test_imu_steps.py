@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from odocal_ros.calib.smoother.imu_steps import ImuSteps, STEP
-from odocal_ros.calib.smoother.preintegrate import preintegrate
+from odocal_ros.estimator.imu_steps import ImuSteps, STEP
+from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.nav.rotations import exp_so3, skew
 
 RATE = np.array([0.05, -0.1, 0.6])      # rad/s
@@ -134,7 +134,7 @@ def test_chunks_of_any_size_give_the_same_sums(monkeypatch):
     rng = np.random.default_rng(3)
     leg = samples(t, 0.2 * rng.standard_normal((len(t), 3)), rng.standard_normal((len(t), 3)))
     whole = ImuSteps.of(leg, 1.0)
-    monkeypatch.setattr('odocal_ros.calib.smoother.imu_steps.AT_A_TIME', 33)
+    monkeypatch.setattr('odocal_ros.estimator.imu_steps.AT_A_TIME', 33)
     parts = ImuSteps.of(leg, 1.0)
     for name in ('turn', 'turn_mean', 'dv', 'dp', 'signals', 'longest', 't', 'key'):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-12)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made, truth
 
-from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.fixes import Fixes
-from odocal_ros.calib.smoother.left_over import bias_sigmas, left_over
-from odocal_ros.calib.smoother.motion import D, PHI, V
-from odocal_ros.calib.smoother.motion_rows import MotionRows
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.smoother import best_fit
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.motion import D, PHI, V
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.result.left_over import bias_sigmas, left_over
+from odocal_ros.estimator.smoother import best_fit
 
 pytestmark = pytest.mark.slow
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
@@ -26,7 +26,7 @@ SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 def fitted(**options):
     """Return a drive, its leg, problem and fit."""
     drive, config, leg = made(**(SHORT | options))
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     return drive, config, leg, problem, best_fit(problem, config)
 
 
@@ -103,7 +103,7 @@ def test_a_wheel_that_slipped_is_seen_where_it_did():
     more = np.round(share * metres / drive.truth.scale).astype(int)
     leg = leg_of(replace(rows, odometer=changed(rows.odometer, value=lambda value: value + more)),
                  config)
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     fit = best_fit(problem, config)
     value, sigma = in_halves(left_over(leg, problem, fit)['left_odometer'])
     t, along = fit.state.t, value[:, 0]
@@ -121,7 +121,7 @@ def test_where_no_odometer_was_there_is_nothing():
     when = (rows.odometer.stamp_ns - rows.start_ns) * 1e-9
     leg = leg_of(replace(rows, odometer=changed(rows.odometer, **dict.fromkeys(
         ('stamp_ns', 'received_ns', 'value'), lambda column: column[when < 150.0]))), config)
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     fit = best_fit(problem, config)
     value, sigma = in_halves(left_over(leg, problem, fit)['left_odometer'])
     absent = fit.state.t[1:] > 152.0

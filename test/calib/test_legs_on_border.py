@@ -13,10 +13,10 @@ from smoother_legs import made
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.joint import joint
 from odocal_ros.calib.result import Estimate, LegResult
-from odocal_ros.calib.smoother import several, smooth
-from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
-from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS
+from odocal_ros.estimator import several, smooth
+from odocal_ros.estimator.result.remarks import MODEL_FLOOR
+from odocal_ros.estimator.several import combine_legs
 from odocal_ros.pipeline.beyond_model import held
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason

@@ -10,12 +10,12 @@ import pytest
 from smoother_legs import made
 
 from odocal_ros.calib.border import Border
-from odocal_ros.calib.smoother import point_rows
-from odocal_ros.calib.smoother.chain import solve
-from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.level_steps import prior_information
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.smoother import best_fit
+from odocal_ros.estimator.chain import solve
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors import point_rows
+from odocal_ros.estimator.level_steps import prior_information
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.smoother import best_fit
 
 STEP = 0.02                 # of logarithms of levels
 # relative: third derivatives of logarithms are as large as the second: STEP**2 / 6
@@ -28,7 +28,7 @@ NAMES = ('size_squat', 'gyro', 'along', 'side', 'fix', 'slow', 'size_gyro_axis')
 def weighed():
     """Return (function from changed levels to equations and solution, levels), no row a tail."""
     _, config, leg = made(imu_grade='industrial', duration=135.0, fix_sigma=0.5)
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     fit = best_fit(problem, config)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(point_rows, 'TAIL_SIGMAS', 1e3)   # weights would change with the levels

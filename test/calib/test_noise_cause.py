@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from odocal_ros.calib.smoother.noise_cause import noise_remedy, quantised, steps
-from odocal_ros.calib.smoother.several import _disputed
+from odocal_ros.estimator.result.noise_cause import noise_remedy, quantised, steps
+from odocal_ros.estimator.several import _disputed
 
 RATE = 100.0
 

@@ -6,8 +6,8 @@
 import numpy as np
 import pytest
 
-from odocal_ros.calib.smoother.odometer_filter import as_rolled, REACH
-from odocal_ros.calib.smoother.state import M, ODO_DELAY, ODO_LAG2
+from odocal_ros.estimator.factors.odometer_filter import as_rolled, REACH
+from odocal_ros.estimator.state import M, ODO_DELAY, ODO_LAG2
 from odocal_ros.nav.odometer import Travel
 
 SPEED, SWING, RATE = 10.0, 5.0, 0.5     # m/s, m, rad/s: travel SPEED t + SWING sin(RATE t)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
-from odocal_ros.calib.smoother import bound, problem, smooth
-from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
 from odocal_ros.errors import BadConfig
+from odocal_ros.estimator import bound, problem, smooth
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.forecast.ideal_samples import ideal
 from odocal_ros.forecast.planned_drive import from_rates, TOWN_SIDES, TOWN_SPEED, TOWN_T
 from odocal_ros.forecast.planned_methods import (
@@ -62,7 +62,7 @@ CELLS = [({'scenario': 'town', 'imu_grade': 'industrial'}, 0.0),
 def test_the_bound_of_ideal_samples_is_that_of_a_simulated_leg_at_its_truth(options, tau):
     drive, config, leg = made(**ROAD, **options)
     sigmas = figures(drive, config, tau)
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     true = bound(leg, config, truth(drive, config, leg), planned_levels(problem, sigmas))
     sigma = np.hypot(np.sqrt(np.diag(true))[:3], MODEL_FLOOR)
     # rests are found to a second or so of the twenty and more that a drive has, keyframes fall
@@ -158,7 +158,7 @@ def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
         'gnss.lever_arm': (0.3, -0.6, 1.5)})
     sigmas = replace(town_sigmas, config=config, fix=0.02)
     one = ideal(drive, sigmas, 1.0)
-    problem = Problem.of(one.leg, config, one.imu)
+    problem = problem_of(one.leg, config, one.imu)
     parts = Equations(problem, one.state).parts
     # a turn sets in within a sample of 0.05 s: 0.2 rad/s and 3 m/s^2 then are 5 mrad, 4 cm/s at
     # most, beside what a planned drive's own steps of 0.1 s leave

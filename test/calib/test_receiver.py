@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made
 
-from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.long_run import long_run
-from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.estimator import smooth
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.long_run import long_run
 from odocal_ros.reasons import Code
 from odocal_ros.sim.noise import gauss_markov
 from odocal_ros.sim.options import SimOptions

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made, truth
 
-from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.motion_rows import MotionRows
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.smoother import smooth
-from odocal_ros.calib.smoother.state import ACCEL_ERRORS, CONSTANTS, GYRO_ERRORS
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.smoother import smooth
+from odocal_ros.estimator.state import ACCEL_ERRORS, CONSTANTS, GYRO_ERRORS
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.draw import drawn
 from odocal_ros.sim.real import Real
@@ -25,7 +25,7 @@ SCALES = [name for name in CONSTANTS if name.startswith(('gyro_scale', 'accelero
 def scores(fitted):
     """Return what noise alone says of the IMU's errors at the truth, in its sigmas."""
     drive, config, leg = made(duration=300.0, imu_grade='consumer')
-    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
     weighted = Equations(problem, state, fitted=fitted).at(
         problem.first_levels)
     rows = weighted[MotionRows]
@@ -65,7 +65,7 @@ KERBS = {'scenario': 'yard', 'real': Real(kerbs=0.06, wheelbase=0.5)}
 @pytest.mark.parametrize('road', [BANKED, KERBS])
 def test_without_noise_the_whole_signal_counts(road):
     drive, config, leg = made(duration=300.0, imu_grade='perfect', **road)
-    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
     raw, fitted = (Equations(problem, state, fitted=x).at(problem.first_levels)[MotionRows].J[
         :, :, -len(CONSTANTS):] for x in (False, True))
     for i, name in enumerate(CONSTANTS):

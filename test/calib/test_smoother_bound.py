@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
-from odocal_ros.calib.smoother import bound
-from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.priors import SIZE, START_SIGMAS
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.rests import STILL_SPEED, STILL_TURN
-from odocal_ros.calib.smoother.state import BARE, E, IMPERFECT, M, SLOW, WITH_SLOW
+from odocal_ros.estimator import bound
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.priors import SIZE, START_SIGMAS
+from odocal_ros.estimator.factors.rests import STILL_SPEED, STILL_TURN
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.state import BARE, E, IMPERFECT, M, SLOW, WITH_SLOW
 
 pytestmark = pytest.mark.core
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.core
 def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     drive, config, leg = made(duration=140.0, fix_rate=1.0)
     leg = replace(leg, t_stop=50.0)
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     levels = problem.first_levels.but(correlation_time=correlation_time, fix=0.5)
     state = truth(drive, config, leg)
     parts = Equations(problem, state, fitted=True).parts

@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from odocal_ros.calib.smoother.chain import Normal, NotPositive, solve
+from odocal_ros.estimator.chain import Normal, NotPositive, solve
 
 pytestmark = pytest.mark.core
 N, SIZE, BORDER = 6, 4, 3

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from smoother_legs import made
 
-from odocal_ros.calib.smoother.axle import rates_at
-from odocal_ros.calib.smoother.chain import solve
-from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.motion_rows import MotionRows
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.start import first_state
 from odocal_ros.data.mapped import HELD_BYTES, let_go, room
+from odocal_ros.estimator.chain import solve
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.axle import rates_at
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.start import first_state
 
 MOST = 36e3     # bytes a keyframe: the chain and its covariances are 12e3, sums and rows the rest
 
@@ -24,7 +24,7 @@ MOST = 36e3     # bytes a keyframe: the chain and its covariances are 12e3, sums
 def peak_of_a_pass(duration):
     """Return keyframes and peak, bytes, of a pass with slow fix errors."""
     _, config, leg = made(scenario='town', duration=duration, imu_rate=25.0, fix_rate=1.0)
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     state = first_state(leg, problem.imu, problem.priors).state
     levels = problem.first_levels.but(correlation_time=60.0)
     tracemalloc.start()

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
-from odocal_ros.calib.smoother.axle import Axle
-from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.motion import D
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import (
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.axle import Axle
+from odocal_ros.estimator.factors.motion import D
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.state import (
     ACCEL,
     BARE,
     LEAN,
@@ -34,7 +34,7 @@ from odocal_ros.sim.wheels import G
 def perfect():
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0)
     leg = replace(leg, t_stop=60.0)
-    return Problem.of(leg, config), truth(drive, config, leg)
+    return problem_of(leg, config), truth(drive, config, leg)
 
 
 @pytest.mark.parametrize('turned', [-2 * np.pi, np.pi, 2.0, 0.3])
@@ -68,7 +68,7 @@ def test_a_turn_is_no_braking():
     drive, config, leg = made(
         imu_grade='perfect', fix_sigma=0.0, duration=150.0, scale=1e-3, nominal_scale=1e-3,
         real=Real(tyre_slip=stiff, driven=True))
-    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
     c = state.constants.copy()
     c[TYRES][2:] = 2 * stiff / G, stiff / G
     state = replace(state, constants=c)
@@ -89,7 +89,7 @@ def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
     for arm in ((0.0, 0.0, 0.0), (0.7, 0.6, 0.5)):
         drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
                                   imu_lever_arm=arm)
-        problem = Problem.of(leg, config)
+        problem = problem_of(leg, config)
         state = truth(drive, config, leg)
         axle = Axle(problem, state)
         found.append((axle.accelerations()[:, :2], axle.acceleration(), problem))
@@ -107,7 +107,7 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
     """About axes of an IMU that is rolled by 5 deg a squat were a tenth of a sideslip too."""
     roll = 0.09
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, roll=roll)
-    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
     motion = Equations(problem, state).parts['motion'].motion
     C_nv = state.C_nb[:-1] @ matrix_from_rpy([roll, drive.options.pitch, drive.options.yaw]).T
     by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(BARE)[2][:, 15:18, LEAN]
@@ -123,7 +123,7 @@ def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
     """A third at least of what is left of a lean goes with the change of the push."""
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, scale=1e-3,
                               nominal_scale=1e-3, real=real)
-    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
     part = Equations(problem, state).parts['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     off = (C_vn @ part.raw[:, 15:18, None])[:, axis, 0]
@@ -141,7 +141,7 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     """What is left is that the road bends within it: by (h / length)^2 of it, and seconds."""
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.1,
                               scale=1e-3, nominal_scale=1e-3, real=Real(wheelbase=3.0))
-    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
     part = Equations(problem, state).parts['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     off = (C_vn @ part.raw[:, 15:18, None])[:, 2, 0]
@@ -161,7 +161,7 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
 
 def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.1)
-    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
     motion = Equations(problem, state).parts['motion'].motion
     since = (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     there = drive.motion.at(since + (state.t[1:] + state.t[:-1]) / 2)
@@ -179,7 +179,7 @@ def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
                               accel_scale_error=error)
     leg = replace(leg, t_stop=60.0)
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     state = truth(drive, config, leg)
     c = state.constants.copy()
     c[ACCEL.start:ACCEL.start + 2] = error / (1 + error)      # of what is measured

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from smoother_legs import made
 
-from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.noise import REST_NOISE, rest_noise
-from odocal_ros.calib.smoother.travel_error import once_a_rest
+from odocal_ros.estimator import smooth
+from odocal_ros.estimator.factors.interval_noise import REST_NOISE, rest_noise
+from odocal_ros.estimator.factors.travel_error import once_a_rest
 from odocal_ros.sim.real import Real
 
 pytestmark = pytest.mark.slow

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made, truth, VELOCITY_SIGMA as SIGMA, with_velocity
 
-from odocal_ros.calib.smoother import bound, smooth
-from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.outside import Heading
-from odocal_ros.calib.smoother.point_rows import alike
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import YAW
+from odocal_ros.estimator import bound, smooth
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.point_rows import alike
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.outside import Heading
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.state import YAW
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import with_settings
@@ -48,7 +48,7 @@ def test_rows_are_true_at_the_truth():
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
                             heading_sigma=0.0, **ARMS)
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0)
-    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
     parts = Equations(problem, state).parts
     # 50 Hz: a turn rate is a mean over 20 ms, 5 mrad/s off at 0.5 rad/s^2, on an arm of 0.6 m
     assert np.abs(parts['velocity'].raw).max() < 5e-3

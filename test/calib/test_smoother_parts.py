@@ -10,14 +10,14 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 from smoother_legs import leg_of, made, truth, with_velocity
 
-from odocal_ros.calib.smoother.axle import Axle
-from odocal_ros.calib.smoother.chain import Normal, solve
-from odocal_ros.calib.smoother.equations import Equations, FACTORS
-from odocal_ros.calib.smoother.motion import D
-from odocal_ros.calib.smoother.priors import PriorRows, SIZE, SIZE_SPREADS
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.slow_error import SlowError, TIME_SPREAD, USUAL_TIME
-from odocal_ros.calib.smoother.state import (
+from odocal_ros.estimator.chain import Normal, solve
+from odocal_ros.estimator.equations import Equations, FACTORS
+from odocal_ros.estimator.factors.axle import Axle
+from odocal_ros.estimator.factors.motion import D
+from odocal_ros.estimator.factors.priors import PriorRows, SIZE, SIZE_SPREADS
+from odocal_ros.estimator.factors.slow_error import SlowError, TIME_SPREAD, USUAL_TIME
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.state import (
     ACCEL,
     BA,
     BG,
@@ -78,7 +78,7 @@ def shaken():
                             antenna_lever_arm=(0.5, -0.3, 1.2))
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0,
                   imu_arm=np.array([1.2, 0.3, 0.4]))
-    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
     rng = np.random.default_rng(1)
     step = 1e-3 * rng.standard_normal((len(state.t), N))
     step[:, PHI.start:BG.stop] *= 0.1

@@ -14,19 +14,19 @@ import pytest
 from smoother_legs import leg_of, made, truth
 
 from odocal_ros.calib.budget import total_covariance
-from odocal_ros.calib.smoother import bound, smooth
-from odocal_ros.calib.smoother.estimate import fit
-from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.outcome import outcome
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.start import first_state
-from odocal_ros.calib.smoother.state import ACCEL, CONSTANTS, GYRO_SCALE, IMPERFECT, M, YAW
+from odocal_ros.estimator import bound, smooth
+from odocal_ros.estimator.fit import fit
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.result.outcome import outcome
+from odocal_ros.estimator.start import first_state
+from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO_SCALE, IMPERFECT, M, YAW
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
 from odocal_ros.settings.grades import GRADES, turn_on_bias
 
 pytestmark = pytest.mark.slow
-smoother = import_module('odocal_ros.calib.smoother.smoother')
+smoother = import_module('odocal_ros.estimator.smoother')
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
 
@@ -168,7 +168,7 @@ def test_the_gyro_scale_is_believed_as_it_is_set():
     _, config, leg = made(**SHORT)
     for asked, believed in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
         told = with_settings(config, {'imu.gyro_scale_sigma': asked})
-        assert Problem.of(leg, told).priors.constants[GYRO_SCALE] == believed
+        assert problem_of(leg, told).priors.constants[GYRO_SCALE] == believed
 
 
 def test_too_little_is_refused():
@@ -212,7 +212,7 @@ def test_a_fit_cut_off_gives_what_it_has_with_wider_sigmas(monkeypatch):
 
 def test_what_still_moves_far_widens_by_as_much():
     _, config, leg = made(**SHORT)
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     start = first_state(leg, problem.imu, problem.priors).state
     start.constants[YAW] += 0.1         # far off, and but one pass
     method = outcome(leg, problem, fit(problem, start, problem.first_levels, 1), config)
@@ -254,9 +254,9 @@ def test_turn_on_biases_have_the_priors_of_imus_as_sold():
     """Else what a bias does would pass for an axis that points off: docs/decisions/0016."""
     _, config, leg = made(**SHORT)
     gyro, accel = turn_on_bias(config.imu)
-    priors = Problem.of(leg, config).priors
+    priors = problem_of(leg, config).priors
     assert priors.gyro_bias == pytest.approx(gyro)
     assert priors.accel_bias[:2] == pytest.approx(accel)
     assert accel > GRADES['industrial'].accel_bias
     known = with_settings(config, {'imu.accel_bias': 0.04})
-    assert Problem.of(leg, known).priors.accel_bias[:2] == pytest.approx(0.04)
+    assert problem_of(leg, known).priors.accel_bias[:2] == pytest.approx(0.04)

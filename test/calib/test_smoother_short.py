@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from smoother_legs import made
 
-from odocal_ros.calib.smoother import smooth
+from odocal_ros.estimator import smooth
 from odocal_ros.sim.real import Real
 
 pytestmark = pytest.mark.slow

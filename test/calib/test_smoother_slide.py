@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
-from odocal_ros.calib.smoother import bound, smooth
-from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.slide import (
+from odocal_ros.estimator import bound, smooth
+from odocal_ros.estimator.factors.slide import (
     HEAVE,
     least_slide,
     ORDINARY_ROAD,
@@ -20,6 +18,8 @@ from odocal_ros.calib.smoother.slide import (
     TURN_SLIDE,
     turned,
 )
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.reasons import Code
 
 pytestmark = pytest.mark.slow
@@ -64,19 +64,19 @@ def test_a_leg_with_turns_tests_it_itself():
 
 def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
     drive, config, leg = made(duration=200.0, imu_grade='industrial')
-    problem = Problem.of(leg, config)
+    problem = problem_of(leg, config)
     t = problem.imu.t[problem.imu.key] + (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     yaw = np.abs(np.diff(drive.motion.at(t).yaw))
     # slower than TURNING between turns: less than that rate for all the time
     assert turned(leg, problem.imu) == pytest.approx(yaw[yaw > 0.05].sum(), rel=0.02)
     biased = replace(leg, w_b=leg.w_b + [0.0, 0.0, 0.06])
-    assert Problem.of(biased, config).turned == pytest.approx(problem.turned, rel=0.02)
+    assert problem_of(biased, config).turned == pytest.approx(problem.turned, rel=0.02)
     assert straight_angle() == 0.0
 
 
 def straight_angle():
     _, config, leg = straight()
-    return Problem.of(leg, config).turned
+    return problem_of(leg, config).turned
 
 
 def test_the_least_falls_from_a_road_to_what_turns_can_test_without_a_step():

@@ -11,8 +11,8 @@ import pytest
 from reversing_drives import made as by_hand
 from smoother_legs import leg_of, made
 
-from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.outcome import in_words
+from odocal_ros.estimator import smooth
+from odocal_ros.estimator.result.outcome import in_words
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code
 from odocal_ros.sim import routes

@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose
 import pytest
 from smoother_legs import made
 
-from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.estimate import damped
+from odocal_ros.estimator import smooth
+from odocal_ros.estimator.fit import damped
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import with_settings
 

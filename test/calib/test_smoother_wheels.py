@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.calib.smoother.wheel_result import (
+from odocal_ros.estimator.result.wheel_result import (
     joined,
     unknown_wheels,
     wheel_details,
     wheel_estimates,
 )
-from odocal_ros.calib.smoother.wheels import Wheel
+from odocal_ros.estimator.result.wheels import Wheel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, SIDES, with_settings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import AS_SENT
-from odocal_ros.calib.twist_noise import twist_noise
+from odocal_ros.estimator.result.twist_noise import twist_noise
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.sim.real import Real

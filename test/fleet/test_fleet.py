@@ -244,7 +244,7 @@ def test_libraries_are_loaded_before_memory_is_limited():
     code = ('import resource\nimport numpy as np\nfrom odocal_ros.fleet import bag_task\n'
             'bag_task._load_libraries()\nmost = bag_task._data_bytes() + 2**24\n'
             'resource.setrlimit(resource.RLIMIT_DATA, (most, -1))\n'
-            'from odocal_ros.calib import smoother\nfrom scipy.linalg import cho_factor\n'
+            'from odocal_ros import estimator\nfrom scipy.linalg import cho_factor\n'
             'cho_factor(np.eye(128) @ np.eye(128))')
     assert subprocess.run([sys.executable, '-c', code], timeout=60.0).returncode == 0
 

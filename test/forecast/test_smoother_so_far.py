@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate
-from odocal_ros.calib.smoother import growing
-from odocal_ros.calib.smoother.growing import LOOK_PASSES
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.warm_start import carried, steps_of
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, OdocalError
+from odocal_ros.estimator import growing
+from odocal_ros.estimator.growing import LOOK_PASSES
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.warm_start import carried, steps_of
 from odocal_ros.forecast.forecast import Abandoned, as_keys, Forecast, Prospect
 from odocal_ros.forecast.foresight import forecast_of
 from odocal_ros.forecast.smoother_forecast import look, with_running
@@ -157,9 +157,9 @@ def test_keyframes_stay_where_they_are(config, looks):
     assert np.diff(times[1])[1:-1] == pytest.approx(1.0, abs=0.11)     # cells are 0.1 s wide
     assert 0.45 < np.diff(times[1])[-1] < 1.6
     so_far.look(looks[-2].leg, config)
-    going_on = carried(so_far._growing._last, Problem.of(views[1], config, second))
+    going_on = carried(so_far._growing._last, problem_of(views[1], config, second))
     assert len(going_on.state.t) == len(going_on.spread) + 1 == len(times[1])
-    other = Problem.of(views[1], config, steps_of(views[1], 0.7))
+    other = problem_of(views[1], config, steps_of(views[1], 0.7))
     assert carried(so_far._growing._last, other) is None
 
 
@@ -167,7 +167,7 @@ def test_the_state_is_reckoned_on_to_where_the_vehicle_is(drive, config, looks):
     so_far = SmootherSoFar()
     so_far.look(looks[-3].leg, config)      # 7 s are to be reckoned on, at speed
     view = so_far._view(looks[-2].leg, config)
-    state = carried(so_far._growing._last, Problem.of(view, config, steps_of(view, 1.0))).state
+    state = carried(so_far._growing._last, problem_of(view, config, steps_of(view, 1.0))).state
     later = SmootherSoFar()
     later.look(looks[-2].leg, config)
     last = later._growing._last.state

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 import numpy as np
 import pytest
 
-from odocal_ros.calib.smoother import problem
-from odocal_ros.calib.smoother.leg import smoother_leg
-from odocal_ros.calib.smoother.problem import _priors
 from odocal_ros.data.samples import LOCAL
+from odocal_ros.estimator import problem
+from odocal_ros.estimator.leg import smoother_leg
+from odocal_ros.estimator.problem import _priors
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, OMEGA, PartlyKnownRate, rate_without_north
 from odocal_ros.nav.local_frame import local_fixes

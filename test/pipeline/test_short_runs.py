@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.drive import not_moving
-from odocal_ros.calib.smoother.leg import drift_time, SmootherLeg
 from odocal_ros.calib.turning import turn_ratio
+from odocal_ros.estimator.leg import drift_time, SmootherLeg
 from odocal_ros.nav.dead_reckoning import rough_scale
 from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
 from odocal_ros.nav.odometer import Travel

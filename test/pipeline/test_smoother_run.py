@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.smoother.estimate import CONVERGENCE
+from odocal_ros.estimator.fit import CONVERGENCE
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate, combine

@@ -1,0 +1,129 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The least-squares problem of a leg at one state: factors, normal equations, cost, components.
+
+An additional sensor or prior is one more class in ``FACTORS`` (``factor.Factor``).
+"""
+
+from typing import TypeVar
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.chain import JointMarginals, Normal, Solved
+from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
+from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.heading import HeadingRows
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.factors.odometer_filter import as_rolled
+from odocal_ros.estimator.factors.point_rows import PointRows
+from odocal_ros.estimator.factors.priors import PriorRows, SIZES
+from odocal_ros.estimator.factors.rests import Rests
+from odocal_ros.estimator.factors.slow_error import SlowError
+from odocal_ros.estimator.factors.speed_steps import SpeedSteps
+from odocal_ros.estimator.factors.travel_error import TravelError
+from odocal_ros.estimator.factors.velocity import VelocityRows
+from odocal_ros.estimator.level_information import LevelInformation, LevelSides
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.preintegrate import Intervals, Points, preintegrate
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import BARE, M, Priors, State, WITH_SLOW
+
+SomeFactor = TypeVar('SomeFactor', bound=Factor)
+FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, SpeedSteps,
+                                 TravelError, SlowError, Rests, PriorRows)
+
+
+def sums(problem: Problem, state: State) -> tuple[Intervals, dict[str, Points]]:
+    """Return the sums over all intervals, and to the times of rows by their part."""
+    leg, c = problem.leg, state.constants
+    times = {part.name: part.times(problem, c) for part in FACTORS
+             if issubclass(part, PointRows) and part.there(problem)}
+    all_t = np.concatenate(list(times.values()))
+    order = np.argsort(all_t, kind='stable')
+    intervals, points = preintegrate(
+        problem.imu, state.gyro_bias[:-1], state.accel_bias[:-1],
+        as_rolled(leg.travel, c), state.scale * state.forward, all_t[order], c)
+    place = np.split(np.argsort(order, kind='stable'),
+                     np.cumsum([len(t) for t in times.values()])[:-1])
+    return intervals, {name: points.take(own) for name, own in zip(
+        times, place, strict=True)}
+
+
+class Equations:
+    """The factors at one linearisation point, without weights."""
+
+    def __init__(self, problem: Problem, state: State,
+                 priors: Priors | None = None, spread: Floats | None = None,
+                 fitted: bool = False) -> None:
+        self.state = state
+        point = LinearisationPoint(state, *sums(problem, state), priors or problem.priors, spread,
+                                   fitted)
+        self.parts = {kind.name: kind(problem, point) for kind in FACTORS if kind.there(problem)}
+
+    def at(self, levels: Levels) -> 'Weighted':
+        """Return the equations weighted by levels."""
+        return Weighted(self, levels)
+
+
+class Weighted:
+    """
+    The factors at given levels.
+
+    ``after`` applies a step; cost and components then refer to the new state. ``marginals`` are
+    those of ``Solved``.
+    """
+
+    def __init__(self, equations: Equations, levels: Levels) -> None:
+        self.state, self.levels = equations.state, levels
+        self.n = WITH_SLOW if levels.correlation_time else BARE
+        self.parts = {name: part.weighed(levels) for name, part in equations.parts.items()
+                      if part.in_use(levels)}
+
+    def __getitem__(self, kind: type[SomeFactor]) -> SomeFactor:
+        return next(part for part in self.parts.values() if isinstance(part, kind))
+
+    def normal(self) -> Normal:
+        """Return the normal equations of the step."""
+        out = Normal(len(self.state.t), self.n, M)
+        for part in self.parts.values():
+            part.add(out)
+        return out
+
+    def after(self, solved: Solved) -> 'Weighted':
+        """Apply the step to the residuals, to first order; return self."""
+        step, constants = solved.step, solved.step_border
+        reached = self.state.moved(step, constants)
+        for part in self.parts.values():
+            part.after(step, constants, reached)
+        return self
+
+    def information(self, solved: Solved) -> LevelInformation:
+        """Return the information on the levels, sizes last; call before ``solved.marginals``."""
+        names = sorted(self.levels.values, key=SIZES.__contains__)
+        sides = LevelSides(len(self.state.t), self.n, M, names)
+        for part in self.parts.values():
+            part.add_levels(sides)
+        taken, moves = solved.products(sides.chain, sides.border)
+        return LevelInformation(sides.names, (sides.square - taken) / 2, moves)
+
+    def cost(self) -> float:
+        """Return the weighted sum of squares of all rows; point rows with their robust loss."""
+        return float(sum(part.cost() for part in self.parts.values()))
+
+    def log_R_total(self) -> float:
+        """Return the log determinant of the covariance of all rows that the levels change."""
+        return float(sum(part.log_R for part in self.parts.values()))
+
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
+        """
+        Return the quadratic sum and its expectation for each variance component: (S26).
+
+        The restricted likelihood has its maximum where, for every component of level s with
+        covariance s V, r' R^-1 s V R^-1 r equals the trace of R^-1 s V less that of the part the
+        unknowns take up, P J' R^-1 s V R^-1 J (P the covariance of the unknowns).
+        """
+        return {name: pair for part in self.parts.values()
+                for name, pair in part.components(marginals).items()}

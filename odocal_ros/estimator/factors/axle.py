@@ -1,0 +1,114 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Accelerations at the axle, to which springs and tyres respond, from those at the IMU.
+
+An IMU half a metre beside the axle also measures half a metre times the angular acceleration as
+forward acceleration, with opposite signs in left and right turns. With wheel slip, this would
+change the path length.
+"""
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.chain import stepping
+from odocal_ros.estimator.preintegrate import Intervals, turn
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
+from odocal_ros.settings.grades import G
+
+WALK_SPEED = 1.0     # m/s, below it slopes are reduced: judgement
+WARM_TIME = 600.0    # s, physical: tyres warm within ten minutes of driving
+RATE_WINDOW = 0.1    # s, judgement: about a keyframe, in which vibration averages down
+
+
+def rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
+    """Return measured turn rates at some times, means over RATE_WINDOW: (N, 3) rad/s."""
+    first = np.searchsorted(t, at - RATE_WINDOW / 2)
+    last = np.maximum(np.searchsorted(t, at + RATE_WINDOW / 2, side='right'), first + 1)
+    return np.stack([w_b[first[k]:last[k]].mean(axis=0) for k in stepping(range(len(at)))])
+
+
+class Axle:
+    """
+    Speeds and pushes of the origin of base_link, where the vehicle does not slide, at one state.
+
+    v_n : (N, 3) its velocity at the keyframes, m/s.   wheel : (N,) speed along the vehicle where
+    the odometer is, m/s.
+    """
+
+    def __init__(self, problem: Problem, state: State) -> None:
+        self.state = state
+        leg = problem.leg
+        rate = problem.rate_b - state.gyro_bias
+        arm = state.constants[ODO_ARM] - leg.imu_arm
+
+        def at(arm_v: Floats) -> Floats:
+            return state.v_n + turn(state.C_nb, np.cross(rate, state.C_bv @ arm_v))
+
+        self.v_n = at(arm)
+        self.wheel = self._ahead(at(arm + leg.odometer_arm))
+
+    def _ahead(self, v_n: Floats) -> Floats:
+        speed: Floats = np.einsum('ki,ki->k', v_n, self.state.C_nb @ self.state.forward)
+        return speed
+
+    def _slope(self) -> Floats:
+        """
+        Return the slope of the road in each interval from the vertical velocity: (K,) rad.
+
+        The attitude contains the pitch mounting angle, which would then depend on itself.
+        """
+        speed, rise = self._ahead(self.v_n), self.v_n[:, 2]
+        ahead = speed[1:] + speed[:-1]
+        slope: Floats = (rise[1:] + rise[:-1]) * ahead / np.maximum(ahead**2, (2 * WALK_SPEED)**2)
+        return slope
+
+    def accelerations(self) -> Floats:
+        """
+        Return accelerations and jerks of each interval in the order of LEAN: (K, 4).
+
+        Acceleration forward, what holds the vehicle on a slope with it, and left, m/s^2, and their
+        change, m/s^3.
+        """
+        T = np.diff(self.state.t)[:, None]
+        # by the axes at mid interval: those at its begin would take the push of a turn for braking
+        C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
+        force = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
+        force[:, 0] += G * self._slope()
+        jerk = np.gradient(force, axis=0) / T if len(T) > 1 else np.zeros_like(force)
+        return np.concatenate([force, jerk], axis=1)
+
+    def acceleration(self) -> Floats:
+        """
+        Return the acceleration along the path plus the part of gravity on slopes: (K,) m/s^2.
+
+        The tyres produce both. From speeds, since the acceleration of a vehicle that slides in a
+        turn has a forward part.
+        """
+        speed = self._ahead(self.v_n)
+        up: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
+        return np.diff(np.abs(speed)) / np.diff(self.state.t) + up
+
+    def means_by_way(self, sums: Intervals) -> Floats:
+        """Return the means of ``varies_with`` over a leg, weighted by distance: (4,)."""
+        state = self.state
+        way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
+        t = (state.t[1:] + state.t[:-1]) / 2
+        share = way / max(way.sum(), 1e-9)
+        mean: Floats = share @ varies_with(way / sums.T, t - state.t[0], self.acceleration())
+        return mean
+
+
+def varies_with(speed: Floats, t: Floats, faster: Floats) -> Floats:
+    """
+    Return the signals that change the scale, as TYRES, docs/method.md (S11): (..., 4).
+
+    t : s since the begin of the leg.
+    """
+    # m/s^2, 1/m: what a car's tyres pull at a steady speed, against rolling and air
+    force = faster + 0.1 + 1e-4 * speed**2
+    warm = WARM_TIME * (1 - np.exp(-t / WARM_TIME))
+    return np.stack([speed**2 / (2 * FAST_SPEED), warm, np.maximum(force, 0.0),
+                     np.minimum(force, 0.0)], -1)

@@ -1,0 +1,142 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The factor of fixes, docs/method.md (S15), (S16): antenna position after a keyframe."""
+
+import numpy as np
+
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.estimator.factors.factor import LinearisationPoint
+from odocal_ros.estimator.factors.least import LEAST
+from odocal_ros.estimator.factors.motion import gravity_n
+from odocal_ros.estimator.factors.point_rows import PointRows
+from odocal_ros.estimator.preintegrate import turn
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import (
+    ACCEL,
+    BA,
+    BARE,
+    BG,
+    FIX_BY_MOTION,
+    FIX_LAG2,
+    FIX_TIME,
+    GNSS_ARM,
+    GNSS_DELAY,
+    M,
+    P,
+    PHI,
+    PITCH,
+    SLOW,
+    State,
+    V,
+    YAW,
+)
+from odocal_ros.nav.receiver_filter import odometer_error, smoothing
+from odocal_ros.nav.rotations import skew
+
+
+class Fixes(PointRows):
+    """Residuals (fix less prediction) and their derivatives at one state."""
+
+    name, source = 'fixes', 'fixes'
+    levels_of = {'fix': slice(0, 2), 'fix_up': slice(2, 3)}
+    share: Floats
+
+    def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
+        leg, state, points = problem.leg, point.state, point.points['fixes']
+        self.state, self.points, self.root = state, points, problem.root
+        k, tau = points.interval, points.tau[:, None]
+        self.k = k
+        self.C = state.C_nb[k]
+        dp = turn(self.C, points.dp)
+        v = state.v_n[k]
+        w = leg.origin.earth_rate_n
+        g = gravity_n(state.p_n[k], leg.origin)
+        self.arm_v = leg.antenna_arm - leg.imu_arm + state.constants[GNSS_ARM]
+        arm_b = state.C_bv @ self.arm_v
+        self.C_t = self.C @ points.R
+        self.arm_n = self.C_t @ arm_b
+        T = np.diff(state.t)[k]
+        self.share = np.clip(points.tau / T, 0.0, 1.0)
+        slow = state.slow_n[k] * (1 - self.share)[:, None] \
+            + state.slow_n[k + 1] * self.share[:, None]
+        self.dp = dp
+        self.v_n = v + turn(self.C, points.dv) + g * tau + turn(
+            self.C_t, np.cross(point.intervals.mean_rate[k], arm_b))
+        place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
+        raw = leg.fixes_n[problem.use] - place - self.arm_n - slow
+        # of a receiver that smooths the mean age is a delay
+        track = (state.t, *antenna(state, point.intervals.mean_rate, arm_b),
+                 state.t[k] + points.tau)
+        smoothed, self.by_lag = smoothing(*track, state.constants[FIX_LAG2])
+        added, self.by_motion, self.by_time = odometer_error(
+            *track, state.constants[FIX_BY_MOTION], state.constants[FIX_TIME])
+        self.raw = np.nan_to_num(raw) - smoothed - added
+
+    def errors(self) -> Floats:
+        """Return the fix errors, white and correlated, at the linearisation point: (m, 3) m."""
+        s, share = self.state.slow_n, self.share[:, None]
+        return self.raw + s[self.k] * (1 - share) + s[self.k + 1] * share
+
+    def jacobians(self, n: int) -> tuple[Floats, Floats]:
+        """
+        Return derivatives of the residual: (m, 3, n) by the keyframe before, (m, 3, M).
+
+        Those by the correlated errors are -(1 - share) before, -share after.
+        """
+        tau = self.points.tau[:, None, None]
+        m = len(tau)
+        one = np.broadcast_to(np.eye(3), (m, 3, 3))
+        J, c = np.zeros((m, 3, n)), np.zeros((m, 3, M))
+        J[:, :, P], J[:, :, V] = -one, -one * tau
+        J[:, :, PHI] = skew(self.dp + self.arm_n)
+        J[:, :, BA] = self.C @ self.points.AA
+        J[:, :, BG] = -skew(self.dp) @ self.C * tau / 3 - skew(self.arm_n) @ self.C * tau
+        if n > BARE:
+            J[:, :, SLOW] = -one * (1 - self.share)[:, None, None]
+        by_yaw, by_pitch = self.state.C_bv_gradient
+        c[:, :, YAW], c[:, :, PITCH] = (-self.C_t @ (g @ self.arm_v) for g in (by_yaw, by_pitch))
+        c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
+        # stamps late by d: the place is that of d before
+        c[:, :, GNSS_DELAY] = self.v_n
+        c[:, :, FIX_LAG2] = -self.by_lag
+        c[:, :, FIX_BY_MOTION], c[:, :, FIX_TIME] = -self.by_motion, -self.by_time
+        c[:, :, ACCEL] = self.C @ self.points.FF
+        return J, c
+
+    @classmethod
+    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+        """Return initial and minimum levels, factors on the stated variances."""
+        least = (LEAST.fix / problem.fix_sigma)**2
+        return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
+
+    @classmethod
+    def times(cls, problem: Problem, constants: Floats) -> Floats:
+        """Return the times of validity of the used fixes, s."""
+        out: Floats = problem.leg.t_fix[problem.use] - constants[GNSS_DELAY]
+        return out
+
+    def stated(self, rows: Floats) -> Floats:
+        """Return rows divided by the sigmas that the receiver states."""
+        return self.root @ rows
+
+    def known(self) -> Bools:
+        """Return a mask of the components that exist, (m, 3); fixes without height have two."""
+        known = np.ones((len(self.k), 3), bool)
+        known[:, 2] = self.root[:, 2, 2] > 1e-5
+        return known
+
+
+def antenna(state: State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
+    """Return places and velocities of the antenna at the keyframes, (N, 3) m and m/s."""
+    rate = np.concatenate([mean_rate[:1], (mean_rate[:-1] + mean_rate[1:]) / 2, mean_rate[-1:]])
+    return (state.p_n + state.C_nb @ arm_b,
+            state.v_n + turn(state.C_nb, np.cross(rate, arm_b)))
+
+
+def whitener(covariance_n: Floats, no_height: Bools) -> Floats:
+    """Return inverse Cholesky factors of covariances; without a height only horizontal rows."""
+    C = covariance_n.copy()
+    C[no_height, 2, :] = C[no_height, :, 2] = 0.0
+    C[no_height, 2, 2] = 1e6**2     # m^2, of a height that is not there
+    return np.linalg.inv(np.linalg.cholesky(C))

@@ -1,0 +1,200 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Variance components, and the effect of a unit of each on the rows of an interval, (S13).
+
+White noise at a time within the interval affects the rest of the interval. The integral over that
+time is a three-point Gauss rule, exact for the polynomials of constant force and speed. Columns of
+one component times the root of its level are independent unit noises (docs/method.md).
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Bools
+from odocal_ros.estimator.factors.motion import D, Motion, ROWS
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.state import BA, BG, ODO_DELAY, P, PHI, V
+from odocal_ros.nav.rotations import skew
+
+Floats = NDArray[np.float64]
+# level: variance per second of the white noise or walk; of the road also the axis of the vehicle
+IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
+ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
+INTERVAL = (*IMU, *ROAD)
+# definition: Gauss and Legendre's nodes and weights on 0 to 1
+GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
+    np.polynomial.legendre.leggauss(3)[1] / 2
+# rad/s: above it, a vehicle may slide sideways. Judgement: 0.5 m/s^2 at 10 m/s
+TURNING_RATE = 0.05
+# m in a second, minimum error of an odometer at rest: physical, play of a drive train
+REST_NOISE = 5e-4
+ABSENT_VARIANCE = 1e4   # m^2, of travel without odometer samples
+
+
+@dataclass(eq=False)
+class IntervalNoise:
+    """
+    The noises of K intervals; the effect of a unit of each on the rows, (K, 18, c), in chunks.
+
+    component : (c,) index in INTERVAL of each column.
+    """
+
+    motion: Motion
+    axes: Floats                       # (K, 3, 3) rows: forward, left, up
+    road: Floats                       # (K, 5) effects of the wheels' unit noises along their axes
+    extra: Floats                      # (K, 18) variances that are given, not estimated
+    given: Floats                      # (K, 18, g) columns of unit noises, the same
+    component: ClassVar[NDArray[np.int64]] = np.array(
+        len(GAUSS_X) * [INTERVAL.index(name) for name in IMU for _ in range(3)]
+        + [INTERVAL.index(name) for name in ROAD])
+
+    def columns(self, rows: slice) -> Floats:
+        """Return the effects of unit noises in the intervals of a slice: (k, 18, c)."""
+        motion = self.motion.take(rows)
+        T, C = motion.T[:, 0], motion.C
+        force, way = skew(motion.dv / motion.T), skew(motion.way / motion.T)
+        one = np.broadcast_to(np.eye(3), (len(T), 3, 3))
+        out = np.zeros((len(T), ROWS, len(self.component)))
+        for point, (x, weight) in enumerate(zip(GAUSS_X, GAUSS_W, strict=True)):
+            u = ((1 - x) * T)[:, None, None]
+            root = np.sqrt(weight * T)[:, None, None]
+            gyro, accel, gyro_walk, accel_walk = (
+                out[:, :, first:first + 3] for first in 12 * point + 3 * np.arange(4))
+            gyro[:, PHI], gyro[:, V] = -one * root, force * u * root
+            gyro[:, P], gyro[:, D] = force * (u**2 / 2) * root, way * u * root
+            accel[:, V], accel[:, P] = one * root, one * u * root
+            gyro_walk[:, PHI], gyro_walk[:, V] = -C * u * root, force @ C * (u**2 / 2) * root
+            gyro_walk[:, P] = force @ C * (u**3 / 6) * root
+            gyro_walk[:, D], gyro_walk[:, BG] = way @ C * (u**2 / 2) * root, one * root
+            accel_walk[:, V], accel_walk[:, P] = -C * u * root, -C * (u**2 / 2) * root
+            accel_walk[:, BA] = one * root
+        for column, axis in enumerate(ROAD.values(), 12 * len(GAUSS_X)):
+            root = self.road[rows, column - 12 * len(GAUSS_X)]
+            out[:, D, column] = self.axes[rows, axis] * root[:, None]
+        return out
+
+    def grown(self, by: dict[str, float]) -> Floats:
+        """Return the factors of the road's variances forward, left, up by new levels: (K, 3)."""
+        out = np.ones((len(self.road), 3))
+        for column, (name, axis) in enumerate(ROAD.items()):
+            out[:, axis] = np.where(self.road[:, column] > 0, by[name], out[:, axis])
+        return out
+
+    def covariance(self, levels: Levels, rows: slice = slice(None)) -> Floats:
+        """Return the covariance of the rows of the intervals of a slice, (k, 18, 18)."""
+        root = np.sqrt([levels[INTERVAL[i]] for i in self.component])
+        W = self.columns(rows) * root
+        Q = W @ np.swapaxes(W, 1, 2)
+        given = self.given[rows]
+        if given.shape[2]:
+            Q += given @ np.swapaxes(given, 1, 2)
+        Q[:, range(ROWS), range(ROWS)] += self.extra[rows]
+        return Q
+
+
+def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
+                   spread: Floats | None = None) -> IntervalNoise:
+    """
+    Return the noises of a motion.
+
+    rest : (K,) bool, intervals at standstill: their odometer noise is given, since it does not
+        depend on the noise in motion.
+    spread : (K, 3 or more) factors on the odometer's variances, forward, sideways and up first.
+    """
+    K, T = len(motion.T), motion.T[:, 0]
+    axes = np.swapaxes(motion.C_end @ motion.state.C_bv, 1, 2)      # rows: forward, left, up
+    axes = axes + np.swapaxes(motion.C @ motion.state.C_bv, 1, 2)
+    axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
+    speed = np.linalg.norm(motion.way, axis=1) / T
+    share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # some of it where a wheel hardly turns
+    hard, turning = hard_and_turning(motion)
+    spread = np.ones((K, 3)) if spread is None else spread
+    left = motion.state.C_bv[:, 1]
+    pitching = np.sqrt(np.maximum(left @ motion.swings @ left, 0.0))
+    acting = (share * ~hard, share * hard, share * ~turning, share * turning, share, pitching)
+    road = np.stack([size * ~rest * np.sqrt(spread[:, axis])
+                     for axis, size in zip(ROAD.values(), acting, strict=True)], -1)
+    extra = _extra(motion, leg)
+    still = rest_noise(speed, rest)
+    extra[rest, D] += still
+    slow = ~rest & (speed < 1.0)
+    extra[slow, D] += still * (1 - speed[slow, None])
+    return IntervalNoise(motion, axes, road, extra, _given(motion, leg, axes, rest))
+
+
+def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Floats:
+    """
+    Return noises of travel from quantised speeds: (K, 18, g).
+
+    Fine steps are rounding noise. Coarse steps are not used along the path; speed_steps.py uses
+    their transitions. In a turn, a quantisation error that changes within the interval displaces
+    the end sideways.
+    """
+    coarse = leg.travel.coarse
+    if coarse is None:
+        return np.zeros((len(rest), ROWS, 0))
+    if not leg.by_steps:
+        sigma = motion.state.scale * np.sqrt(coarse.way_variance(motion.state.t))
+        given = np.zeros((len(rest), ROWS, 1))
+        given[:, D, 0] = axes[:, 0] * sigma[:, None]
+        return given * ~rest[:, None, None]
+    # as long as it may be, it goes where the wheels roll; how the body pitches is not in that
+    size = np.linalg.norm(motion.rolled, axis=1, keepdims=True)
+    along = np.where(size > 1e-3, motion.rolled / np.maximum(size, 1e-3), axes[:, 0])
+    turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)) * motion.T[:, 0]
+    most = motion.state.scale * coarse.most * motion.T[:, 0]
+    given = np.zeros((len(rest), ROWS, 2))
+    given[:, D, 0] = along * np.sqrt(ABSENT_VARIANCE)
+    given[:, D, 1] = axes[:, 1] * (most * turned / 8)[:, None]
+    return given * ~rest[:, None, None]
+
+
+def rest_noise(speed: Floats, rest: Bools) -> float:
+    """Return the variance of the travel in a second at rest, m^2."""
+    measured = float((speed[rest]**2).mean()) if rest.sum() >= 5 else 0.0      # s to know it by
+    return max(measured, REST_NOISE**2)
+
+
+def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
+    """
+    Return masks of the intervals with acceleration or braking, and with turns: (K,) bool each.
+
+    Above 0.5 m/s^2, where a wheel may slip, and TURNING_RATE, where it may slide.
+    """
+    T = motion.T[:, 0]
+    speed = np.einsum('ki,ki->k', motion.way, (motion.f_n + motion.f_n_end) / 2) \
+        / motion.state.scale / T
+    padded = np.pad(speed, 1, mode='edge')
+    hard = np.abs(padded[2:] - padded[:-2]) > 0.5 * 2 * T
+    rate = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate))
+    return hard, rate > TURNING_RATE
+
+
+def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
+    """Return variances of the motion within gaps: (K, 18)."""
+    sums, T = motion.sums, motion.T[:, 0]
+    extra = np.zeros((len(T), ROWS))
+    # s: a longer step between IMU samples hides motion
+    gap = np.where(sums.longest_step > max(0.06, 3 * np.median(sums.longest_step)),
+                   sums.longest_step, 0.0)
+    rate, force = 0.1, 1.5      # rad/s, m/s^2, 1 sigma of what may hide in it: of a car in town
+    extra[:, PHI] = (rate * gap[:, None])**2
+    extra[:, V] = (force * gap[:, None])**2
+    extra[:, P] = (force * gap * T)[:, None]**2
+    t = motion.state.t
+    way = leg.travel
+    delay = motion.state.constants[ODO_DELAY]
+    outside = (t[:-1] + delay < way.t[0] - 0.1) | (t[1:] + delay > way.t[-1] + 0.1)
+    extra[outside, D] = ABSENT_VARIANCE
+    for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
+        k = np.searchsorted(t, at) - 1
+        if 0 <= k < len(T) and sigma > 0:
+            near = slice(max(k - 1, 0), k + 2)       # the row before the gap may lie in the last
+            extra[near, D] += (motion.state.scale * sigma)**2
+    return extra

@@ -1,0 +1,243 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The motion between keyframes, docs/method.md (S5) to (S9): residuals and their derivatives.
+
+Rows of an interval: [position, velocity, attitude, gyro bias, accelerometer bias, odometer], each
+the state at its end less what the state at its begin and the preintegrated sums make of it. n
+turns with the Earth, so Coriolis and the turn of n within the interval are taken in to first order
+of the Earth rate (what is left is below 1e-8 of the motion), gravity where the vehicle is.
+"""
+
+from copy import copy
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.factors.axle import Axle, varies_with
+from odocal_ros.estimator.preintegrate import Intervals, turn
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import (
+    ACCEL,
+    BA,
+    BG,
+    E,
+    GYRO,
+    LEAN,
+    LN_K,
+    M,
+    ODO_ARM,
+    ODO_DELAY,
+    ODO_LAG2,
+    P,
+    PHI,
+    PITCH,
+    PITCH_CENTRE,
+    SPEED_OFFSET,
+    State,
+    TYRES,
+    V,
+    YAW,
+)
+from odocal_ros.nav.coarse_speed import CoarseSpeed
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.earth import C_en, gravity
+from odocal_ros.nav.rotations import exp_so3, skew, transpose
+
+D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
+ROWS = D.stop
+# of Motion, what each interval has
+EACH = ('T', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed', 'nose_down',
+        'from_mean', 'varied', 'travelled', 'residual')
+
+
+def rotvec(C: Floats) -> Floats:
+    """Return the rotation vector of (..., 3, 3), well below pi."""
+    axis = np.stack([C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0],
+                     C[..., 1, 0] - C[..., 0, 1]], -1) / 2
+    sine = np.linalg.norm(axis, axis=-1)
+    angle = np.arctan2(sine, (np.trace(C, axis1=-2, axis2=-1) - 1) / 2)
+    return axis * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[..., None]
+
+
+def gravity_n(position_n: Floats, origin: Origin) -> Floats:
+    """Return gravity at positions in n, as a vector in n: (N, 3) m/s^2."""
+    latitude, longitude, height = origin.to_geodetic(position_n).T
+    up_e = C_en(latitude, longitude)[..., 2]
+    down: Floats = -gravity(latitude, height)[:, None] * (
+        up_e @ C_en(origin.latitude, origin.longitude))
+    return down
+
+
+class Motion:
+    """
+    The interval equations at one state.
+
+    fitted : the state is so close that residuals are noise: the derivative by the scale then
+        uses the fitted path, those by IMU errors the fitted signals (signals.py).
+    """
+
+    def __init__(self, problem: Problem, state: State, intervals: Intervals,
+                 fitted: bool = False) -> None:
+        leg, self.axle = problem.leg, Axle(problem, state)
+        self.state, self.sums, self.fitted = state, intervals, fitted
+        self.by_steps, self.swings = leg.by_steps, problem.swings
+        T = self.T = intervals.T[:, None]
+        self.C, self.C_end = state.C_nb[:-1], state.C_nb[1:]
+        self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
+        self.f = state.scale * state.forward
+        _, self.left, self.up = state.C_bv.T
+        w = leg.origin.earth_rate_n
+        W = skew(w)
+        dv, dp = turn(self.C, intervals.dv), turn(self.C, intervals.dp)
+        half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
+        way = turn(intervals.S, self.f + self._vary()) * self.varied
+        self.faster = self._by_odometer_filter()
+        self.rolled = turn(half @ self.C, way)
+        self.way = self.rolled + self.heaved
+        self.unsaid = self._by_speed_offset(leg.travel.coarse)
+        if self.unsaid is not None:
+            self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
+        self.dv, self.dp = dv, dp
+        p, v = state.p_n, state.v_n
+        g = gravity_n((p[:-1] + p[1:]) / 2, leg.origin)
+        moved = p[1:] - p[:-1]
+        r_p = moved - (v[:-1] * T + dp - dp @ W.T * T / 3 + g * T**2 / 2
+                       - 2 * (v[:-1] * T**2 / 2 + dp * T / 3 + g * T**3 / 6) @ W.T)
+        r_v = v[1:] - (v[:-1] + dv - (dv * T - dp) @ W.T + g * T - 2 * moved @ W.T)
+        predicted = exp_so3(-w * T) @ self.C @ intervals.R
+        r_phi = rotvec(self.C_end @ transpose(predicted))
+        e = state.travel_error
+        f_n, f_n_end = self.f_n, self.f_n_end
+        swing = turn(self.C_end - self.C,
+                     np.broadcast_to(state.C_bv @ self.arm_v, dv.shape))
+        self.travelled = moved + swing
+        r_d = self.travelled - (self.way - f_n_end * e[1:, None] + f_n * e[:-1, None])
+        self.residual = np.concatenate(
+            [r_p, r_v, r_phi, np.diff(state.gyro_bias, axis=0),
+             np.diff(state.accel_bias, axis=0), r_d], axis=1)
+
+    def take(self, rows: slice) -> 'Motion':
+        """Return the motion of the intervals of a slice, for derivatives and noises of its own."""
+        part = copy(self)
+        part.sums = self.sums.take(rows)
+        for name in EACH:
+            whole = getattr(self, name)
+            setattr(part, name, whole if whole is None else whole[rows])
+        return part
+
+    @property
+    def f_n(self) -> Floats:
+        """Return the forward axis times the scale at the begins: (K, 3)."""
+        return self.C @ self.f
+
+    @property
+    def f_n_end(self) -> Floats:
+        """Return the same at the ends: (K, 3)."""
+        return self.C_end @ self.f
+
+    @property
+    def pitched(self) -> Floats:
+        """Return the derivative of the path by the centre of pitching: (K, 3)."""
+        out: Floats = (self.C @ self.up) * self.nose_down[:, None]
+        return out
+
+    @property
+    def heaved(self) -> Floats:
+        """Return the vertical displacement of the odometer by pitching: (K, 3) m."""
+        out: Floats = self.pitched * self.state.constants[PITCH_CENTRE]
+        return out
+
+    def _vary(self) -> Floats:
+        """
+        Return the change of the scaled forward axis in each interval, (K, 3): (S11), (S12).
+
+        Also sets the signals and the factor of the scale.
+        """
+        state, T, c = self.state, self.T, self.state.constants
+        self.pushed = self.axle.accelerations()
+        speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
+        t = (state.t[1:] + state.t[:-1]) / 2
+        self.from_mean = varies_with(
+            speed, t - state.t[0], self.axle.acceleration()) - self.axle.means_by_way(self.sums)
+        self.varied = 1 + self.from_mean @ c[TYRES, None]
+        pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
+        # nose down about a point ahead, the odometer goes up
+        self.nose_down = (self.sums.mean_rate - state.gyro_bias[:-1]) @ self.left * T[:, 0]
+        out: Floats = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
+        return out
+
+    def _by_speed_offset(self, coarse: CoarseSpeed | None) -> Floats | None:
+        """Return the derivative of the path by the offset of a coarse speed: (K, 3), or None."""
+        if coarse is None:
+            return None
+        said = np.einsum('kij,j->ki', self.sums.S, self.state.forward) @ self.state.forward
+        moves = np.abs(said) > coarse.step * self.T[:, 0]
+        ahead: Floats = (self.f_n + self.f_n_end) / 2 * (np.sign(said) * moves)[:, None]
+        return np.asarray(ahead * self.T)
+
+    def _by_odometer_filter(self) -> Floats:
+        """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
+        wheel = self.axle.wheel / self.state.scale
+        # by the fit, whose accelerometer knows it better than readings do
+        push = np.gradient(wheel, self.state.t)
+        return np.stack([np.diff(wheel), -np.diff(push) / 2], -1)
+
+    def jacobians(self, n: int) -> tuple[Floats, Floats, Floats]:
+        """Return derivatives by begin, end and constants: (K, 18, n), (K, 18, n), (K, 18, M)."""
+        s, C, state = self.sums, self.C, self.state
+        K, T = len(self.T), self.T[:, :, None]
+        one = np.broadcast_to(np.eye(3), (K, 3, 3))
+        a, b = np.zeros((K, ROWS, n)), np.zeros((K, ROWS, n))
+        arm_b = state.C_bv @ self.arm_v
+        a[:, P, P], a[:, P, V], a[:, P, PHI] = -one, -one * T, skew(self.dp)
+        gyro = self._by_gyro()
+        a[:, :, BG] = gyro[:, :, :3]
+        a[:, D, BG] += state.constants[PITCH_CENTRE] * T * np.outer(
+            C @ self.up, self.left).reshape(K, 3, 3)
+        a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
+        a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
+        a[:, PHI, PHI] = -one
+        a[:, BG, BG] = a[:, BA, BA] = -one
+        a[:, D, P], a[:, D, PHI] = -one, skew(C @ arm_b + self.way)
+        a[:, D, E] = -self.f_n
+        b[:, P, P] = b[:, V, V] = b[:, PHI, PHI] = b[:, BG, BG] = b[:, BA, BA] = one
+        b[:, D, P], b[:, D, PHI], b[:, D, E] = one, -skew(self.C_end @ arm_b), self.f_n_end
+        return a, b, self._by_constants(gyro)
+
+    def _by_gyro(self) -> Floats:
+        """Return derivatives by the gyro's bias and constants: (K, 18, 3 + g)."""
+        s, C = self.sums, self.C
+        out = np.zeros((len(C), ROWS, s.turned.shape[2]))
+        out[:, PHI], out[:, V], out[:, P] = C @ s.turned, -C @ s.dv_by, -C @ s.dp_by
+        out[:, D] = -C @ s.S_by
+        return out
+
+    def _by_constants(self, gyro: Floats) -> Floats:
+        s, C, state = self.sums, self.C, self.state
+        c = np.zeros((len(self.T), ROWS, M))
+        swing = self.C_end - C
+        # a body that pitches lifts the odometer by no count
+        c[:, D, LN_K] = self.heaved - (self.travelled if self.fitted else self.way)
+        c[:, D, TYRES] = (c[:, D, LN_K] / self.varied)[:, :, None] \
+            * self.from_mean[:, None]
+        for column, gradient in zip((YAW, PITCH), state.C_bv_gradient, strict=True):
+            c[:, D, column] = -(C @ s.S @ (state.scale * gradient[:, 0])) \
+                + swing @ gradient @ self.arm_v
+        for i, axis in enumerate((self.up, -self.left)):
+            turned = C @ s.S @ (state.scale * axis)
+            c[:, D, LEAN.start + i:LEAN.stop:2] = -turned[:, :, None] * self.pushed[:, None, i::2]
+        c[:, D, PITCH_CENTRE] = -self.pitched
+        c[:, D, ODO_ARM] = swing @ state.C_bv
+        if self.unsaid is not None:
+            c[:, D, SPEED_OFFSET] = -self.unsaid
+        # stamps late by d: the reading at a time is the travel d before it
+        ahead = (self.f_n + self.f_n_end) / 2
+        c[:, D, [ODO_DELAY, ODO_LAG2]] = -ahead[:, :, None] * self.faster[:, None]
+        if self.by_steps:       # only the direction of the path is used; these do not change it
+            c[:, D, [LN_K, ODO_DELAY, ODO_LAG2, SPEED_OFFSET]] = 0.0
+            c[:, D, TYRES] = 0.0
+        c[:, :, GYRO] = gyro[:, :, 3:]
+        c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF
+        return c

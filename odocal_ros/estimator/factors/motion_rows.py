@@ -1,0 +1,226 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The motion factor: IMU and odometer between adjacent keyframes."""
+
+from collections.abc import Iterator
+from functools import cached_property
+from weakref import ref
+
+import numpy as np
+
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.mapped import room
+from odocal_ros.estimator.chain import blocks, JointMarginals, Normal
+from odocal_ros.estimator.factors.factor import ChunkedSum, Factor, LinearisationPoint
+from odocal_ros.estimator.factors.interval_noise import INTERVAL, interval_noise
+from odocal_ros.estimator.factors.least import LEAST
+from odocal_ros.estimator.factors.motion import D, Motion, ROWS
+from odocal_ros.estimator.factors.signals import Signals
+from odocal_ros.estimator.factors.slide import (
+    HEAVE,
+    least_slide,
+    PITCHING,
+    PITCHING_LEAST,
+    SIDEWAYS,
+)
+from odocal_ros.estimator.factors.speed_steps import SpeedSteps
+from odocal_ros.estimator.imu_noise import at_rest, sensor_noise
+from odocal_ros.estimator.level_information import LevelSides
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import BG, M, State
+
+ALONG = ('along', 'along_hard')
+# sources in the budget
+NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
+         'accel_walk': 'accelerometer_bias_walk', 'along': 'travel_noise',
+         'along_hard': 'travel_noise', 'side': 'sideslip', 'side_turn': 'sideslip',
+         'up': 'vertical_motion', 'pitching': 'vertical_motion'}
+ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up', 'pitching'))
+
+
+class MotionRows(Factor):
+    """
+    Rows of ``Motion`` with the noise of ``IntervalNoise``.
+
+    Weighted are r (K, 18) and whiten (K, 18, 18).
+
+    Unit noises are recomputed when needed, some intervals at a time: stored, they would be the
+    largest memory.
+    """
+
+    name = 'motion'
+
+    def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
+        self.motion = Motion(problem, point.state, point.intervals, point.fitted)
+        self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
+        self.signals = Signals(self.motion) if point.fitted else None
+        self.noise = interval_noise(self.motion, problem.leg,
+                                    problem.still[:-1] & problem.still[1:], point.spread)
+
+    @classmethod
+    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+        """Return initial and minimum levels, of the IMU by its standstills, and of the road."""
+        imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
+        imu |= at_rest(problem.imu, problem.leg, problem.still)
+        slide, road = least_slide(problem.turned)**2, 0.01**2      # m^2/s, initial
+        return (imu | dict.fromkeys(ALONG, road)
+                | dict.fromkeys(SIDEWAYS, max(road, slide)) | {'pitching': PITCHING**2},
+                imu | dict.fromkeys(ALONG, LEAST.road**2) | dict.fromkeys(SIDEWAYS, slide)
+                | {'up': max(slide, HEAVE**2), 'pitching': PITCHING_LEAST**2})
+
+    def weigh(self, levels: Levels) -> None:
+        """Whiten the rows by the Cholesky factor of their covariance."""
+        self._found: tuple[ref[JointMarginals], Floats, Floats] | None = None
+        self.whiten = room(len(self.raw), ROWS, ROWS)
+        self.r, logs = np.empty((2, len(self.raw), ROWS))
+        for rows in blocks(len(self.raw)):
+            Q = self.noise.covariance(levels, rows)
+            scale = 1 / np.sqrt(np.einsum('kii->ki', Q))
+            root = np.linalg.cholesky(Q * scale[:, :, None] * scale[:, None, :])
+            self.whiten[rows] = np.linalg.inv(root) * scale[:, None, :]
+            logs[rows] = np.log(np.einsum('kii->ki', self.whiten[rows]).copy())     # see arctan2
+            self.r[rows] = np.einsum('kij,kj->ki', self.whiten[rows], self.raw[rows])
+        self.log_R = -2 * logs.sum()
+
+    def after(self, step: Floats, constants: Floats, reached: State) -> None:
+        """Apply the step to the residuals."""
+        r, n = self.r.copy(), self.n
+        for rows in blocks(len(r)):
+            J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
+            r[rows] += np.einsum('kij,kj->ki', J[:, :, :n], step[rows]) + np.einsum(
+                'kij,kj->ki', J[:, :, n:2 * n], step[ends]) + J[:, :, 2 * n:] @ constants
+        self.r = r
+
+    @cached_property
+    def J(self) -> Floats:
+        """Return the whitened derivatives: (K, 18, 2n + M)."""
+        J = room(*self.raw.shape, 2 * self.n + M)
+        for rows in blocks(len(J)):
+            J[rows] = self.whiten[rows] @ np.concatenate(self.derivatives(rows), axis=2)
+        return J
+
+    def derivatives(self, rows: slice) -> tuple[Floats, Floats, Floats]:
+        """Return derivatives of some intervals as ``Motion.jacobians``, by fitted signals."""
+        begin, end, constants = self.motion.take(rows).jacobians(self.n)
+        if self.signals is not None:
+            gyro = (self.noise.columns(rows) * self.roots())[:, :, self.of('gyro')]
+            whiten = self.whiten[rows]
+            found = np.einsum('kic,kij,kj->kc', whiten @ gyro, whiten, self.raw[rows],
+                              optimize=True)
+            self.signals.fit(rows, constants, begin[:, :, BG], gyro, found)
+        return begin, end, constants
+
+    def add(self, out: Normal) -> None:
+        """Add the rows to normal equations."""
+        n = self.n
+        corner, g_border = ChunkedSum(), ChunkedSum()
+        for rows in blocks(len(self.r)):
+            ends = slice(rows.start + 1, rows.stop + 1)
+            J = self.J[rows]
+            H = np.swapaxes(J, 1, 2) @ J
+            g = -np.einsum('kij,ki->kj', J, self.r[rows])
+            out.diagonal[rows] += H[:, :n, :n]
+            out.diagonal[ends] += H[:, n:2 * n, n:2 * n]
+            out.beside[rows] += H[:, :n, n:2 * n]
+            out.border[rows] += H[:, :n, 2 * n:]
+            out.border[ends] += H[:, n:2 * n, 2 * n:]
+            corner.add(H[:, 2 * n:, 2 * n:])
+            out.g[rows] += g[:, :n]
+            out.g[ends] += g[:, n:2 * n]
+            g_border.add(g[:, 2 * n:])
+        out.corner += corner.sum
+        out.g_border += g_border.sum
+
+    def cost(self) -> float:
+        """Return the sum of squares, in sigmas."""
+        out: float = (self.r**2).sum()
+        return out
+
+    def _units(self, rows: slice) -> tuple[Floats, Floats]:
+        """Return the whitened unit noises A of some intervals, (k, 18, c), and J' A."""
+        A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
+        return A, np.swapaxes(self.J[rows], 1, 2) @ A
+
+    def roots(self) -> Floats:
+        """Return the standard deviation of each unit noise, (c,), per root second."""
+        return np.sqrt([self.levels[INTERVAL[i]] for i in self.noise.component])
+
+    def of(self, *names: str) -> Bools:
+        """Return a mask of the unit noises of these levels: (c,) bool."""
+        return np.isin(self.noise.component, [INTERVAL.index(name) for name in names])
+
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
+        """Return the quadratic sum and its expectation for each level."""
+        estimates, seen = self._noises(marginals)
+        quadratic, expected = np.einsum('kc,kc->c', estimates, estimates), seen.sum(axis=0)
+        return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
+                for name in INTERVAL}
+
+    def add_levels(self, out: LevelSides) -> None:
+        """Add the right-hand sides of its levels."""
+        n, columns = self.n, out.at(INTERVAL)
+        of = np.eye(len(INTERVAL))[self.noise.component]
+        square, border = ChunkedSum(), ChunkedSum()
+        for rows in blocks(len(self.r)):
+            ends = slice(rows.start + 1, rows.stop + 1)
+            A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
+            q = (A * np.einsum('kic,ki->kc', A, self.r[rows])[:, None]) @ of
+            g = np.swapaxes(self.J[rows], 1, 2) @ q
+            out.chain[rows, :, columns] += g[:, :n]
+            out.chain[ends, :, columns] += g[:, n:2 * n]
+            border.add(g[:, 2 * n:])
+            square.add(np.swapaxes(q, 1, 2) @ q)
+        out.border[:, columns] += border.sum
+        out.square[np.ix_(columns, columns)] += square.sum
+
+    def _noises(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
+        """
+        Return the estimates of the unit noises and their expected variances.
+
+        (K, c) each; computed once for one ``marginals``, since levels and slips both use them.
+        """
+        if self._found is None or self._found[0]() is not marginals:
+            estimates, variances = np.empty((2, len(self.r), len(self.noise.component)))
+            n = self.n
+            for rows in blocks(len(self.r)):
+                A, Y = self._units(rows)
+                estimates[rows] = np.einsum('kic,ki->kc', A, self.r[rows])
+                variances[rows] = (A**2).sum(axis=1) - marginals.variances_of(
+                    rows, Y[:, :n], Y[:, 2 * n:], Y[:, n:2 * n])
+            self._found = ref(marginals), estimates, variances
+        return self._found[1:]
+
+    def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
+        """Yield the effects of the unit noises of each level."""
+        units, given = [], []
+        for rows, block in zip(blocks(len(self.r)), marginals.blocks(), strict=True):
+            cross = self.with_wanted(block)
+            units.append(cross @ self._units(rows)[1])
+            given.append(cross @ np.swapaxes(self.J[rows], 1, 2)
+                         @ (self.whiten[rows] @ self.noise.given[rows]))
+        X = np.concatenate(units)
+        for name in INTERVAL:
+            yield NAMES[name], X[:, :, self.of(name)]
+        if self.noise.given.shape[2]:
+            yield SpeedSteps.source, np.concatenate(given)
+
+    def road_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
+        """
+        Return the odometer's noise in each interval, forward, sideways, up: (K, 3) each.
+
+        First the estimate in its own sigmas, second its expected variance: the observable part
+        of 1.
+        """
+        estimate, seen = self._noises(marginals)
+        columns = [self.of(*names) for names in ODOMETER_AXES]
+        return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
+                np.stack([seen[:, c].sum(axis=1) for c in columns], -1))
+
+    def along_size(self) -> Floats:
+        """Return the displacement by a unit of the noise along the path, m: (K,)."""
+        pick = self.of(*ALONG)
+        return np.concatenate([
+            np.linalg.norm(self.noise.columns(rows)[:, D, pick] * self.roots()[pick], axis=1)
+            .sum(axis=1) for rows in blocks(len(self.r))])

@@ -1,0 +1,79 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What velocity and heading from outside have in common: rows with a sigma for each component."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.factors.factor import LinearisationPoint
+from odocal_ros.estimator.factors.point_rows import PointRows
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.outside import Heading, Velocity
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import BARE
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of one kind at one state: (m,), (m, d), (m, d, BARE), (m, d, M), (m, d) 1 / sigma."""
+
+    k: np.ndarray
+    raw: np.ndarray
+    J: np.ndarray
+    c: np.ndarray
+    root: np.ndarray
+
+
+class OutsideRows(PointRows):
+    """Rows of one of ``problem.outside``."""
+
+    def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
+        self._rows = self.rows(problem, point)
+        self.k, self.raw = self._rows.k, self._rows.raw
+        self.per_effective = problem.per_effective.get(self.name, 1.0)
+
+    def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
+        """Return the rows at a state."""
+        raise NotImplementedError
+
+    @classmethod
+    def there(cls, problem: Problem) -> bool:
+        """Return True if there are any."""
+        return cls.name in problem.outside
+
+    @classmethod
+    def times(cls, problem: Problem, constants: Floats) -> Floats:
+        """Return the times of validity, s."""
+        return problem.outside[cls.name].t
+
+    @classmethod
+    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+        """Return first levels, factors on stated variances, and their least."""
+        return dict.fromkeys(cls.levels_of, 1.0), cls.least(problem.outside[cls.name])
+
+    @staticmethod
+    def least(sent: Any) -> dict[str, float]:
+        """Return the least levels."""
+        raise NotImplementedError
+
+    def jacobians(self, n: int) -> tuple[Floats, Floats]:
+        """Return derivatives by the keyframe before and by constants: (m, d, n), (m, d, M)."""
+        J = self._rows.J
+        return np.pad(J, ((0, 0), (0, 0), (0, n - BARE))), self._rows.c
+
+    def stated(self, rows: Floats) -> Floats:
+        """Return rows (m, d, c) in the sigmas that the sensor states."""
+        out: Floats = rows * self._rows.root[:, :, None]
+        return out
+
+
+def used(leg: SmootherLeg, t: Floats) -> dict[str, Velocity | Heading]:
+    """Return velocity and heading within the keyframes, those that there are."""
+    found: dict[str, Velocity | Heading] = {
+        'velocity': leg.velocity.between(t[0], t[-1]),
+        'heading': leg.heading.between(t[0], t[-1])}
+    return {name: x for name, x in found.items() if len(x.t)}

@@ -1,0 +1,240 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Rows at times between keyframes, for sensors that measure at an instant.
+
+Each depends on the keyframe before it, on the constants and, if correlated fix errors are
+estimated, on those of the keyframe after it. Outliers are down-weighted: docs/method.md (S25).
+"""
+
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.mapped import room
+from odocal_ros.estimator.chain import blocks, JointMarginals, Normal
+from odocal_ros.estimator.factors.factor import ChunkedSum, Factor
+from odocal_ros.estimator.level_information import LevelSides
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import M, SLOW, State, WITH_SLOW
+from odocal_ros.nav.statistics import NORMAL_MEDIAN
+
+# sigmas beyond which a row, or the slip of an interval, has a heavy tail. Statistical: one normal
+# row in 370 is down-weighted
+TAIL_SIGMAS = 3.0
+FEWEST_JUDGED = 5    # rows, of which one may be an outlier: judgement
+
+
+Gather = Callable[[Floats], Floats]     # rows (m, d, c) to (intervals, d most, c)
+
+
+class PointRows(Factor):
+    """
+    Rows of d components each.
+
+    A subclass sets k (m,), the keyframes before; raw (m, d), the residuals; per_effective, rows
+    per independent row; share (m,), the weight of the correlated fix error of the keyframe after,
+    in rows of three components, or None. It implements ``jacobians`` and ``stated``. Weighted are
+    r (m, d), J (m, d, n + M), and J_end (m, 3, 3) by that correlated error, or None.
+    """
+
+    levels_of: ClassVar[dict[str, slice]]     # columns of each level, a factor on variances
+    source: ClassVar[str]                     # name in the budget
+    k: Ints
+    raw: Floats
+    per_effective = 1.0
+    share: Floats | None = None
+
+    @classmethod
+    def times(cls, problem: Problem, constants: Floats) -> Floats:
+        """Return the times of validity, s: (m,); ``point`` holds the sums up to these times."""
+        raise NotImplementedError
+
+    def jacobians(self, n: int) -> tuple[Floats, Floats]:
+        """Return derivatives by the keyframe before and by constants: (m, d, n), (m, d, M)."""
+        raise NotImplementedError
+
+    def stated(self, rows: Floats) -> Floats:
+        """Return rows (m, d, c) divided by the sigmas that the sensor states."""
+        raise NotImplementedError
+
+    def known(self) -> Bools | bool:
+        """Return a mask of the components that exist: (m, d) bool or one for all."""
+        return True
+
+    def weigh(self, levels: Levels) -> None:
+        """Compute r and J_end with the weights of heavy tails."""
+        white = self.stated(self.raw[:, :, None])[:, :, 0]
+        factor = np.ones(white.shape[1])
+        for level, columns in self.levels_of.items():
+            factor[columns] /= np.sqrt(levels[level])
+        white = white * factor
+        self.weight = self._weights(white)
+        each = np.sqrt(self.weight / self.per_effective)
+        self.r = each * white
+        self._root = (each * factor)[:, :, None]
+        self.J_end = None
+        if self.n == WITH_SLOW and self.share is not None:
+            one = np.broadcast_to(np.eye(3), (len(white), 3, 3))
+            self.J_end = -self.stated(one) * self._root * self.share[:, None, None]
+        self.log_R = -2 * np.log(np.tile(factor, (len(white), 1))).sum() / self.per_effective
+
+    @cached_property
+    def J(self) -> Floats:
+        """Return the whitened derivatives: (m, d, n + M)."""
+        rows, constants = self.jacobians(self.n)
+        out = room(*self.raw.shape, self.n + M)
+        out[:, :, :self.n] = self.stated(rows)
+        del rows
+        out[:, :, self.n:] = self.stated(constants)
+        out *= self._root
+        return out
+
+    def _sizes(self, white: Floats) -> Iterator[tuple[slice, Floats]]:
+        for columns in self.levels_of.values():
+            yield columns, np.abs(np.hypot.reduce(white[:, columns], axis=1))
+
+    def _weights(self, white: Floats) -> Floats:
+        """Return weights of whitened residuals, (m, d), equal for the columns of one level."""
+        w = np.ones_like(white)
+        if len(white) >= FEWEST_JUDGED:
+            for columns, size in self._sizes(white):
+                w[:, columns] = np.minimum(1.0, TAIL_SIGMAS / np.maximum(size, 1e-12))[:, None]**2
+        return w
+
+    def cost(self) -> float:
+        """Return the robust loss of the weights: squares, logarithms beyond TAIL_SIGMAS."""
+        total = 0.0
+        for _, size in self._sizes(self.r / np.sqrt(self.weight / self.per_effective)):
+            far = np.maximum(size / TAIL_SIGMAS, 1.0)
+            total += float((np.minimum(size, TAIL_SIGMAS)**2
+                            + 2 * TAIL_SIGMAS**2 * np.log(far)).sum())
+        return total / self.per_effective
+
+    def after(self, step: Floats, constants: Floats, reached: State) -> None:
+        """Apply the step to the residuals."""
+        own = np.concatenate([step[self.k], np.broadcast_to(constants, (len(self.k), M))], axis=1)
+        self.r = self.r + np.einsum('kij,kj->ki', self.J, own)
+        if self.J_end is not None:
+            self.r = self.r + np.einsum('kij,kj->ki', self.J_end, step[self.k + 1, SLOW])
+
+    def add(self, out: Normal) -> None:
+        """Add the rows to normal equations."""
+        n, corner, g_border = self.n, ChunkedSum(), ChunkedSum()
+        for present, gather in self._intervals():
+            J, r = gather(self.J), gather(self.r[:, :, None])
+            H = np.swapaxes(J, 1, 2) @ J
+            g = -(np.swapaxes(J, 1, 2) @ r)[:, :, 0]
+            out.diagonal[present] += H[:, :n, :n]
+            out.border[present] += H[:, :n, n:]
+            corner.add(H[:, n:, n:])
+            out.g[present] += g[:, :n]
+            g_border.add(g[:, n:])
+            if self.J_end is None:
+                continue
+            B = gather(self.J_end)
+            X = np.swapaxes(J, 1, 2) @ B
+            out.beside[present, :, SLOW] += X[:, :n]
+            out.border[present + 1, SLOW] += np.swapaxes(X[:, n:], 1, 2)
+            out.diagonal[present + 1, SLOW, SLOW] += np.swapaxes(B, 1, 2) @ B
+            out.g[present + 1, SLOW] -= (np.swapaxes(B, 1, 2) @ r)[:, :, 0]
+        out.corner += corner.sum
+        out.g_border += g_border.sum
+
+    def _intervals(self) -> Iterator[tuple[Ints, Gather]]:
+        """
+        Yield the intervals that have rows, some at a time, and a function that groups rows.
+
+        The function pads rows (m, d, c) to (intervals, d most, c).
+        """
+        present, first, count = np.unique(self.k, return_index=True, return_counts=True)
+        for some in blocks(len(present)):
+            counts, most = count[some], count.max()
+            rows = slice(first[some.start], first[some.start] + counts.sum())
+            own = np.repeat(np.arange(len(counts)), counts)
+            place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+
+            def gather(x: Floats, rows: slice = rows, own: Ints = own, place: Ints = place,
+                       counts: Ints = counts, most: int = most) -> Floats:
+                out = np.zeros((len(counts), most, *x.shape[1:]))
+                out[own, place] = x[rows]
+                return out.reshape(len(counts), -1, x.shape[2])
+
+            yield present[some], gather
+
+    def _columns(self) -> tuple[Ints, Ints]:
+        """Return the columns of J and of J_end in the joint marginals."""
+        n = self.n
+        return np.r_[0:n, 2 * n:2 * n + M], np.arange(n + SLOW.start, n + SLOW.stop)
+
+    def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
+        """Return the quadratic sum and its expectation for each level."""
+        if len(self.k) < FEWEST_JUDGED:
+            return {}
+        taken = np.concatenate([self._taken(marginals, present, gather)
+                                for present, gather in self._intervals()])
+        known = np.broadcast_to(self.known(), self.r.shape)
+        r2 = np.where(known, self.r, 0.0)**2 * self.per_effective
+        return {level: (float(r2[:, columns].sum()),
+                        float(known[:, columns].sum() - taken[:, :, columns].sum()))
+                for level, columns in self.levels_of.items()}
+
+    def add_levels(self, out: LevelSides) -> None:
+        """Add the right-hand sides of its levels."""
+        if len(self.k) < FEWEST_JUDGED:
+            return
+        columns = out.at(self.levels_of)
+        q = np.zeros((*self.r.shape, len(columns)))
+        for i, own in enumerate(self.levels_of.values()):
+            q[:, own, i] = self.r[:, own]
+        border = ChunkedSum()
+        for present, gather in self._intervals():
+            some = gather(q)
+            g = np.swapaxes(gather(self.J), 1, 2) @ some
+            out.chain[present[:, None], :, columns] += np.moveaxis(g[:, :self.n], 2, 1)
+            border.add(g[:, self.n:])
+            if self.J_end is not None:
+                end = np.swapaxes(gather(self.J_end), 1, 2) @ some
+                out.chain[present[:, None] + 1, SLOW, columns] += np.moveaxis(end, 2, 1)
+        out.border[:, columns] += border.sum
+        out.square[columns, columns] += np.einsum('kdi,kdi->i', q, q)
+
+    def _taken(self, marginals: JointMarginals, present: Ints, gather: Gather) -> Floats:
+        """Return the part of the row variances that the unknowns fit: (k, most, d)."""
+        J = np.swapaxes(gather(self.J), 1, 2)
+        end = None if self.J_end is None else np.swapaxes(gather(self.J_end), 1, 2)
+        taken = marginals.variances_of(present, J[:, :self.n], J[:, self.n:], end, SLOW)
+        return taken.reshape(len(present), -1, self.r.shape[1])
+
+    def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
+        """Yield the effect of a unit error of each row."""
+        own, end = self._columns()
+        parts = []
+        for present, gather in self._intervals():
+            cross = np.ascontiguousarray(self.with_wanted(marginals.of(present)))
+            X = cross[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
+            if self.J_end is not None:
+                X = X + cross[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)
+            parts.append(X)
+        yield self.source, np.concatenate(parts)
+
+
+def alike(rows: PointRows) -> float:
+    """Return rows per independent row, by the scatter of means of adjacent rows."""
+    r = rows.r / np.sqrt(rows.weight)
+    r = (r - np.median(r, axis=0))[:, :2]       # horizontal: these determine scale and yaw
+    scale = np.median(np.abs(r), axis=0) / NORMAL_MEDIAN
+    r = np.clip(r, -TAIL_SIGMAS * scale, TAIL_SIGMAS * scale)
+    r = r - r.mean(axis=0)
+    power = (r**2).mean()
+    most, length = 1.0, 2
+    while len(r) >= 12 * length and power > 0:      # bins: their spread is good to 20 %
+        bins = r[:len(r) // length * length].reshape(-1, length, r.shape[1])
+        most = max(most, float(length * (bins.mean(axis=1)**2).mean() / power))
+        length *= 2
+    return most

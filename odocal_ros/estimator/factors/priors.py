@@ -1,0 +1,162 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The prior factor, docs/method.md (S21): biases, constants, and the first keyframe."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.estimator.chain import JointMarginals, Normal
+from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint, WANTED
+from odocal_ros.estimator.level_information import LevelSides
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import (
+    BA,
+    BG,
+    constants_from,
+    FIX_BY_MOTION,
+    FIX_LAG2,
+    FIX_TIME,
+    GNSS_ARM,
+    IMPERFECT,
+    KIND_OF,
+    KIND_SIZES,
+    M,
+    ODO_ARM,
+    ODO_DELAY,
+    ODO_LAG2,
+    P,
+    PHI,
+    TYRES,
+    V,
+    VELOCITY,
+)
+
+# sizes of imperfections, by the square of the usual one: names of the levels, and their median.
+# Judgement: usual sizes are those of data sheets, which most sensors keep
+SIZES, SIZE = tuple(f'size_{kind}' for kind in KIND_SIZES), 0.5
+# of the logarithms of sizes. Tuned: at 2 pitch is up to 5.2 sigma off in 113 drives, at 1 2.8
+# (docs/decisions/0016). Most receivers have no odometer, others one that is up to 2 % off, 6 of
+# the logarithm apart: at 1 the sigma of the scale is up to 2.8 times as large in drives without
+# one, at 3 1.7 times (docs/decisions/0019)
+SIZE_SPREADS = dict.fromkeys(SIZES, 1.0) | {'size_fix_error_by_motion': 3.0}
+# definition: logarithms of sizes that are compared, from the least on
+LOG_SIZES = np.arange(np.log(1e-6), np.log(1e6), 0.05)
+# priors of the first keyframe: m, m/s, rad about east, north, up. Judgement: far wider than any
+# data
+START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
+    'position': (P, 1e4), 'velocity': (V, 100.0), 'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
+# m: without heights; 1e4 m would be lost in rounding. Definition
+UP, LEVEL_START = slice(P.stop - 1, P.stop), 1.0
+# priors of the vehicle, shared by all legs
+SHARED: dict[str, slice | Ints] = {
+    'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
+    'odometer_delay': np.array([ODO_DELAY, ODO_LAG2]),
+    'fix_latency': constants_from('gnss_delay'),
+    'gyro_scale': constants_from('gyro_scale_z', 'gyro_scale_y'),
+    'gyro_axes': constants_from('gyro_axis_xy', 'gyro_axis_zy'),
+    'gyro_by_force': constants_from('gyro_x_by_force_x', 'gyro_z_by_force_y'),
+    'accelerometer_scale': constants_from('accelerometer_scale_x', 'accelerometer_scale_z'),
+    'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz'),
+    'receiver_smoothing': np.array([FIX_LAG2, FIX_BY_MOTION, FIX_TIME]),
+    'tyre_changes': TYRES,
+    'body_lean': constants_from('squat', 'pitch_centre'),
+    'speed_truncation': constants_from('speed_offset'),
+    'heading': constants_from('heading_offset'), 'velocity': VELOCITY}
+
+
+class PriorRows(Factor):
+    """Rows of the unknowns with their priors."""
+
+    name = 'priors'
+
+    def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
+        self.state, self.base = point.state, point.priors
+        absent = {'heading', 'velocity'} - {*problem.outside}
+        coarse = problem.leg.travel.coarse
+        absent |= set() if coarse and coarse.truncation else {'speed_truncation'}
+        self.level = not problem.leg.felt
+        self.shared = {name: where for name, where in SHARED.items() if name not in absent}
+
+    @classmethod
+    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+        """Return initial and minimum sizes of imperfections, in squares of the usual one."""
+        return dict.fromkeys(SIZES, SIZE), dict.fromkeys(SIZES, 1e-6)
+
+    def weigh(self, levels: Levels) -> None:
+        """Compute the priors from the sizes of imperfections: docs/method.md (S28)."""
+        size = np.array([levels[name] for name in SIZES])[KIND_OF]
+        constants = self.base.constants.copy()
+        constants[IMPERFECT] *= np.sqrt(size)
+        self.priors = replace(self.base, constants=constants)
+        self.log_R = float(np.log(size).sum())
+
+    def sizes(self, marginals: JointMarginals) -> dict[str, float]:
+        """
+        Return the most likely size of each type, all else as it is: docs/method.md (S29).
+
+        An imperfection is weighted by the share of the drive in its information: a model error
+        elsewhere would move the size of one that is hardly observable.
+        """
+        at = 2 * self.n + np.arange(IMPERFECT.start, IMPERFECT.stop)
+        usual = self.base.constants[IMPERFECT]**2
+        weight = 1 / self.priors.constants[IMPERFECT]**2
+        total = 1 / marginals[0][at, at]
+        data = np.maximum(total - weight, 1e-9 * total)     # a share lost in rounding
+        known = data / (data + 1 / (SIZE * usual))
+        found = (self._constants_off()[IMPERFECT] * total / data)**2
+        variance = np.exp(LOG_SIZES)[:, None] * usual + 1 / data
+        off = (known * (found / variance + np.log(variance))) @ np.eye(len(SIZES))[KIND_OF]
+        spread = np.array([SIZE_SPREADS[name] for name in SIZES])
+        best = np.argmin(off + ((LOG_SIZES[:, None] - np.log(SIZE)) / spread)**2, axis=0)
+        return dict(zip(SIZES, np.exp(LOG_SIZES[best]).tolist(), strict=True))
+
+    def add_levels(self, out: LevelSides) -> None:
+        """Add the right-hand sides of the sizes."""
+        columns = out.at(SIZES)
+        off, sigma = self._constants_off()[IMPERFECT], self.priors.constants[IMPERFECT]
+        of = np.eye(len(SIZES))[KIND_OF]
+        out.border[IMPERFECT, columns] += of * (off / sigma**2)[:, None]
+        out.square[columns, columns] += of.T @ (off / sigma)**2
+
+    def _biases(self) -> Iterator[tuple[slice, Floats, Floats]]:
+        """Yield columns, value and sigma of the biases at the first keyframe."""
+        state, priors = self.state, self.priors
+        yield BG, state.gyro_bias[0], priors.gyro_bias
+        yield BA, state.accel_bias[0], priors.accel_bias
+
+    def _constants_off(self) -> Floats:
+        return self.state.constants - self.priors.centre
+
+    def add(self, out: Normal) -> None:
+        """Add the rows to normal equations; the first keyframe has a wide prior at its value."""
+        for columns, sigma in START_SIGMAS.values():
+            add_prior(out, 0, columns, sigma**2, 0.0)
+        if self.level:
+            add_prior(out, 0, UP, LEVEL_START**2, 0.0)
+        for columns, value, sigma in self._biases():
+            add_prior(out, 0, columns, sigma**2, value)
+        w = 1 / self.priors.constants**2
+        out.corner[range(M), range(M)] += w
+        out.g_border -= w * self._constants_off()
+
+    def cost(self) -> float:
+        """Return the sum of squares, in sigmas."""
+        total = sum((value**2 / sigma**2).sum() for _, value, sigma in self._biases())
+        out: float = total + (self._constants_off()**2 / self.priors.constants**2).sum()
+        return out
+
+    def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
+        """Yield the effects of the turn-on biases."""
+        first = self.with_wanted(marginals[0][None])[0]
+        yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
+        yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
+
+    def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
+        """Yield names and effects, (3, k), of errors that all legs share."""
+        for name, where in self.shared.items():
+            yield name, covariance[:WANTED, where] / self.priors.constants[where]

@@ -1,0 +1,100 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What of the IMU's signals its errors multiply: docs/method.md, noise in the regressor.
+
+Derivatives by a scale error go by a signal. By the signal as measured they hold its noise, which
+the fit then takes for information, and a smaller signal for a better one. So, once the state is so
+near that residuals are noise, that is taken out: what an axis has put into the residual, and,
+since the noise of a gyro turns the force within an interval, what gravity makes of that.
+
+Of the heave, what odometer and attitude do not predict is noise of the road. The fit judges it by
+the level of this noise, so it is taken out as well.
+"""
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.factors.motion import D, Motion, ROWS
+from odocal_ros.estimator.preintegrate import turn
+from odocal_ros.estimator.state import (
+    ACCEL,
+    ACCEL_AXIS,
+    ACCEL_SIGNAL,
+    BG,
+    GYRO,
+    GYRO_AXIS,
+    GYRO_SIGNAL,
+    P,
+    PHI,
+    V,
+)
+from odocal_ros.nav.rotations import transpose
+
+# definition: the axis whose force is gravity and heave; signals of a gyro from there on are forces
+UPRIGHT, FORCES = 2, 3
+
+
+class Signals:
+    """
+    Turn rates and forces of a motion's intervals, as fitted.
+
+    heave : by the noise of the road, (K,) of the vertical velocity of the axle and its integral,
+    m/s and m, in an interval.
+    """
+
+    def __init__(self, motion: Motion) -> None:
+        self.motion, state = motion, motion.state
+        noise = motion.axle.v_n[:, 2] - motion.axle.wheel * (state.C_nb @ state.forward)[:, 2]
+        moved = motion.residual[:, D][:, 2] - noise[:-1] * motion.T[:, 0]
+        self.heave = (V, np.diff(noise)), (P, moved)
+
+    def fit(self, rows: slice, constants: Floats, by_bias: Floats, gyro: Floats,
+            found: Floats) -> None:
+        """
+        Put the derivatives by the IMU's errors right, in constants: (k, 18, M).
+
+        rows : slice of the intervals.   by_bias : (k, 18, 3) derivatives by the gyro's bias.
+        gyro : (k, 18, 3 p) columns of the gyro's unit noises, along the axes of n at p points.
+        found : (k, 3 p) their best estimates. The noises of two sensors are independent, so the
+        forces that act on the gyro are left.
+        """
+        part = self.motion.take(rows)
+        self._by_rates(part, constants[:, :, GYRO], by_bias)
+        k, C = len(part.C), part.C[:, None]
+        # of the noise about each axis of b
+        of_gyro = ((gyro.reshape(k, ROWS, -1, 3) @ C) * (found.reshape(k, 1, -1, 3) @ C)).sum(2)
+        for axes, heave in self.heave:
+            self._by_forces(part, constants[:, axes, ACCEL], heave[rows] * part.C[:, 2, 2],
+                            part.residual[:, axes], of_gyro[:, axes])
+
+    def _by_rates(self, part: Motion, columns: Floats, by_bias: Floats) -> None:
+        """Put the derivatives right that go by turn rates: columns (k, 18, g)."""
+        noise = turn(transpose(part.C), part.residual[:, PHI]) / part.T
+        by_bias = by_bias.copy()
+        by_bias[:, BG] = 0.0        # which walks, as a scale does not
+        for i, (into, by) in enumerate(zip(GYRO_AXIS, GYRO_SIGNAL, strict=True)):
+            if by < FORCES:
+                columns[:, :, i] += by_bias[:, :, into] * noise[:, by, None]
+
+    def _by_forces(self, part: Motion, columns: Floats, heave: Floats, residual: Floats,
+                   of_gyro: Floats) -> None:
+        """
+        Put the derivatives of velocity, or of place, right that go by forces: columns (k, 3, a).
+
+        heave : (k,) of it what is noise of the road, in b.
+        of_gyro : (k, 3, 3) what the gyro's noise about each axis of b put into the residual.
+        """
+        back = transpose(part.C)
+        turned = back @ of_gyro      # toward an axis of b, about one
+        own = turn(back, residual) - turned.sum(axis=2)
+        for i, (into, by) in enumerate(zip(ACCEL_AXIS, ACCEL_SIGNAL, strict=True)):
+            noise = np.zeros_like(own)
+            noise[:, into] = own[:, by]
+            if by == UPRIGHT:
+                noise[:, into] -= heave
+            if into == by:      # the force along it, turned about another, toward the third
+                for about, toward in ((into - 1, into - 2), (into - 2, into - 1)):
+                    noise[:, toward] += turned[:, toward, about]
+            columns[:, :, i] += turn(part.C, noise)

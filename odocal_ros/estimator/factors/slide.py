@@ -1,0 +1,65 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Lower limits of sideslip and vertical motion, by the turns of the leg.
+
+Sideslip is observable in turns: a leg with turns uses its own estimate. On a straight leg a
+constant sideslip cannot be separated from the mounting yaw: the noise of an ordinary road is the
+lower limit, whatever the residuals of single seconds.
+"""
+
+import numpy as np
+
+from odocal_ros.estimator.factors.interval_noise import TURNING_RATE
+from odocal_ros.estimator.imu_steps import ImuSteps
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.start import rest_bias
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import SWAY
+
+# m/sqrt(s), least slide where turns test it. Tuned: the simulator's vehicles, which do not slide,
+# then have the yaw sigma of their errors (docs/decisions/0005)
+TURN_SLIDE = 2e-4
+# m/sqrt(s), least up and down: what springs, tyres and road do in a second that no unknown holds.
+# Tuned: with a tenth the pitch of yards was 3 sigmas off (docs/decisions/0005)
+HEAVE = 2e-3
+# m/rad, by which the pitch of a body within a second lifts its axle beyond the model, as kerbs
+# shorter than a wheelbase do: initial level and lower limit, judgement; each drive has its own
+PITCHING, PITCHING_LEAST = 0.03, 1e-4
+# m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
+ORDINARY_ROAD = SWAY / np.sqrt(10.0)
+# rad turned in all: less than one crossroads tests nothing, two do. Judgement
+NO_TURN = np.pi / 2
+SIDEWAYS = ('side', 'side_turn', 'up')
+
+
+def turned(leg: SmootherLeg, imu: ImuSteps) -> float:
+    """Return the total angle of the turns, without sign, rad."""
+    t = imu.t[imu.key]
+    T = np.diff(t)
+    turn = imu.over_intervals(imu.turn) - rest_bias(leg, imu)[0] * T[:, None]
+    up = imu.signals[:, 3:].sum(axis=0)
+    angle = np.abs(turn @ up) / np.linalg.norm(up)
+    way = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
+    return float(angle[(angle > TURNING_RATE * T) & (way > 0.2 * T)].sum())    # m/s: moving
+
+
+def least_slide(angle: float) -> float:
+    """Return the minimum sideways and vertical noise, m/sqrt(s), by the total turn angle, rad."""
+    tested = np.clip((angle - NO_TURN) / NO_TURN, 0.0, 1.0)
+    return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**tested)
+
+
+def assumed(problem: Problem, levels: Levels) -> list[Reason]:
+    """Return the reason that names an assumed road noise, if it matters."""
+    least = problem.least['side']
+    if least < 2e-3**2 or all(      # m^2/s, worth a word
+            levels[name] > 1.01 * least for name in SIDEWAYS):
+        return []
+    return [Reason(Code.PARAMETER_NOT_DETERMINED, 'total turn angle '
+                   f'{np.rad2deg(problem.turned):.0f} deg, too little to estimate sideslip: '
+                   f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed, and the uncertainties of the '
+                   'mounting angles depend on it')]

@@ -1,0 +1,111 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The horizontal velocity of the GNSS antenna as rows, docs/method.md (S18).
+
+Derivatives by constants go by means of the interval. Those by samples hold vibration, by which a
+delay and axes look certain, and a lever arm short.
+"""
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.factors.factor import LinearisationPoint
+from odocal_ros.estimator.factors.fixes import antenna
+from odocal_ros.estimator.factors.least import LEAST
+from odocal_ros.estimator.factors.motion import gravity_n
+from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
+from odocal_ros.estimator.outside import Velocity
+from odocal_ros.estimator.preintegrate import Points, turn
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import (
+    ACCEL,
+    ACCEL_AXIS,
+    ACCEL_SIGNAL,
+    BA,
+    BARE,
+    BG,
+    GNSS_ARM,
+    GYRO_SCALE,
+    M,
+    PHI,
+    PITCH,
+    V,
+    VELOCITY_DELAY,
+    VELOCITY_LAG2,
+    VELOCITY_SCALE,
+    YAW,
+)
+from odocal_ros.nav.receiver_filter import smoothing
+from odocal_ros.nav.rotations import skew, transpose
+
+# m/s, to start from: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
+FIRST_SIGMA = 0.5
+
+
+class VelocityRows(OutsideRows):
+    """Residuals of a velocity (sent less predicted) and their derivatives at one state."""
+
+    name, source = 'velocity', 'fix_velocity'
+    levels_of = {'velocity': slice(0, 2)}
+
+    def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
+        """Return the rows."""
+        return _velocity(problem, point, point.points['velocity'])
+
+    @classmethod
+    def times(cls, problem: Problem, constants: Floats) -> Floats:
+        """Return the times of validity, s."""
+        out: Floats = super().times(problem, constants) - constants[VELOCITY_DELAY]
+        return out
+
+    @classmethod
+    def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the first level, of residuals before the delay is known, and the least."""
+        first, least = super().first_levels(problem)
+        sigma = float(np.median(problem.outside[cls.name].sigma))
+        return {name: max(x, (FIRST_SIGMA / sigma)**2) for name, x in first.items()}, least
+
+    @staticmethod
+    def least(sent: Velocity) -> dict[str, float]:
+        """Return the least level."""
+        return {'velocity': (LEAST.velocity / float(np.median(sent.sigma)))**2}
+
+
+def _velocity(problem: Problem, point: LinearisationPoint, points: Points) -> Rows:
+    leg, state, sent, k = problem.leg, point.state, problem.outside['velocity'], points.interval
+    assert isinstance(sent, Velocity)
+    C, tau = state.C_nb[k], points.tau[:, None]
+    C_t = C @ points.R
+    arm_v = leg.antenna_arm - leg.imu_arm + state.constants[GNSS_ARM]
+    arm_b = state.C_bv @ arm_v
+    dv, g = turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
+    swing = turn(C_t, np.cross(points.rate, arm_b))
+    _, at_keys = antenna(state, point.intervals.mean_rate, arm_b)
+    faster = (np.diff(at_keys, axis=0) / point.intervals.T[:, None])[k]
+    smoothed, by_lag = smoothing(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
+                                 state.t[k] + points.tau, state.constants[VELOCITY_LAG2])
+    v = state.v_n[k] + dv + g * tau + swing + smoothed
+    # on the prediction: on what is sent it would be on its noise too, and the smallest fit best
+    times = 1 + state.constants[VELOCITY_SCALE]
+    m, t, rate = len(k), tau[:, :, None], point.intervals.mean_rate[k]
+    J, c = np.zeros((m, 3, BARE)), np.zeros((m, 3, M))
+    J[:, :, V] = -np.eye(3)
+    J[:, :, PHI] = skew(dv + swing)
+    J[:, :, BA] = C * t
+    # a turn rate less by the bias: half the turn acts on what force did, all of it on the arm
+    J[:, :, BG] = -(skew(dv) / 2 + skew(swing)) @ C * t - C_t @ skew(arm_b)
+    by_yaw, by_pitch = state.C_bv_gradient
+    W = C_t @ skew(rate)
+    c[:, :, YAW], c[:, :, PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
+    c[:, :, GNSS_ARM] = -W @ state.C_bv
+    c[:, :, VELOCITY_DELAY], c[:, :, VELOCITY_LAG2] = faster, -by_lag
+    c[:, :, GYRO_SCALE] = J[:, :, BG.start + 2] * rate[:, 2:]
+    force, signals = turn(transpose(C), faster - g), np.zeros((m, 3, len(ACCEL_AXIS)))
+    # as fitted, (m, 3) m/s^2, by the axes that it enters
+    signals[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]
+    c[:, :, ACCEL] = C @ signals * t
+    J, c = J[:, :2] * times, c[:, :2] * times
+    c[:, :, VELOCITY_SCALE] = -v[:, :2]
+    return Rows(k, sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))

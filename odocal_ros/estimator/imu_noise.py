@@ -1,0 +1,78 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""White noise and random walks of an IMU by its grade, its standstills and its samples."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.pieces import by_step
+from odocal_ros.estimator.factors.least import LEAST
+from odocal_ros.estimator.imu_steps import ImuSteps
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.screening.leg_kind import TILT_SIGMA
+from odocal_ros.settings.grades import G, Grade
+
+# m/s^2/sqrt(Hz) minimum, and m/s^2/sqrt(s): accelerations of the vehicle, 1.5 m/s^2 for some
+# seconds, and slopes of a few per cent over a minute. Judgement
+UNFELT_NOISE, UNFELT_WALK = 5.0, 0.01
+
+
+def sensor_noise(grade: Grade) -> dict[str, float]:
+    """Return sigmas of white noise and random walks by the grade of the IMU, SI."""
+    stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
+              'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
+    return {name: max(sigma, LEAST.imu[name]) for name, sigma in stated.items()}
+
+
+def unfelt(grade: Grade) -> Grade:
+    """Return the grade of an IMU without an accelerometer: its specific force is gravity."""
+    return replace(grade, accel_noise=UNFELT_NOISE, accel_bias=TILT_SIGMA * G,
+                   accel_bias_walk=UNFELT_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
+
+
+def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
+    """Return white noise levels of gyro and accelerometer from standstills."""
+    turn, force = np.split(imu.over_intervals(imu.signals), 2, axis=1)
+    T = np.diff(imu.t[imu.key])[:, None]
+    inside = still[:-1] & still[1:]
+    rest = np.flatnonzero(inside)
+    runs = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
+    sums, freedom = np.zeros(2), 0
+    for run in runs:
+        if len(run) < 3:
+            continue
+        # second differences contain no bias and no drift; their variance is six times as large
+        for i, x in enumerate((turn, force)):
+            d = np.diff((x / T)[run], n=2, axis=0) * np.sqrt(T[run][1:-1] / 6)
+            sums[i] += (d**2).sum() / 3
+        freedom += len(run) - 2
+    if freedom < 15:        # of three axes each: a variance by fewer is good to 20 % at best
+        return {}
+    found = {name: max(float(total / freedom), LEAST.imu[name]**2)
+             for name, total in zip(('gyro', 'accel'), sums, strict=True)}
+    return found if leg.felt else {'gyro': found['gyro']}
+
+
+def shaken(leg: SmootherLeg) -> dict[str, float]:
+    """
+    Return white noise levels of gyro and accelerometer from adjacent samples.
+
+    They include vibration, most of which cancels within a second: initial levels that decrease.
+    """
+    rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
+    return {name: sigma**2 for name, sigma in of_samples(leg, rows).items()}
+
+
+def of_samples(leg: SmootherLeg, rows: slice | Bools) -> dict[str, float]:
+    """Return the noise of differences of adjacent samples, as white noise, SI per sqrt(Hz)."""
+    def jumps(x: Floats) -> Floats:
+        out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)
+        return out
+
+    usual = float(np.median(np.diff(leg.t_imu[rows]), overwrite_input=True))
+    return {name: float(np.sqrt(np.median(by_step(jumps, x[rows]), overwrite_input=True)
+                                / 2.366 / 2 * usual))      # 2.366: of chi2 with 3
+            for name, x in (('gyro', leg.w_b), ('accel', leg.f_b))}

@@ -1,0 +1,82 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A step of the noise levels and sizes towards the maximum of the restricted likelihood."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.estimator.chain import JointMarginals
+from odocal_ros.estimator.equations import Weighted
+from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.priors import PriorRows, SIZE_SPREADS, SIZES
+from odocal_ros.estimator.factors.slow_error import TIME_SPREAD
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.long_run import long_run
+from odocal_ros.estimator.problem import Problem
+
+
+@dataclass(frozen=True)
+class OverRelaxation:
+    """Exponents on the steps of a level: the fixed-point iteration is slow for small noises."""
+
+    first: float = 1.6          # from 2 on a single level oscillates
+    faster: float = 1.25        # factor after a step in the same direction
+    # factor after a step that reverses; taken back at once if the next one does not, since a small
+    # exponent converges slowly (an exponent that recovers by ``faster``: 1.04 times the passes)
+    slower: float = 0.5
+    most: float = 3.0
+
+
+RELAXATION = OverRelaxation()
+# pseudo-observations of the prior of an IMU level. Judgement: equivalent to a few seconds
+PRIOR_ROWS = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
+# levels of rows with slips
+SLIPPING = ('along', 'along_hard', 'side', 'side_turn', 'up')
+
+
+def prior_information(levels: Levels) -> dict[str, float]:
+    """Return the prior information on the logarithm of each level."""
+    return {name: SIZE_SPREADS[name]**-2 if name in SIZES
+            else TIME_SPREAD**-2 if name == 'correlation_time'
+            else PRIOR_ROWS.get(name, 1.0) / 2 for name in levels.values}
+
+
+def update(weighted: Weighted, marginals: JointMarginals, levels: Levels, problem: Problem,
+           pace: dict[str, tuple[float, float]], fitted: bool = True) -> Levels:
+    """
+    Return the levels after one step of (S27), docs/method.md.
+
+    pace : exponent and last step of each level, updated in place.
+    """
+    new, found = {}, weighted.components(marginals)
+    if 'slow' in found and 'fix' in found:
+        for name, by in long_run(weighted[Fixes], levels, found).items():
+            found[name] = by * found[name][0], found[name][1]
+    for name, (quadratic, expected) in found.items():
+        level = levels[name]
+        # the others have one, at their current value: more would stop at too large a noise
+        pseudo = PRIOR_ROWS.get(name, 1.0)
+        pull = pseudo * (problem.first_levels[name] / level if name in PRIOR_ROWS else 1.0)
+        step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
+                                    0.03, 30.0)))
+        first = RELAXATION.first if name in SLIPPING or name in PRIOR_ROWS else 1.0
+        move = np.clip(_paced(pace, name, step, first) * step, np.log(0.03), np.log(30.0))
+        new[name] = max(level * float(np.exp(move)), problem.least[name])
+    # constants by residuals that contain the start are not judged
+    for name, size in weighted[PriorRows].sizes(marginals).items() if fitted else ():
+        step = float(np.log(size / levels[name]))
+        new[name] = levels[name] * float(np.exp(min(_paced(pace, name, step, 1.0), 1.0) * step))
+    return levels.but(**new)
+
+
+def _paced(pace: dict[str, tuple[float, float]], name: str, step: float, first: float) -> float:
+    """Return the exponent of a step: larger after one in the same direction, else smaller."""
+    power, last = pace.get(name, (first, 0.0))
+    if step * last < 0:
+        power *= RELAXATION.slower
+    elif last:
+        power *= RELAXATION.faster if power >= 1.0 else 1 / RELAXATION.slower
+    pace[name] = min(power, RELAXATION.most), step
+    return pace[name][0]

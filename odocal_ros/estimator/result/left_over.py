@@ -1,0 +1,114 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Residuals of each sensor after the fit, and the sigmas of the biases, along the leg."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.chain import blocks, JointMarginals
+from odocal_ros.estimator.equations import Weighted
+from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.interval_noise import ABSENT_VARIANCE
+from odocal_ros.estimator.factors.motion import D
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.fit import Fit
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import BA, BG, PHI, V
+from odocal_ros.nav.rotations import transpose
+
+OF_INTERVALS = ('odometer', 'gyro', 'accelerometer')
+
+
+def bias_sigmas(near: JointMarginals, widen: float) -> Floats:
+    """Return the sigmas of the biases at the keyframes: (2, N, 3), gyro first, rad/s, m/s^2."""
+    variance = near.variances()
+    return np.sqrt(np.stack([variance[:, BG], variance[:, BA]])) * widen
+
+
+def left_over(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, NDArray[Any]]:
+    """
+    Return the residuals of each sensor, fitted less measured, and the sigmas of its noise.
+
+    Returns
+    -------
+    dict of arrays, a row's three values before their sigmas, NaN where the sensor says nothing.
+    Of an interval, at its end: ``left_odometer`` along, left, up, m; ``left_gyro`` x, y, z, rad/s,
+    and ``left_accelerometer`` x, y, z, m/s^2, means in b. ``left_fix``, of the fixes used, at
+    ``left_fix_t``, s: east, north, up, m, without the slow part of their error. Single precision,
+    for hours have many rows.
+
+    """
+    rows = {**_of_intervals(fit), 'fix': _of_fixes(fit)}
+    return {f'left_{name}': np.concatenate(pair, axis=1).astype(np.float32)
+            for name, pair in rows.items()} | {'left_fix_t': leg.t_fix[problem.use]}
+
+
+def correlation(t: Floats, residual: Floats, width: float = 2.0) -> tuple[float, float]:
+    """
+    Return the correlation of neighbouring bins of residuals and its sigma, were they white.
+
+    t : (m,) s.   residual : (m, c) in sigmas.   width : of a bin, s.
+    """
+    if len(t) < 4:
+        return 0.0, 1.0
+    cell = np.floor((t - t[0]) / width).astype(int)
+    at, first = np.unique(cell, return_index=True)
+    count = np.diff(np.append(first, len(t)))
+    mean = np.add.reduceat(residual, first, axis=0) / np.sqrt(count)[:, None]
+    beside = np.flatnonzero(np.diff(at) == 1)
+    power = (mean**2).mean()
+    if len(beside) < 5 or power == 0:
+        return 0.0, 1.0
+    return (float((mean[beside] * mean[beside + 1]).mean() / power),
+            float(1 / np.sqrt(residual.shape[1] * len(beside))))
+
+
+def normalised(weighted: Weighted) -> dict[str, dict[str, float]]:
+    """Return the whitened residuals' rms and tails by sensor, before weights take off tails."""
+    motion, fixes = weighted[MotionRows].r, weighted[Fixes]
+    white = fixes.r / np.sqrt(fixes.weight / fixes.per_effective)
+    return {name: {'rms': float(np.sqrt((r**2).mean())), 'rows': r.size,
+                   'beyond_3_sigma': float((np.abs(r) > 3).mean())}
+            for name, r in (('gyro', motion[:, PHI]), ('accelerometer', motion[:, V]),
+                            ('odometer', motion[:, D]), ('fixes, level', white[:, :2]))}
+
+
+def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
+    """Return of each sensor of the motion values and sigmas, (K, 3) each."""
+    motion = fit.weighted[MotionRows]
+    found: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in OF_INTERVALS}
+    T, C, C_end = (getattr(motion.motion, name) for name in ('T', 'C', 'C_end'))
+    for some in blocks(len(motion.r)):
+        raw = np.linalg.solve(motion.whiten[some], motion.r[some, :, None])
+        Q = motion.noise.covariance(motion.levels, some)
+        per_T = 1 / T[some, :, None]
+        for name, own, axes in (('odometer', D, motion.noise.axes[some]),
+                                ('gyro', PHI, transpose(C_end[some]) * per_T),
+                                ('accelerometer', V, transpose(C[some]) * per_T)):
+            variance = np.einsum('kij,kjl,kil->ki', axes, Q[:, own, own], axes)
+            found[name].append(((axes @ raw[:, own])[:, :, 0], np.sqrt(variance)))
+    whole = {name: (np.concatenate([value for value, _ in parts]),
+                    np.concatenate([sigma for _, sigma in parts]))
+             for name, parts in found.items()}
+    value, sigma = whole['odometer']
+    absent = sigma**2 > ABSENT_VARIANCE / 2
+    return whole | {'odometer': (np.where(absent, np.nan, value), np.where(absent, np.nan, sigma))}
+
+
+def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
+    """Return of the fixes values and sigmas, (m, 3) each."""
+    fixes = fit.weighted[Fixes]
+    covariance_root = np.linalg.inv(fixes.root)
+    factor = np.ones(3)
+    for level, columns in fixes.levels_of.items():
+        factor[columns] = np.sqrt(fixes.levels[level])
+    each = np.sqrt(fixes.weight / fixes.per_effective) / factor
+    value = -(covariance_root @ (fixes.r / each)[:, :, None])[:, :, 0]
+    sigma = np.sqrt(covariance_root**2 @ factor**2)
+    known = fixes.known()
+    return np.where(known, value, np.nan), np.where(known, sigma, np.nan)

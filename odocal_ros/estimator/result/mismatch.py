@@ -1,0 +1,90 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Model validation: where residuals contradict the noise model, and the factor on all sigmas."""
+
+import numpy as np
+
+from odocal_ros.estimator.factors.factor import WANTED
+from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.fit import CONVERGENCE, Fit
+from odocal_ros.estimator.imu_noise import sensor_noise
+from odocal_ros.estimator.outside import Heading
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.result.noise_cause import noise_remedy
+from odocal_ros.estimator.result.slip import SLIP_VARIANCE
+from odocal_ros.estimator.state import HEADING
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.grades import grade_of, turn_on_bias
+from odocal_ros.settings.levels import REMARK_SIGMAS
+
+WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: judgement
+
+
+def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
+    """Return the factor on all sigmas, at least 1, and reasons."""
+    reasons: list[Reason] = []
+    stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
+    gyro_sold, accel_sold = turn_on_bias(config.imu)
+    level = fit.levels.roots()
+    # of an accelerometer that is not there nothing is said
+    sensors = {'gyro': 'gyro', 'accel': 'accelerometer'} if problem.leg.felt else {'gyro': 'gyro'}
+    remedy = noise_remedy(problem, level, [
+        name for name in sensors if level[name] > WORSE_THAN_GRADE * min(own[name], stated[name])])
+    over_grade = max(level[name] / own[name] for name in sensors)
+    worse = [f'{what} noise is {level[name] / stated[name]:.1f} times'
+             for name, what in sensors.items() if level[name] > WORSE_THAN_GRADE * stated[name]]
+    worse += [f'{what} bias is {np.max(np.abs(now[0]) / sigma):.1f} times' for (
+        now, sigma, sold), what in zip((
+            (fit.state.gyro_bias, problem.priors.gyro_bias, gyro_sold),
+            (fit.state.accel_bias, problem.priors.accel_bias, accel_sold)),
+            sensors.values(), strict=False)
+        if np.max(np.abs(now[0]) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE]
+    if worse:
+        reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
+                              f'{config.imu.grade} grade; the estimate from this drive is used',
+                              remedy))
+    odd, move = [], 0.0
+    if fit.creeping or not fit.settled:
+        move = moving(fit)
+        odd.append(f'after {fit.iterations} passes ' + (
+            f'the estimates still changed by {move:.2g} sigma'
+            if move > CONVERGENCE.nearly else 'the noise levels still changed'))
+    odd_share = 0.15        # of fixes far off, of intervals with a slip: judgement
+    noisy = []
+    if over_grade > WORSE_THAN_GRADE:      # vibration is not white, and of no known spectrum
+        noisy = [f'IMU noise is {over_grade:.1f} times that of its grade and may not be white; '
+                 'uncertainties were increased']
+    odd += noisy
+    share = float((fit.weighted[Fixes].weight[:, 0] < 0.5).mean())
+    if share > odd_share:
+        odd.append(f'{100 * share:.0f} % of the fixes are outliers')
+    share = float((fit.spread[:, 0] > SLIP_VARIANCE).mean())
+    if share > odd_share:
+        odd.append(f'the wheel slips {100 * share:.0f} % of the time')
+    if max(level['side'], level['side_turn']) > 0.2:       # m/sqrt(s): no vehicle on wheels
+        odd.append(f'sideslip at the odometer is {max(level["side"], level["side_turn"]):.2f} '
+                   'm/√s')
+    reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
+    if odd:
+        known = 'See IMU_WORSE_THAN_GRADE.' if worse else remedy
+        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd), known if odd == noisy else ''))
+    # judgement: the size of a model error is unknown; a fit that has not converged may be off by
+    # several times its last step
+    return max(1.0, 2.0 * bool(odd), 4.0 * move), reasons
+
+
+def moving(fit: Fit) -> float:
+    """Return the largest step of scale, yaw and pitch in the last pass, in sigmas."""
+    step = fit.solved.step_border / np.sqrt(np.diag(fit.solved.covariance))
+    return float(np.abs(step[:WANTED]).max())
+
+
+def _heading(heading: Heading, error: float) -> list[Reason]:
+    """Report an external heading that differs from that of the drive by more than its sigma."""
+    if not len(heading.t) or abs(error) < REMARK_SIGMAS * heading.sigma:
+        return []
+    return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source}) differs by '
+                   f'{np.rad2deg(error):+.2f} deg, {abs(error) / heading.sigma:.1f} sigma, from '
+                   'the heading estimated on this drive; it was down-weighted')]

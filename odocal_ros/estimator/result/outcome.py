@@ -1,0 +1,270 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The smoother's fit as a method's result: estimates, reasons, budget, what the drive was like."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
+from odocal_ros.calib.evidence import KEPT_ROWS
+from odocal_ros.calib.judge import judge
+from odocal_ros.calib.mounting import FAR_YAW
+from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.chain import JointMarginals
+from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.factors.slide import assumed
+from odocal_ros.estimator.fit import Fit
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.result.as_sent import as_sent
+from odocal_ros.estimator.result.border import border_of
+from odocal_ros.estimator.result.exported import exported
+from odocal_ros.estimator.result.filters import filter_reasons
+from odocal_ros.estimator.result.left_over import bias_sigmas, correlation, left_over, normalised
+from odocal_ros.estimator.result.mismatch import mismatch
+from odocal_ros.estimator.result.refusal import OPTIONAL, UNITS, unknown
+from odocal_ros.estimator.result.remarks import beside, level_pitch, MODEL_FLOOR, remarks
+from odocal_ros.estimator.result.shares import shares
+from odocal_ros.estimator.result.slip import (
+    along,
+    find_slips,
+    level_when_changing,
+    Slip,
+    slip_reasons,
+    SLIP_VARIANCE,
+)
+from odocal_ros.estimator.result.wheel_result import wheel_details, wheel_estimates
+from odocal_ros.estimator.result.wheels import wheels_beside
+from odocal_ros.estimator.state import (
+    BG,
+    CONSTANTS,
+    GNSS_ARM,
+    GYRO,
+    HEADING,
+    LN_K,
+    M,
+    ODO_ARM,
+    ODO_LAG2,
+    PITCH,
+    VELOCITY,
+    YAW,
+)
+from odocal_ros.nav.angles import wrap
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import INFORMED_SHARE
+
+SCALE_LIMIT = 0.05      # relative sigma: a scale no better is not known. Judgement
+AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
+SCALES = range(GYRO.start, VELOCITY.start)    # errors of IMU, receiver, tyres, body
+
+
+def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
+    """Return the result of a fit: estimates, reasons, budget, details."""
+    near = fit.marginals()
+    widen, reasons = mismatch(problem, fit, config)
+    count = leg.travel.quantum * fit.state.scale
+    state, c = fit.state, fit.state.constants
+    covariance = floored(fit.covariance * widen**2)
+    sigma = np.sqrt(np.diag(covariance))
+    filtered = filter_reasons(c[ODO_LAG2], sigma[ODO_LAG2])
+    slips, slip_said = _slips(leg, fit, near, count, filtered=bool(filtered))
+    reasons += [*filtered, *slip_said]
+    reasons += remarks(problem, fit, sigma, config)
+    after = np.sqrt(np.diag(fit.covariance)) / fit.first.constants
+    ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
+    found, undetermined = determined(c + configured(leg), sigma, after, leg.scale_unit,
+                                     leg.nominal_scale, config, widen)
+    reasons += undetermined
+    if found['scale_factor'].value is not None:
+        found |= as_sent(leg, state, covariance)
+    up_b = state.C_bv[:, 2]
+    drift = float(np.sqrt(up_b @ near[0][BG, BG] @ up_b) * widen)
+    wheels = wheels_beside(problem, fit, covariance, drift, config.odometer.track_width)
+    if leg.wheels:
+        of_wheels, why = wheel_estimates(
+            [wheel.name for wheel in leg.wheels], wheels, found['scale_factor'], config)
+        found, reasons = found | of_wheels, reasons + why
+    bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
+    for i, axis in enumerate('xyz'):
+        name = f'gyro_bias_{axis}'
+        ratio[name] = float(bias_sigma[i] / fit.first.gyro_bias[i])
+        if ratio[name] < INFORMED_SHARE:
+            found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
+    unsaid = [name for name in ratio if name in found and found[name].value is None]
+    if unsaid:
+        reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: '
+                              f'{in_words(unsaid)}; the configured values are used'))
+    reasons += assumed(problem, fit.levels)
+    reasons += judge(found, leg.nominal_scale, config)
+    sources = [*(_widened(s, widen) for s in shares(fit, near)),
+               Source('model', np.diag(MODEL_FLOOR))]
+    return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
+                        _details(leg, problem, fit, sources, ratio, widen, sigma)
+                        | left_over(leg, problem, fit) | wheel_details(wheels)
+                        | exported(leg, problem, fit, near, widen)
+                        | {'key_bias_sigmas': bias_sigmas(near, widen),
+                           'slips': [vars(s) for s in slips],
+                           'beside': beside(c, covariance, problem.grade if leg.felt else None)}
+                        | ({'level_pitch_angle': level_pitch(fit, near, widen)} if leg.felt
+                           else {}),
+                        border_of(fit, configured(leg)).widened(widen))
+
+
+def _slips(leg: SmootherLeg, fit: Fit, near: JointMarginals, count: float, *,
+           filtered: bool) -> tuple[tuple[Slip, ...], list[Reason]]:
+    """Return the slips, and the reasons that report them."""
+    if leg.by_steps:    # only the steps of a coarse speed are used, which do not show slip
+        return (), []
+    turned = along(fit, near)
+    slips = find_slips(fit, turned, count)
+    # the shape of a filter is unknown: its residuals at changes of speed are no slip
+    level = '' if filtered else level_when_changing(fit, near, count)
+    return slips, slip_reasons(slips, level)
+
+
+def floored(covariance: Floats) -> Floats:
+    """Return the covariance with the floor of the model: docs/method.md (S31)."""
+    covariance, at = covariance.copy(), range(len(MODEL_FLOOR))
+    covariance[at, at] += MODEL_FLOOR**2
+    return covariance
+
+
+def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nominal: float,
+               config: Config, doubt: float = 1.0) -> tuple[dict[str, Estimate], list[Reason]]:
+    """
+    Return the estimates of the constants that the data determine, and why not the others.
+
+    value, sigma : (M,) of the constants, ln K first, whole lever arms.   ratio : (M,) posterior
+    sigma by that of the prior.   scale_unit, nominal : of the scale; K0, 0 unknown.   config :
+    limits.   doubt : factor on the sigmas by model errors; angles must be determined with it.
+    """
+    K, yaw, pitch = float(np.exp(value[LN_K])), float(wrap(value[YAW])), float(value[PITCH])
+    found = unknown(scale_unit)
+    if sigma[LN_K] <= SCALE_LIMIT:
+        found['scale_factor'] = Estimate(K, float(K * sigma[LN_K]), scale_unit)
+        if nominal:
+            found['scale_ratio'] = Estimate(K / nominal, float(K / nominal * sigma[LN_K]), '1')
+    # an angle with a larger sigma than half a degree and the limit is not determined
+    limit = max(np.deg2rad(0.5), config.verdict.max_yaw_sigma)
+    for name, i, angle in (('yaw_mounting_angle', YAW, yaw),
+                           ('pitch_mounting_angle', PITCH, pitch)):
+        # a configured mounting angle is not determined by the drive
+        if doubt * sigma[i] <= limit and ratio[i] < INFORMED_SHARE:
+            found[name] = Estimate(angle, float(sigma[i]), 'rad')
+    for i in OPTIONAL:
+        if ratio[i] < INFORMED_SHARE:
+            found[CONSTANTS[i]] = Estimate(float(value[i]), float(sigma[i]), UNITS[CONSTANTS[i]])
+    return found, _undetermined(sigma, limit / doubt, config, yaw)
+
+
+def configured(leg: SmootherLeg) -> Floats:
+    """Return the values of the settings that constants are corrections to: (M,)."""
+    value = np.zeros(M)
+    value[ODO_ARM], value[GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
+    return value
+
+
+def in_words(names: Iterable[str]) -> str:
+    """Return names of estimates as people say them, axes of one thing together."""
+    words: dict[str, list[str]] = {}
+    for name in names:
+        stem, _, axis = name.rpartition('_')
+        if axis not in AXES:
+            stem, axis = name, ''
+        words.setdefault(stem.replace('gnss', 'fix').replace('_', ' '), []).append(
+            AXES.get(axis, ''))
+    said = [f'the {word}' + (f' ({", ".join(axes)})' if 0 < len(axes) < 3 and axes[0] else '')
+            for word, axes in words.items()]
+    return said[0] if len(said) == 1 else f'{", ".join(said[:-1])} and {said[-1]}'
+
+
+def _widened(source: Source, widen: float) -> Source:
+    return type(source)(source.name, source.effects * widen, source.shared)
+
+
+def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float) -> list[Reason]:
+    # with model errors the limit is smaller
+    reasons, wanted = [], f'; the limit is {np.rad2deg(limit):.2g} deg'
+    if sigma[LN_K] > SCALE_LIMIT:
+        reasons.append(Reason(Code.SCALE_NOT_DETERMINED, 'scale uncertainty is '
+                              f'{100 * sigma[LN_K]:.0f} %, too large to state a value'))
+    nominal = 0.0 if np.isnan(config.imu.nominal_yaw) else config.imu.nominal_yaw
+    off = abs(float(wrap(yaw - nominal)))
+    if sigma[YAW] > limit:
+        reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
+                              f'{np.rad2deg(sigma[YAW]):.1f} deg{wanted}. Likely cause: too '
+                              'little acceleration, or too few turns'))
+    elif off > np.deg2rad(135.0):       # more than any mounting: reversed
+        reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
+                              'directions: positive counts mean backwards, or the IMU x axis '
+                              f'points backwards (yaw {np.rad2deg(yaw):+.1f} deg)'))
+    elif off > FAR_YAW:
+        reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+.1f} '
+                              f'deg differs by {np.rad2deg(off):.1f} deg from its nominal value'))
+    if sigma[PITCH] > limit:
+        reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
+                              f'{np.rad2deg(sigma[PITCH]):.1f} deg{wanted}',
+                              'Drive longer, with stops and starts. Accurate ellipsoidal heights '
+                              'also help.'))
+    return reasons
+
+
+def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source],
+             ratio: dict[str, float], widen: float,
+             sigma: Floats) -> dict[str, Any]:
+    state, motion, fixes = fit.state, fit.weighted[MotionRows].motion, fit.weighted[Fixes]
+    K = state.scale
+    arm = state.C_bv @ motion.arm_v
+    step = max(1, len(state.t) // KEPT_ROWS)
+    t_fix = leg.t_fix[problem.use]
+    alike, _ = correlation(t_fix, fixes.r[:, :2])
+    speed = np.linalg.norm(motion.way, axis=1) / motion.T[:, 0]
+    turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)
+                    * motion.T[:, 0]).sum()
+    return {
+        'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
+        'correlation': correlations(fit.covariance[:3, :3], PARAMETERS),
+        'f': K * state.forward,
+        'noise': fit.levels.roots(),
+        'iterations': fit.iterations, 'widened': float(widen),
+        'outside': _outside(leg, problem, fit, sigma),
+        'posterior_to_prior': ratio,
+        **{CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
+           for i in SCALES},
+        'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
+                      'fix_correlation_2s': alike,
+                      'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
+                      'fixes': len(t_fix), 'normalised': normalised(fit.weighted),
+                      'intervals_slipping': int((fit.spread[:, 0] > SLIP_VARIANCE).sum())},
+        'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
+                       'speed_changes': float(np.abs(np.diff(speed)).sum()),
+                       'turned': float(turned), 'in_turns': problem.turned,
+                       'standing': float(problem.still.sum())},
+        'track_t': state.t[::step], 'track_n': (state.p_n + state.C_nb @ arm)[::step],
+        'key_t': state.t, 'key_C_nb': state.C_nb, 'gyro_bias': state.gyro_bias.mean(axis=0),
+        'key_biases': np.stack([state.gyro_bias, state.accel_bias]),
+    }
+
+
+def _outside(leg: SmootherLeg, problem: Problem, fit: Fit,
+             sigma: Floats) -> dict[str, dict[str, Any]]:
+    """Return details of GNSS velocity and external heading."""
+    out: dict[str, dict[str, Any]] = {}
+    for name, sent in problem.outside.items():
+        out[name] = {'messages': len(sent.t),
+                     'alike': problem.per_effective.get(name, 1.0)}
+    if 'velocity' in out:
+        out['velocity'] |= {CONSTANTS[i]: {'value': float(fit.state.constants[i]),
+                                           'sigma': float(sigma[i])}
+                            for i in range(VELOCITY.start, VELOCITY.stop)}
+    if 'heading' in out:
+        out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,
+                           'error': float(fit.state.constants[HEADING]),
+                           'error_sigma': float(sigma[HEADING])}
+    return out

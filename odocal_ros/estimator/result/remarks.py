@@ -1,0 +1,177 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Diagnostics of a fit: a scale that varies, constants far off their priors, the model's floor."""
+
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.chain import JointMarginals
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.fit import Fit
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.prepare import imperfect_sigmas
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.result.filters import lag_reasons, odometer_reasons
+from odocal_ros.estimator.state import (
+    BA,
+    BY_SPEED,
+    BY_TIME,
+    CONSTANTS,
+    FIX_BY_MOTION,
+    FIX_LAG2,
+    FIX_TIME,
+    GNSS_ARM,
+    IMPERFECT,
+    LN_K,
+    ODO_ARM,
+    PITCH,
+    YAW,
+)
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.grades import G, Grade, grade_of
+from odocal_ros.settings.levels import REMARK_SIGMAS
+
+IMU_SCALES = tuple(i for i, name in enumerate(CONSTANTS) if name.startswith(
+    ('gyro_scale', 'accelerometer_scale')))
+AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
+# 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
+# body on springs within a second (docs/conventions.md)
+MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
+FALLS_WITH_SPEED = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
+                    'wheel at high speed. Tyres grow with speed, which is the opposite. Use wheel '
+                    'pulses, or a wheel that is not driven.')
+VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
+OF_POSES = ('Uncertainties were increased to match the residuals. Check the map, and the '
+            'covariance that this source of positions states.')
+SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have the same error, it is '
+          'imu.lever_arm. Skid steering and tracks look the same; then keep the setting.')
+
+
+def beside(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
+    """
+    Return additional figures by their names in calibration.json.
+
+    value, covariance : (M,), (M, M) of the constants.   grade : of the IMU, None
+    without an accelerometer.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    # scale_by_speed: the slope at FAST
+    out: dict[str, Any] = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
+                 for name, i, unit in (('scale_by_speed', BY_SPEED, '1/(m/s)'),
+                                       ('scale_by_time', BY_TIME, '1/s'))}
+    if grade is not None:
+        for name, angle, axis in (('yaw', YAW, AXIS_XY), ('pitch', PITCH, AXIS_ZX)):
+            out[f'{name}_mounting_angle_housing_sigma'] = _figure(
+                _of_housing(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
+    next_drive = 1e-3       # physical: by so much tyres differ from drive to drive, warm or cold
+    out['scale_ratio_next_drive_sigma'] = _figure(np.hypot(sigma[LN_K], next_drive), '1')
+    return out
+
+
+def _figure(value: float, unit: str) -> dict[str, Any]:
+    return {'value': float(value), 'sigma': None, 'unit': unit}
+
+
+def _of_housing(found: float, found_sigma: float, sigma: float, misalignment: float) -> float:
+    """
+    Return the sigma of an angle against the housing's axes, where that of the IMU's own is given.
+
+    The angle between both is one of two errors of axes, of one size, whose sum is ``found``: half
+    of it, with what is left of either.
+    """
+    if not misalignment:
+        return sigma
+    posterior_share = min(1.0, found_sigma**2 / (2 * misalignment**2))
+    out: float = np.sqrt(sigma**2 + misalignment**2 * (1 + posterior_share) / 2 + (found / 2)**2)
+    return out
+
+
+def level_pitch(fit: Fit, near: JointMarginals, widen: float) -> dict[str, Any]:
+    """Return the pitch against what the accelerometer calls level: method_real's third pitch."""
+    k = len(near) // 2
+    n = fit.solved.step.shape[1]
+    at = np.array([2 * n + PITCH, BA.start])
+    C = near[k][np.ix_(at, at)]
+    row = np.array([1.0, -1 / G])
+    return {'value': float(row @ [fit.state.constants[PITCH], fit.state.accel_bias[k, 0]]),
+            'sigma': float(np.sqrt(row @ C @ row) * widen), 'unit': 'rad'}
+
+
+def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[Reason]:
+    """Return reasons: filtered signals, a varying scale, deviations from configured values."""
+    c = fit.state.constants
+    said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
+            *odometer_reasons(c[FIX_BY_MOTION], sigma[FIX_BY_MOTION], c[FIX_TIME]),
+            *_varies(fit, sigma)]
+    usual = imperfect_sigmas(grade_of(config.imu))
+    off = np.zeros(len(c))
+    off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)
+    off *= np.abs(c) > REMARK_SIGMAS * sigma
+    if off[[AXIS_XY, AXIS_ZX]].max() > REMARK_SIGMAS:
+        worst = max((AXIS_XY, AXIS_ZX), key=lambda i: off[i])
+        said.append(Reason(Code.IMU_AXES_SKEW, 'accelerometer axes are '
+                           f'{np.rad2deg(abs(c[worst])):.2f} deg off perpendicular, '
+                           f'{off[worst]:.0f} times the sigma of the {config.imu.grade} grade; '
+                           'accounted for'))
+    worst = max(IMU_SCALES, key=lambda i: off[i])
+    if off[worst] > 4.0:        # of the sigma of the grade: another IMU
+        said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {CONSTANTS[worst].replace("_", " ")} '
+                           f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
+                           f'the {config.imu.grade} grade; accounted for'))
+    return said + _arms(c, sigma, config)
+
+
+def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
+    """Return the reason for fix errors, white and correlated, above the stated ones."""
+    slow = levels['slow'] * levels.correlation_time / 2 if levels.correlation_time else 0.0
+    factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
+    if factor <= 1.5:       # worth a word: receivers state their errors no better
+        return []
+    return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'fix errors (white and time-correlated) are '
+                   f'{factor:.1f} times as large as their covariance states',
+                   OF_POSES if problem.leg.origin.local else '')]
+
+
+def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
+    """Return the reason for a scale that varies in the leg."""
+    motion, c = fit.weighted[MotionRows].motion, fit.state.constants
+    said = []
+    for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from low to high speed'),
+                          (BY_TIME, motion.from_mean[:, 1], 'from start to end')):
+        change = c[i] * np.ptp(span)
+        if abs(c[i]) > REMARK_SIGMAS * sigma[i] and abs(change) > 3e-4:     # worth a word
+            said.append(f'{100 * change:+.2f} % {what}')
+    if not said:
+        return []
+    less = said[0].startswith('-') and 'speed' in said[0]
+    return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(said)}; the stated '
+                   'value is the mean over this leg', FALLS_WITH_SPEED if less else '')]
+
+
+def _arms(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
+    """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
+    said, do = [], []
+    for name, arm, where, axes in (
+            ('odometer.lever_arm', config.odometer.lever_arm, ODO_ARM, 'xy'),
+            ('gnss.lever_arm', config.gnss.lever_arm, GNSS_ARM, 'xyz')):
+        for i, axis, value, most in zip(range(where.start, where.stop), axes, arm, VEHICLE,
+                                        strict=False):
+            if abs(c[i]) <= max(REMARK_SIGMAS * sigma[i], 0.3):     # m
+                continue
+            found = value + c[i]
+            text = f'{found:+.2f} ± {sigma[i]:.2f} m'
+            if abs(found) > most:
+                said.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
+                do.append(f'Ignore the estimate of {name} {axis}: another error causes it.')
+            elif any(arm):
+                said.append(f'{name} {axis}: set to {value:+.2f} m, found {text}')
+                do.append(f'Measure {name} {axis} again.')
+            else:
+                said.append(f'{name} {axis}: not set, found {text}')
+                do.append(f'Measure {name} {axis} and set it.')
+    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(said)}; accounted for', ' '.join(
+        [*do, SLIDES] if any('easure' in x for x in do) else do))] if said else []

@@ -1,0 +1,126 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A line fitted to increments that hold a random walk and the errors of readings: (W5) to (W7).
+
+The error of the reading at a node is in the increment that ends there and, with the other sign, in
+the one that begins there: the covariance of the increments is tridiagonal, and what the reading
+errs by does not add up.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.optimize import minimize
+
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
+
+# of the logarithm of a level about its first value: walks may all be a thousand times smaller or
+# larger, one against their mean three times; a reading errs as its rounding says. Judgement
+WALK_SPREAD, APART_SPREAD, READING_SPREAD = 7.0, 1.0, 0.5
+# judgement: of finding increments that lie far out, until their variances stay within a tenth;
+# each round takes nine tenths of what they add to a level
+TAIL_ROUNDS, TAIL_SETTLED = 8, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Increments:
+    """
+    The observations y = X x + errors, in m.
+
+    y : (k,).   X : (k, p).   prior : (p,) sigmas of x about ``centre``, (p,), inf: none.
+    reading : variance of the error at a node, m^2.   share : (k,) variance of the walk in each
+    increment at a level of 1.   kind : (k,) index of its level.   walk : first levels, m^2.
+    """
+
+    y: Floats
+    X: Floats
+    prior: Floats
+    centre: Floats
+    reading: float
+    share: Floats
+    kind: Ints
+    walk: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """
+    The line found.
+
+    x : (p,).   covariance : (p, p).   levels : of the walk, m^2.   gain : (p, k) derivatives of x
+    by the increments.
+    """
+
+    x: Floats
+    covariance: Floats
+    levels: Floats
+    gain: Floats
+
+
+def fit_line(seen: Increments) -> Line:
+    """Return the line at the restricted maximum of the likelihood, far increments weighed less."""
+    spread = np.ones(len(seen.y))
+    log_levels = np.zeros(len(seen.walk) + 1)
+    for _ in range(TAIL_ROUNDS):
+        simplex = log_levels + np.concatenate([np.zeros((1, len(log_levels))), -2 * np.eye(
+            len(log_levels))])
+        found = minimize(_minus_log_likelihood, log_levels, args=(seen, spread),
+                         method='Nelder-Mead', options={
+                             'xatol': 0.05, 'fatol': 0.02, 'initial_simplex': simplex})
+        log_levels = found.x
+        x, covariance, _, banded = _solved(log_levels, seen, spread)
+        off = _left_out(banded, seen.y - seen.X @ x)
+        before, spread = spread, np.maximum(spread * (off / TAIL_SIGMAS)**2, 1.0)
+        if np.allclose(spread, before, rtol=TAIL_SETTLED):
+            break
+    root = cholesky_banded(banded, check_finite=False)
+    gain = covariance @ cho_solve_banded((root, False), seen.X, check_finite=False).T
+    return Line(x, covariance, seen.walk * np.exp(log_levels[:-1]), gain)
+
+
+def _banded(log_levels: Floats, seen: Increments, spread: Floats) -> Floats:
+    """Return the covariance of the increments, upper form: (2, k)."""
+    reading = seen.reading * np.exp(log_levels[-1])
+    walk = (seen.walk * np.exp(log_levels[:-1]))[seen.kind] * seen.share * spread
+    out = np.empty((2, len(seen.y)))
+    out[0], out[1] = -reading, walk + 2 * reading
+    return out
+
+
+def _solved(log_levels: Floats, seen: Increments,
+            spread: Floats) -> tuple[Floats, Floats, float, Floats]:
+    """Return x, its covariance, twice the restricted likelihood negative, and the covariance."""
+    banded = _banded(log_levels, seen, spread)
+    root = cholesky_banded(banded, check_finite=False)
+    both = np.column_stack([seen.X, seen.y - seen.X @ seen.centre])
+    inverse = both.T @ cho_solve_banded((root, False), both, check_finite=False)
+    information = inverse[:-1, :-1] + np.diag(1 / seen.prior**2)
+    covariance = np.linalg.inv(information)
+    step = covariance @ inverse[:-1, -1]
+    cost = (2 * np.log(root[1]).sum() + np.linalg.slogdet(information)[1] + inverse[-1, -1]
+            - step @ information @ step)
+    return seen.centre + step, covariance, float(cost), banded
+
+
+def _minus_log_likelihood(log_levels: Floats, seen: Increments, spread: Floats) -> float:
+    walk, reading = log_levels[:-1], log_levels[-1]
+    held = (walk.mean()**2 / WALK_SPREAD**2 + ((walk - walk.mean())**2).sum() / APART_SPREAD**2
+            + reading**2 / READING_SPREAD**2)
+    return (_solved(log_levels, seen, spread)[2] + float(held)) / 2
+
+
+def _left_out(banded: Floats, residual: Floats) -> Floats:
+    """Return residuals as those of increments left out, in sigmas: (k,)."""
+    root = cholesky_banded(banded, check_finite=False)
+    weighted = cho_solve_banded((root, False), residual, check_finite=False)
+    before, after = banded[1].copy(), banded[1].copy()
+    square, k = banded[0, -1]**2, len(residual)
+    for i in range(1, k):
+        before[i] -= square / before[i - 1]
+        after[k - 1 - i] -= square / after[k - i]
+    off: Floats = weighted * np.sqrt(before + after - banded[1])
+    return off

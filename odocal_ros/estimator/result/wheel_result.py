@@ -1,0 +1,151 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Estimates of single wheels of one or several legs: factors, track width, reasons."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.calib.result import Estimate, FACTOR, MethodResult
+from odocal_ros.calib.track_width import TRACK_WIDTH
+from odocal_ros.estimator.result.wheels import Wheel
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.axles import axles_of
+from odocal_ros.settings.config import Config, SIDES
+from odocal_ros.settings.levels import (
+    FAULT_SIGMAS,
+    INFORMED_SHARE,
+    REMARK_SIGMAS,
+    TYRE_SPREAD,
+)
+
+Found = tuple[dict[str, Estimate], list[Reason]]
+FEWEST_ALIKE = 3        # definition: of fewer, the one that departs is unknown
+# judgement: of new tyres of one size; a tyre without a third of its air has lost half of that
+DEPARTS = 0.01
+
+
+def wheel_details(wheels: Mapping[str, Wheel]) -> dict[str, Any]:
+    """Return the entry of the wheels in calibration.json, {} for one counter."""
+    return {'wheels': {name: wheel.as_dict() for name, wheel in wheels.items()}} if wheels else {}
+
+
+def unknown_wheels(names: Iterable[str], scale_unit: str) -> dict[str, Estimate]:
+    """Return the estimates of wheels of which nothing is known, {} of one counter."""
+    names = list(names)
+    return {FACTOR + name: Estimate(None, None, scale_unit) for name in names} | {
+        width: Estimate(None, None, 'm') for width in _widths(names)}
+
+
+def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Estimate,
+                    config: Config) -> Found:
+    """
+    Return the estimates of several wheels and the reasons, docs/method.md (W4), (W8).
+
+    names : of the wheels.   wheels : by name, none where nothing is known of them.   scale : of
+    their mean.
+    """
+    names = list(names)
+    found = unknown_wheels(names, scale.unit)
+    if scale.value is None or scale.sigma is None:
+        return found, []
+    limit = INFORMED_SHARE * (config.wheels.radius_range or TYRE_SPREAD)
+    # left and right are one line, seen twice: right by left is off by twice what either is off
+    # from the mean
+    sigma = 2 * max((wheel.ratio_sigma for wheel in wheels.values()), default=np.inf)
+    if sigma > limit:
+        known = f'has an uncertainty of {100 * sigma:.2g} %' if wheels else 'is not known'
+        return found, [Reason(Code.WHEELS_NOT_SEPARABLE, f'the ratio of {_pair(names)} '
+                              f'{known}; the limit is {100 * limit:.2g} %. The factors of the '
+                              'wheels are not stated')]
+    for name, wheel in wheels.items():
+        value = scale.value * wheel.ratio
+        relative = np.hypot(scale.sigma / scale.value, wheel.ratio_sigma)
+        found[FACTOR + name] = Estimate(value, float(value * relative), scale.unit)
+    reasons = _departing(wheels)
+    for width, (left, right) in _widths(names).items():
+        found[width], why = _track_width(wheels[left], wheels[right], config.odometer.track_width)
+        reasons += why
+        if (left, right) != SIDES and found[width].value is not None:
+            found |= _places({name: wheels[name] for name in (left, right)})
+    return found, reasons
+
+
+def _pair(names: Sequence[str]) -> str:
+    return 'right to left wheel' if tuple(names) == SIDES else 'the wheels'
+
+
+def _widths(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return the names of the track widths, and the left and the right wheel of each."""
+    axles = [axle for axle in axles_of(names) if len(axle) == len(SIDES)]
+    return {'_'.join(('track_width', *(axle if axle != SIDES else ()))): axle for axle in axles}
+
+
+def _places(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
+    """Return the positions of the wheels of an axle, m to the left and ahead of the mean."""
+    found = {f'lateral_position_{name}': Estimate(wheel.y, wheel.y_sigma, 'm')
+             for name, wheel in axle.items()}
+    return found | {f'forward_position_{name}': Estimate(wheel.x, wheel.x_sigma, 'm')
+                    for name, wheel in axle.items() if wheel.x is not None}
+
+
+def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
+    """Return the reason for one wheel whose factor is unlike that of all others."""
+    if len(wheels) < FEWEST_ALIKE:
+        return []
+    off = {}
+    for name, wheel in wheels.items():
+        usual = float(np.median([w.ratio for other, w in wheels.items() if other != name]))
+        if abs(wheel.ratio / usual - 1) > max(DEPARTS, FAULT_SIGMAS * wheel.ratio_sigma):
+            off[name] = wheel.ratio / usual - 1
+    return [Reason(Code.WHEEL_DEPARTS, f'the factor of wheel {name} is {100 * abs(x):.2f} % '
+                   f'{"larger" if x > 0 else "smaller"} than that of the others. Likely cause: '
+                   'tyre pressure, another tyre, or continuous slip')
+            for name, x in off.items()] if len(off) == 1 else []
+
+
+def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, list[Reason]]:
+    width, sigma = left.y - right.y, left.y_sigma + right.y_sigma     # one line, seen twice
+    none = Estimate(None, None, 'm')
+    if given and sigma >= INFORMED_SHARE * TRACK_WIDTH.taped_share * given:
+        return none, []         # the tape knows it better
+    if sigma < TRACK_WIDTH.least and width < TRACK_WIDTH.least:
+        return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
+                             f'match the gyro turns: the track width would be {width:.2g} m')]
+    if sigma >= TRACK_WIDTH.determined_share * max(width, TRACK_WIDTH.least):
+        return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
+                             f'{sigma:.2g} m. Likely cause: too few turns')]
+    if given and abs(width - given) > REMARK_SIGMAS * np.hypot(
+            TRACK_WIDTH.taped_share * given, sigma):
+        return Estimate(width, sigma, 'm'), [Reason(
+            Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.4f} +- '
+            f'{sigma:.4f} m; odometer.track_width is {given:.4g} m')]
+    return Estimate(width, sigma, 'm'), []
+
+
+def joined(legs: Sequence[MethodResult]) -> dict[str, Wheel]:
+    """
+    Return the wheels of several legs, means by their variances: {} where no leg knows them.
+
+    Where legs differ by more than their sigmas allow, the sigma is as much larger.
+    """
+    each: dict[str, list[Mapping[str, Any]]] = {}
+    for leg in legs:
+        for name, wheel in leg.details.get('wheels', {}).items():
+            each.setdefault(name, []).append(wheel)
+    return {name: _mean(wheels) for name, wheels in each.items()}
+
+
+def _mean(wheels: Sequence[Mapping[str, Any]]) -> Wheel:
+    mean = {}
+    for name in ('ratio', 'y', 'x'):
+        if any(name not in wheel for wheel in wheels):
+            continue
+        x, sigma = (np.array([w[key] for w in wheels]) for key in (name, f'{name}_sigma'))
+        weight = 1 / sigma**2
+        mean[name] = float(x @ weight / weight.sum())
+        chi2 = float(((x - mean[name])**2 @ weight) / max(len(x) - 1, 1))
+        mean[f'{name}_sigma'] = float(np.sqrt(max(chi2, 1.0) / weight.sum()))
+    return Wheel(**mean, walk=tuple(wheels[-1]['walk']))

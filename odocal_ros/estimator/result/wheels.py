@@ -1,0 +1,225 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Each wheel beside the mean: its factor, and where it rolls, docs/method.md (W1) to (W4).
+
+The scale factor of the fit is that of the mean reading of the wheels that do not steer. What a
+wheel reads beyond the mean is the turn of the vehicle times the wheel's distance from the middle,
+and the difference of the tyres; a steered wheel also rolls farther in turns, (W9):
+
+    K (s_i - s) = (a_i - 1) K s - a_i y_i psi + a_i x_i^2 q,        K_i = K / a_i
+
+s_i and s the readings of wheel i and of the mean, psi the turn, y_i the wheel's place, positive to
+the left, x_i its distance ahead. The attitudes of the fit give the turn; any number of wheels is
+one line each. The places are those of the leg's turns: an outer tyre, which is pressed more, rolls
+on a smaller radius, and that is in them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.calib.track_width import TRACK_WIDTH
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.pieces import by_row
+from odocal_ros.estimator.factors.interval_noise import hard_and_turning
+from odocal_ros.estimator.factors.motion import rotvec
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.factors.odometer_filter import as_rolled
+from odocal_ros.estimator.fit import Fit
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.result.wheel_noise import fit_line, Increments, Line
+from odocal_ros.estimator.state import (
+    GYRO,
+    GYRO_AXIS,
+    GYRO_SIGNAL,
+    LN_K,
+    ODO_DELAY,
+    State,
+)
+from odocal_ros.nav.integral import integral_at
+from odocal_ros.screening.axles import STEER_GRID, steering_path
+
+OWN_DELAY = 0.02        # s, 1 sigma of a wheel's stamps against the others'. Judgement
+FIRST_WALK = 2e-3**2    # m^2/s, definition: where the levels set out
+DOUBTED = 1e10          # definition: share of a walk that makes an increment say nothing
+GAP = 0.3               # s, judgement: a line between readings is then off by a centimetre or two
+FEWEST = 20             # increments, judgement: levels by fewer are good to 30 % at best
+NUISANCE = range(2, 5)  # definition: unknowns of a line that nobody asks for
+# physical: 1 sigma of it by sideslip and body motion; 20 mm of 2.7 m in docs/decisions/0022
+PLACE_SHARE = 8e-3
+WHEELBASE = 5.0         # m, 1 sigma of how far a steered wheel is ahead. Physical: of a lorry
+
+
+@dataclass(frozen=True, eq=False)
+class Wheel:
+    """
+    A wheel beside the mean.
+
+    ratio : K_i / K.   ratio_sigma : relative.   y : m to the left of the middle of all wheels.
+    y_sigma : m.   walk : m/sqrt(s), by which it parts from the mean: even, hard, in turns.
+    x, x_sigma : m, of a steered wheel ahead of the mean, None of one that does not steer.
+    """
+
+    ratio: float
+    ratio_sigma: float
+    y: float
+    y_sigma: float
+    walk: tuple[float, ...]
+    x: float | None = None
+    x_sigma: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entry of calibration.json."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
+
+
+def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
+                  width: float) -> dict[str, Wheel]:
+    """
+    Return each wheel of a leg by name, none where there are no two or too little motion.
+
+    problem, fit : the leg and its fit.   covariance : (M, M) of the constants.   drift : sigma of
+    the gyro's bias about up, rad/s: of how the attitudes of the fit drift.   width : track width
+    as set, m, 0: unknown.
+    """
+    wheels, state = problem.leg.wheels, fit.state
+    if len(wheels) < 2:
+        return {}
+    t = state.t + state.constants[ODO_DELAY]
+    inside = np.flatnonzero((t >= max(w.t[0] for w in wheels))
+                            & (t <= min(w.t[-1] for w in wheels)))
+    if len(inside) < FEWEST:
+        return {}
+    s = np.stack([as_rolled(w, state.constants)(state.t[inside]) for w in wheels]) * state.scale
+    at = _nodes(s, state.scale * max(w.quantum for w in wheels))
+    if len(at) < FEWEST:
+        return {}
+    common = _Common(problem, fit, inside[at], s[:, at])
+    delay = float(np.sqrt(covariance[ODO_DELAY, ODO_DELAY]))
+    own = [LN_K, *range(GYRO.start, GYRO.stop)]
+    lines = [common.line(i, delay, drift, width) for i in range(len(wheels))]
+    return {wheel.name: _wheel(line, common.moved(i, line), covariance[np.ix_(own, own)])
+            for i, (wheel, line) in enumerate(zip(wheels, lines, strict=True))}
+
+
+def _nodes(s: Floats, quantum: float) -> Ints:
+    """Return the nodes at which readings (w, k) are compared: at least one count apart."""
+    nodes = [0]
+    for k in range(1, s.shape[1]):
+        # m: standing, a reading is one
+        if np.abs(s[:, k] - s[:, nodes[-1]]).max() > max(quantum, 1e-3):
+            nodes.append(k)
+    return np.array(nodes)
+
+
+def _unknown(leg: SmootherLeg) -> Iterator[tuple[float, float]]:
+    """Yield where increments say nothing: slips that are known, what gaps of a wheel hide, s."""
+    for t in leg.doubt_t:
+        yield t - 1.0, t + 1.0
+    for wheel in leg.wheels:
+        steps = np.diff(wheel.t)
+        for k in np.flatnonzero(steps > max(GAP, 3 * float(np.median(steps)))):
+            yield wheel.t[k], wheel.t[k + 1]
+
+
+class _Common:
+    """What the lines of all wheels have in common; s : (w, k) readings at the nodes, m."""
+
+    def __init__(self, problem: Problem, fit: Fit, at: Ints, s: Floats) -> None:
+        state, motion = fit.state, fit.weighted[MotionRows].motion
+        self.leg, self.s = problem.leg, s
+        self.fixed = np.array([not wheel.ahead for wheel in self.leg.wheels])
+        self.mean = s[self.fixed].mean(axis=0)
+        self.way = np.diff(self.mean)
+        up = state.C_bv[:, 2]
+        turn = rotvec(np.swapaxes(state.C_nb[:-1], 1, 2) @ state.C_nb[1:]) @ up
+        self.turn = np.diff(np.append(0.0, np.cumsum(turn))[at])
+        signals = np.concatenate([motion.sums.mean_rate, motion.sums.mean_force], axis=1)
+        errors = signals[:, GYRO_SIGNAL] * up[list(GYRO_AXIS)] * motion.T
+        ends = np.concatenate([np.zeros((1, errors.shape[1])), np.cumsum(errors, axis=0)])
+        self.turn_errors = np.diff(ends[at], axis=0)     # by units of the gyro's errors
+        rate = (problem.rate_b - state.gyro_bias) @ up
+        speed = np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward)
+        self.faster, self.turning = np.diff(speed[at]), np.diff(rate[at])
+        hard, turns = hard_and_turning(motion)
+        kind = np.where(turns, 2, np.where(hard, 1, 0))
+        self.kind = kind[np.clip(at[1:] - 1, 0, len(kind) - 1)]
+        self.T, self.t = np.diff(state.t[at]), state.t[at]
+        # a second of driving each, less where wheels hardly turn, whatever they stood before
+        rolled = np.abs(np.diff(s)).max(axis=0)
+        self.share = np.clip(rolled, 0.02 * np.minimum(self.T, 1.0), self.T)
+        delay = state.constants[ODO_DELAY]
+        for begin, end in _unknown(problem.leg):
+            self.share[(self.t[1:] > begin - delay) & (self.t[:-1] < end - delay)] = DOUBTED
+        self.scale = state.scale
+        self.steer = {i: self._steering(state, up, i) for i, fixed in enumerate(self.fixed)
+                      if not fixed}
+
+    def _left(self, i: int, width: float) -> float:
+        """Return the prior place of a wheel: axles are left, right; an odd last one between."""
+        alone = i == len(self.leg.wheels) - 1 and i % 2 == 0
+        return 0.0 if alone else (width or TRACK_WIDTH.of_a_car) / 2 * (1 if i % 2 == 0 else -1)
+
+    def _steering(self, state: State, up: Floats, i: int) -> Floats:
+        """Return the path of a steered wheel beyond a fixed one by its squared distance, 1/m."""
+        leg, scale = self.leg, state.scale
+        t = np.arange(self.t[0], self.t[-1], STEER_GRID)
+        turn = integral_at(t, leg.t_imu, by_row(
+            lambda w_b: (w_b - state.gyro_bias.mean(axis=0)) @ up, leg.w_b))
+        wheels = [wheel for wheel in leg.wheels if not wheel.ahead]
+        s = np.mean([as_rolled(wheel, state.constants)(t) for wheel in wheels], axis=0)
+        path = steering_path(t, turn, scale * s, scale * leg.wheels[i].ahead, self._left(i, 0.0))
+        return np.diff(np.interp(self.t, t, path))
+
+    def line(self, i: int, delay: float, drift: float, width: float) -> Line:
+        """
+        Return the line of a wheel.
+
+        Unknown are a - 1, a y, own delay, common delay, drift of the turn; a x^2 if it steers.
+        """
+        y0 = self._left(i, width)
+        X = np.stack([self.way, -self.turn, self.faster, y0 * self.turning, y0 * self.T], -1)
+        taped = TRACK_WIDTH.taped_share * width / 2
+        prior = np.array([1.0, taped or TRACK_WIDTH.any_sigma, OWN_DELAY,
+                          max(delay, 1e-4), max(drift, 1e-9)])
+        centre = np.array([0.0, y0 if taped else 0.0, 0.0, 0.0, 0.0])
+        if i in self.steer:
+            X = np.column_stack([X, self.steer[i]])
+            prior, centre = np.append(prior, WHEELBASE**2), np.append(centre, 0.0)
+        weight = np.where(self.fixed, -1 / self.fixed.sum(), 0.0)
+        weight[i] += 1.0
+        rounding = sum((w * q.quantum * self.scale)**2 / 12 for w, q in zip(
+            weight, self.leg.wheels, strict=True))
+        return fit_line(Increments(
+            np.diff(self.s[i] - self.mean), X, prior, centre,
+            max(float(rounding), 1e-4**2), self.share, self.kind, np.full(3, FIRST_WALK)))
+
+    def moved(self, i: int, line: Line) -> Floats:
+        """Return the derivatives of a - 1, a y and a x^2 by ln K and the gyro's errors."""
+        rows = [0, 1, *range(NUISANCE.stop, len(line.x))]
+        by_scale, by_gyro = [0.0, line.x[1]], -line.gain[rows] @ self.turn_errors * line.x[1]
+        if i in self.steer:     # q grows with the square of the turn, and falls with the speed
+            by_scale.append(2 * line.x[-1])
+            curvature = self.turn / np.where(self.way, self.way, np.inf)
+            by_gyro += line.gain[rows] @ (curvature[:, None] * self.turn_errors) * line.x[-1]
+        return np.column_stack([by_scale, by_gyro])
+
+
+def _wheel(line: Line, moved: Floats, of_fit: Floats) -> Wheel:
+    rows = [k for k in range(len(line.x)) if k not in NUISANCE]
+    a, y = 1 + line.x[0], line.x[1] / (1 + line.x[0])
+    covariance = line.covariance[np.ix_(rows, rows)] + moved @ of_fit @ moved.T
+    gradient = np.array([-y, 1.0]) / a
+    whole = Wheel(float(1 / a), float(np.sqrt(covariance[0, 0]) / a), float(y),
+                  float(np.sqrt(gradient @ covariance[:2, :2] @ gradient)),
+                  tuple(np.sqrt(line.levels).tolist()))
+    if len(rows) == 2:
+        return whole
+    x = float(np.sqrt(max(line.x[-1], 0.0) / a))
+    sigma = float(np.sqrt(covariance[2, 2])) / (2 * a * max(x, 0.1))
+    return replace(whole, x=x, x_sigma=float(np.hypot(sigma, PLACE_SHARE * x)))

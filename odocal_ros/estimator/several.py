@@ -1,0 +1,182 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Several legs of the smoother to one result, on the border of their equations."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.calib.border import Border
+from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
+from odocal_ros.calib.causes import cause_of_change, change_in_words
+from odocal_ros.calib.combine import newest
+from odocal_ros.calib.joint import Joint, joint
+from odocal_ros.calib.result import MethodResult, Source
+from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps, ScaleStep
+from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.estimator.factors.factor import WANTED
+from odocal_ros.estimator.factors.priors import SHARED, SIZE
+from odocal_ros.estimator.result.as_sent import as_sent_of
+from odocal_ros.estimator.result.outcome import determined, floored, in_words, SCALES
+from odocal_ros.estimator.result.refusal import OPTIONAL
+from odocal_ros.estimator.result.remarks import beside, MODEL_FLOOR
+from odocal_ros.estimator.result.wheel_result import joined, wheel_details, wheel_estimates
+from odocal_ros.estimator.state import CONSTANTS, IMPERFECT, LN_K, PITCH
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.levels import FAULT_SIGMAS
+
+DAY = 86400e9        # ns, definition
+# usual scatter of ln K, yaw and pitch between the legs of a vehicle: 20 ppm by tyres, 2 and 5 mdeg
+# by load and the cross slopes of roads. Judgement
+SCATTER = 2e-5, 3.5e-5, 8.7e-5
+DELAY_DIFFERS = ('A delay changed between the legs, not the vehicle. Check the clocks and the '
+                 'time stamps of this sensor: driver restarts, buffering, clock synchronisation.')
+
+
+def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
+                 numbers: Sequence[int] | None = None) -> MethodResult:
+    """
+    Combine the smoother results of several legs of one vehicle.
+
+    results : those with a border, at least one.   times_ns : when each leg was driven.   config :
+    limits, ``verdict.scale_drift_per_day``.   numbers : what the legs are called; 1, 2, ...; 0:
+    legs of an earlier result, carried on.
+
+    Returns
+    -------
+    MethodResult: the result of one fit of all legs, the scale as in the last leg. A value that no
+    leg determines alone may be determined by all. One in which the legs disagree has their scatter
+    in its sigma (LEGS_DISAGREE). With ``leg.automatic`` a scale may change permanently between two
+    legs (SCALE_CHANGED).
+
+    """
+    order = np.argsort(times_ns, kind='stable')
+    legs = [results[i] for i in order]
+    names = [(numbers or range(1, len(results) + 1))[i] for i in order]
+    days = np.diff(np.asarray(times_ns)[order]) / DAY
+    borders = _of_one_vehicle([leg.border for leg in legs])
+    steps = config.verdict.scale_drift_per_day * np.sqrt(days)
+    changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED]) \
+        if config.leg.automatic else []
+    steps[[change.leg - 1 for change in changes]] = FREE_STEP
+    found = _joint(borders, steps, days == 0)
+    at = [found.names.index(name) for name in CONSTANTS]
+    C = floored(found.covariance[np.ix_(at, at)])
+    sigma = np.sqrt(np.diag(C))
+    ratio = sigma / found.factor / found.sigma[at]
+    scale = legs[-1].estimates['scale_factor']
+    nominal = next((e['scale_factor'].value / e['scale_ratio'].value for e in
+                    (leg.estimates for leg in legs) if e['scale_ratio'].value), 0.0)
+    estimates, why = determined(found.value[at], sigma, ratio, scale.unit, nominal, config)
+    estimates |= as_sent_of(legs, estimates['scale_factor'])
+    wheels = joined(legs)
+    if wheels:
+        of_wheels, more = wheel_estimates(wheels, wheels, estimates['scale_factor'], config)
+        estimates, why = estimates | of_wheels, why + more
+    estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
+    unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
+    if unsaid:
+        why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on these {len(legs)} '
+                          f'drives: {in_words(unsaid)}; the configured values are used'))
+    sources = _sources(found.used[at] * found.factor, C)
+    # by any leg with an accelerometer
+    grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None
+    said = [_changed(change, np.asarray(times_ns)[order], names) for change in changes]
+    return MethodResult('smoother', (*said, *_disputed(found, names), *why), estimates, PARAMETERS,
+                        sources, _details(found, found.value[at], C, sources, len(legs))
+                        | {'beside': beside(found.value[at], C, grade)}
+                        | wheel_details(wheels),
+                        found.carried)
+
+
+def _of_one_vehicle(borders: Sequence[Border]) -> list[Border]:
+    """
+    Return borders with the same sizes of imperfections.
+
+    The geometric mean of the legs' sizes, each leg weighted as far as it knows the constant: one
+    that knows nothing of it has the usual size.
+    """
+    imperfect = set(CONSTANTS[IMPERFECT])
+    logs: dict[str, list[tuple[float, float]]] = {}
+    for border in borders:
+        prior = 1 / border.used**2
+        data = 1 / np.diag(np.linalg.inv(border.information + np.diag(prior))) - prior
+        known = data / (data + 1 / (SIZE * border.sigma**2))        # docs/method.md (S29)
+        for name, used, weight in zip(border.names, border.used, known, strict=True):
+            if name in imperfect:
+                logs.setdefault(name, []).append((np.log(used), max(weight, 1e-9)))
+    sizes = {}
+    for name, pairs in logs.items():
+        log, weight = np.transpose(pairs)
+        sizes[name] = float(np.exp(np.average(log, weights=weight)))
+    return [replace(border, used=np.array([sizes.get(name, used) for name, used in zip(
+        border.names, border.used, strict=True)])) for border in borders]
+
+
+def _joint(borders: list[Border], steps: Floats, same: Bools) -> Joint:
+    usual = dict(zip(CONSTANTS[:WANTED], SCATTER, strict=True))
+    return joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED], CONSTANTS[:WANTED],
+                 usual, same.tolist())
+
+
+def _changed(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:
+    """Say by how much the scale changed between two legs, since when, and why that may be."""
+    relative = float(np.expm1(change.change))
+    since = str(np.datetime64(int(times_ns[change.leg - 1]), 'ns').astype('datetime64[m]'))
+    return Reason(Code.SCALE_CHANGED, f'the scale changed by {change_in_words(relative)} '
+                  f'({abs(change.sigmas):.1f} sigma) since {since.replace("T", " ")} UTC, seen '
+                  f'in {_name(numbers[change.leg])}: {cause_of_change(relative)}')
+
+
+def _name(number: int) -> str:
+    return f'leg {number}' if number else 'the saved result'
+
+
+def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
+    """Say in which constants legs differ, and which leg differs most from the others."""
+    J, said = len(found.deviation), list[Reason]()
+    apart = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
+    # what is determined with a parameter differs with it
+    worst = max((np.abs(z).max() for n, z in apart.items() if n in PARAMETERS), default=0.0)
+    for name, z in apart.items():
+        k = int(np.argmax(np.abs(z)))
+        if name not in PARAMETERS and abs(z[k]) < max(FAULT_SIGMAS, worst):
+            continue
+        # two legs differ from each other by the same
+        who = f', {_name(numbers[k])} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
+        said.append(Reason(
+            Code.LEGS_DISAGREE, f'{name}: the {J} legs differ {np.sqrt((z**2).mean()):.1f} times '
+            f'more than their uncertainties{who}', DELAY_DIFFERS if 'delay' in name else ''))
+    if found.factor > 1:
+        said.append(Reason(
+            Code.LEGS_DISAGREE, f'the {J} legs differ {found.factor:.1f} times more than their '
+            'uncertainties, in other parameters than the ones listed'))
+    return tuple(said)
+
+
+def _sources(used: Floats, C: Floats) -> tuple[Source, ...]:
+    """Return the budget: priors of the vehicle, shared, and what is the legs' own."""
+    alike = np.abs(C[:WANTED] / np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))).max(axis=0)
+    shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
+              if alike[i].max() > 1e-9]      # of a correlation: rounding
+    apart = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
+    size, V = np.linalg.eigh(C[:WANTED, :WANTED] - apart)
+    return (*shared, Source('legs', V * np.sqrt(np.maximum(size, 0.0))),
+            Source('model', np.diag(MODEL_FLOOR)))
+
+
+def _details(found: Joint, value: Floats, C: Floats, sources: tuple[Source, ...],
+             legs: int) -> dict[str, Any]:
+    sigma = np.sqrt(np.diag(C))
+    return {
+        'legs_used': legs, 'widened': found.factor,
+        'budget': budget_table(sources, PARAMETERS, (float(np.exp(value[LN_K])), 1.0, 1.0)),
+        'correlation': correlations(C[:WANTED, :WANTED], PARAMETERS),
+        'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
+                         'between_legs': found.between, 'curvature': found.bent.tolist()},
+        **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])} for i in SCALES}}

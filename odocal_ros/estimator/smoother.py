@@ -1,0 +1,155 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The smoother: scale and mounting angles from all samples of a leg at once (docs/method.md)."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.chain import NotPositive, solve
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
+from odocal_ros.estimator.fit import Fit, fit, Trace
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.prepare import nominal_yaw, problem_of, with_imperfect
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.result.outcome import outcome
+from odocal_ros.estimator.result.refusal import no_imu, refused
+from odocal_ros.estimator.speed_offset import judge_offset
+from odocal_ros.estimator.start import first_state, Start
+from odocal_ros.estimator.state import State, YAW
+from odocal_ros.nav.angles import wrap
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+
+# rad, passes, judgement: a heading from accelerations with a larger sigma may be one of two; both
+# are tried for this number of passes
+TWO_HEADINGS, START_PASSES = 0.1, 3
+# initial size of a receiver's own odometer, and s of a leg from which on it is used: ten times the
+# time in which satellites correct it; shorter legs cannot separate it. Tuned: in yards of 300 s
+# with one 5 % off the fit from 0.5 finds a scale and an accelerometer 3 % off instead, 9 to 12
+# sigma in 6 of 6; from 50 so in 1 of 6 (docs/decisions/0019)
+LARGE_SIZE, LARGE_SIZE_FROM = 50.0, 200.0
+
+
+def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> MethodResult:
+    """
+    Estimate scale, yaw and pitch mounting of a leg from all its samples.
+
+    leg : screened samples.   config : grade, lever arms' and delays' sigmas, limits.   trace :
+    called with each pass of the iteration, for benchmarks.
+
+    Returns
+    -------
+    MethodResult named ``smoother``; what the leg cannot determine is None with its reason.
+
+    """
+    few = too_little_of(leg)
+    if few:
+        return refused([few], leg.scale_unit, leg.wheels)
+    problem = problem_of(leg, config)
+    try:
+        best = best_fit(problem, config, trace)
+    except (NotPositive, np.linalg.LinAlgError) as error:
+        return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}. '
+                               'Likely cause: missing or invalid samples '
+                               'there')], leg.scale_unit, leg.wheels)
+    if implausible := no_imu(best):
+        return refused(implausible, leg.scale_unit, leg.wheels)
+    return outcome(leg, problem, best, config)
+
+
+def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fit:
+    """
+    Return the fit of a leg.
+
+    From one start, or from two if accelerations do not determine the heading: the likelier after
+    a few passes continues. The offset of a quantised speed is then tested for two usual values.
+    """
+    # not stored in a variable: one fit in memory at a time
+    return judge_offset(problem, _fit(problem, config, trace), trace)
+
+
+def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
+    nominal = nominal_yaw(config)
+    start = first_state(problem.leg, problem.imu, problem.priors,
+                        None if problem.leg.felt else nominal)
+    if problem.leg.felt and start.yaw_sigma > TWO_HEADINGS:
+        other = first_state(problem.leg, problem.imu, problem.priors, nominal)
+        turned = wrap(other.state.constants[YAW] - start.state.constants[YAW])
+        if abs(turned) > TWO_HEADINGS:
+            return _likelier(problem, config, (start, other), trace)
+    return fit(problem, start.state, _first_levels(problem, start), config.leg.compute_limit,
+               trace=trace)
+
+
+def _likelier(problem: Problem, config: Config, starts: tuple[Start, Start],
+              trace: Trace | None) -> Fit:
+    """Return the fit from the start that is likelier after START_PASSES."""
+    about = max((fit(problem, one.state, _first_levels(problem, one), START_PASSES, trace=trace)
+                 for one in starts), key=lambda f: f.likelihood).summary()
+    last = fit(problem, about.state, about.levels, config.leg.compute_limit, about=about,
+               trace=trace)
+    return replace(last, iterations=about.iterations + last.iterations)
+
+
+def _first_levels(problem: Problem, start: Start) -> Levels:
+    """Return initial levels: fixes no better than their fit to the odometer track."""
+    wide = max(1.0, (start.fix_spread / problem.fix_sigma)**2)
+    time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
+    long = problem.leg.felt and problem.leg.t_stop - problem.leg.t_begin > LARGE_SIZE_FROM
+    sizes = {'size_fix_error_by_motion': LARGE_SIZE} if long else {}
+    return problem.first_levels.but(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE * wide,
+                                    correlation_time=time, **sizes, **problem.shaken)
+
+
+def too_little_of(leg: SmootherLeg) -> Reason | None:
+    """Return the reason if a leg has too few fixes with IMU rows, else None."""
+    first = int(np.searchsorted(leg.t_imu, leg.t_begin))
+    t = leg.t_imu[first:int(np.searchsorted(leg.t_imu, leg.t_stop, side='right'))]
+    if len(t) < 2:
+        return too_little(0, 0.0)
+    beside = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
+    return too_little(int(beside.sum()), float(t[-1] - t[0]))
+
+
+def too_little(fixes: int, seconds: float) -> Reason | None:
+    """Return the reason if a number of fixes, or their duration, is too small, else None."""
+    fewest, shortest = 10, 20.0     # fixes, s: judgement, of less no start is found
+    if fixes >= fewest and seconds >= shortest:
+        return None
+    return Reason(Code.SCALE_NOT_DETERMINED, f'{fixes} fixes in {seconds:.0f} s; the smoother '
+                  f'needs at least {fewest} fixes in {shortest:.0f} s')
+
+
+def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
+          imperfect: Floats | None = None) -> Floats:
+    """
+    Return the covariance of the constants at a given state, covariance only.
+
+    leg, config : as for ``smooth``.   truth : values of all unknowns, at the times of
+    ``keyframe_times``.   levels : noise levels.   imperfect : (k,) sigmas of what is imperfect, as
+    IMPERFECT; None: as usual.
+
+    Returns
+    -------
+    (M, M) covariance in the order of CONSTANTS, ln K first: the inverse of the information that
+    the rows hold there, priors in lever arms and delays included.
+
+    """
+    problem = problem_of(leg, config)
+    if imperfect is not None:
+        problem.priors = with_imperfect(problem.priors, imperfect)
+    equations = Equations(problem, truth, fitted=True)
+    return solve(equations.at(levels).normal()).covariance
+
+
+def keyframe_times(leg: SmootherLeg, config: Config) -> Floats:
+    """Return the times of the keyframes of a leg, s: (N,)."""
+    problem = problem_of(leg, config)
+    out: Floats = problem.imu.t[problem.imu.key]
+    return out

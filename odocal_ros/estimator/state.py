@@ -1,0 +1,225 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The state vector of the smoother, docs/method.md (S1), and the leg's constants, (S2).
+
+A block of the chain is [position, velocity, attitude error, gyro bias, accelerometer bias, travel
+error, (slow fix error)]; the attitude error phi turns the estimate: C_nb = exp(phi) C_hat. The
+travel error is that of the odometer's reading at the keyframe (quantisation: bounded), in scale
+units. The constants are the border.
+"""
+
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from itertools import accumulate
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
+from odocal_ros.nav.rotations import exp_so3
+
+Floats = NDArray[np.float64]
+# the unknowns of a block, one after the other, and how many each has
+BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
+         'accelerometer bias': 3, 'travel error': 1, 'slow fix error, ENU, where there is one': 3}
+P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
+    BLOCK.values(), accumulate(BLOCK.values()), strict=True))
+E = TRAVEL.start
+BARE, WITH_SLOW = SLOW.start, SLOW.stop     # unknowns of a block
+
+# Errors of the IMU's axes: (axis that is wrong, signal that it wrongly contains). Signals of the
+# gyro are (w_x, w_y, w_z, f_x, f_y), of the accelerometer (f_x, f_y, f_z); f_z in x and y is a
+# bias of a level IMU, not of one mounted at an angle. Three of the 18 are zero by the definition
+# of the axes: z is the axis of turns on level ground, x the direction of a push that the y
+# accelerometer does not show.
+GYRO_ERRORS = {
+    'gyro_scale_z': (2, 2), 'gyro_scale_x': (0, 0), 'gyro_scale_y': (1, 1),
+    'gyro_axis_xy': (0, 1), 'gyro_axis_yx': (1, 0), 'gyro_axis_zx': (2, 0), 'gyro_axis_zy': (2, 1),
+    'gyro_x_by_force_x': (0, 3), 'gyro_x_by_force_y': (0, 4), 'gyro_y_by_force_x': (1, 3),
+    'gyro_y_by_force_y': (1, 4), 'gyro_z_by_force_x': (2, 3), 'gyro_z_by_force_y': (2, 4)}
+ACCEL_ERRORS = {
+    'accelerometer_scale_x': (0, 0), 'accelerometer_scale_y': (1, 1),
+    'accelerometer_scale_z': (2, 2), 'accelerometer_axis_xy': (0, 1),
+    'accelerometer_axis_zx': (2, 0), 'accelerometer_axis_zy': (2, 1),
+    'accelerometer_axis_xz': (0, 2), 'accelerometer_axis_yz': (1, 2)}
+GYRO_AXIS, GYRO_SIGNAL = zip(*GYRO_ERRORS.values(), strict=True)
+ACCEL_AXIS, ACCEL_SIGNAL = zip(*ACCEL_ERRORS.values(), strict=True)
+
+# the border
+CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
+             'odometer_lever_arm_x', 'odometer_lever_arm_y', 'odometer_lever_arm_z',
+             'antenna_lever_arm_x', 'antenna_lever_arm_y', 'antenna_lever_arm_z',
+             'odometer_delay', 'gnss_delay', 'heading_offset', *GYRO_ERRORS, *ACCEL_ERRORS,
+             'fix_lag_square', 'fix_error_by_motion', 'odometer_lag_square',
+             'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking', 'squat',
+             'sideslip', 'squat_by_jerk', 'sideslip_by_jerk', 'pitch_centre',
+             'fix_motion_time', 'speed_offset', 'velocity_delay', 'velocity_lag_square',
+             'velocity_scale')
+
+
+def constants_from(first: str, last: str = '') -> slice:
+    """Return the slice of constants from one name to another, the last included, or of one."""
+    return slice(CONSTANTS.index(first), CONSTANTS.index(last or first) + 1)
+
+
+LN_K, YAW, PITCH = map(CONSTANTS.index, ('scale_factor', 'yaw_mounting_angle',
+                                         'pitch_mounting_angle'))
+# from the IMU, base_link axes, m
+ODO_ARM = constants_from('odometer_lever_arm_x', 'odometer_lever_arm_z')
+GNSS_ARM = constants_from('antenna_lever_arm_x', 'antenna_lever_arm_z')
+# s; error of the outside heading, the same through the leg, rad
+ODO_DELAY, GNSS_DELAY, HEADING = map(CONSTANTS.index, ('odometer_delay', 'gnss_delay',
+                                                       'heading_offset'))
+GYRO = constants_from('gyro_scale_z', 'gyro_z_by_force_y')
+GYRO_SCALE = GYRO.start
+ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_yz')
+# s^2, of a receiver's filter: square of the time constant of the mean of the past, or, below zero,
+# of a filter of position and velocity (nav/receiver_filter.py)
+FIX_LAG2 = CONSTANTS.index('fix_lag_square')
+# s^2, of a low-pass filter on the odometer's speed: square of its time constant
+ODO_LAG2 = CONSTANTS.index('odometer_lag_square')
+# of an odometer in the receiver: its relative error, and the time constant, logarithm of s, with
+# which satellites take its places back
+FIX_BY_MOTION, FIX_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_motion_time'))
+# relative change of the scale from its mean by distance: with the square of the speed (its slope
+# at FAST_SPEED, s/m), with time as tyres warm (its rate at the begin of the leg, 1/s), and with
+# what the tyres pull and brake, 1/(m/s^2): a wheel that is not driven only brakes
+TYRES = constants_from('scale_by_speed', 'scale_by_braking')
+BY_SPEED, BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
+FAST_SPEED = 20.0           # m/s, definition: where the slope is said, of a road out of town
+# of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
+# change, rad per m/s^3: a body answers late, tyres at once
+LEAN = constants_from('squat', 'sideslip_by_jerk')
+# what an ideal vehicle has not: all to here
+PITCH_CENTRE = CONSTANTS.index('pitch_centre')
+IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre')
+# kinds of these with one size each, and their numbers of constants
+KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
+              'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
+              'odometer_lag_square': 1,
+              'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2, 'squat': 1,
+              'sideslip': 1, 'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 1}
+KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECT
+# scale units per s: offset of a quantised speed, half a step if it is truncated
+SPEED_OFFSET = CONSTANTS.index('speed_offset')
+# of a GNSS velocity: delay of its stamps, s, square of the time constant by which the receiver
+# smooths it, s^2, and by how much it is too large, relative
+VELOCITY = constants_from('velocity_delay', 'velocity_scale')
+VELOCITY_DELAY, VELOCITY_LAG2, VELOCITY_SCALE = range(VELOCITY.start, VELOCITY.stop)
+M = len(CONSTANTS)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """
+    Values of all unknowns.
+
+    t : (N,) s, keyframes.   p_n, v_n : (N, 3) of the IMU, m, m/s.   C_nb : (N, 3, 3).
+    gyro_bias, accel_bias : (N, 3) in b.   travel_error : (N,) scale units.
+    slow_n : (N, 3) slow part of the fix error, m.   constants : (M,) as CONSTANTS, ln K first.
+    up_b : (3,) up in b, mean of the leg: by it the IMU's roll on the vehicle is observable.
+    """
+
+    t: Floats
+    p_n: Floats
+    v_n: Floats
+    C_nb: Floats
+    gyro_bias: Floats
+    accel_bias: Floats
+    travel_error: Floats
+    slow_n: Floats
+    constants: Floats
+    up_b: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+
+    @cached_property
+    def scale(self) -> float:
+        """Return K."""
+        return float(np.exp(self.constants[LN_K]))
+
+    @cached_property
+    def forward(self) -> Floats:
+        """Return the forward axis in b: (3,)."""
+        return forward_b(self.constants[YAW], self.constants[PITCH])
+
+    @cached_property
+    def C_bv(self) -> Floats:
+        """Return the rotation from vehicle to body axes: (3, 3)."""
+        return C_bv(self.forward, self.up_b)
+
+    def of_keyframes(self) -> dict[str, Floats]:
+        """Return the arrays with a row for each keyframe, by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)
+                if f.name not in ('constants', 'up_b')}
+
+    def level(self) -> 'State':
+        """Return the state with the mean up axis of its attitudes: the roll of the IMU."""
+        return replace(self, up_b=self.C_nb[:, 2].mean(axis=0))
+
+    @cached_property
+    def C_bv_gradient(self) -> tuple[Floats, Floats]:
+        """Return the derivatives of C_bv by yaw and by pitch: two (3, 3)."""
+        C, up = self.C_bv, self.up_b
+        by_yaw, by_pitch = forward_gradient(self.constants[YAW], self.constants[PITCH])
+        return _turned_axes(C, up, by_yaw), _turned_axes(C, up, by_pitch)
+
+    def moved(self, step: Floats, step_constants: Floats) -> 'State':
+        """Return the state with an increment of every unknown: (N, n), (M,)."""
+        slow = self.slow_n + step[:, SLOW] if step.shape[1] > BARE else self.slow_n
+        return replace(
+            self, p_n=self.p_n + step[:, P], v_n=self.v_n + step[:, V],
+            C_nb=exp_so3(step[:, PHI]) @ self.C_nb, gyro_bias=self.gyro_bias + step[:, BG],
+            accel_bias=self.accel_bias + step[:, BA],
+            travel_error=self.travel_error + step[:, E], slow_n=slow,
+            constants=upright(self.constants + step_constants))
+
+
+def upright(constants: Floats) -> Floats:
+    """
+    Return constants whose pitch is within a quarter turn: the same forward axis, the top up.
+
+    Far from the answer a step may turn the pitch over, and the lever arms with it.
+    """
+    if abs(constants[PITCH]) <= np.pi / 2:
+        return constants
+    out = constants.copy()
+    out[YAW], out[PITCH] = mounting_from_forward(forward_b(constants[YAW], constants[PITCH]))
+    return out
+
+
+def C_bv(forward: Floats, up: Floats) -> Floats:
+    """
+    Return the rotation from vehicle to body axes, forward, left, up in columns: (3, 3).
+
+    forward, up : (3,) in b. The left axis is level: the motion of a point does not determine roll.
+    """
+    left = np.cross(up, forward)
+    left = left / np.linalg.norm(left)
+    return np.stack([forward, left, np.cross(forward, left)], -1)
+
+
+def _turned_axes(C: Floats, up: Floats, by_forward: Floats) -> Floats:
+    """Return the derivative of C_bv by what turns the forward axis by ``by_forward``: (3, 3)."""
+    forward, left = C[:, 0], C[:, 1]
+    size = np.linalg.norm(np.cross(up, forward))
+    by_left = np.cross(up, by_forward) / size
+    by_left = by_left - left * (left @ by_left)
+    return np.stack([by_forward, by_left,
+                     np.cross(by_forward, left) + np.cross(forward, by_left)], -1)
+
+
+def forward_gradient(yaw: float, pitch: float) -> tuple[Floats, Floats]:
+    """Return the derivatives of the forward axis by yaw and by pitch: two (3,)."""
+    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    return np.array([-sy * cp, -cy, -sy * sp]), np.array([-cy * sp, 0.0, cy * cp])
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """Prior sigmas of the first biases and the constants: (3,), (3,), (M,), inf where none is."""
+
+    gyro_bias: Floats
+    accel_bias: Floats
+    constants: Floats
+    centre: Floats               # (M,) of the constants
