@@ -1,13 +1,15 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Distance and standstill so far, where rows of the odometer hold impossible values."""
+"""Distance and standstill so far with impossible values; an IMU without accelerometer."""
 
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
-from odocal_ros.forecast.progress import Travel
+from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
+from odocal_ros.forecast.ability import ability
+from odocal_ros.forecast.progress import Progress, Travel
+from odocal_ros.settings.config import Config
 
 SECOND = 10**9
 
@@ -29,3 +31,15 @@ def test_impossible_values_change_no_distance_and_no_standstill(odd, quantity):
         found.append((travel.total, travel.still_s(), travel.top))
     assert found[1] == pytest.approx(found[0], abs=0.2)
     assert found[0][0] == pytest.approx(30.0, abs=0.3)
+
+
+@pytest.mark.core
+def test_with_an_imu_without_accelerometer_only_the_scale_is_observable():
+    stamps, rates = np.arange(1, 4) * SECOND, np.zeros((3, 3))
+    progress = Progress()
+    for force in (9.81, 0.0):
+        progress.feed('imu', ImuSamples(stamps, stamps, rates, rates + force, np.zeros((3, 4)),
+                                        np.full(3, np.nan)), Config(), None, 0.0)
+        words = ability(Config(), progress.received_before(600.0)).words()
+        assert ('observable: the scale; not observable: the yaw' in words) == (not force), words
+        assert ('the pitch (IMU without acceleration)' in words) == (not force)
