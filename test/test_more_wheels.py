@@ -21,7 +21,7 @@ from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.axles import axles_of, steering_path
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
-from odocal_ros.sim.vehicle_wheels import wheels_of
+from odocal_ros.sim.wheels import wheels_of
 
 pytestmark = pytest.mark.slow
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'industrial', 'seed': 3}

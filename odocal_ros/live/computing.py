@@ -12,7 +12,7 @@ from rclpy.task import Future
 
 from odocal_ros.live import answers
 from odocal_ros.live.worker import give_back, Job, Worker
-from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.prepared import Stage
 
 # judgement: s that ~/stop_leg waits for the result. It answers within 5 s, of which one is for a
 # busy machine; the last samples take up to 1 s, the fit of a leg of ten minutes 1 to 2 s

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from odocal_ros.calib.choice import ABOUT, deciding
 from odocal_ros.forecast import quantities
-from odocal_ros.forecast.clocks_so_far import clocks_differ
 from odocal_ros.forecast.forecast import REST_FORESEEN_S
+from odocal_ros.forecast.progress import clocks_differ
 from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import cautions, Reason

@@ -19,9 +19,8 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.live.session import LEGS_HELD
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold, refusal
-from odocal_ros.pipeline.calibrate import combine
-from odocal_ros.pipeline.method_run import Stage
-from odocal_ros.pipeline.parts import calibrate_parts
+from odocal_ros.pipeline.calibrate import calibrate_parts, combine
+from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 

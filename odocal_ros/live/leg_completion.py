@@ -14,8 +14,8 @@ from rclpy.task import Future
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.forecast.ability import Ability, ability
-from odocal_ros.forecast.clocks_so_far import clocks_differ
 from odocal_ros.forecast.leg_so_far import SILENT_TIME
+from odocal_ros.forecast.progress import clocks_differ
 from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, jobs
 from odocal_ros.live.computing import Computing

@@ -10,7 +10,7 @@ from typing import Any
 from odocal_ros.forecast.ability import Ability
 from odocal_ros.forecast.forecast import Forecast
 from odocal_ros.live.session import Session, State
-from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config, LegConfig
 

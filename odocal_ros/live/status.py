@@ -22,7 +22,7 @@ from odocal_ros.live.guidance import (
 from odocal_ros.live.health import Health
 from odocal_ros.live.session import Session, State
 from odocal_ros.live.session_view import SessionView
-from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Verdict
 
 SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a move in a yard is no fault

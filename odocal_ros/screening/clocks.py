@@ -10,7 +10,7 @@ from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_step, median, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
-from odocal_ros.nav.gaps import GAP_INTERVALS
+from odocal_ros.nav.statistics import GAP_INTERVALS
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_APART

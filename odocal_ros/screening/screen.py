@@ -19,18 +19,16 @@ from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_step
-from odocal_ros.nav.gaps import gaps_in_rhythm
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.nav.statistics import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
 from odocal_ros.screening.clocks import judge_clocks, offsets
-from odocal_ros.screening.dead_reckoned import reckoned
-from odocal_ros.screening.fix_screen import contradicted, usable_fixes
-from odocal_ros.screening.force import with_force
+from odocal_ros.screening.fix_screen import contradicted, reckoned, usable_fixes
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.inputs import Inputs, place
-from odocal_ros.screening.local_frame import without_north
+from odocal_ros.screening.leg_kind import with_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import usable_rows
 from odocal_ros.screening.wheel_travel import wheels
@@ -41,15 +39,10 @@ MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not
 
 def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
     """
-    Clean a leg.
+    Return the usable arrays of a leg, empty where nothing is left, and reasons.
 
     judged : False for its motion alone: clocks, gyro and wheels that fail are not looked for, and
     orientations stay as sent.
-
-    Returns
-    -------
-    The usable arrays (empty where nothing is left) and the findings.
-
     """
     leg, unfelt = with_force(leg, config)
     leg, local = without_north(leg, config)
@@ -127,8 +120,7 @@ def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> In
     placed = place(inputs, config)
     if not placed.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs
-    up = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
-    rate = inputs.w_b @ up
+    rate = inputs.w_b @ inputs.up_b
     # straights, and turns to both sides: the median is the bias
     angle = np.cumsum((rate[1:] - np.median(rate)) * np.diff(inputs.t_imu))
     lost, why = reckoned(inputs.t_fix, placed.fixes_n, inputs.travel.at(inputs.t_fix)

@@ -11,8 +11,8 @@ from player import leg_of, messages_of
 import pytest
 
 from odocal_ros.bagio import encode
-from odocal_ros.sim.robot_wheels import effective_width
 from odocal_ros.sim.scenarios import SimOptions, simulate
+from odocal_ros.sim.wheels import effective_width
 
 SIGMAS = 4.0             # 1 in 16 000 of a normal error; the seeds are fixed
 
