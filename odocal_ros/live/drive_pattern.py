@@ -3,6 +3,7 @@
 
 """The node that drives a robot along a pattern, from ``~/start`` to a cause to stop."""
 
+from functools import partial
 import math
 import signal
 import time
@@ -41,8 +42,7 @@ settings     parameters, all described in config/drive_pattern.yaml"""
 class DrivePattern(SettledNode):
     """Joins poses, ``pattern.follow`` and commands; it sends nothing unless it drives or stops."""
 
-    def __init__(self, node_name: str = 'drive_pattern', **kwargs: Any) -> None:
-        super().__init__(node_name, **kwargs)
+    default_name = 'drive_pattern'
 
     def _build(self) -> None:
         self.config: PatternConfig = params.declare(self, PatternConfig)
@@ -182,6 +182,4 @@ class DrivePattern(SettledNode):
         self._publisher.publish(stamped)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it must stop; see ``process.run``."""
-    return run('drive_pattern', HELP, DrivePattern, args)
+main = partial(run, DrivePattern, HELP)

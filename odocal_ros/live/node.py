@@ -7,7 +7,6 @@ from collections.abc import Callable
 from functools import partial
 import threading
 import time
-from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -59,10 +58,8 @@ class Calibrator(SettledNode):
     threads was, which will end with the process.
     """
 
+    default_name = 'calibrator'
     at_work = False
-
-    def __init__(self, node_name: str = 'calibrator', **kwargs: Any) -> None:
-        super().__init__(node_name, **kwargs)
 
     def _build(self) -> None:
         self.config = params.declare(self)
@@ -125,7 +122,7 @@ class Calibrator(SettledNode):
         with self._lock:
             self.operation.tick()
             if self._due('look', LOOK_AROUND_S):
-                self.recording.look_around(self.config)
+                self.recording.inputs.update(self.config)
                 session = self.operation.session
                 self.recording.forget(self.config.leg.preroll,
                                       session.start_ns if session.open_leg else 0)
@@ -168,6 +165,4 @@ class Calibrator(SettledNode):
         return response
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it must stop; see ``process.run``."""
-    return run('calibrator', HELP, Calibrator, args)
+main = partial(run, Calibrator, HELP)

@@ -4,6 +4,7 @@
 """The node that applies a calibration: counter and IMU in, odometry and twist out."""
 
 from collections.abc import Callable
+from functools import partial
 import re
 import struct
 import time
@@ -85,8 +86,7 @@ class NumbersPublisher:
 class OdometryNode(SettledNode):
     """Joins the inputs of the calibrator to ``Odometry`` and its poses to two topics."""
 
-    def __init__(self, node_name: str = 'odometry', **kwargs: Any) -> None:
-        super().__init__(node_name, **kwargs)
+    default_name = 'odometry'
 
     def _build(self) -> None:
         self.config = params.declare(self, ApplyConfig)
@@ -248,6 +248,4 @@ def transform_of(pose: Pose, frames: OdomFrames) -> TransformStamped:
     return out
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it must stop; see ``process.run``."""
-    return run('odometry', HELP, OdometryNode, args)
+main = partial(run, OdometryNode, HELP)

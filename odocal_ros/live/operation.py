@@ -10,7 +10,7 @@ from rclpy.task import Future
 from odocal_ros.calib.result import Calibration
 from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, jobs
-from odocal_ros.live.automatic_way import AutomaticWay
+from odocal_ros.live.automatic_legs import AutomaticLegs
 from odocal_ros.live.computing import PATIENCE_S
 from odocal_ros.live.filing import iso
 from odocal_ros.live.guidance import after_result, hint, quantities_ok
@@ -22,7 +22,7 @@ from odocal_ros.pipeline.floor_marks import mark_positions, place_of, WITHIN
 MARK_STILL_S = 2 * WITHIN + 0.5
 
 
-class Operation(AutomaticWay):
+class Operation(AutomaticLegs):
     """
     The commands of the node's services.
 
@@ -111,7 +111,7 @@ class Operation(AutomaticWay):
             return True, f'{text}; no leg is left'
 
         def take(outcome: tuple[Calibration, jobs.Paths]) -> None:
-            self.session.finish_undo(outcome[0])
+            self.session.settle(outcome[0])
             self._take_result(*outcome)
 
         self._computing.submit(

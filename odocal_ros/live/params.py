@@ -215,27 +215,23 @@ def restored_from(results: dict[str, Any],
         No calibration gives such values: the checks are those of a calibration.json.
 
     """
-    try:
-        return _restored(results, estimates)
-    except ValueError as error:
-        raise BadConfig(f'{error}; {TAKE}') from None
-
-
-def _restored(results: dict[str, Any], names: dict[str, str]) -> Restored | None:
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:
-        raise ValueError(f'result.legs: {legs} is not a number of legs')
+        raise BadConfig(f'result.legs: {legs} is not a number of legs; {TAKE}')
     if one_line(stamp) != stamp:
-        raise ValueError(f"result.stamp: '{one_line(stamp)}' is not a date")
-    estimates = {}
-    for name, unit in names.items():
+        raise BadConfig(f"result.stamp: '{one_line(stamp)}' is not a date; {TAKE}")
+    found = {}
+    for name, unit in estimates.items():
         value, sigma = (None if math.isnan(x) else x for x in (
             results[PREFIX + name], results[PREFIX + name + '_sigma']))
-        check_estimate(name, value, sigma)
-        estimates[name] = Estimate(value, sigma, '1' if unit == SCALE else unit)
-    if all(e.value is None for e in estimates.values()):
+        try:
+            check_estimate(name, value, sigma)
+        except ValueError as error:
+            raise BadConfig(f'{error}; {TAKE}') from None
+        found[name] = Estimate(value, sigma, '1' if unit == SCALE else unit)
+    if all(e.value is None for e in found.values()):
         return None
-    return Restored(estimates, legs, results[PREFIX + 'valid'], stamp or NO_STAMP,
+    return Restored(found, legs, results[PREFIX + 'valid'], stamp or NO_STAMP,
                     results[PREFIX + 'vehicle'])
 
 

@@ -32,9 +32,11 @@ LOOK_FOR_NAMESAKE_S = 5.0      # judgement: s between looks for another node of 
 class SettledNode(Node):
     """A node that raises BadConfig, as one line, if a parameter is wrong."""
 
-    def __init__(self, node_name: str, **kwargs: Any) -> None:
+    default_name = ''
+
+    def __init__(self, node_name: str = '', **kwargs: Any) -> None:
         try:
-            super().__init__(node_name, **kwargs)
+            super().__init__(node_name or self.default_name, **kwargs)
             try:
                 self._build()
                 self._alone = self.steady_timer(LOOK_FOR_NAMESAKE_S, self._look_for_namesake)
@@ -69,17 +71,17 @@ class SettledNode(Node):
         return PlainLog(super().get_logger())  # type: ignore[no-untyped-call]
 
 
-def run(name: str, about: str, make: Callable[[], SettledNode],
-        args: list[str] | None = None) -> int:
+def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> int:
     """
     Run a node until it must stop.
 
-    name : of the command.   about : what --help prints.   make : returns the node.
+    kind : of the node; its default name is that of the command.   about : text of --help.
 
     Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and where only help or version
     was asked for; 1 when it cannot start, with one line that says why.
     """
     hold_little()
+    name = kind.default_name
     # rclpy's handler ends the context on either signal, and calls this one: no KeyboardInterrupt
     signal.signal(signal.SIGINT, lambda *_: None)
     try:
@@ -100,7 +102,7 @@ def run(name: str, about: str, make: Callable[[], SettledNode],
                         '-r from:=to')
     executor, node, code = SingleThreadedExecutor(), None, 0
     try:
-        node = make()
+        node = kind()
         executor.add_node(node)
         node.spin(executor)
     except ExternalShutdownException:

@@ -45,13 +45,8 @@ class Publishing:
         self._shown: dict[Publisher, str] = {}        # what these publishers said last
         self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
-        self._setting = False
+        self.setting_results = False      # true while the node itself sets ``result.*``
         self._before = self.results()    # what holds while no leg is kept: restored, or nothing
-
-    @property
-    def setting_results(self) -> bool:
-        """Return True while the node itself sets ``result.*``."""
-        return self._setting
 
     def results(self) -> dict[str, Any]:
         """Return the ``result.*`` parameters in force."""
@@ -68,12 +63,12 @@ class Publishing:
         if calibration:
             vehicle = self._node.get_parameter('vehicle').value
             results = params.as_results(calibration, stamp, vehicle)
-        self._setting = True
+        self.setting_results = True
         try:
             self._node.set_parameters_atomically(
                 [Parameter(name, value=value) for name, value in results.items()])
         finally:
-            self._setting = False
+            self.setting_results = False
 
     def forget_restored(self) -> None:
         """Let go of a result that came with the start."""

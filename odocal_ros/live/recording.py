@@ -88,10 +88,6 @@ class Recording:
         fix = self.inputs.by_slot.get('fix')
         return fix is None or fix.health.fix_status == LOCAL
 
-    def look_around(self, config: Config) -> None:
-        """Look for publishers of topics that are silent."""
-        self.inputs.update(config)
-
     def forget(self, preroll_s: float, start_ns: int) -> None:
         """Bound the memory of what came before the pre-roll, of a leg that began then."""
         # by each topic's own stamps: one on a foreign clock must not grow without bound

@@ -152,12 +152,12 @@ class Session:
             replace(leg, results=tuple(one.numbers() for one in leg.results))
             for leg in self.legs[:-LEGS_HELD]]
         self.unused = None
-        self._settle(calibration)
+        self.settle(calibration)
 
     def leave_out(self, why: Reason) -> None:
         """Drop the computed leg, which nobody asked for and which is no good."""
         self.event, self.unused = 'cancelled', why
-        self._settle(self.calibration)
+        self.settle(self.calibration)
 
     def carry_on(self, carried: Carried | None, legs: int) -> None:
         """Release the first kept legs: their information is carried over."""
@@ -173,7 +173,7 @@ class Session:
             raise Refused('no leg is running: nothing to cancel; ~/undo_leg drops the last kept '
                           'leg')
         self.event, self.lost = 'cancelled', lost
-        self._settle(self.calibration)
+        self.settle(self.calibration)
 
     def begin_undo(self) -> list[KeptLeg]:
         """Drop the last kept leg and return those left, which must be combined again."""
@@ -183,15 +183,11 @@ class Session:
         if not self.legs:
             raise Refused('no leg to undo')
         dropped = self.legs.pop()
-        self._touch(dropped, 'undone')
+        self.dropped(dropped)
         self.lost = ''
         self.state = State.COMPUTING if self.legs else State.IDLE
         self.calibration = None
         return self.legs
-
-    def finish_undo(self, calibration: Calibration) -> None:
-        """Take the combination of the legs left."""
-        self._settle(calibration)
 
     def begin_reset(self) -> list[KeptLeg]:
         """Drop everything and return the legs that were kept."""
@@ -206,7 +202,8 @@ class Session:
 
     def dropped(self, leg: KeptLeg) -> None:
         """Show a leg as undone."""
-        self._touch(leg, 'undone')
+        self.leg_id, self.start_ns, self.stop_ns = leg.leg_id, leg.start_ns, leg.stop_ns
+        self.event = 'undone'
 
     def restored_since(self) -> str:
         """Return the stamp of the restored result while it is in force, else empty."""
@@ -218,11 +215,8 @@ class Session:
         """Return the verdict in force, empty before the first."""
         return self.calibration.verdict.value if self.calibration else ''
 
-    def _touch(self, leg: KeptLeg, event: str) -> None:
-        self.leg_id, self.start_ns, self.stop_ns = leg.leg_id, leg.start_ns, leg.stop_ns
-        self.event = event
-
-    def _settle(self, calibration: Calibration | None) -> None:
+    def settle(self, calibration: Calibration | None) -> None:
+        """Take the combination of the kept legs, None without one; no leg is open then."""
         self.calibration, self.trouble = calibration, ''
         if calibration is None:
             self.state = State.IDLE

@@ -34,19 +34,11 @@ PLACES = dict.fromkeys((
     'metres_to_go_yaw', 'computing_percent'), 1) | {
         'max_speed_mps': 2, 'predicted_scale_sigma_ppm': 2, 'predicted_yaw_sigma_deg': 4,
         'asked_scale_sigma_ppm': 1, 'asked_yaw_sigma_deg': 4, 'computing_change_sigmas': 4}
-# key: result.* parameter
-VALUES = {
-    'scale_factor': 'scale_factor', 'scale_factor_sigma': 'scale_factor_sigma',
-    'yaw_mounting_angle_rad': 'yaw_mounting_angle',
-    'yaw_mounting_angle_sigma_rad': 'yaw_mounting_angle_sigma',
-    'pitch_mounting_angle_rad': 'pitch_mounting_angle',
-    'pitch_mounting_angle_sigma_rad': 'pitch_mounting_angle_sigma',
-    'scale_factor_left': 'scale_factor_left',
-    'scale_factor_left_sigma': 'scale_factor_left_sigma',
-    'scale_factor_right': 'scale_factor_right',
-    'scale_factor_right_sigma': 'scale_factor_right_sigma',
-    'track_width_m': 'track_width', 'track_width_sigma_m': 'track_width_sigma',
-}
+# results of the status, and the unit in their keys
+UNITS = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad',
+         'scale_factor_left': '', 'scale_factor_right': '', 'track_width': '_m'}
+VALUES = {f'{name}{end}{unit}': f'result.{name}{end}'      # key: parameter
+          for name, unit in UNITS.items() for end in ('', '_sigma')}
 
 
 def calibration_status(now: SessionView) -> DiagnosticStatus:
@@ -62,7 +54,7 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
         'imu_rate_hz': now.rates_hz.get('imu', 0.0),
         'odometer_rate_hz': now.rates_hz.get('odometer', 0.0),
         'fix_rate_hz': now.rates_hz.get('fix', 0.0),
-    } | {key: results[f'result.{name}'] for key, name in VALUES.items()} | _of_wheels(now) | {
+    } | {key: results[name] for key, name in VALUES.items()} | _of_wheels(now) | {
         'verdict': session.verdict(), 'hint': text, 'legs': legs,
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
         'restored': now.restored,

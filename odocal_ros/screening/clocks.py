@@ -3,8 +3,6 @@
 
 """Clocks: how far apart the topics' stamps are, and whether one was set during the leg."""
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
@@ -32,18 +30,20 @@ def offsets(config: Config) -> dict[str, float]:
     return {slot: of(one.clock) - of('imu') for slot, one in INPUTS.items()}
 
 
-def judge_clocks(leg: Leg, offset: Mapping[str, float]) -> list[Reason]:
+def judge_clocks(leg: Leg, config: Config) -> list[Reason]:
     """
     Compare each topic's clock with the IMU's, at equal times of arrival.
 
-    leg : as it came.   offset : s to add to the stamps of each input.
+    leg : as it came.   Positions of marks have IMU stamps, and arrive as late as WITHIN: no clock.
     """
-    found = [r for slot in ('imu', *TOPICS) for r in _was_set(
+    topics = [slot for slot in TOPICS if not (slot == 'fix' and config.reference.points)]
+    offset = offsets(config)
+    found = [r for slot in ('imu', *topics) for r in _was_set(
         getattr(leg, slot), INPUTS[slot].label, leg.start_ns)]
     imu = _stamped(leg.imu)
     if len(imu.stamp_ns) < 2:
         return found
-    for slot in TOPICS:
+    for slot in topics:
         samples = _stamped(getattr(leg, slot))
         if not len(samples.stamp_ns):
             continue

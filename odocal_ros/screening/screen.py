@@ -55,7 +55,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
             found.append(Reason(code, f'no {INPUTS[slot].label} message between the marks'))
     offset = offsets(config)
     if judged:
-        found += judge_clocks(leg, offset)
+        found += judge_clocks(leg, config)
 
     def rows(slot: str) -> tuple[Any, Floats]:
         return usable_rows(slot, leg, config, offset[slot], found)

@@ -6,7 +6,7 @@
 from functools import cache
 
 import pytest
-from streams import odometry_of, PIECE_NS, samples_of
+from streams import odometry_of, poses_of, samples_of
 
 from odocal_ros.data.samples import take
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -21,19 +21,6 @@ def drive():
                                imu_grade='industrial'))
 
 
-def fed(made, blocks):
-    """Return the odometry of the first 20 s of rows that come in pieces, and its poses."""
-    odometry, poses = odometry_of(made), []
-    first = int(made.imu.stamp_ns[0])
-    for begin in range(first, first + 20 * SECOND, PIECE_NS):
-        for slot, block in blocks.items():
-            rows = (block.stamp_ns >= begin) & (block.stamp_ns < begin + PIECE_NS)
-            if rows.any():
-                odometry.feed(slot, take(block, rows), made.form)
-        poses += odometry.poses()
-    return odometry, poses
-
-
 @pytest.mark.core
 @pytest.mark.parametrize('from_s', [1.0, 4.0, 6.0, 9.0])
 def test_it_does_not_start_across_a_gap_of_the_imu(from_s):
@@ -43,7 +30,9 @@ def test_it_does_not_start_across_a_gap_of_the_imu(from_s):
     blocks['imu'] = take(blocks['imu'], (t < 5.0) | (t > 10.0))
     begins = blocks['odometer'].stamp_ns > made.imu.stamp_ns[0] + int(from_s * SECOND)
     blocks['odometer'] = take(blocks['odometer'], begins)
-    odometry, poses = fed(made, blocks)
+    odometry, end_ns = odometry_of(made), made.imu.stamp_ns[0] + 20 * SECOND
+    poses = poses_of(odometry, {slot: take(block, block.stamp_ns < end_ns)
+                                for slot, block in blocks.items()}, made.form)
     assert odometry.restarts == 0
     since = (poses[0].stamp_ns - made.imu.stamp_ns[0]) / SECOND
     # two seconds of rows without a gap

@@ -143,3 +143,35 @@ def test_rows_of_another_recorder_are_held_uncopied():
     np.testing.assert_array_equal(both.rows('odometer_right').value, np.arange(100) * 7)
     assert both.newest_ns('odometer_right') == TOPICS['odometer'].stamp_ns[99]
     assert len(both.rows('imu').stamp_ns) == 50
+
+
+def block(begin_s, rows=5):
+    stamps = begin_s * S + np.arange(rows) * S // 10
+    return OdometerSamples(stamps, stamps, np.arange(rows))
+
+
+def kept(recorder, slot):
+    return len(recorder.snapshot().rows(slot).stamp_ns)
+
+
+def test_closing_legs_from_snapshots_does_not_keep_old_rows():
+    recorder = LegRecorder()
+    for second in range(1, 200):
+        recorder.feed('odometer', block(second))
+        if second % 20 == 0:
+            leg = recorder.snapshot().close((second - 10) * S, second * S, preroll=5.0)
+            assert len(leg.odometer.stamp_ns) == 15 * 5 + 2  # 5 + 10 s, the mark, one row beyond
+        recorder.forget_before((second - 15) * S)
+    assert kept(recorder, 'odometer') == 16 * 5
+
+
+def test_forgetting_one_topic_leaves_the_others_and_a_snapshot_its_rows():
+    recorder = LegRecorder()
+    for slot in ('odometer', 'odometer_right'):
+        for second in range(1, 10):
+            recorder.feed(slot, block(second))
+    copy = recorder.snapshot()
+    recorder.forget_before(6 * S, ('odometer',))
+    assert (kept(recorder, 'odometer'), kept(recorder, 'odometer_right')) == (4 * 5, 9 * 5)
+    recorder.feed('odometer', block(10))
+    assert (kept(copy, 'odometer'), copy.newest_ns('odometer')) == (9 * 5, round(9.4 * S))

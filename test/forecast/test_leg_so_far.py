@@ -10,13 +10,15 @@ from drives import changed, drive, held_up, seconds, settings
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
+from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
+from odocal_ros.forecast.ability import ability
 from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps
-from odocal_ros.forecast.progress import Travel
+from odocal_ros.forecast.progress import Progress, Travel
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import Config
 
 pytestmark = pytest.mark.core
 SECOND = 10**9
@@ -125,3 +127,15 @@ def test_impossible_values_change_no_distance_and_no_standstill(odd, quantity):
         found.append((travel.total, travel.still_s(), travel.top))
     assert found[1] == pytest.approx(found[0], abs=0.2)
     assert found[0][0] == pytest.approx(30.0, abs=0.3)
+
+
+@pytest.mark.core
+def test_with_an_imu_without_accelerometer_only_the_scale_is_observable():
+    stamps, rates = np.arange(1, 4) * SECOND, np.zeros((3, 3))
+    progress = Progress()
+    for force in (9.81, 0.0):
+        progress.feed('imu', ImuSamples(stamps, stamps, rates, rates + force, np.zeros((3, 4)),
+                                        np.full(3, np.nan)), Config(), None, 0.0)
+        words = ability(Config(), progress.received_before(600.0)).words()
+        assert ('observable: the scale; not observable: the yaw' in words) == (not force), words
+        assert ('the pitch (IMU without acceleration)' in words) == (not force)

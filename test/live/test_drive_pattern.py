@@ -71,20 +71,28 @@ class Robot:
 
 
 @contextlib.contextmanager
-def driven(kind=Twist, **settings):
-    """Yield node, client and robot, which drives; all end."""
+def ready(kind=Twist, before=lambda client: None, **settings):
+    """Yield node, client and robot; all end.   before : called before the node starts."""
     client = Client('drive_pattern')
     robot = Robot(client, kind)
+    before(client)
     node = NodeProcess(*given(SETTINGS | settings), module='drive_pattern')
     try:
         wait_for(lambda: 'ready: ' in node.text, 'the node')
-        wait_for(lambda: client.call('start').success, 'a start')
-        wait_for(lambda: (robot.commands or [(0.0, 0.0)])[-1] != (0.0, 0.0), 'a command')
         yield node, client, robot
     finally:
         node.end()
         robot.close()
         client.close()
+
+
+@contextlib.contextmanager
+def driven(kind=Twist, **settings):
+    """Yield node, client and robot, which drives; all end."""
+    with ready(kind, **settings) as (node, client, robot):
+        wait_for(lambda: client.call('start').success, 'a start')
+        wait_for(lambda: (robot.commands or [(0.0, 0.0)])[-1] != (0.0, 0.0), 'a command')
+        yield node, client, robot
 
 
 def stopped(node, robot, why, within_s):
@@ -169,20 +177,12 @@ def test_a_node_that_ends_stops_the_robot(number):
 
 
 def test_another_publisher_of_commands_is_refused():
-    client = Client('drive_pattern')
-    robot = Robot(client)
-    other = client.node.create_publisher(Twist, 'cmd_vel', 1)
-    node = NodeProcess(*given(SETTINGS), module='drive_pattern')
-    try:
-        wait_for(lambda: 'ready: ' in node.text, 'the node')
+    def other(client):
+        client.node.create_publisher(Twist, 'cmd_vel', 1)
+    with ready(before=other) as (_, client, robot):
         wait_for(lambda: client.call('start').message == (
             '/cmd_vel has 1 other publisher: end the other node, or remap one of them'), 'refusal')
         assert not robot.commands        # nothing is sent before a start
-        client.node.destroy_publisher(other)
-    finally:
-        node.end()
-        robot.close()
-        client.close()
 
 
 @pytest.mark.parametrize(('settings', 'message'), [

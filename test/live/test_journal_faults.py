@@ -22,10 +22,15 @@ NAME = '2026-01-02T03-04-05Z_leg_1'
 CHUNKS = 6
 
 
+def journal(root):
+    """Return the journal of a leg, not begun."""
+    return LegJournal(Plan(1, root, NAME, 'a: 1\n', 10**9),
+                      {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
+
+
 def driven(root):
     """Write a leg of six seconds and a mark added later; return its journal."""
-    one = LegJournal(Plan(1, root, NAME, 'a: 1\n', 10**9),
-                     {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
+    one = journal(root)
     said = []
     for k in range(CHUNKS):
         one.put([chunk(k)])
@@ -104,8 +109,7 @@ def test_a_disk_that_takes_no_more_keeps_what_it_took(tmp_path, monkeypatch, cod
 @pytest.mark.parametrize('where', ['root', 'leg'])
 def test_a_folder_that_is_removed_or_read_only_is_told_and_used_again(tmp_path, where):
     root = tmp_path / 'journal'
-    one = LegJournal(Plan(1, root, NAME, 'a: 1\n', 10**9),
-                     {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
+    one = journal(root)
     one.put([chunk(0)])
     folder = root if where == 'root' else root / NAME
     away = tmp_path / 'away'
@@ -121,8 +125,7 @@ def test_a_folder_that_is_removed_or_read_only_is_told_and_used_again(tmp_path, 
 
 
 def test_two_nodes_on_one_folder_have_journals_of_their_own(tmp_path):
-    both = [LegJournal(Plan(1, tmp_path, NAME, 'a: 1\n', 10**9),
-                       {1: Channel('/odometer', 'std_msgs/msg/Int64')}, []) for _ in range(2)]
+    both = [journal(tmp_path) for _ in range(2)]
     for k in range(CHUNKS):
         for n, one in enumerate(both):
             one.put([chunk(10 * n + k)])

@@ -1,11 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of the journal that need no node: settings, space, pre-roll, definitions."""
+"""Parts of the journal that need no node: settings, space, pre-roll, message definitions."""
 
 import json
 import math
 import os
+import sys
 
 import pytest
 import ros_bags
@@ -16,9 +17,10 @@ from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import pack
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.read import open_bag
+from odocal_ros.errors import BadConfig
 from odocal_ros.library.read_bag import journal_notes
 from odocal_ros.live import journal_leg, journal_writer
-from odocal_ros.live.definitions import _in_msg, definition_of
+from odocal_ros.live.definitions import _in_msg, definition_of, message_class
 from odocal_ros.live.journal import journal_text
 from odocal_ros.live.journal_leg import LegJournal, Plan
 from odocal_ros.live.journal_space import claim, journals, make_room, size_of
@@ -217,14 +219,32 @@ def test_fields_are_written_as_in_a_msg_file(about, base, text):
     'std_msgs/msg/Int32MultiArray', 'std_msgs/msg/UInt64', 'sensor_msgs/msg/BatteryState',
     'geometry_msgs/msg/TwistWithCovarianceStamped', 'shape_msgs/msg/SolidPrimitive'])
 def test_definitions_are_those_of_the_message_types(msgtype):
-    rclpy = pytest.importorskip('rclpy')
-    assert rclpy
+    pytest.importorskip('rclpy')
     from rosbags.typesys import get_types_from_msg
-
-    from odocal_ros.live.definitions import message_class
     found = get_types_from_msg(definition_of(message_class(msgtype)), msgtype)
     known = make.store().fielddefs
     assert msgtype in found
     for name, (_, fields) in found.items():
         # constants do not come through a message class, and no byte depends on them
         assert fields == known[name][1], name
+
+
+def test_a_message_type_is_imported():
+    pytest.importorskip('rclpy')
+    assert message_class('sensor_msgs/msg/Imu').__name__ == 'Imu'
+
+
+@pytest.mark.parametrize('name', [
+    'antigravity/msg/X', 'this/that/X', 'evil/msg/X', 'evil/run/X', '../msg/X', 'sensor_msgs/Imu',
+    'sensor_msgs/msg/imu', 'sensor_msgs/msg/_Imu', 'sensor_msgs/msg/Imu\n', '', 'sys/msg/X',
+    'os.path/msg/X', 'no_msgs/msg/Such'])
+def test_no_other_module_is_imported(name, tmp_path, monkeypatch):
+    (tmp_path / 'evil').mkdir()
+    (tmp_path / 'evil' / '__init__.py').write_text('import sys\nsys.evil = True\n')
+    (tmp_path / 'evil' / 'run.py').write_text('X = 1\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    before = set(sys.modules)
+    with pytest.raises(BadConfig, match='cannot be imported here'):
+        message_class(name)
+    assert not hasattr(sys, 'evil')
+    assert not {'antigravity', 'this', 'evil'} & (set(sys.modules) - before)

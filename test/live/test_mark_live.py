@@ -59,7 +59,7 @@ def session(drive, tmp_path_factory):
         seen = stopped(client, player, part(sent, at, at + 3.0), SPEED)
         seen.first, seen.second = first, second
         seen.node, seen.early, seen.turning, seen.answers = node, early, turning, answers
-        yield seen
+        return seen
 
 
 def test_a_mark_is_refused_without_a_leg_and_while_the_wheels_turn(session):

@@ -4,7 +4,6 @@
 """The node that applies a calibration, as a process over DDS, beside replay."""
 
 from types import SimpleNamespace
-from xml.etree import ElementTree
 
 from bench import Client, NodeProcess, ROOT, wait_for
 from drives import settings
@@ -12,6 +11,7 @@ from launch_stand_in import of_xml
 import numpy as np
 from player import Player, sent_of
 import pytest
+from test_policy import allowed, seen
 
 from odocal_ros.bagio import encode
 from odocal_ros.nav.alignment import Alignment
@@ -150,26 +150,16 @@ def test_the_launch_file_starts_it_with_both_files():
 
 
 def test_the_node_takes_its_own_settings_file_and_is_what_the_policy_allows(replayed):
-    policy = ElementTree.parse(ROOT / 'config' / 'sros2_policy.xml').getroot()
-    profile, = policy.findall('enclaves/enclave[@path="/odometry"]/profiles/profile')
-    allowed = {kind: {one.text for group in profile.findall(f'*[@{kind}="ALLOW"]')
-                      for one in group} for kind in ('publish', 'subscribe')}
+    wanted = allowed('/odometry')
     node = NodeProcess('--params-file', str(ROOT / 'config' / 'odometry.yaml'),
                        '--params-file', str(replayed.path), '-p', 'odometer.left:=topic', '-p',
                        'odometer.right:=topic', '-p', 'use_sim_time:=true', '-p',
                        'odometer.type:=std_msgs/msg/Int64', module='odometry')
     client = Client('odometry')
     try:
-        for kind, names in (('publish', 'get_publisher_names_and_types_by_node'),
-                            ('subscribe', 'get_subscriber_names_and_types_by_node')):
-            wanted = {name if name.startswith('/') else f'/{name}' for name in allowed[kind]}
-
-            def seen(names=names):
-                try:
-                    return {n for n, _ in getattr(client.node, names)('odometry', '/')}
-                except Exception:       # not in the graph yet
-                    return set()
-            wait_for(lambda seen=seen, wanted=wanted: seen() == wanted, f'{kind}: {wanted}')
+        for kind in ('publish', 'subscribe'):
+            wait_for(lambda kind=kind: seen(client, kind, 'odometry') == wanted[kind],
+                     f'{kind}: {wanted[kind]}')
     finally:
         assert node.end() == 0
         client.close()

@@ -34,10 +34,10 @@ def allowed(enclave):
     return found
 
 
-def seen(client, kind):
+def seen(client, kind, node='calibrator'):
     """Return the names of a kind that have been discovered so far, none of an unknown node."""
     with suppress(NodeNameNonExistentError):
-        return {name for name, _ in getattr(client.node, NAMES[kind])('calibrator', '/')}
+        return {name for name, _ in getattr(client.node, NAMES[kind])(node, '/')}
     return set()
 
 

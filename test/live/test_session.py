@@ -91,7 +91,7 @@ def test_undo_takes_the_last_leg_and_shows_its_marks():
     assert [leg.leg_id for leg in left] == [1]
     assert (session.leg_id, session.start_ns, session.stop_ns) == (2, 11, 15)
     assert (session.event, session.state) == ('undone', State.COMPUTING)
-    session.finish_undo(calibration(Code.LEG_TOO_SHORT))
+    session.settle(calibration(Code.LEG_TOO_SHORT))
     assert session.state is State.REJECTED
     assert session.begin_undo() == []
     assert (session.state, session.calibration) == (State.IDLE, None)

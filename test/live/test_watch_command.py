@@ -11,8 +11,11 @@ import subprocess
 import sys
 
 from bench import PATIENCE, ROOT, wait_for
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import pytest
+from std_msgs.msg import Float64, String
 
+from odocal_ros.live.status_listener import LATCHED, StatusListener
 from odocal_ros.live.watch_command import NEEDS
 
 ODOCAL = [sys.executable, '-m', 'odocal_ros.offline.cli', 'watch', '--once']
@@ -20,7 +23,6 @@ ODOCAL = [sys.executable, '-m', 'odocal_ros.offline.cli', 'watch', '--once']
 
 def test_hint_and_values_are_latched_in_standard_types(start, connect):
     from rclpy.qos import DurabilityPolicy, QoSProfile
-    from std_msgs.msg import Float64, String
     start('-p', 'result.scale_factor:=0.02', '-p', 'result.scale_factor_sigma:=0.00001', '-p',
           'result.valid:=true')
     client, received = connect(), {}
@@ -93,10 +95,6 @@ def test_the_bars_are_shares_of_what_is_asked():
 
 
 def test_what_anybody_publishes_does_not_reach_the_terminal():
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-    from std_msgs.msg import String
-
-    from odocal_ros.live.status_listener import LATCHED, StatusListener
     odd = 'waiting\x1b]52;c;eA==\x07\x1b]0;title\x07\u202e'
     with StatusListener('/odd') as listener:
         other = listener._node
@@ -112,3 +110,28 @@ def test_what_anybody_publishes_does_not_reach_the_terminal():
         assert len(said) < 3000
         assert (said + values['state']).isprintable()
         assert 'waiting' in said
+
+
+def test_a_status_comes_with_its_own_hint():
+    import rclpy
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node('sender', context=context)
+    status = node.create_publisher(DiagnosticArray, '/sent/status', LATCHED)
+    hint = node.create_publisher(String, '/sent/hint', LATCHED)
+
+    def send(number):
+        hint.publish(String(data=str(number)))
+        status.publish(DiagnosticArray(status=[DiagnosticStatus(
+            values=[KeyValue(key='number', value=str(number))])]))
+    with StatusListener('/sent') as listener:
+        send(0)
+        pairs = []
+        for _, values, text in listener:
+            pairs.append((values['number'], text))
+            if len(pairs) == 20:
+                break
+            send(len(pairs))
+    assert pairs == [(str(k), str(k)) for k in range(20)]
+    node.destroy_node()
+    context.try_shutdown()

@@ -140,6 +140,9 @@ def test_clocks_that_differ_refuse_the_leg_until_an_offset_is_set(leg, slot, set
     seen = float(codes[Code.CLOCKS_DIFFER].split('are ')[1].split(' s')[0])
     assert abs(seen - late) < 0.055       # fixes take 0.05 s to arrive, which looks the same
     assert f'to {setting}' in codes[Code.CLOCKS_DIFFER]
+    if slot == 'fix':       # positions of marks have IMU stamps
+        by_marks = with_settings(Config(), {'reference.points': [0.0, 0.0]})
+        assert Code.CLOCKS_DIFFER not in said(moved, by_marks)[1]
     inputs, codes, _ = said(moved, with_settings(Config(), {setting: -late}))
     assert Code.CLOCKS_DIFFER not in codes
     t = inputs.travel.t if slot == 'odometer' else inputs.t_fix

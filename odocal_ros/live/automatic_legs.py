@@ -16,7 +16,7 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, LegConfig
 
 
-class AutomaticWay(LegCompletion):
+class AutomaticLegs(LegCompletion):
     """
     Handle automatic legs: ``LegSearch`` finds them from the samples.
 
