@@ -31,7 +31,7 @@ OWN_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
 def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
                    spans: list[tuple[float, float]]) -> tuple[Alignment, tuple[Reason, ...]]:
     """
-    Return the alignment a drive will have, and what is to be said of it.
+    Return the alignment of a planned drive, and its reasons.
 
     drive : as planned.   config : grade, heading source and its sigma.   fix_sigma : of one fix,
     m, for a course.   spans : list of (begin, end) standstills, s.
@@ -53,7 +53,7 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
 
 
 def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade) -> Level:
-    """Return the level of a standstill from what its sensors will show on the mean."""
+    """Return the level of a standstill from the mean of its planned samples."""
     span = (span[0], min(span[1], drive.duration))
     k = int(np.searchsorted(drive.t, span[0]))
     C_bn = transpose(drive.C_nb[k])
@@ -64,7 +64,7 @@ def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade)
 
 
 def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
-    """Return the level that the first half minute of driving gives."""
+    """Return the level from the first half minute of driving."""
     pick = (drive.t >= 0.0) & (drive.t <= MOTION_LEVEL)
     if pick.sum() < 2:
         pick = np.arange(len(drive.t)) < 2
@@ -79,7 +79,7 @@ def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
 
 def _heading(drive: PlannedDrive, config: AlignmentConfig, fix_sigma: float, level: Level,
              grade: Grade) -> tuple[float, float, str, tuple[Reason, ...]]:
-    """Return yaw, sigma and source of the heading, and what is to be said of it."""
+    """Return yaw, sigma and source of the heading, and its reasons."""
     yaw = float(np.interp(level.t, drive.t, drive.yaw))
     source = config.heading_source
     why: tuple[Reason, ...] = ()

@@ -37,9 +37,9 @@ class Running:
     """
     The running estimate.
 
-    method : as the leg would come out, ended here.   sigmas : (3,) of ln scale, yaw, pitch, rad,
-    of what is not determined too.   distance : m.   agility : m^2/s^3, square of the horizontal
-    acceleration summed up.   speed : m/s, usual.
+    method : the result if the leg ended here.   sigmas : (3,) of ln scale, yaw, pitch, rad, also
+    of values that are not determined.   distance : m.   agility : m^2/s^3, sum of the squared
+    horizontal acceleration.   speed : m/s, median.
     """
 
     method: MethodResult
@@ -58,7 +58,7 @@ class SmootherSoFar:
 
     @property
     def once_s(self) -> float:
-        """Return the seconds of CPU in the last look for what is done ever less often."""
+        """Return the CPU time of the last update for work that is done ever less often, s."""
         return self._growing.once_s
 
     def look(self, leg: Leg, config: Config, wanted: Callable[[], bool] = lambda: True) -> Running:

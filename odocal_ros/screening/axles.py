@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The axles of a vehicle: those that count, and those that steer."""
+"""The axles of a vehicle: which ones count, and which ones steer."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -36,7 +36,7 @@ def axles_of(wheels: Sequence[T]) -> list[tuple[T, ...]]:
 def judged_axles(wheels: Wheels, imu: Imu,
                  between: tuple[float, float]) -> tuple[Wheels, list[Reason]]:
     """
-    Return the wheels that count, steered ones marked, and the reasons.
+    Return the wheels that count, with the distance ahead of steered ones, and reasons.
 
     imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   between : s, the marks.
 

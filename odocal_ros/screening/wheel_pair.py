@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Two wheels and the gyro on one time grid, and the line that joins them."""
+"""Two wheels and the gyro on one time grid, and a robust linear fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ TUKEY = 4.685
 @dataclass(frozen=True, eq=False)
 class Pair:
     """
-    Ways of both wheels and the vehicle's turn at the edges of equal cells.
+    Travel of both wheels and the vehicle's turn at the edges of equal cells.
 
     t : (n,) s.   left, right : (n,) scale units.   turn : (n,) rad about the vehicle's up axis,
     gyro bias and all.   known : (n - 1,) cells within no gap.   quantum : scale units.
