@@ -21,6 +21,7 @@ from odocal_ros.nav.alignment import (
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, gravity
 from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_multiply, transpose
+from odocal_ros.pipeline.align import choose_standstill
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import AlignmentConfig, Config
 from odocal_ros.settings.grades import Grade, grade_of
@@ -37,10 +38,10 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
     m, for a course.   spans : list of (begin, end) standstills, s.
     """
     grade = grade_of(config.imu)
-    before = [span for span in spans if span[0] <= 0.5]
+    span = choose_standstill(spans)
     found: tuple[Reason, ...] = ()
-    if before:
-        level = _level_at_rest(drive, before[-1], grade)
+    if span is not None:
+        level = _level_at_rest(drive, span, grade)
     else:
         level = _level_in_motion(drive, grade)
         found = (Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level and gyro '

@@ -7,8 +7,9 @@ Alignment of a leg: which standstill, which heading source.
 Pure: takes screened inputs, returns an Alignment and its reasons.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -37,6 +38,7 @@ from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
 
+Span = TypeVar('Span', Floats, tuple[float, float])
 Found = tuple[tuple[float, float] | None, str]      # yaw and sigma, rad; or None and why
 
 
@@ -61,7 +63,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     return complete(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
 
 
-def choose_standstill(spans: Floats) -> Floats | None:
+def choose_standstill(spans: Iterable[Span]) -> Span | None:
     """Return the standstill that holds or last ended before the start mark (t = 0), or None."""
     before = [s for s in spans if s[0] <= 0.5]
     return before[-1] if before else None

@@ -115,8 +115,7 @@ def _square(own: Travel, other: Travel, imu: Imu, between: tuple[float, float],
     keep = np.logical_and.reduceat(two.known, at[:-1])[:len(y)] & (np.abs(y) > 2 * two.quantum)
     if keep.sum() < CELL or not A[keep, 1].any():
         return 0.0, 0.0
-    x, covariance, _ = robust_fit(A[keep], y[keep], 0.3 * two.quantum + 1e-4 * float(
-        np.median(np.abs(y[keep]))))
+    x, covariance, _ = robust_fit(A[keep], y[keep], two.least_sigma(y[keep]))
     beyond = abs(x[1]) * np.abs(A[keep, 1]).sum() > LEAST_STEERED * np.abs(y[keep]).sum()
     return (float(x[1]), float(np.sqrt(covariance[1, 1]))) if beyond else (0.0, 0.0)
 

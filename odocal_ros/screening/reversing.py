@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.pieces import runs
 from odocal_ros.nav.integral import integral_at, integrals_at, twice_integrals_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
@@ -119,10 +120,8 @@ def _stretches(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
         return np.empty(0, int), np.empty(0, int)
     stands_of_top = 0.02    # of the top speed: below it is a stop
     stands = speed <= max(1.01 * travel.quantum / PUSH_TIME, stands_of_top * top)
-    edge = np.flatnonzero(np.diff(stands.astype(int)))
-    begins = edge[stands[edge]] + 1
-    ends = np.append(edge[~stands[edge]], len(t) - 1)
-    ends = ends[np.searchsorted(ends, begins)]
+    moving = runs(~stands) - [0, 1]
+    begins, ends = moving[moving[:, 0] > 0].T
     long = (ends - begins) * REVERSING_STEP > 2 * PUSH_TIME
     return begins[long], ends[long]
 

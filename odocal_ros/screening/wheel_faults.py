@@ -57,7 +57,7 @@ def broken_wheels(axle: Sequence[Travel], imu: Imu,
     if keep.sum() < 10:
         return _dead(two, steps, held)
     A = np.stack([steps[0], turn, np.full(len(turn), FAULT_GRID)], -1)
-    x, covariance = _line(A[keep], steps[1][keep], _floor(two, steps))
+    x, covariance = _line(A[keep], steps[1][keep], two.least_sigma(steps))
     held = [_not_pivoting(held[k], steps, A, x, k) for k in (0, 1)]
     return _dead(two, steps, held) + _reversed(two, steps, A @ x, x[0], covariance[0, 0],
                                                imu)
@@ -84,10 +84,6 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     left_over = [np.minimum(1.0, ((y - A @ x) / (
         TUKEY * np.hypot(least, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
     return fits[int(np.argmin(left_over))][:2]
-
-
-def _floor(two: Pair, steps: Floats) -> float:
-    return 0.3 * two.quantum + 1e-4 * float(np.median(np.abs(steps)))
 
 
 def _rolling(steps: Floats, quantum: float) -> Bools:

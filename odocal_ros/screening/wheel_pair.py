@@ -45,6 +45,10 @@ class Pair:
         length: float = self.t[1] - self.t[0]
         return length
 
+    def least_sigma(self, steps: Floats) -> float:
+        """Return the least sigma of steps: rounding, and a part of their median."""
+        return 0.3 * self.quantum + 1e-4 * float(np.median(np.abs(steps)))
+
 
 def pair(axle: Sequence[Travel], imu: Imu, between: tuple[float, float], step: float,
          doubt_t: Sequence[float] | Floats = ()) -> Pair | None:
