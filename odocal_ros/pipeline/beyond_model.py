@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Errors that no method models: coarse speeds, slow wheel slip, unknown slopes; delays that it saw.
+Errors that no method models (coarse speeds, slow wheel slip, unknown slopes), and delays.
 
 Errors of the scale go into the sigmas and the budget of a method, delays into a note with the
 setting that corrects them.
