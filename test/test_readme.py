@@ -119,12 +119,13 @@ def test_settings_and_reasons_named_in_the_text_exist():
 
 def test_the_node_offers_what_the_page_lists():
     pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
-    from odocal_ros.live import node, topic_input
+    from odocal_ros.data.inputs import TOPICS
+    from odocal_ros.live import node
     from odocal_ros.live.publishing import PLOTTED
     topics = {'status', 'hint', 'scale_factor', 'yaw_mounting_angle'}     # and `_sigma`
     assert topics | {f'{name}_sigma' for name in topics} >= set(PLOTTED)
     page = (ROOT / 'docs' / 'interface.md').read_text(encoding='utf-8')
     services = set(re.findall(r'`~/(\w+)`', page)) - topics
     assert services == set(node.SERVICES)
-    for topic in topic_input.TOPICS.values():
+    for topic in TOPICS.values():
         assert f'`{topic}`' in page, topic

@@ -4,7 +4,7 @@
 """
 Values that a drive can determine with these settings and inputs, before it is driven.
 
-Asked of the code that will judge the leg: the alignment it will have, the methods that run.
+By the code that will process the leg: its alignment and its methods.
 """
 
 from collections.abc import Sequence
@@ -21,21 +21,21 @@ from odocal_ros.pipeline.methods import METHODS
 from odocal_ros.screening.glitches import Oriented, oriented
 from odocal_ros.settings.config import Config, with_settings
 
-EXACT_HEADING = 1e-6      # rad; judgement: of a heading that is said to be known exactly
-COURSE_FIX_SIGMA = 1.5    # m; physical: of a single receiver, that a course may come from
+EXACT_HEADING = 1e-6      # rad; judgement: of a heading with a configured sigma of 0
+COURSE_FIX_SIGMA = 1.5    # m; physical: fixes of a single receiver, for a course
 SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topic',
            'imu_orientation': 'the IMU orientation', 'gyrocompass': 'the gyrocompass'}
-ALL_SAMPLES = 'smoother'   # the method that needs no heading from outside
+ALL_SAMPLES = 'smoother'   # the method that needs no external heading
 
 
 @dataclass(frozen=True)
 class Received:
     """
-    What came before the start mark.
+    Samples received before the start mark.
 
-    variances : of the yaw, rad^2, that ``heading_topic`` and ``imu_orientation`` state, inf where
-    none is sent.   rested_s : length of the standstill that the leg begins with, or last had.
-    latitude : rad.   height : the fixes carry one.   felt : the IMU has an accelerometer.
+    variances : of the yaw, rad^2, in ``heading_topic`` and ``imu_orientation``, inf if none is
+    sent.   rested_s : length of the current or last standstill.   latitude : rad.   height : the
+    fixes have one.   felt : the IMU has an accelerometer.
     """
 
     variances: dict[str, float]
@@ -105,7 +105,7 @@ def _of_two_wheels(config: Config) -> list[tuple[bool, str]]:
 
 
 def _alignment(config: Config, received: Received) -> Alignment:
-    """Return the alignment that a drive straight on from here will have."""
+    """Return the alignment of a drive straight on from here."""
     rest = received.rested_s if received.rested_s >= config.leg.standstill else 0.0
     t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
     drive = from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
@@ -115,7 +115,7 @@ def _alignment(config: Config, received: Received) -> Alignment:
 
 
 def stated_variance(sent: Oriented) -> float:
-    """Return the variance of the yaw that orientations as sent state, rad^2; inf: none is sent."""
+    """Return the yaw variance stated by orientations as sent, rad^2; inf if none is sent."""
     variance = oriented(sent).yaw_variance
     stated = variance[~np.isnan(variance)]
     return float(np.median(stated)) if len(stated) else math.inf
@@ -125,8 +125,8 @@ def with_heading(config: Config, variances: dict[str, float]) -> Config:
     """
     Return config with the heading source, and its sigma, that the alignment will find.
 
-    variances : as in ``Received``. What is left ``auto`` is a gyrocompass or the course, as the
-    alignment itself decides.
+    variances : as in ``Received``. If the source stays ``auto``, the alignment selects gyrocompass
+    or course.
     """
     asked = config.alignment
     source, sigma = asked.heading_source, max(asked.heading_sigma, EXACT_HEADING)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is foreseen of a leg while it is recorded, and how it is said."""
+"""The forecast of a leg while it is recorded, and its text."""
 
 from dataclasses import dataclass, field, replace
 import math
@@ -11,10 +11,9 @@ import numpy as np
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.reasons import Reason
 
-PERCENT_FROM = 0.01       # judgement: relative sigma from which it is said in per cent
-FARTHEST_M = 2e4          # judgement: who must drive on for more needs something else
-# judgement: standstill at a predicted end; it gives the level and the gyro
-# bias
+PERCENT_FROM = 0.01       # judgement: relative sigma from which it is printed in per cent
+FARTHEST_M = 2e4          # judgement: limit of a useful forecast of the remaining distance
+# judgement: standstill at a predicted end; it gives the level and the gyro bias
 REST_FORESEEN_S = 10.0
 SOURCE_SHARE = 0.01    # judgement: of the variance; smaller sources are not listed
 # estimate: unit at the end of its key
@@ -22,20 +21,20 @@ RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_ang
 
 
 class Abandoned(Exception):
-    """The leg is over: what it might have become is of no more interest."""
+    """The leg is over: its forecast is not needed."""
 
 
 @dataclass(frozen=True)
 class Prospect:
     """
-    What is foreseen of one parameter.
+    The forecast of one parameter.
 
-    sigma, asked : relative or rad; sigma None: not determined by the data so far.
+    sigma, asked : relative or rad, asked: required; sigma None: not determined so far.
     metres : m more for the limit, 0: reached, None: unreachable.
-    sources : (name, sigma) of the errors that matter, the largest first.
+    sources : (name, sigma) of the largest errors, in order.
     why : cause why more driving does not reach the limit.
-    now : the value so far, for people, if it is determined before the end.
-    lack : what to drive for it, besides metres.
+    now : the value so far, as text, if it is determined before the end.
+    lack : manoeuvres for it, besides metres.
     """
 
     sigma: float | None
@@ -47,7 +46,7 @@ class Prospect:
     lack: str = ''
 
     def words(self, name: str, unit: str, factor: float) -> str:
-        """Return it for people, sigmas times ``factor`` in ``unit``."""
+        """Return it as text, sigmas times ``factor`` in ``unit``."""
         if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
             unit, factor = '%', 100.0
         asked = three_digits(self.asked * factor)
@@ -84,12 +83,12 @@ class WheelsForecast:
 @dataclass(frozen=True)
 class Forecast:
     """
-    What is foreseen of a leg that ends where the vehicle is.
+    The forecast of a leg that ends at the current position.
 
-    pitch : rad, sigma.   wheels : None with one counter, and where nothing could be said yet.
-    methods : what those say that need no end of the drive.   estimates : the running estimate,
-    each value by the method that will give it.   until_ns : stamp up to which it was looked at.
-    faults : what a method would reject the leg for however far it goes.
+    pitch : rad, sigma.   wheels : None with one counter, and before the first estimate.
+    methods : results of methods that need no end of the drive.   estimates : the running
+    estimate, each value by the method that will give it.   until_ns : stamp of the newest sample
+    used.   faults : reasons for which a method will reject the leg, however long it is.
     """
 
     scale: Prospect
@@ -108,7 +107,7 @@ class Forecast:
                 'left_right': of_wheels.left_right, 'track_width': of_wheels.track_width}[quantity]
 
     def words(self) -> str:
-        """Return it as a sentence: what is enough, what more makes it so, what never will be."""
+        """Return it as a sentence: limits reached, remaining distances, limits out of reach."""
         return '; '.join([self.scale.words('scale', 'ppm', 1e6),
                           self.yaw.words('yaw', 'deg', math.degrees(1))])
 
@@ -160,7 +159,7 @@ def _better(earlier: Prospect, newest: Prospect) -> Prospect:
 
 def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str, str | float]:
     """
-    Return the keys of ``~/status``; what is not foreseen is empty.
+    Return the keys of ``~/status``; values without forecast are empty.
 
     age_s : age of the newest sample of the forecast.
     """

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Foresight: how good a leg would be if it ended here, and how far to drive until it is good enough.
+Forecast of a leg: its sigmas if it ended here, and the remaining distance to the limits.
 
-Foreseen for a vehicle that comes to rest where it is and stands for REST_FORESEEN_S in all, with
-the start mark and the recorded path. Shown to the operator, never part of a result.
+For a vehicle that stops at its current position and stands for REST_FORESEEN_S in total, with the
+start mark and the recorded path. Shown to the operator, never part of a result.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,7 @@ from odocal_ros.forecast.smoother_so_far import SmootherSoFar
 from odocal_ros.screening.leg_kind import felt
 from odocal_ros.settings.config import Config
 
-DRIVE_ROWS = 1000         # judgement: of the drive that a prediction is made from
+DRIVE_ROWS = 1000         # judgement: of the drive of a prediction
 # judgement: this many orientations, until this time after the start mark, give their accuracy
 ORIENTATION_NS, ORIENTATION_ROWS = 10**9, 100
 DRIVE_ON = 'drive on with stops, starts and turns'
@@ -75,10 +75,10 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
     Return the forecast of a leg that ends here, and the reasons of its methods so far.
 
     leg : the data so far; its last row is the current position.   fix_rate : Hz.   config : as
-    frozen into the leg.   wanted : asked now and then; Abandoned is raised when it says no.
-    smoother : that of this leg; looks go from the one before to the next.
+    frozen into the leg.   wanted : called sometimes; if False, Abandoned is raised.   smoother :
+    that of this leg; each update starts from the previous one.
 
-    Raises OdocalError: nothing can be foreseen yet: no motion, no fixes, scale unknown.
+    Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
     """
     running = look(leg, config, smoother, wanted)
     if deciding(config.method) == ONLY or gives_all(running):     # the ends add nothing to it
@@ -152,7 +152,7 @@ def _heading_found(leg: Leg, config: Config) -> Config:
 
 
 def _thinned(drive: PlannedDrive) -> PlannedDrive:
-    """Return a drive of not many rows; where it stops and starts it stays as it is."""
+    """Return a drive with at most about DRIVE_ROWS rows; its stops and starts are kept."""
     rest = np.abs(drive.speed) <= REST_SPEED
     change = np.flatnonzero(np.diff(rest))
     if len(change) > DRIVE_ROWS // 4:
@@ -164,7 +164,7 @@ def _thinned(drive: PlannedDrive) -> PlannedDrive:
 
 
 def _at_rest(drive: PlannedDrive, wanted: Callable[[], bool]) -> DriveSoFar:
-    """Return the drive with as much rest at its end as makes REST_FORESEEN_S seconds."""
+    """Return the drive with a standstill of REST_FORESEEN_S seconds at its end."""
     moving = np.flatnonzero(np.abs(drive.speed) > REST_SPEED)
     rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0
     if rested < REST_FORESEEN_S:

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Ideal samples of a planned drive: what IMU, odometer and fixes would show without any error."""
+"""Ideal samples of a planned drive: IMU, odometer and fixes without any error."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ class Ideal:
     A planned drive as the smoother sees it, free of errors.
 
     leg : its samples; fixes and headings are thinned to one for each keyframe or so.
-    imu : their IMU steps with keyframes.     state : what is true at the keyframes.
+    imu : their IMU steps with keyframes.     state : true state at the keyframes.
     fixes_in_one : how many fixes each fix of the leg stands for.
     """
 
@@ -57,9 +57,9 @@ class _Motion:
 
 def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
     """
-    Return the samples that a drive would give were nothing in error.
+    Return the samples of a drive without any error.
 
-    drive : as planned. Mounting angles are zero, the scale is 1: a sigma does not hang on them.
+    drive : as planned. Mounting angles are zero, the scale is 1: sigmas do not depend on them.
     sigmas : lever arms, fix rate and sigma, size of a count, heading from outside.   spacing : s
     between keyframes.
     """
@@ -68,7 +68,7 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
     before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = max(min(0.0, float(before[-1][0])), -config.leg.preroll) if before else 0.0
     origin = Origin(drive.latitude, drive.longitude, drive.height)
-    sample_rate = 20.0    # Hz: the noise of a second does not hang on how often it is sampled
+    sample_rate = 20.0    # Hz: the noise of a second does not depend on the sample rate
     samples_enough = 50    # samples between keyframes that lie far apart
     rate = min(sample_rate, samples_enough / spacing)
     t = np.linspace(t_begin, drive.duration,
@@ -115,7 +115,7 @@ def _times(begin: float, end: float, rate: float, spacing: float) -> Floats:
 
 
 def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float) -> Heading:
-    """Return the heading that the settings promise; a course is none, and none a gyrocompass."""
+    """Return the external heading of the settings; none for a course or a gyrocompass."""
     asked, sigma = config.alignment.heading_source, config.alignment.heading_sigma
     if asked == 'fixed' or asked == 'auto' and not np.isnan(config.alignment.heading):
         t, noise, asked = np.zeros(1), GIVEN_HEADING_NOISE, 'fixed'

@@ -25,7 +25,7 @@ from odocal_ros.screening.inputs import Inputs, place, Placed
 from odocal_ros.screening.screen import imu_gap
 from odocal_ros.settings.config import Config, SETTINGS, with_settings
 
-SILENT_TIME = 0.9    # s; judgement: what comes in no order may be as late; said within a second
+SILENT_TIME = 0.9    # s; judgement: delay of rows out of order; reported within a second
 
 
 class ImuGaps:
@@ -37,7 +37,7 @@ class ImuGaps:
         self._edges_ns: list[int] = []      # on both sides of a gap
 
     def feed(self, block: ImuSamples) -> int:
-        """Take IMU rows; return where they go on after a gap, 0 without one."""
+        """Take IMU rows; return the stamp after a gap, 0 without a gap."""
         stamps = block.stamp_ns[block.stamp_ns > self._newest_ns]
         if not len(stamps):
             return 0
@@ -59,7 +59,7 @@ class ImuGaps:
         return imu_gap(np.union1d(sound, t), 0.0, float(end), self._limit_s)
 
 
-@lru_cache(maxsize=1)      # faults and running estimate of one look ask of the same leg
+@lru_cache(maxsize=1)      # faults and running estimate of one update use the same leg
 def screened_in_cells(leg: Leg, config: Config) -> Screened:
     """Return the inputs of a leg whose IMU rows are means over cells of time."""
     return screened(leg, _with_cells(leg, config))
@@ -71,7 +71,7 @@ def faults_in_cells(leg: Leg, config: Config) -> tuple[Reason, ...]:
 
 
 def _with_cells(leg: Leg, config: Config) -> Config:
-    """Return config with cells to be no gaps of the IMU."""
+    """Return config with an IMU gap limit that cells do not exceed."""
     cell_s = float(np.median(np.diff(leg.imu.stamp_ns))) * 1e-9 if len(leg.imu.stamp_ns) > 1 \
         else 0.0
     limit_s = min(config.leg.max_gap + 2 * cell_s, SETTINGS['leg.max_gap'].high or math.inf)

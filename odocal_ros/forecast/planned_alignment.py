@@ -21,6 +21,7 @@ from odocal_ros.nav.alignment import (
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, gravity
 from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_multiply, transpose
+from odocal_ros.pipeline.align import choose_standstill
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import AlignmentConfig, Config
 from odocal_ros.settings.grades import Grade, grade_of
@@ -31,16 +32,16 @@ OWN_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
 def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
                    spans: list[tuple[float, float]]) -> tuple[Alignment, tuple[Reason, ...]]:
     """
-    Return the alignment a drive will have, and what is to be said of it.
+    Return the alignment of a planned drive, and its reasons.
 
     drive : as planned.   config : grade, heading source and its sigma.   fix_sigma : of one fix,
     m, for a course.   spans : list of (begin, end) standstills, s.
     """
     grade = grade_of(config.imu)
-    before = [span for span in spans if span[0] <= 0.5]
+    span = choose_standstill(spans)
     found: tuple[Reason, ...] = ()
-    if before:
-        level = _level_at_rest(drive, before[-1], grade)
+    if span is not None:
+        level = _level_at_rest(drive, span, grade)
     else:
         level = _level_in_motion(drive, grade)
         found = (Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level and gyro '
@@ -53,7 +54,7 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
 
 
 def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade) -> Level:
-    """Return the level of a standstill from what its sensors will show on the mean."""
+    """Return the level of a standstill from the mean of its planned samples."""
     span = (span[0], min(span[1], drive.duration))
     k = int(np.searchsorted(drive.t, span[0]))
     C_bn = transpose(drive.C_nb[k])
@@ -64,7 +65,7 @@ def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade)
 
 
 def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
-    """Return the level that the first half minute of driving gives."""
+    """Return the level from the first half minute of driving."""
     pick = (drive.t >= 0.0) & (drive.t <= MOTION_LEVEL)
     if pick.sum() < 2:
         pick = np.arange(len(drive.t)) < 2
@@ -79,7 +80,7 @@ def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
 
 def _heading(drive: PlannedDrive, config: AlignmentConfig, fix_sigma: float, level: Level,
              grade: Grade) -> tuple[float, float, str, tuple[Reason, ...]]:
-    """Return yaw, sigma and source of the heading, and what is to be said of it."""
+    """Return yaw, sigma and source of the heading, and its reasons."""
     yaw = float(np.interp(level.t, drive.t, drive.yaw))
     source = config.heading_source
     why: tuple[Reason, ...] = ()

@@ -37,7 +37,7 @@ class PlannedDrive:
     """
     A drive by time; the start mark is at 0, the stop mark at the last time.
 
-    t : (m,) s, rising; what lies before 0 is for the alignment.
+    t : (m,) s, rising; times before 0 are for the alignment.
     speed : (m,) m/s of the odometer's point, negative backwards.
     yaw : (m,) rad, of the vehicle, ENU.    slope : (m,) rad, nose up.
     latitude, longitude, height : rad, rad, m of the start.
@@ -179,7 +179,7 @@ def left_and_right_turns(drive: PlannedDrive) -> PlannedDrive:
 
 
 def town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
-    """Return the drive with so many minutes of stop and go, with turns, before its last rest."""
+    """Return the drive with minutes of stop and go, with turns, before its last standstill."""
     moving = int(np.flatnonzero(np.abs(drive.speed) > REST_SPEED)[-1])
     k = min(moving + 1, len(drive.t) - 1)
     v, yaw = drive.speed[k], 0.0
@@ -215,7 +215,7 @@ def inserted(drive: Drive, k: int, t: Floats, speed: Floats, turned: Floats) -> 
 
 
 def _amid(drive: PlannedDrive) -> int:
-    """Return the row nearest to the middle of the path among those near the greatest speed."""
+    """Return the row nearest to the middle of the path among those near the top speed."""
     speed = np.where(drive.t >= 0, np.abs(drive.speed), 0.0)
     near_top = 0.9    # of the greatest speed: where there is room for a manoeuvre
     fast = np.flatnonzero(speed >= near_top * speed.max())

@@ -29,7 +29,7 @@ from odocal_ros.reasons import Code, Reason, Verdict, verdict_of
 from odocal_ros.settings.grades import grade_of
 
 WIDEST_SPACING = 5.0    # s, judgement: between keyframes of a planned drive
-SWAY_RATE = 10.0        # Hz, definition: of the white noise that sigmas.sway is said for
+SWAY_RATE = 10.0        # Hz, definition: of the white noise of sigmas.sway
 
 
 def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
@@ -58,7 +58,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
 
 
 def spacing_for(drive: PlannedDrive) -> float:
-    """Return the seconds between keyframes that a drive is predicted with."""
+    """Return the time between keyframes for the prediction of a drive, s."""
     # keyframes lie farther apart in longer drives: sigmas come out 5 to 10 % too large at
     # WIDEST_SPACING, more beyond two hours, longer than a live leg may last; never too small
     enough_intervals, most_intervals = 600, 1440
@@ -68,11 +68,11 @@ def spacing_for(drive: PlannedDrive) -> float:
 
 def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) -> Levels:
     """
-    Return the noise that a drive is planned with, where a fit would estimate it.
+    Return the noise levels of a planned drive, which a fit would estimate.
 
-    IMU by its grade; wheels that slip by ``sigmas.slip``, slide and bounce by ``sigmas.sway``;
-    fixes of the stated sigma, white, or white to WHITE_SHARE of it besides a time-correlated part
-    for the correlation time. Never less than the smoother's own bounds.
+    IMU by its grade; wheel slip by ``sigmas.slip``, sideways and vertical motion by
+    ``sigmas.sway``; fixes of the stated sigma, white, or white to WHITE_SHARE of it besides a
+    time-correlated part for the correlation time. Never less than the smoother's own bounds.
     """
     grade = grade_of(sigmas.config.imu)
     road = dict.fromkeys(SLIPPING, sigmas.sway**2 / SWAY_RATE)
@@ -91,7 +91,7 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
 
 
 def _fit(problem: Problem, made: Ideal, levels: Levels) -> Fit:
-    """Return the fit that stands where it is: no step is taken."""
+    """Return the fit at the true state, without any step."""
     state, priors = made.state, problem.priors
     weighted = Equations(problem, state, priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), True, False, 0,
@@ -101,12 +101,12 @@ def _fit(problem: Problem, made: Ideal, levels: Levels) -> Fit:
 @dataclass(frozen=True, eq=False)
 class Plan:
     """
-    What a drive will give.
+    The prediction of a drive.
 
-    two_point : the operator's own marks, with alignment and drive.
-    methods : by name, those predicted; what each says of the alignment is said with it.
-    estimates : each parameter by the method that will give it, as a result has it.
-    deciding : the methods of ``methods`` that may give.
+    two_point : by the operator's own marks, with alignment and drive.
+    methods : by name, those predicted, with their reasons on the alignment.
+    estimates : each parameter by the method that will give it, as in a result.
+    deciding : the methods of ``methods`` that may give a parameter.
     """
 
     two_point: Prediction
@@ -150,8 +150,8 @@ class Plan:
         """
         Return the reasons of the prediction.
 
-        Of the drive; of methods that give; and why the others that might have been the result
-        give nothing, the smoother's refusals always.
+        Of the drive; of methods that give a parameter; and the refusals of the others that may
+        give one, those of the smoother always.
         """
         said = list(self.two_point.of_drive)
         for name in self.methods:

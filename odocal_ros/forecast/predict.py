@@ -4,9 +4,8 @@
 """
 Prediction: the sigmas a leg will have, before it is driven or while it is.
 
-The planned drive becomes what a recorded one becomes, a track, two marks and an alignment, and
-goes through ``two_point.fit``: the predicted sigma and that of a result are one budget, computed
-by one code path.
+The planned drive is converted to a track, two marks and an alignment, as a recorded one, and goes
+through ``two_point.fit``: predicted sigmas and those of results have the same budget.
 """
 
 from collections.abc import Sequence
@@ -37,7 +36,7 @@ SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive determi
 @dataclass(frozen=True, kw_only=True)
 class Sigmas:
     """
-    Error figures a drive is planned with, 1 sigma.
+    Errors of a planned drive, 1 sigma.
 
     config : grade of the IMU (imu.*), heading source and its sigma (alignment.*; ``auto`` takes
     the given heading sigma where the source is set, else a gyrocompass if the gyro allows, else
@@ -86,11 +85,10 @@ class Sigmas:
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """
-    What a drive will give by one method.
+    The prediction of a drive by one method.
 
-    method : as a result has it; scale factor 1, angles 0, sigmas and budget as they will be
-    (scale relative). reasons : what is said of drive and method.    of_drive : those of the drive
-    alone, whatever the method.
+    method : as in a result; scale factor 1, angles 0, sigmas and budget as they will be (scale
+    relative).    reasons : of drive and method.    of_drive : those of the drive, for all methods.
     distance, chord : m.    duration : s.    standing : s of rest for each mark, 0 in motion.
     """
 
@@ -150,7 +148,7 @@ def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: flo
     """
     Return the straight distance, m, that brings a sigma down to its limit.
 
-    None where no distance up to ``farthest`` m does: a two-point yaw is never better than its
+    None if no distance up to ``farthest`` m is enough: a two-point yaw is never better than its
     heading.
     """
     def enough(metres: float) -> bool:

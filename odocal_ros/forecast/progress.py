@@ -24,16 +24,16 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_APART, DAY_NS, FASTEST
 from odocal_ros.settings.nominal import nominal_scale
 
-IMU_BLOCKS = 40       # judgement: newest, that rows of others are laid beside: some seconds
-CLOCK_ROWS = 10       # judgement: newest of a topic that determine its clock
-SPEED_SPAN_NS = 10**9       # judgement: speeds are taken over that long, or longer
+IMU_BLOCKS = 40       # judgement: newest blocks that other topics are compared with: some seconds
+CLOCK_ROWS = 10       # judgement: newest rows of a topic that determine its clock
+SPEED_SPAN_NS = 10**9       # judgement: minimum time over which a speed is computed
 STANDING_S = 0.5            # judgement: without a count, the vehicle stands
 SHORTEST_REST_NS = 10**9    # judgement: a shorter pause is no standstill
 
 
 class Clocks:
     """
-    Compares the stamps of rows that arrived together: whose clock differs from the IMU's.
+    Compares stamps of rows that arrive together: finds clocks that differ from the IMU's.
 
     simulated : arrivals are times of the node's clock at reception, not at sending.
     """
@@ -56,8 +56,8 @@ class Clocks:
         received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
         first_received, first_stamp = int(received[0]), int(stamps[0])
         received, stamps = received - first_received, stamps - first_stamp
-        # messages that queued for a node in simulated time arrive late, the IMU's more so than
-        # others': which of them belong together is not known then
+        # messages that queue for a node in simulated time arrive late, those of the IMU more than
+        # others: then it is not known which of them belong together
         queued = self._simulated and np.ptp(received - stamps) > CLOCK_APART * 1e9
         for name, (row_ns, stamp_ns) in list(self._waiting.items()):
             row = row_ns - first_received
@@ -73,8 +73,8 @@ class Clocks:
         result = []
         for slot, ahead in self._ahead_s.items():
             offset = offsets(config)[slot]
-            # latency makes a row look older: only a clock whose freshest row is behind, is behind;
-            # that of an IMU's row makes others look newer: ahead are those of whom most are
+            # latency makes a row look older: a clock is only behind if its newest row is; latency
+            # of IMU rows makes others look newer: a clock is ahead if most of its rows are
             value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
             if abs(value) > CLOCK_APART:
                 result.append((slot, value))
@@ -94,7 +94,7 @@ def _apart(seconds: float) -> str:
 
 
 def known_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
-    """Return m per unit of the odometer as well as it is known, 0 where it is not."""
+    """Return m per unit of the odometer, by the best value so far; 0 if unknown."""
     if np.isfinite(found) and found > 0:
         return float(found)
     if form is None:
@@ -150,7 +150,7 @@ class Travel:
 
 
 class FixPath:
-    """Distance along the fixes while the counter moves; steps below the noise do not count."""
+    """Distance along the fixes while the counter moves; steps below the noise are ignored."""
 
     def __init__(self) -> None:
         self.total = self.top = 0.0      # m, m/s
@@ -178,7 +178,7 @@ class FixPath:
 
 
 class Progress:
-    """All of it, for one node; ``begin_leg`` sets distance and speed to zero."""
+    """Distance, speed, standstill and clocks of one node; ``begin_leg`` resets the first two."""
 
     def __init__(self, simulated: bool = False) -> None:
         self.clocks = Clocks(simulated)
@@ -190,7 +190,7 @@ class Progress:
 
     def feed(self, slot: str, block: Any, config: Config, form: OdometerForm | None,
              found_scale: float) -> None:
-        """Take a block as it went into the recorder."""
+        """Take a block as recorded."""
         if not len(block.stamp_ns):
             return
         self.clocks.feed(slot, block)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which quantities are good enough: yes, no or unknown, while a leg is recorded and after it."""
+"""Quantities within their limits: yes, no or unknown, while a leg is recorded and after it."""
 
 from collections.abc import Set
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ YES, NO, UNKNOWN = 'yes', 'no', 'unknown'
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity by the estimates it is made of; ``relative``: its limit is a share of it."""
+    """A quantity and its estimates; ``relative``: its limit is relative to the value."""
 
     label: str
     estimates: tuple[str, ...]
@@ -29,7 +29,7 @@ class Quantity:
     def limit(self, config: Config) -> float:
         """Return the largest sigma that is good enough, a share of the value or rad."""
         if self.estimates[0] == 'track_width':
-            # no verdict.* asks for it: what the method states it by
+            # no setting verdict.*: the limit of the method
             return TRACK_WIDTH.determined_share
         return config.verdict.max_scale_sigma if self.relative else config.verdict.max_yaw_sigma
 
@@ -54,8 +54,8 @@ def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
     """
     Return the values within their limits for a leg that ends now.
 
-    Unknown before the first look; a track width that is configured is not asked of the drive.
-    ``lost``: the leg would be rejected, and nothing of it is.
+    Unknown before the first update; a configured track width is not required of the drive.
+    ``lost``: the leg would be rejected: no value is within its limit.
     """
     ok = nothing_known()
     if forecast is None:
@@ -108,7 +108,7 @@ def as_keys(ok: dict[str, str]) -> dict[str, str]:
 
 
 def words(ok: dict[str, str]) -> str:
-    """Return it for people, empty where nothing is known."""
+    """Return them as text, empty if all are unknown."""
     parts = []
     for value, text in ((YES, 'OK'), (NO, 'not OK')):
         labels = [QUANTITIES[name].label for name, v in ok.items() if v == value]

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the running estimate makes foreseen: which sigma counts, how far to drive, and what."""
+"""Forecast from the running estimate: sigmas, remaining distance and manoeuvres."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,18 +28,18 @@ from odocal_ros.settings.config import Config
 
 ONLY = ('smoother',)
 SCALE, YAW, PITCH = PARAMETERS
-# physical: m/s^2 of an ordinary stop and start, m/s that one would do it from at least
+# physical: m/s^2 of an ordinary stop and start, and the minimum speed for it, m/s
 STOP_FORCE, STOP_SPEED = 1.5, 5.0
 # physical: path length is proportional to sigma to the power of minus this: for white errors of
 # fixes, with slow
 PATH_POWER, PATH_POWER_SLOW = 1.0, 2.0
-MOST_STOPS = 50    # judgement: more stops and starts nobody does
+MOST_STOPS = 50    # judgement: limit of a useful number of stops and starts
 
 
 def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
          wanted: Callable[[], bool]) -> Running | None:
     """
-    Return the smoother's running estimate, None where it says nothing yet or is not asked.
+    Return the smoother's running estimate, None if there is none yet or it is not used.
 
     leg : the data so far.   wanted : called between passes; if False, Abandoned is raised.
 
@@ -76,7 +76,7 @@ def without_force(forecast: Forecast) -> Forecast:
 
 
 def with_running(forecast: Forecast, running: Running, config: Config) -> Forecast:
-    """Return an forecast with a running estimate, where the result will be by it."""
+    """Return a forecast with the running estimate for the values that it will give."""
     method = running.method
     faults = [r for r in method.reasons
               if r.code.gravity is Verdict.REJECTED and r.code not in ABOUT]
@@ -148,13 +148,13 @@ def _yaw(running: Running, asked: float) -> Prospect:
 
 
 def _metres(running: Running, ratio: float, power: float) -> float | None:
-    """Return the metres more that make a sigma so many times better, driven as so far."""
+    """Return the further distance that improves a sigma by a ratio, driven as so far, m."""
     metres = running.distance * (max(ratio, 1.0)**power - 1)
     return metres if metres <= FARTHEST_M else None
 
 
 def _digits(value: float, sigma: float) -> str:
-    """Return a value to a tenth of its sigma, no more than eight digits of it."""
+    """Return a value to a tenth of its sigma, with at most eight digits."""
     size = max(abs(value), sigma)
     places = math.floor(math.log10(size)) - math.floor(math.log10(sigma)) + 2
     return f'{value:.{min(max(places, 1), 8)}g}'

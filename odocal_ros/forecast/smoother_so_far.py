@@ -34,7 +34,7 @@ class SmootherSoFar:
 
     @property
     def once_s(self) -> float:
-        """Return the seconds of CPU in the last look for what is done ever less often."""
+        """Return the CPU time of the last update for work that is done ever less often, s."""
         return self._growing.once_s
 
     def look(self, leg: Leg, config: Config, wanted: Callable[[], bool] = lambda: True) -> Running:

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A leg in few rows, kept while it is recorded: enough to foresee its sigmas, never for a result.
+A leg in few rows, kept while it is recorded: for forecasts, never for a result.
 
-Rows are gathered into cells of time. Turn rates are averaged, since picking every tenth row would
-take vibration for turns; counts are kept as they stand at the end of a cell. When the cells
-become too many they are made twice as wide, so that neither memory nor work grows with the leg.
+Rows are gathered into cells of time. Turn rates are averaged, since every tenth row alone would
+turn vibration into rotation; counts are those at the end of a cell. When there are too many cells
+their width is doubled, so that memory and work do not grow with the leg.
 """
 
 from dataclasses import replace
@@ -29,12 +29,12 @@ from odocal_ros.data.samples import (
 from odocal_ros.nav.odometer import without_rollover
 from odocal_ros.screening.late_rows import on_time, ON_TIME_WINDOW
 
-# judgement: a tenth of what keyframes are apart; of a topic as many as 26 minutes of them,
-# pre-roll and all, so that a look has a bound
+# judgement: a tenth of the time between keyframes; per topic 26 minutes of them with pre-roll, so
+# that the time of an update is bounded
 FIRST_CELL_NS = 100_000_000
 MOST_CELLS = 16_000
-SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # definition: after which no row to come moves one
-RHYTHM_NS = 3 * SETTLED_NS       # judgement: of earlier rows, which determine the rhythm
+SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # definition: after it later rows have no effect
+RHYTHM_NS = 3 * SETTLED_NS       # judgement: earlier rows, which determine the rhythm
 UNROLLED = OdometerForm('cumulative', 0, '')     # definition: a count that never rolls over
 
 
@@ -89,7 +89,7 @@ class ThinnedLeg:
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form, **cells)
 
     def _newest(self, slot: str) -> OdometerSamples:
-        """Return the cells of a counter with rows that those to come may still move."""
+        """Return the cells of a counter with rows whose times are not final."""
         rows = self._late[slot].rest()
         if slot in self._open:
             rows = join([self._open[slot], rows])
@@ -155,15 +155,15 @@ class LateSoFar:
     """
     The newest rows of one counter that never rolls over; ``feed`` takes them as sent.
 
-    Late ones are put back as the result has them.
+    Late ones are moved back as for the result.
     """
 
     def __init__(self) -> None:
         self._rows: OdometerSamples | None = None
-        self._given = 0             # of these, given away
+        self._given = 0             # of these, returned
 
     def feed(self, rows: OdometerSamples) -> OdometerSamples:
-        """Take rows, and return those that stay where they are now."""
+        """Take rows, and return those whose times are final."""
         rows = rows if self._rows is None else join([self._rows, rows])
         settled = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[-1] - SETTLED_NS))
         settled = max(settled, self._given)
@@ -173,7 +173,7 @@ class LateSoFar:
         return out
 
     def rest(self) -> OdometerSamples:
-        """Return the rows that are not given away, where they seem to belong; some were fed."""
+        """Return the remaining rows at their estimated times; some were fed."""
         assert self._rows is not None
         return take(_on_time(self._rows), slice(self._given, None))
 

@@ -19,12 +19,12 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 
-# what a leg is aligned by, recorded or planned
-MOTION_LEVEL = 30.0       # s, judgement: of driving that a level without standstill is taken from
+# limits of the alignment of a leg, recorded or planned
+MOTION_LEVEL = 30.0       # s, judgement: of driving that determines a level without standstill
 COURSE_DISTANCE = 30.0    # m, judgement: of track for a course
-HEADING_LIMIT = 0.5      # rad, judgement: an orientation worse than this is no heading
-COMPASS_LIMIT = 0.05      # rad, judgement: a gyrocompass worse than this is no heading
-# s, judgement: cut off each end of a standstill: a slow start leans the specific force
+HEADING_LIMIT = 0.5      # rad, judgement: limit of the sigma of an orientation used as heading
+COMPASS_LIMIT = 0.05      # rad, judgement: limit of the sigma of a gyrocompass
+# s, judgement: cut off at each end of a standstill: a slow start tilts the specific force
 REST_EDGE = 0.3
 
 
@@ -85,7 +85,7 @@ class Level:
 
 
 class Grade(Protocol):
-    """What the errors of an IMU are like (``settings.grades.Grade``), 1 sigma, SI."""
+    """Errors of an IMU (``settings.grades.Grade``), 1 sigma, SI."""
 
     @property
     def level_bias(self) -> float: ...
@@ -187,9 +187,9 @@ def gyrocompass(level: Level, latitude: float, grade: Grade) -> tuple[float, flo
 
 def off_the_earth(level: Level, latitude: float, grade: Grade) -> float:
     """
-    Return by how many sigmas the rate at rest is not the Earth's, level and up: the worse one.
+    Return the deviation of the rate at rest from the Earth's in sigmas, level or up: the larger.
 
-    Both are known but for the heading, so a bias that the grade does not have shows.
+    Both are known without the heading, so a bias beyond the grade is detected.
     """
     rate_L = level.C_Lb @ level.mean_rate_b
     level_rate, up_rate = OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)
@@ -202,9 +202,9 @@ def off_the_earth(level: Level, latitude: float, grade: Grade) -> float:
 def complete(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bool,
              origin: Origin, grade: Grade, gyro_noise: float) -> Alignment:
     """
-    Return the Alignment of a level and a heading, rad; the gyro bias from rest where there is one.
+    Return the Alignment of a level and a heading, rad; with the gyro bias of a standstill.
 
-    yaw is that of L's x axis where the level is taken, its sigma holds for that too.
+    yaw : of L's x axis where the level is measured.   yaw_sigma : of the same.
     """
     C_nb = level.C_np @ C_nL(yaw) @ level.C_Lb
     bias_n, sigma_n = _gyro_bias_n(level, C_nb, yaw_sigma, origin, grade)
@@ -221,10 +221,9 @@ def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, origin: Origin,
 
     A wrong heading puts the Earth rate on wrong axes: a yaw error psi moves the east part by
     psi, the north part by psi^2 / 2 of its level part; a tilt moves all three. In a local frame
-    the Earth rate is not known. Where that says
-    less than the grade does of the turn-on bias, or without a standstill, the bias is taken as
-    zero: so the east part after a gyrocompass, which has used it up. A reading that the grade
-    rules out shows that the grade is wrong (or the unit): the reading is taken.
+    the Earth rate is not known. If the reading is less certain than the turn-on bias of the grade,
+    or without a standstill, the bias is zero; so is the east part after a gyrocompass, which has
+    used it. If the grade excludes the reading, grade or unit are wrong, and the reading is used.
     """
     if level.standstill is None:
         return np.zeros(3), np.full(3, grade.gyro_bias)

@@ -21,8 +21,8 @@ def arctan2(y: ArrayLike, x: ArrayLike) -> Floats:
     """
     Return np.arctan2, the same wherever the values lie in memory.
 
-    numpy 1.26, which Jazzy has, rounds that of columns of a matrix by their addresses; live would
-    part from replay by the last digits.
+    numpy 1.26, which Jazzy has, rounds that of columns of a matrix by their addresses: live and
+    replay would differ in the last digits.
     """
     return np.arctan2(np.copy(y), np.copy(x))
 

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Speeds in coarse steps: whole km/h of a car's bus, truncated or rounded, at times interpolated.
+Speeds in coarse steps: whole km/h of a car's bus, truncated or rounded, sometimes interpolated.
 
-Such a speed says where it lies in a cell of the grid, so its error is no noise: a cruise stands in
-one cell for half a minute. What is sharp is the change: in the step in which the value changes by
-one, the speed passes the edge between both cells. Where it changes by more, each value is one of a
-cell. Zero is no cell: below it is whatever the sender holds for rest.
+Such a value determines a cell of the grid, and its error is not noise: a cruise stays in one cell
+for half a minute. Changes are accurate: when the value changes by one step, the speed passes the
+edge between two cells. When it changes by more, each value only determines its cell. Zero is not a
+cell: it stands for all speeds that the sender considers rest.
 """
 
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ class CoarseSpeed:
     A speed on a grid.
 
     step : scale units per s.   t, value : (n,) s and scale units per s, the rows that are data.
-    interpolated : rows between these were sent, which say nothing more.
+    interpolated : rows between these were sent too, without more information.
     """
 
     step: float
@@ -74,8 +74,8 @@ class CoarseSpeed:
         """
         Return the variance of travel between n times, s, by rounding: (n - 1,) scale units^2.
 
-        A run of one value has one error, uniform in its cell, which a cruise does not average: as
-        much white noise as adds up to the same over the run.
+        A run of equal values has one error, uniform in its cell, that does not average out. It is
+        replaced by white noise with the same variance over the run.
         """
         first = np.flatnonzero(np.diff(self.value, prepend=np.nan))
         begin = self.t[first]
@@ -90,10 +90,10 @@ class CoarseSpeed:
         """
         Return the speeds that the rows determine, but for the offset that all values share.
 
-        The offset is half a cell where the sender truncates, none where it rounds. A change by one
-        cell: the speed of its middle is the mean of both values, uniform by what the speed changes
-        in the step. A value between changes by more, or in steps so long that the speed changes by
-        more than a cell: it is uniform in its cell, and its rows, however many, count as one.
+        The offset is half a cell if the sender truncates, zero if it rounds. A change by one cell
+        gives the speed in its middle: the mean of both values, with an error uniform over the
+        speed change in the step. A value between larger changes, or in steps so long that the
+        speed changes by more than a cell, is uniform in its cell; its rows count as one.
         """
         q, t, v = self.step, self.t, self.value
         cell = np.rint(v / q)
@@ -125,9 +125,9 @@ def _rates(t: Floats, edge: Floats, q: float) -> Floats:
     """
     Return the limit of the speed change at its crossings (m,): the faster of both sides.
 
-    As fast as three quarters of the drive's do at least: a small step between two cruises is made
-    as quickly as a large one, though no other edge is near to show it; and by its own neighbours
-    alone a crossing weighs the more, the later it falls in its step, which is its error.
+    It is at least the upper quartile of the drive: a small step between two cruises is as fast as
+    a large one, but no other edge is near to show it. By its own neighbours alone, a crossing late
+    in its step, which is its error, would have a larger weight.
     """
     if len(t) < 2:
         return np.full(len(t), np.inf)      # one change alone shows no rate
@@ -159,8 +159,8 @@ def grid(value: Floats) -> float | None:
     """
     Return the step of the grid that values other than zero lie on, None where they lie on none.
 
-    Each distinct value counts once, so that a cruise says no more than a passage; the grid is the
-    lowest frequency at which all have one phase.
+    Each distinct value counts once, so that a cruise has no more weight than a passage. The grid
+    is the lowest frequency at which all values have the same phase.
     """
     value = np.abs(value[value != 0])
     span = np.ptp(value) if len(value) else 0.0
@@ -207,7 +207,7 @@ def _may_be_grid(u: Ints) -> bool:
 
 
 def _of_few(value: Floats, u: Floats, count: Ints) -> float | None:
-    """Return the step of few distinct values u, each sent time and again, that it divides."""
+    """Return the step that divides few distinct values u, each sent many times."""
     few_values, often_sent = 4, 5    # distinct, times that each is sent
     if len(u) < few_values or np.median(count) < often_sent:
         return None
@@ -218,7 +218,7 @@ def _of_few(value: Floats, u: Floats, count: Ints) -> float | None:
 
 
 def _refined(value: Floats, step: float) -> float:
-    """Return the step with which values lie on its multiples best, about one that is near."""
+    """Return the step, near a given one, whose multiples fit the values best."""
     cell = np.rint(value / step)
     for _ in range(3):
         step = float(cell @ value / (cell @ cell))

@@ -5,9 +5,9 @@
 Dead reckoning: attitude and odometer travel to a track in n, linear in scale and forward axis.
 
 ``P`` is the sum of attitude over travel: the track of a vehicle whose forward axis in b is d and
-whose scale is K is P @ (K d). All of scale, yaw and pitch stay outside, so that they can be solved
-for, or tried by the thousand, without another pass. n is Cartesian and fixed to the Earth, so the
-track is exact on the ellipsoid: converting it back to latitude, longitude and height is all.
+whose scale is K is P @ (K d). P does not depend on scale, yaw and pitch, so they can be solved
+for, or varied, without another pass. n is Cartesian and fixed to the Earth, so the track is exact
+on the ellipsoid.
 """
 
 from dataclasses import dataclass
@@ -143,10 +143,10 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
     """
     Return metres per unit of travel from distances between fixes, None where nothing moves.
 
-    The path is cut into equal sections, as short as possible with fixes ``least`` m and eight
-    sigmas apart, and the median of the sections is used: good to a few per cent despite outliers,
-    for thresholds and for scales that have no nominal value. Where the path folds back within
-    ``least`` (the lanes of a mower), shorter sections have the longer chords.
+    It is the median of equal sections of the path, as short as possible with fixes ``least`` m and
+    eight sigmas apart. Despite outliers it is good to a few per cent: enough for thresholds and
+    for scales without a nominal value. Where the path folds back within ``least`` (the lanes of a
+    mower), shorter sections have the longer chords.
     """
     inside = (t_fix >= travel.t[0]) & (t_fix <= travel.t[-1]) if len(travel.t) else []
     if not np.any(inside):

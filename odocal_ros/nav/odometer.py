@@ -149,11 +149,11 @@ def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
         return np.zeros(len(step), bool)
     usual = np.median(dt)
     size = np.abs(step) / np.maximum(dt, usual)    # bursts of stamps are no speed
-    if not (size > 0).any():       # steps that no number per second is left of
+    if not (size > 0).any():       # steps so small that their rates are zero
         return np.zeros(len(step), bool)
     limit = RESET_FACTOR * np.percentile(size[size > 0], 95)
     far = size > (max(limit, 3 / usual) if whole else limit)
-    # motion of a drive that mostly stands comes in long runs, a reset or a false row does not
+    # motion comes in long runs, even if the vehicle mostly stands; a reset or a false row does not
     for begin, end in runs(far):
         if end - begin > 2:
             far[begin:end] = False

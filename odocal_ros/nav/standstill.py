@@ -16,7 +16,7 @@ REST_GRID = 0.1       # s, judgement: grid of the detector
 REST_WINDOW = 0.5     # s, judgement: each side
 REST_TRAVEL = 0.03    # m, judgement: travel in the window that still counts as standing
 REST_TURN = 0.02      # rad/s, judgement: drift of the gyro that still counts as standing
-MOST_BIAS = 0.12      # rad/s, each axis, physical: no gyro at rest says more (cheap phones: 0.1)
+MOST_BIAS = 0.12      # rad/s, each axis, physical: largest bias of a gyro (cheap phones: 0.1)
 
 
 def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: float,
@@ -50,7 +50,7 @@ def _allowed(travel: Travel, metres_per_unit: float) -> float:
     """Return the travel, m, of one that stands: REST_TRAVEL, or a count or so of jitter."""
     count = travel.quantum * metres_per_unit
     coarse_count = 0.5    # m, a count beyond which one is motion
-    # a few counts a turn of the wheel: one of them is motion, not jitter
+    # of a counter with few counts per turn of the wheel one count is motion, not jitter
     return max(REST_TRAVEL, (1.5 if count <= coarse_count else 0.5) * count)
 
 
@@ -89,9 +89,9 @@ def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> 
     """
     Return a mask of windows in which the gyro reads as at rest.
 
-    A vehicle that turns on the spot at an even rate holds wheels (their mean) and gyro as steady
-    as one that stands. The slowest of the steady intervals is the standstill: its reading is the
-    bias, and the others must agree with it.
+    If a vehicle turns on the spot at an even rate, gyro and wheels (their mean) are as steady as
+    at rest. The steady interval with the lowest rate is the standstill: its reading is the bias,
+    and the others must agree with it.
     """
     means = [np.median(rate[(edges[:-1] >= a) & (edges[1:] <= b)], axis=0)
              for a, b in _spans(quiet, edges, shortest)]

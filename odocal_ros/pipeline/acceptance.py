@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Pass or fail of a calibration against limits: what a line's end must know.
+Pass or fail of a calibration against limits, as at the end of a production line.
 
-A value passes where all within two sigma of it lies within its limits, and fails where all of it
-lies outside; else it is not decided, and more must be driven. With a correct sigma a vehicle that
-is on a limit or beyond passes in 2.3 % of all cases at most, and one within its limits fails in no
-more (docs/fleet.md).
+A value passes if its two-sigma interval lies within its limits, and fails if all of it lies
+outside; else it is undecided, and more must be driven. With a correct sigma a vehicle on a limit
+or beyond passes in at most 2.3 % of all cases, and one within its limits fails in no more
+(docs/fleet.md).
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class Decision(Enum):
 
 @dataclass(frozen=True)
 class Held:
-    """One value held against its limits; sigma_wanted: with which this value would pass."""
+    """A value compared with its limits; sigma_wanted: the sigma with which it would pass."""
 
     name: str
     estimate: Estimate
@@ -56,7 +56,7 @@ class Held:
 
 @dataclass(frozen=True)
 class Acceptance:
-    """The decision on a vehicle, each value's own, why it is not decided and what to do then."""
+    """The decision on a vehicle and on each value; if undecided, the cause and the remedy."""
 
     decision: Decision
     values: tuple[Held, ...]
@@ -79,10 +79,10 @@ def decide(value: float, sigma: float, low: float, high: float) -> Decision:
 
 def accept(calibration: Calibration, config: Config) -> Acceptance | None:
     """
-    Hold a calibration against the settings ``accept.*``; None where no limit is set.
+    Return the decision on a calibration by the settings ``accept.*``; None if no limit is set.
 
-    A vehicle fails with any of its values, and passes with all of them. A rejected calibration
-    decides nothing, and with ``accept.strict`` one with a caution does not pass.
+    A vehicle fails with any of its values, and passes with all of them. A rejected calibration is
+    undecided, and with ``accept.strict`` one with a caution does not pass.
     """
     unknown = Estimate(None, None, '')
     values = tuple(hold(name, calibration.estimates.get(name, unknown), low, high)
@@ -105,7 +105,7 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
 
 
 def hold(name: str, found: Estimate, low: float, high: float) -> Held:
-    """Return a value with the decision that its limits give."""
+    """Return a value with its decision."""
     value, sigma = found.value, found.sigma
     if value is None or sigma is None:
         return Held(name, found, low, high, Decision.UNDECIDED)

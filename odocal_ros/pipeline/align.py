@@ -7,8 +7,9 @@ Alignment of a leg: which standstill, which heading source.
 Pure: takes screened inputs, returns an Alignment and its reasons.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -37,6 +38,7 @@ from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
 
+Span = TypeVar('Span', Floats, tuple[float, float])
 Found = tuple[tuple[float, float] | None, str]      # yaw and sigma, rad; or None and why
 
 
@@ -61,7 +63,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     return complete(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
 
 
-def choose_standstill(spans: Floats) -> Floats | None:
+def choose_standstill(spans: Iterable[Span]) -> Span | None:
     """Return the standstill that holds or last ended before the start mark (t = 0), or None."""
     before = [s for s in spans if s[0] <= 0.5]
     return before[-1] if before else None
@@ -72,7 +74,7 @@ def _from_place(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes
     """
     Return C_np of the place of a standstill: east, north and up differ from those at the origin.
 
-    By 0.16 mrad for each kilometre of path from there to the mark.
+    They turn by 0.16 mrad per kilometre of path from there to the mark.
     """
     if span is None or not len(fixes_n):
         return np.eye(3)
@@ -95,7 +97,7 @@ def _level(inputs: Inputs, spans: Floats, metres_per_unit: float, latitude: floa
     t = inputs.t_imu
     first = max(0.0, float(t[0]))
     pick = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
-    if pick.sum() < 2:      # the IMU falls silent at the mark: IMU_GAP will say so
+    if pick.sum() < 2:      # the IMU ends at the mark, which IMU_GAP reports
         pick = np.abs(t - first) <= np.sort(np.abs(t - first))[1]
     _, q_0b = attitude(t[pick], inputs.w_b[pick], np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
     ends = t[pick][[0, -1]]
@@ -111,7 +113,7 @@ def _level(inputs: Inputs, spans: Floats, metres_per_unit: float, latitude: floa
 
 
 def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
-    """Return a caution where the gyro at rest is far noisier than its grade: walks will be too."""
+    """Return a caution if the gyro at rest is far noisier than its grade: so are its walks."""
     times = noise / max(grade.gyro_noise, 1e-12)
     noisier_at_rest = 10.0    # times the noise of the grade at rest: another gyro, or another unit
     if times <= noisier_at_rest:
@@ -122,7 +124,7 @@ def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
 
 
 def _measured_noise(inputs: Inputs, span: Floats) -> float:
-    """Return the white gyro noise seen at rest, rad/s/sqrt(Hz), the largest axis."""
+    """Return the white gyro noise at rest, rad/s/sqrt(Hz), of the largest axis."""
     pick = (inputs.t_imu >= span[0]) & (inputs.t_imu <= span[1])
     t, w = inputs.t_imu[pick], inputs.w_b[pick]
     if len(t) < 20:
@@ -158,8 +160,8 @@ def _fixed(inputs: Inputs, level: Level, latitude: float, grade: Grade, config: 
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
     mark_yaw = float(yaw_from_heading(config.alignment.heading))
-    # the heading holds at the mark: carry it back over the turn since the standstill, and to
-    # the north of where that was
+    # the heading holds at the mark: subtract the turn since the standstill, and the direction of
+    # north there
     turned = _turn_since(inputs, level) if level.standstill and level.t < 0.0 else 0.0
     turned += float(np.arctan2(level.C_np[1, 0], level.C_np[0, 0]))
     return (float(wrap(mark_yaw - turned)), config.alignment.heading_sigma), ''

@@ -4,10 +4,10 @@
 """
 Start and end of automatic legs (``leg.automatic``): one search for node and replay.
 
-It goes by the stamps of the rows alone, so that a recording gives the legs that the node had. A
-leg begins where the vehicle drives off, and ends at the first standstill after half of
-``leg.automatic_minutes``, at any long one, or when the minutes are over, in motion: the next one
-then begins where it ended. A gap of the IMU that no leg survives lies between two legs.
+It only uses the stamps of the rows, so that a recording gives the legs of the node. A leg begins
+where the vehicle starts to move, and ends at the first standstill after half of
+``leg.automatic_minutes``, at any long one, or when the minutes are over, in motion: then the next
+one begins where it ended. A gap of the IMU that would reject a leg lies between two legs.
 """
 
 from collections import deque
@@ -26,9 +26,9 @@ from odocal_ros.screening.odometer_care import Steps
 from odocal_ros.settings.config import Config
 
 SECOND = 10**9    # definition: ns
-LEG_END_REST_NS = 10 * SECOND    # judgement: of the rest that ends a leg, for place and biases
+LEG_END_REST_NS = 10 * SECOND    # judgement: standstill that ends a leg, for place and biases
 PARKED_NS = 120 * SECOND         # judgement: a longer standstill ends a leg of any length
-STOOD_NS = 1 * SECOND            # judgement: before the first count of a drive-off it stood
+STOOD_NS = 1 * SECOND            # judgement: standstill before the first count of a start
 
 
 @dataclass
@@ -41,10 +41,10 @@ class Span:
 
 class LegSearch:
     """
-    Finds legs in rows as they come; ``spans`` holds them, the open one last.
+    Finds legs in rows as they arrive; ``spans`` holds them, the open one last.
 
-    The rows of the odometer decide, once the IMU has passed them; how they were chopped into
-    blocks leaves no trace.
+    The rows of the odometer decide, once there are later rows of the IMU. The division into blocks
+    has no effect.
     """
 
     def __init__(self, config: Config) -> None:
@@ -73,7 +73,7 @@ class LegSearch:
         return self.spans[-1] if self.spans and not self.spans[-1].stop_ns else None
 
     def feed(self, slot: str, block: Samples, form: OdometerForm | None = None) -> None:
-        """Take rows as they went into the recorder; the odometer's say nothing without form."""
+        """Take rows as recorded; those of the odometer are ignored without form."""
         if slot not in self._first_ns or not len(block.stamp_ns):
             return
         self._first_ns[slot] = self._first_ns[slot] or int(block.stamp_ns[0])
@@ -91,9 +91,9 @@ class LegSearch:
 
     def begin_anew(self, after_ns: int, at_rest: bool) -> None:
         """
-        Forget the legs: the next begins after a stamp.
+        Remove the legs: the next begins after a stamp.
 
-        at_rest : where the vehicle drives off from a standstill, else as soon as it moves.
+        at_rest : at the next start from a standstill, else as soon as the vehicle moves.
         """
         self.spans.clear()
         self._from_ns, self._needs_rest = after_ns, at_rest

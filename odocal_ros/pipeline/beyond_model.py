@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Errors that no method models: coarse speeds, slow wheel slip, unknown slopes; delays that it saw.
+Errors that no method models (coarse speeds, slow wheel slip, unknown slopes), and delays.
 
 Errors of the scale go into the sigmas and the budget of a method, delays into a note with the
 setting that corrects them.
@@ -60,8 +60,8 @@ def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """
     Return a method's result with the change of one wheel in its sigmas, or as it was.
 
-    A wheel that slips all along from some moment on, or loses air, leaves a scale between that of
-    before and that of after; the fixes do not determine which of them is the vehicle's.
+    If a wheel slips from some moment on, or loses air, the estimated scale lies between those
+    before and after; the fixes do not determine which of them is the vehicle's.
     """
     change = abs(prepared.wheel_slips.change)
     if not change:
@@ -74,9 +74,9 @@ def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
 
 def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """
-    Return a method's result as it was, or of an IMU without force: hills in, no angles.
+    Return a method's result; without an accelerometer with the error of hills, and no angles.
 
-    ``screening/leg_kind.py`` says why.
+    See ``screening/leg_kind.py``.
     """
     if prepared.inputs.felt:
         return method
@@ -95,8 +95,8 @@ def half_step(inputs: Inputs) -> float:
     """
     Return half a step of the speed relative to the path length, 0.0 without steps.
 
-    Speeds sent are too low by that on the mean where the sender truncates, by nothing where it
-    rounds, and the grid does not say which.
+    On average, speeds are too low by it if the sender truncates, and correct if it rounds; the
+    grid does not determine which.
     """
     coarse = _coarse(inputs)
     if coarse is None:
@@ -107,7 +107,7 @@ def half_step(inputs: Inputs) -> float:
 
 
 def held_steps(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
-    """Return the result of a method that adds up speeds, what truncation takes in its sigmas."""
+    """Return the result of a method that adds up speeds, with truncation in its sigmas."""
     size = half_step(prepared.inputs)
     if method.name != 'two_point' or not size:
         return method
@@ -146,10 +146,10 @@ def _coarse(inputs: Inputs) -> CoarseSpeed | None:
 def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
                 scale: float) -> list[Reason]:
     """
-    Return DELAY_SEEN for each delay that is there for certain and matters at the speed driven.
+    Return DELAY_SEEN for each delay that is significant and matters at the speed driven.
 
-    prepared : the leg.   seen : 'gnss' or 'odometer' -> by how many s its stamps are late, with
-    what is set, and sigma.   scale : as the method that saw them found it.
+    prepared : the leg.   seen : 'gnss' or 'odometer' -> delay of its stamps with the configured
+    offset, s, and sigma.   scale : of the method that estimated them.
     """
     speed = _speed(prepared) * scale
     notes = []

@@ -41,7 +41,7 @@ NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX
 
 
 class Screened(NamedTuple):
-    """Inputs, what is said of them, and whether a leg can be made of them."""
+    """Inputs of a leg, their reasons, and True if it can be calibrated."""
 
     inputs: Inputs
     reasons: tuple[Reason, ...]
@@ -84,8 +84,8 @@ def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
     """
     Return the reasons of a leg as in ``calibrate``, without those of its methods.
 
-    A leg that is not over may be given, as ``screened`` has it: what more of a drive cures is left
-    out.
+    The leg, as ``screened`` returns it, may not be over: reasons that disappear with more driving
+    are left out.
     """
     reasons = seen.reasons
     if seen.usable:
@@ -136,7 +136,7 @@ def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:
 
 
 def _turned_over(inputs: Inputs) -> Inputs:
-    """Return inputs with a forward-right-down IMU read as what it is."""
+    """Return inputs of a forward-right-down IMU, turned to forward-left-up."""
     C = matrix_from_rpy([np.pi, 0.0, 0.0])
     return replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)
 
@@ -144,7 +144,7 @@ def _turned_over(inputs: Inputs) -> Inputs:
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     """Return a leg cut where its IMU is silent for longer; itself without gaps, or of many."""
     gaps = _gaps(leg, limit_s)
-    most_parts = 20    # an IMU with more gaps stutters: its leg is rejected
+    most_parts = 20    # with more gaps the leg is rejected
     if not 0 < len(gaps) < most_parts:
         return [leg]
     begins = [None, *gaps[:, 1].tolist()]

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Several legs to one calibration: which legs count, what is said of the whole."""
+"""Several legs to one calibration: which legs are used, and the reasons of the whole."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ from odocal_ros.settings.levels import DAY_NS
 from odocal_ros.settings.nominal import nominal_scale
 
 PER_LEG = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE, Code.SCALE_FAR_FROM_NOMINAL}
-# the same of legs that are combined by marginal information: all may determine what none does
+# the same for legs that are combined by marginal information: together they may determine more
 ON_BORDER = {Code.YAW_NOT_DETERMINED, Code.PITCH_NOT_DETERMINED, Code.PARAMETER_NOT_DETERMINED,
              Code.YAW_FAR_FROM_NOMINAL}
 SMOOTHER = 'smoother'      # the method whose legs are combined on their border
@@ -34,7 +34,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     """
     Return the calibration of one vehicle from its legs.
 
-    legs : at least one. Rejected legs are left out while any other is left, and named.   config :
+    legs : at least one. Rejected legs are left out, and named, unless all are.   config :
     limits, frames.   carried : information of earlier legs on the vehicle.   imu : information of
     other legs on its IMU, if nothing is carried.
     """

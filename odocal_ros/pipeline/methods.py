@@ -48,10 +48,10 @@ def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
     return refused((why,), inputs.scale_unit, inputs.travels)
 
 
-# as they are shown; two_point, the operator's own marks, is always computed
+# in the order of the output; two_point, by the operator's own marks, is always computed
 METHODS: dict[str, Callable[[PreparedLeg, Passed], MethodRun]] = {
     'two_point': two_point, 'smoother': _smoother}
-# what each gives where it refuses: (inputs, reason) to MethodResult
+# the result of each if it refuses: (inputs, reason) to MethodResult
 UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
            'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
            'smoother': _no_smoother}
@@ -78,8 +78,8 @@ def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
     """
     Return the reasons of methods on the data, each once.
 
-    Delays are by the best method that sees them, what the odometer does beside the IMU by the best
-    that looked and is not rejected, else by the first.
+    Delays are by the best method that estimates them. Slip and lateness of the odometer are by the
+    best method that checks them and is not rejected, else by the first.
     """
     found: list[Reason] = []
     notes: list[Reason] = []
@@ -96,7 +96,7 @@ def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
 
 
 def _doubted(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
-    """Return a method's run with the errors that its own model does not hold."""
+    """Return a method's run with the errors beyond its own model."""
     result = upright(held_steps(held(run.result, prepared), prepared), prepared)
     about = (*prepared.about_alignment, *prepared.of_ends) if result.name == 'two_point' else ()
     return run._replace(result=replace(result, reasons=(*about, *result.reasons)))
@@ -114,7 +114,7 @@ def _guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) ->
         return MethodRun(UNKNOWN[name](inputs, Reason(
             Code.NOT_CONVERGED, f'{name} diverged ({error}). Likely cause: invalid or missing '
             'samples')))
-    except Exception as error:      # what it said of the data may be as wrong: nothing of it stays
+    except Exception as error:      # its reasons may be wrong too: nothing of it is kept
         return MethodRun(failed(lambda why: UNKNOWN[name](inputs, why), name, error))
 
 
@@ -180,7 +180,7 @@ def _once(found: Sequence[Reason]) -> list[Reason]:
 
 
 def _methods_of(prepared: PreparedLeg) -> list[str]:
-    """Return the methods to run: those asked for, of auto those that the leg can carry."""
+    """Return the methods to run in the order of the output."""
     wanted = deciding(prepared.config.method, shown=True)
     return [name for name in METHODS if name in wanted]
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From screened inputs to a leg that methods can be run on: placed, faced, aligned, reckoned."""
+"""From screened inputs to a leg for the methods: placed, oriented, aligned, dead reckoned."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -62,7 +62,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
 def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: Facing | None,
               reasons: Sequence[Reason], alignment: Alignment | None,
               holdout: bool) -> PreparedLeg:
-    """Return the leg aligned, dead reckoned, and the drive judged."""
+    """Return the leg aligned and dead reckoned, with the reasons of its drive."""
     spans = inputs.standstills(placed.rough, config)
     about: tuple[Reason, ...] = ()
     if alignment is None:
@@ -75,7 +75,7 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
     track = dead_reckon(*epochs, inputs.travel)
     apart, slips = _wheels_beside(inputs, config, placed, track, reasons)
     distance, judged = judge_drive(track, inputs.t_stop, placed.rough, config.leg)
-    # turns are what the others live on
+    # only methods by end points need straight legs
     of_ends = tuple(r for r in judged if r.code is Code.LEG_NOT_STRAIGHT)
     return PreparedLeg(
         **vars(placed), leg=leg, inputs=inputs, config=config, facing=faces,

@@ -37,8 +37,8 @@ class Paths(NamedTuple):
     """
     The antenna's path as configured and as calibrated: t (n,) to (n, 3) m, but for a constant.
 
-    Both have one attitude, and the fit's angles where it determines none: they differ in what
-    the calibration changes and in nothing else.
+    Both have the same attitude, and the fit's angles if it determines none: they only differ in
+    the calibrated values.
     """
 
     before: Path
@@ -47,12 +47,12 @@ class Paths(NamedTuple):
 
 class MethodRun(NamedTuple):
     """
-    A method's result and what it found beside it.
+    A method's result and its other findings.
 
-    paths : None where it refuses.   found : of the data, said of the leg.   delays : 'gnss' or
-    'odometer' to s late and sigma; None from a method that sees none.   odometer : slip or
-    lateness that its track shows beside the IMU, said of the leg unless a better method has
-    looked; None: it does not look.
+    paths : None if it refuses.   found : reasons of the leg.   delays : 'gnss' or 'odometer' to s
+    late and sigma; None from a method that estimates none.   odometer : reasons on slip or
+    lateness of its track relative to the IMU, used unless a better method has checked; None: not
+    checked.
     """
 
     result: MethodResult
@@ -67,10 +67,9 @@ class Stage:
     """
     A stage of the work on a leg.
 
-    name : the method at work, or ``tracks``; empty before the first.   done : share of the work
-    in the stages before it, 0 to 1; when a fit ends cannot be foreseen.   passes : that its fit
-    has made.   change : the largest change of a constant in the last of them, in sigmas; NaN
-    before the first.
+    name : the running method, or ``tracks``; empty before the first.   done : share of the work
+    in the stages before it, 0 to 1; the end of a fit cannot be predicted.   passes : of its fit so
+    far.   change : largest change of a constant in the last pass, in sigmas; NaN before the first.
     """
 
     name: str = ''
@@ -90,16 +89,16 @@ class Stage:
 @dataclass(frozen=True, eq=False)
 class PreparedLeg(Placed):
     """
-    All that methods read; what they find is theirs, so that their order does not matter.
+    All that methods read. They do not change it, so their order has no effect.
 
-    leg, inputs, config : as screened, under the settings in force.   facing : of the IMU, None
-    unseen.   lever_b : (3,) m, from the odometer's point to the antenna.   spans : (s, 2) s,
-    standstills.   alignment : and what it had to say.   epochs : the attitude as aligned, t (m,)
-    s and q_nb (m, 4).   track : of the odometer (the mean of the wheels), dead reckoned so.
-    wheel_slips : of one wheel against the other.   metres_per_unit : the rough scale, until a
-    method knows it better.   distance : m, by it.   t_fit : s; fixes after it are held out, where
-    ``holdout`` is.   reasons : what was found of the leg;
-    of_ends : what matters to its ends alone.
+    leg, inputs, config : as screened, and the settings.   facing : IMU orientation, None if not
+    determined.   lever_b : (3,) m, from the odometer's point to the antenna.   spans : (s, 2) s,
+    standstills.   alignment, about_alignment : and its reasons.   epochs : the attitude as
+    aligned, t (m,) s and q_nb (m, 4).   track : dead reckoned from these and the odometer (mean of
+    the wheels).   wheel_slips : of one wheel against the other.   metres_per_unit : the rough
+    scale, until a method estimates a better one.   distance : m, by it.   t_fit : s; if
+    ``holdout``, later fixes are held out.   reasons : of the leg.   of_ends : those that only
+    concern its ends.
     """
 
     leg: Leg

@@ -96,7 +96,7 @@ class TwoPointRun:
         return np.append(slips.t, one.t[inside]), np.append(slips.size, in_mean)
 
     def _chord(self) -> Chord | None:
-        """Return the chord between the marks, or None and say why."""
+        """Return the chord between the marks; None, with a reason, without fixes."""
         ready, track, travel = self.ready, self.track, self.inputs.travel
         ends = (max(0.0, float(track.t[0]), float(travel.t[0])),
                 min(ready.t_fit, float(track.t[-1]), float(travel.t[-1])))
@@ -136,7 +136,7 @@ class TwoPointRun:
         drift = float(np.linalg.norm(drift_n))
         residual = stray(ready.path(f), chord.start, fixes)
         up = stray(ready.path(solve(chord)[0]), chord.start, fixes)
-        residual[:, 2] = up[:, 2]              # the pitch is no noise of heights
+        residual[:, 2] = up[:, 2]              # without the error of the pitch
         covariance = self.inputs.covariance_n[between]
         factor = self._noise_factor(residual, covariance, drift, chord)
         if np.isnan(self.config.gnss.correlation_time):     # else set, not judged

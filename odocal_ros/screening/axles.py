@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The axles of a vehicle: those that count, and those that steer."""
+"""The axles of a vehicle: which ones count, and which ones steer."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -36,7 +36,7 @@ def axles_of(wheels: Sequence[T]) -> list[tuple[T, ...]]:
 def judged_axles(wheels: Wheels, imu: Imu,
                  between: tuple[float, float]) -> tuple[Wheels, list[Reason]]:
     """
-    Return the wheels that count, steered ones marked, and the reasons.
+    Return the wheels that count, with the distance ahead of steered ones, and reasons.
 
     imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   between : s, the marks.
 
@@ -115,8 +115,7 @@ def _square(own: Travel, other: Travel, imu: Imu, between: tuple[float, float],
     keep = np.logical_and.reduceat(two.known, at[:-1])[:len(y)] & (np.abs(y) > 2 * two.quantum)
     if keep.sum() < CELL or not A[keep, 1].any():
         return 0.0, 0.0
-    x, covariance, _ = robust_fit(A[keep], y[keep], 0.3 * two.quantum + 1e-4 * float(
-        np.median(np.abs(y[keep]))))
+    x, covariance, _ = robust_fit(A[keep], y[keep], two.least_sigma(y[keep]))
     beyond = abs(x[1]) * np.abs(A[keep, 1]).sum() > LEAST_STEERED * np.abs(y[keep]).sum()
     return (float(x[1]), float(np.sqrt(covariance[1, 1]))) if beyond else (0.0, 0.0)
 

@@ -32,9 +32,10 @@ def offsets(config: Config) -> dict[str, float]:
 
 def judge_clocks(leg: Leg, config: Config) -> list[Reason]:
     """
-    Compare each topic's clock with the IMU's, at equal times of arrival.
+    Return reasons for clocks that differ from the IMU's at equal times of arrival.
 
-    leg : as it came.   Positions of marks have IMU stamps, and arrive as late as WITHIN: no clock.
+    leg : as recorded.   Positions of marks are not compared: they have IMU stamps and arrive late
+    by WITHIN.
     """
     topics = [slot for slot in TOPICS if not (slot == 'fix' and config.reference.points)]
     offset = offsets(config)
@@ -73,7 +74,7 @@ def _lag(samples: Samples) -> Floats:
 
 
 def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
-    """Return the lag of the IMU at times of arrival: (m,) s; in pieces, for it may be long."""
+    """Return the lag of the IMU at times of arrival: (m,) s; computed in pieces."""
     base = imu.received_ns[0]
 
     def seconds(received_ns: Ints) -> Floats:
@@ -109,9 +110,9 @@ def _may_be_odd(stamp_ns: Ints) -> Bools:
 
 def _was_set(samples: Samples, label: str, start_ns: int) -> list[Reason]:
     """
-    Name a clock that was set during the leg: its stamps step, arrivals do not, and so it stays.
+    Return a reason if a clock was set during the leg: its stamps step for good, arrivals do not.
 
-    Rows out of order or with a false stamp step there and back, and leave the lag as it was.
+    Rows out of order or with a false stamp step twice, and the lag does not change.
     """
     samples = _stamped(samples)
     if not by_step(_may_be_odd, samples.stamp_ns).any():

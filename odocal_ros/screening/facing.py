@@ -37,11 +37,11 @@ MAX_RATE = 8.0                  # rad/s, physical: no vehicle on wheels turns so
 @dataclass(frozen=True, eq=False)
 class Pushes:
     """
-    What pushes the IMU in the level plane, by bins of BIN_S seconds, complex: e1 + i e2.
+    Accelerations of the IMU in the level plane, in bins of BIN_S seconds, complex: e1 + i e2.
 
     e1, e2 : (3,) level axes, in the frame of the IMU's data.   force : (m,) m/s^2.
-    onward, inward : (m,) of the vehicle, real m/s^2: speeding up; to the left in turns.
-    near : (m,) whether the bin before it is the one just before.
+    onward, inward : (m,) of the vehicle, real m/s^2: along; to the left in turns.
+    near : (m,) True if the bin before it is adjacent.
     """
 
     e1: NDArray[np.float64]
@@ -54,7 +54,7 @@ class Pushes:
 
 @dataclass(frozen=True)
 class Facing:
-    """Yaw mounting angle by the pushes, rad, and its sigma."""
+    """Yaw mounting angle by the accelerations, rad, and its sigma."""
 
     yaw: float
     sigma: float
@@ -91,8 +91,8 @@ def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
     """
     Return the IMU orientation in the vehicle, None if the drive does not determine it.
 
-    Changes from bin to bin are compared, so that a slope, which changes slowly, is no push. The
-    turns have a factor of their own: a gyro of the wrong sign does not turn the answer.
+    Changes from bin to bin are compared, so that slopes, which change slowly, cancel. The turns
+    have a factor of their own, so that the sign of the gyro has no effect.
 
     inputs : in the configured body frame.   metres_per_unit : as for ``pushes``.
     """
@@ -115,7 +115,7 @@ def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
     variance = np.vdot(rest, rest).real / len(A) * inverse[0, 0].real
     sigma = float(np.sqrt(variance) / max(abs(gain[0]), 1e-9))
     facing_sigma = np.deg2rad(10.0)    # limit of the 1 sigma of the IMU orientation
-    push_gain = 0.5, 2.0    # of the push by what the wheels say: else it is something else
+    push_gain = 0.5, 2.0    # of the acceleration over that of the wheels: limits of a valid fit
     if sigma > facing_sigma or not push_gain[0] < abs(gain[0]) < push_gain[1]:
         return None
     forward = gain[0].real * found.e1 + gain[0].imag * found.e2
@@ -123,16 +123,16 @@ def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
 
 
 def toward(found: Facing | None, f: Floats) -> Floats:
-    """Return scale times forward axis, (3,), turned to where the IMU faces if that is far off."""
+    """Return scale times forward axis, (3,), turned to the IMU orientation if that is far off."""
     yaw, pitch = mounting_from_forward(f)
-    near_facing = np.deg2rad(10.0)    # off what a method takes for forward: no matter for slips
+    near_facing = np.deg2rad(10.0)    # off the forward axis of a method: no effect on slips
     if found is None or abs(float(wrap(found.yaw - yaw))) < max(near_facing, 3 * found.sigma):
         return f
     return np.linalg.norm(f) * forward_b(found.yaw, pitch)
 
 
 def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]:
-    """Return IMU_AXES, or ODOMETER_REVERSED, where the IMU faces far from its nominal yaw, rad."""
+    """Return IMU_AXES or ODOMETER_REVERSED if the yaw of the IMU is far from nominal, rad."""
     if found is None:
         return ()
     nominal = 0.0 if np.isnan(nominal_yaw) else nominal_yaw
@@ -147,7 +147,7 @@ def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]
                        f'(yaw mounting {seen}): positive counts mean backwards, the IMU x axis '
                        'points backwards, or the whole leg was driven in reverse with an unsigned '
                        'counter'),)
-    far_facing = np.deg2rad(75.0)    # off the nominal: no mounting is meant so
+    far_facing = np.deg2rad(75.0)    # off the nominal: beyond any intended mounting
     if off < far_facing + 3 * found.sigma:
         return ()
     return (Reason(Code.IMU_AXES, f'accelerations point {direction} in the IMU frame '

@@ -98,7 +98,7 @@ def sigma_limit(sigma: Floats, max_sigma: float) -> float:
 def placed(fix: FixSamples) -> Bools:
     """Return a mask of fixes on the Earth whose angles are not both zero: (n,) bool."""
     nowhere = (fix.latitude == 0) & (fix.longitude == 0)
-    # NaN compares false: what is not within is nowhere
+    # NaN compares false
     there: Bools = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi) & ~nowhere
     return there
 
@@ -117,8 +117,8 @@ def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
     """
     Return covariances with the unknown ones replaced, and which those are.
 
-    Unknown is type 0, zero or less, not finite, or no covariance at all (a correlation of one or
-    more); where only the height's part is, it is taken from the level part.
+    Unknown: type 0, zero or less, not finite, or not a covariance (a correlation of one or more).
+    If only the height's part is unknown, it is derived from the level part.
     """
     covariance = fix.covariance_n.copy()
     unknown = ~_proper(covariance[:, :2, :2]) | (fix.covariance_type == 0)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Values no sensor means: beyond any range, or alone against all their neighbours."""
+"""Values that are not measurements: beyond any range, or isolated outliers."""
 
 from dataclasses import replace
 from functools import reduce
@@ -47,7 +47,7 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
 
     def odd(x: NDArray[Any]) -> Bools:
         size = np.abs(x)
-        least_value = 1e-50    # no driver means less than a float32 can hold, but zero
+        least_value = 1e-50    # smaller values than a float32 can hold, except 0, are damaged
         usable = (size <= most) & ((size >= least_value) | (size == 0))
         odd: Bools = ~(usable if x.ndim == 1 else across(np.logical_and, usable))
         return odd
@@ -56,7 +56,7 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
 
 
 def oriented(samples: Oriented) -> Oriented:
-    """Return IMU or heading rows without the orientations that are none; variance NaN there."""
+    """Return IMU or heading rows without invalid orientations; their variance is NaN."""
     def no_attitude(wild: Bools, q_ni: Floats, variance: Floats) -> Bools:
         length = lengths(np.where(wild[:, None], 0.0, q_ni))
         unit_length = 2.0    # times one, either way: a quaternion of another length is no attitude
@@ -77,11 +77,11 @@ def about_clumps(wild: Bools) -> Bools:
     """
     Return a mask of rows in or near a group of impossible rows.
 
-    Where a recording is damaged, what shows is a part of what is wrong: rows beside it are wrong
-    by less than a sensor's range.
+    In a damaged recording only a part of the false rows is detected: rows beside them are false by
+    less than a sensor's range.
 
-    wild : (n,) bool.   Returns (n,) bool, the clumps and to either side as many rows as twice the
-    widest stretch in them that looks sound.
+    wild : (n,) bool.   Returns (n,) bool, the clumps and to either side twice as many rows as the
+    longest interval in them without impossible rows.
     """
     suspect = np.zeros(len(wild), bool)
     at = np.flatnonzero(wild)
@@ -123,8 +123,8 @@ def single(x: Floats, least: float) -> Bools:
     """
     Return a mask of isolated outliers with no motion before and after.
 
-    x : (n, k).   least : off by less, a row is let be.   Returns (n,) bool, all false where so
-    many rows are that it is the sensor's nature.
+    x : (n, k).   least : smallest deviation of an outlier.   Returns (n,) bool, all false where
+    so many rows are that it is the sensor's nature.
     """
     edge = ROWS_BESIDE + 1
 
@@ -133,7 +133,7 @@ def single(x: Floats, least: float) -> Bools:
         far = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
         if not (far > least).any():
             return np.zeros(m, bool)
-        # a false row shows in those at it, too
+        # a false row changes the deviations of adjacent rows too
         beside = reduce(np.maximum, (far[ROWS_BESIDE + k:][:m]
                                      for d in range(2, edge) for k in (-d, d)))
         at = far[ROWS_BESIDE:][:m]
@@ -171,7 +171,7 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
     Return IMU_GAP where the gyro repeats one value to the last bit while the wheels roll.
 
     t, w : (n,), (n, 3) IMU rows.   travel : Travel.   limit : s, as long as a gap may be.
-    A gyro that reads zero is let pass: some drivers have a dead band.
+    A gyro that reads zero is accepted: some drivers have a dead band.
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()

@@ -5,7 +5,7 @@
 Fit of the direction of gravity to the gyro, one coefficient for each axis of the gyro.
 
 Hills, bumps and braking tilt a vehicle: gravity turns in the frame of the accelerometer, and the
-gyro must measure that turn. In level axes that the yaw psi of the gyro holds still, the specific
+gyro must measure this turn. In level axes that the yaw psi of the gyro holds still, the specific
 force, as a complex number e1 + i e2, is
 
     F = F0 + i g int (w1 + i w2) exp(i psi) dt + d/dt (v exp(i psi)).
@@ -131,7 +131,7 @@ def _fit(X: Complexes, force: Complexes) -> GravityFit | None:
     adjoint = X.conj().swapaxes(1, 2)
     normal, right = adjoint @ X, (adjoint @ force[..., None])[..., 0]
     scale = np.sqrt(np.einsum('kii->i', normal).real)
-    scale[scale == 0] = 1.0             # a push that never is
+    scale[scale == 0] = 1.0             # an acceleration that is always zero
     normal, right = normal / (scale[:, None] * scale), right / scale
     weight = np.ones(n)
     tiny = 1e-9 * np.eye(p)    # of the unit diagonal, rounding: what the drive does not determine

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-IMU rows on the rhythm of their sender, where stamps jitter about it.
+Sampling times of IMU rows whose stamps have jitter.
 
-An IMU samples by its own crystal; what stamps its rows as they arrive makes jitter of some
-milliseconds, or pairs. Integrals see the change from row to row times the jitter: with an engine's
-vibration a noise many times the sensors' own. Rows are put on an even rhythm where rate and force
-are evener so, unlike those of an IMU that is polled at uneven times.
+An IMU samples by its own crystal; stamps at arrival have jitter of some milliseconds, or come in
+pairs. The error of integrals is the change from row to row times the jitter: with the vibration of
+an engine many times the sensor noise. Rows are placed at even times if rate and force are smoother
+there, unlike those of an IMU that is polled at uneven times.
 """
 
 from collections.abc import Iterable
@@ -20,13 +20,13 @@ from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks, PIECE_ROWS, runs
 
 BLOCK_TIME = 1.0          # s, judgement: of rows in whose mean a lost row shows
-WINDOW_BLOCKS = 20        # judgement: of a mean, which leaves jitter over sqrt(2000) at 100 Hz
-JITTER_SHARE = 2e-3       # judgement: of an interval, the least that is worth it
+WINDOW_BLOCKS = 20        # judgement: of a mean: jitter over sqrt(2000) remains at 100 Hz
+JITTER_SHARE = 2e-3       # judgement: of an interval, smallest jitter that is corrected
 TESTED_ROWS = 20_000      # judgement: at the most, in as many
 TESTED_GROUPS = 40        # judgement: groups, whose sums give the significance
 BESIDE, HERE, NODES = np.arange(-2, 3), 2, (0, 1, 3, 4)     # definition: a row amid its cubic's
-APART = 1e-9              # s, judgement: that rows are apart at least
-SURE_SIGMAS = 4.0         # statistical: that rows are evener so, by chance once in 30,000
+APART = 1e-9              # s, judgement: minimum difference between rows
+SURE_SIGMAS = 4.0         # statistical: significance of smoother rows: by chance once in 30,000
 
 
 def on_rhythm(t: Floats, w: Floats, f: Floats) -> Floats:
@@ -56,10 +56,10 @@ def _interval(t: Floats) -> float:
 
 class _Rhythm:
     """
-    Even times through the means of rows, where none is lost; elsewhere rows keep their stamps.
+    Even times through the means of rows where none is lost; elsewhere rows keep their stamps.
 
-    lost : (b,) bool, blocks of ``per`` rows in or beside which one is.   knots, late : (k,) rows,
-    and by how much rows there are later than so many intervals, s.
+    lost : (b,) bool, blocks of ``per`` rows with a lost row in or beside them.   knots, late :
+    (k,) rows, and their delay relative to so many intervals, s.
     """
 
     def __init__(self, t: Floats, usual: float, per: int) -> None:
@@ -83,7 +83,7 @@ class _Rhythm:
         return np.concatenate(found)
 
     def _line(self, mean: Floats, first: int, last: int) -> Floats:
-        """Return knots of blocks without a loss: a line, and what windows of them differ by."""
+        """Return knots of blocks without a loss: a line plus the deviations of windows."""
         blocks = np.arange(first, last)
         middle = (blocks + 0.5) * self.per
         slope, start = np.polyfit(middle, mean[first:last], 1) if len(blocks) > 1 \
@@ -104,7 +104,7 @@ class _Rhythm:
         return np.where(lost, t[rows], even)
 
     def times(self, t: Floats) -> Floats:
-        """Return the times of all rows, rising: where both kinds meet, none before the last."""
+        """Return the times of all rows, rising, also where both kinds meet."""
         found, last = room(len(t)), -np.inf
         for rows in chunks(len(t)):
             own = np.arange(rows.start, rows.stop)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A leg as the methods use it: its screened rows, where its fixes lie, how far a count reaches."""
+"""A leg as the methods use it: screened rows, fixes in metres, metres per count."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -52,7 +52,7 @@ class Inputs:
 
     @cached_property
     def usual_f_b(self) -> Floats:
-        """Return the median of the specific force, which shows what is up: (3,) m/s^2."""
+        """Return the median of the specific force, which points up: (3,) m/s^2."""
         return medians(self.f_b)
 
     @property
@@ -62,7 +62,7 @@ class Inputs:
 
     @property
     def least_motion(self) -> float:
-        """Return the distance over which positions surely move, m."""
+        """Return the minimum distance between positions that is certainly motion, m."""
         return LOCAL_MOVES if self.local else GNSS_MOVES
 
     def standstills(self, metres_per_unit: float, config: Config) -> Floats:

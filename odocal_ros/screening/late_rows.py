@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Odometer rows that came late: now and then in a burst that catches up, or all of them by chance.
+Sampling times of odometer rows that arrive late: in bursts, or all with random delays.
 
-A counter without a header is stamped at arrival: what delays a message (a serial line, a busy
-machine) looks like a wheel that slid and spun. No row is early, so the sender's even rhythm is
-below the stamps: it goes through the rows that came soonest. The middle of this lateness is a
-delay; the rest is taken out where the travel is more even on the rhythm. Rows of a burst that
-are not on it are placed by their travel.
+A counter without a header is stamped at arrival: a delayed message (serial line, busy machine)
+looks like a wheel that slides and then spins. No row is early, so the sender's even rhythm goes
+through the rows with the smallest delays. The median delay remains; the rest is removed if the
+travel is smoother on the rhythm. Rows of a burst that are not on it are placed by their travel.
 """
 
 import numpy as np
@@ -20,14 +19,14 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.imu_rhythm import APART, TESTED_ROWS
 from odocal_ros.screening.odometer_care import counter_steps
 
-ON_TIME_WINDOW = 5.0      # s, judgement: within which some row comes on time
+ON_TIME_WINDOW = 5.0      # s, judgement: some row in it is on time
 EVEN_BESIDE = 5           # judgement: rows to either side that determine the place of a row
-# definition: a line would take half the acceleration for lateness
+# definition: with a line, half the acceleration would look like delay
 CUBIC = (-2 * EVEN_BESIDE, -EVEN_BESIDE, EVEN_BESIDE, 2 * EVEN_BESIDE)
-MIDDLE_WINDOW = 20.0      # s, judgement: whose median is the middle, at least
-MIDDLE_SIGMA = 5e-4       # s, judgement: which it then has; at 15 m/s a centimetre
-LEAST_JITTER = 1e-4       # s, judgement: off the rhythm that is worth it
-ROUNDING_COUNTS = 2.5     # judgement: that rounding may put a row off by
+MIDDLE_WINDOW = 20.0      # s, judgement: minimum length for the median delay
+MIDDLE_SIGMA = 5e-4       # s, judgement: required sigma of this median; 1 cm at 15 m/s
+LEAST_JITTER = 1e-4       # s, judgement: smallest deviation from the rhythm that is corrected
+ROUNDING_COUNTS = 2.5     # judgement: largest deviation of a row by rounding
 
 
 def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -41,7 +40,7 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
         return t
     whole = np.issubdtype(samples.value.dtype, np.integer)
     if form.quantity == 'rate':
-        # a speed is as smooth as travel, but does not say where a row of a burst belongs
+        # a speed is as smooth as travel, but does not determine the place of a row in a burst
         _, even, evener = _rhythm(t, samples.value.astype(float))
         true = _rising(even) if evener else t
     else:
@@ -50,7 +49,7 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
         travel = np.concatenate([[0.0], np.cumsum(step)])
         true = _put_back(t, travel, ROUNDING_COUNTS if whole else 0.0)
     late = t - true
-    named_late, named_late_share = 0.02, 0.3    # s, of an interval: the more is worth a word
+    named_late, named_late_share = 0.02, 0.3    # s, of an interval: larger delays are reported
     named = late > max(named_late, named_late_share * intervals(t)[0])
     if named.any():
         worst, times = int(np.argmax(late)), int((np.diff(named.astype(int)) == 1).sum())
@@ -88,7 +87,7 @@ def intervals(t: Floats) -> list[float]:
 def _put_back(t: Floats, travel: Floats, least: float) -> Floats:
     """Return times with late rows put back."""
     usual, even, evener = _rhythm(t, travel)
-    least_late, late_share = 0.004, 0.1    # s, of an interval: the more of both matters
+    least_late, late_share = 0.004, 0.1    # s, of an interval: the larger is the limit
     late = t - even > (usual if evener else max(least_late, late_share * usual))
     true = even.copy() if evener else t.copy()
     for begin, end, fits in _fitting(t, even, travel, late, least):
@@ -130,10 +129,10 @@ def _fitting(t: Floats, even: Floats, travel: Floats, late: Bools,
 
 def _rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
     """
-    Return the interval, the times on the rhythm on which the travel is evenest, and if it is.
+    Return the interval, times on the rhythm with the smoothest travel, True if it is smoother.
 
-    What is off a rhythm is stamped late, as a busy machine comes to it, or both ways, by a
-    sender's clock that ticks seldom. True: as a whole these rows are more even on it.
+    Rows off a rhythm are late, on a busy machine, or early and late, by a coarse clock of the
+    sender.
     """
     # of two as even that of the middle: the soonest rows make a stair
     found = [(_unevenness(t, even, travel), usual, even) for usual in reversed(intervals(t))
@@ -160,22 +159,22 @@ def _unevenness(t: Floats, even: Floats, travel: Floats) -> float:
 
 def _soonest(t: Floats, usual: float) -> Floats:
     """
-    Return the rhythm of the rows that came soonest, later by what the middle of all rows is.
+    Return the rhythm of the rows with the smallest delays, shifted by the median delay of all.
 
-    By the morphological opening of the lateness over ON_TIME_WINDOW: what is later for a shorter
-    time is lateness; a rise that stays is a lost row, or another interval.
+    By the morphological opening of the delays over ON_TIME_WINDOW: a shorter increase is a delay;
+    an increase that stays is a lost row, or another interval.
     """
     rows = usual * np.arange(len(t))
     window = min(int(ON_TIME_WINDOW / usual) + 1, len(t))
     least = _least_of_next(t - rows, window)
     least[len(t) - window + 1:] = -np.inf       # of whole windows only
     even = rows - _least_of_next(-least[::-1], window)[::-1]
-    out: Floats = even + np.median(t - even)      # what all have is a delay, and no lateness
+    out: Floats = even + np.median(t - even)      # a constant delay is not corrected
     return out
 
 
 def _middle(t: Floats, usual: float) -> list[Floats]:
-    """Return the rhythm in the middle of rows, some of them early; none where rows are lost."""
+    """Return the rhythm of the median rows, some of them early; [] if rows are lost."""
     row = np.arange(len(t))
     late = t - usual * row
     at, middle = _medians(late, MIDDLE_WINDOW / usual)
@@ -198,7 +197,7 @@ def _medians(x: Floats, per: float) -> tuple[Floats, Floats]:
 
 
 def _least_of_next(x: Floats, count: int) -> Floats:
-    """Return the least of each value and those after it, so many in all."""
+    """Return the minimum of each value and those after it, ``count`` in total."""
     n, count = len(x), min(count, len(x))       # a wild interval asks for any number
     blocks = np.append(x, np.full(count - n % count + count, np.inf)).reshape(-1, count)
     since = np.minimum.accumulate(blocks, axis=1).ravel()       # from its block's first
@@ -207,7 +206,7 @@ def _least_of_next(x: Floats, count: int) -> Floats:
 
 
 def _off(t: Floats, travel: Floats, rows: Ints) -> Floats:
-    """Return by how much rows' travel is off the cubic through rows beside them: (m,)."""
+    """Return the deviation of the travel of rows from the cubic through adjacent rows: (m,)."""
     last = len(t) - 1
     nodes = [np.clip(rows + step, 0, last) for step in CUBIC]
     times, here = [t[at] for at in nodes], t[rows]

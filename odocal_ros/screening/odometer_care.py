@@ -115,7 +115,7 @@ def doubted(travel: Travel, value: Values, form: OdometerForm) -> tuple[Travel, 
     if form.quantity == 'cumulative':
         sent = counter_steps(value, form.modulus)
         odd = np.flatnonzero(np.abs(np.abs(step) - np.abs(sent)) > 1e-6 * np.abs(sent) + 1e-9)
-        # a reset: of the travel since the last count nothing is known but the speeds beside
+        # a reset: only the adjacent speeds bound the travel since the last count
         stall = [_stall(step, k) for k in odd.tolist()]
         most = [max(abs(_usual(rate[max(0, a - STEPS_BESIDE):a])),
                     abs(_usual(rate[k + 1:][:STEPS_BESIDE])))
@@ -178,7 +178,7 @@ def _usual(rate: Floats) -> float:
 
 
 class Steps:
-    """Rows to steps, in odometer units; ``nav.odometer.travel`` does it with all rows at hand."""
+    """Rows to steps, in odometer units; ``nav.odometer.travel`` does it for a whole leg."""
 
     def __init__(self, form: OdometerForm) -> None:
         self.form = form
@@ -186,14 +186,14 @@ class Steps:
 
     @property
     def still(self) -> float:
-        """Return the travel up to which one that stands may seem to move."""
+        """Return the largest apparent travel at rest."""
         return STILL_TRAVEL.get(self.form.scale_unit, 0.02)
 
     def of(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
         """
         Return the step of each row since the row before, its stamp, ns, and its duration, s.
 
-        Rows without a possible value are passed over.
+        Rows with impossible values are skipped.
         """
         good = ~beyond('value', block.value)
         stamps, values = block.stamp_ns[good], block.value[good]

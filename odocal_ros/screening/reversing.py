@@ -4,9 +4,9 @@
 """
 Reversing with an unsigned counter: it counts up while accelerations point backwards.
 
-Off a stop the specific force along the vehicle grows with what the wheels speed up by, in the same
-ratio at every start. Where the ratio has the other sign the vehicle reversed. Fixes see
-that only once the stretch is long beside their noise; a few metres are enough for the IMU.
+After a stop the specific force along the vehicle is proportional to the acceleration of the
+wheels, with the same ratio at every start. If the ratio has the opposite sign, the vehicle
+reversed. The IMU detects a few metres; fixes need a path much longer than their noise.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.pieces import runs
 from odocal_ros.nav.integral import integral_at, integrals_at, twice_integrals_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
@@ -22,8 +23,8 @@ from odocal_ros.settings.grades import G
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 REVERSING_STEP = 0.1          # s, judgement: grid
-PUSH_TIME = 0.6            # s, judgement: each side, that accelerations are taken over
-STOP_BEFORE = 1.0             # s, judgement: of the stop that belong to it
+PUSH_TIME = 0.6            # s, judgement: each side, of accelerations
+STOP_BEFORE = 1.0             # s, judgement: of the stop before a start
 BY_IMU = 'the acceleration has the opposite sign of the other starts'
 BY_FIT = 'IMU and fixes move backwards'
 
@@ -119,10 +120,8 @@ def _stretches(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
         return np.empty(0, int), np.empty(0, int)
     stands_of_top = 0.02    # of the top speed: below it is a stop
     stands = speed <= max(1.01 * travel.quantum / PUSH_TIME, stands_of_top * top)
-    edge = np.flatnonzero(np.diff(stands.astype(int)))
-    begins = edge[stands[edge]] + 1
-    ends = np.append(edge[~stands[edge]], len(t) - 1)
-    ends = ends[np.searchsorted(ends, begins)]
+    moving = runs(~stands) - [0, 1]
+    begins, ends = moving[moving[:, 0] > 0].T
     long = (ends - begins) * REVERSING_STEP > 2 * PUSH_TIME
     return begins[long], ends[long]
 
@@ -150,7 +149,7 @@ class _Forces:
 
 
 def _ratio(t: Floats, push: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:
-    """Return by how much the specific force grows with the odometer's acceleration, and sigma."""
+    """Return the ratio of specific force to the odometer's acceleration, and its sigma."""
     low = max(0, a - round((STOP_BEFORE + PUSH_TIME) / REVERSING_STEP))
     longest_start = 12.0    # s after a stop that are looked at: later the tilt drifts
     high = min(len(t), b + 1, a + round(longest_start / REVERSING_STEP))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rows of one topic made usable: finite, beyond no sensor, stamps that rise, no single spikes."""
+"""Usable rows of one topic: finite, in a possible range, rising stamps, no isolated outliers."""
 
 from bisect import bisect_left
 from dataclasses import replace
@@ -115,7 +115,7 @@ def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
 
 
 def _stood(samples: Any) -> Any:
-    """Return odometer samples with zero where a low-pass filter has faded to next to nothing."""
+    """Return odometer samples with zero where a low-pass filter has faded to tiny values."""
     least_value = 1e-30    # m/s or rad/s: a filter of 0.4 s reaches it after half a minute
     faded = (samples.value != 0) & (np.abs(samples.value) < least_value)
     return replace(samples, value=np.where(faded, 0, samples.value)) if faded.any() else samples
@@ -125,7 +125,7 @@ def _one_by_one(samples: Any) -> Any:
     """
     Return odometer samples without a header, stamped at arrival, with equal stamps 1 ns apart.
 
-    Where many samples have the stamp and the value of the one before, each was sent twice.
+    If many samples repeat stamp and value of the one before, each was sent twice.
     """
     stamp, twice_share = samples.stamp_ns, 1 / 3    # of all, a half: what comes at once moves on
     step = np.diff(stamp)
@@ -160,8 +160,8 @@ def _longest_rising(stamp: Ints) -> Ints:
     """
     Return the indices of a longest strictly rising subsequence (patience sorting).
 
-    Every row loses its place only to a larger number of others: one glitch into the future costs
-    one row, a clock stepped back costs the shorter side.
+    The most rows are kept: one stamp in the future costs one row, a clock that is set back costs
+    the shorter side.
     """
     tails: list[int] = []
     ends: list[int] = []

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Screening: a raw leg to clean arrays on one time axis, with a sentence for each thing found.
+Screening: from a raw leg to clean arrays on one time axis, with a reason for each fault.
 
-Rows that cannot be used are dropped and counted, the rest is used. Times are seconds since the
-start mark; the mark is an IMU stamp, so the IMU's time offset moves the others against it.
+Rows that cannot be used are dropped and counted. Times are seconds since the start mark; the mark
+is an IMU stamp, so the IMU's time offset is subtracted from those of the others.
 """
 
 from collections import Counter
@@ -50,7 +50,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     for slot in ('imu', 'odometer', 'fix'):
         if not len(getattr(leg, slot).stamp_ns):
             code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
-            if any(r.code is code for r in found):      # a frame_id that nobody sends
+            if any(r.code is code for r in found):      # a frame_id that is not sent
                 continue
             found.append(Reason(code, f'no {INPUTS[slot].label} message between the marks'))
     offset = offsets(config)
@@ -140,7 +140,7 @@ def _turned(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:
 
 
 def _gaps(slot: str, t: Floats, found: list[Reason]) -> None:
-    """Name the longest gap of odometer or fixes where it is far beyond their own rhythm."""
+    """Add TOPIC_GAP for the longest gap of a topic far beyond its own rhythm."""
     gaps = gaps_in_rhythm(t)
     if len(gaps):
         begin, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Wheels that do not count as wheels: one dead or hung, one that counts against the other.
+Faults of wheels: one does not count, or counts in the opposite direction.
 
-These are seen by the wheels themselves and the gyro, before any attitude or scale is known: with
-them the mean of both wheels is no travel, and whatever rests on it is wrong.
+They are detected from the wheels and the gyro, before attitude or scale is known: with them the
+mean of both wheels is not the travel.
 """
 
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ def broken_wheels(axle: Sequence[Travel], imu: Imu,
     if keep.sum() < 10:
         return _dead(two, steps, held)
     A = np.stack([steps[0], turn, np.full(len(turn), FAULT_GRID)], -1)
-    x, covariance = _line(A[keep], steps[1][keep], _floor(two, steps))
+    x, covariance = _line(A[keep], steps[1][keep], two.least_sigma(steps))
     held = [_not_pivoting(held[k], steps, A, x, k) for k in (0, 1)]
     return _dead(two, steps, held) + _reversed(two, steps, A @ x, x[0], covariance[0, 0],
                                                imu)
@@ -67,8 +67,8 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     """
     Return the fit of the right wheel by left wheel, turn and time, and its covariance.
 
-    Two starts, since the faulty cells may be many: least squares, and the usual ratio of the
-    wheels without a turn; the one that leaves fewer cells over.
+    Two starts, since many cells may be faulty: least squares, and the median ratio of the wheels
+    without a turn; the fit with fewer outliers is used.
     """
     rolls = A[:, 0] != 0
     usual = float(np.median(y[rolls] / A[rolls, 0])) if rolls.any() else 1.0
@@ -84,10 +84,6 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     left_over = [np.minimum(1.0, ((y - A @ x) / (
         TUKEY * np.hypot(least, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
     return fits[int(np.argmin(left_over))][:2]
-
-
-def _floor(two: Pair, steps: Floats) -> float:
-    return 0.3 * two.quantum + 1e-4 * float(np.median(np.abs(steps)))
 
 
 def _rolling(steps: Floats, quantum: float) -> Bools:
@@ -148,7 +144,7 @@ def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
 
 def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance: float,
               imu: Imu) -> tuple[Reason, ...]:
-    """Return WHEEL_REVERSED where the right wheel goes against what left wheel and gyro say."""
+    """Return WHEEL_REVERSED if the right wheel contradicts left wheel and gyro."""
     if ratio < -FAULT_SIGMAS * np.sqrt(variance) and ratio < -0.1:
         k = _against_imu(two, steps, imu)
         which = (f'the {two.names[k]} wheel counts down when the vehicle drives forward, the '

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Two wheels and the gyro on one time grid, and the line that joins them."""
+"""Two wheels and the gyro on one time grid, and a robust linear fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ TUKEY = 4.685
 @dataclass(frozen=True, eq=False)
 class Pair:
     """
-    Ways of both wheels and the vehicle's turn at the edges of equal cells.
+    Travel of both wheels and the vehicle's turn at the edges of equal cells.
 
     t : (n,) s.   left, right : (n,) scale units.   turn : (n,) rad about the vehicle's up axis,
     gyro bias and all.   known : (n - 1,) cells within no gap.   quantum : scale units.
@@ -44,6 +44,10 @@ class Pair:
         """Return the length of a cell, s."""
         length: float = self.t[1] - self.t[0]
         return length
+
+    def least_sigma(self, steps: Floats) -> float:
+        """Return the least sigma of steps: rounding, and a part of their median."""
+        return 0.3 * self.quantum + 1e-4 * float(np.median(np.abs(steps)))
 
 
 def pair(axle: Sequence[Travel], imu: Imu, between: tuple[float, float], step: float,

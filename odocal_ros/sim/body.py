@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The body on its springs: it squats and rolls by what accelerates it, and takes sensors along.
+The sprung body: accelerations cause pitch and roll, which move the sensors on it.
 
-Roll and pitch answer as a second-order system does, each about the rear axle's centre. Rear
-tyres that push to the side drift there: the axle's centre moves at an angle to its wheels.
+Roll and pitch are second-order systems, each about the rear axle's centre. Lateral forces of the
+rear tyres cause sideslip: the axle's centre moves at an angle to its wheels.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ from odocal_ros.sim.real import Real
 from odocal_ros.sim.road import Hills
 from odocal_ros.sim.zoo import G
 
-# physical: a car's body on its springs goes at some 1.3 Hz, damped by shock absorbers
+# physical: natural frequency of a car's body on its springs, damped by shock absorbers
 FREQUENCY = 2 * np.pi * 1.3   # rad/s
 DAMPING = 0.3
 
@@ -28,8 +28,8 @@ def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
     """
     Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles.
 
-    What holds it on a slope is a push too. Both axles stand on the road: the body lies along the
-    chord of the wheelbase, the rear axle moves along the road below it.
+    The force that holds it on a slope acts like an acceleration. Both axles stand on the road: the
+    body lies along the chord of the wheelbase, the rear axle moves along the road below it.
     """
     hills = hills or Hills()
     # s; a cubic between is then good to (w h)^4 / 384 = 2e-6; a kerb is over within 0.2 s
@@ -47,7 +47,7 @@ def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
 
 
 def leaning(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
-    """Return by how much the road leans to the right by time, rad: cross slopes, banked curves."""
+    """Return the lean of the road to the right by time, rad: cross slopes, banked curves."""
     step = 0.005 if real.kerbs else 0.02    # s, as above
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
     cross = Hills(real.cross_slope, real.cross_slope_length)
@@ -57,9 +57,9 @@ def leaning(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
 
 def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:
     """
-    Return value and rate of ``y'' + 2 z w y' + w^2 y = w^2 u`` for u in straight lines.
+    Return value and rate of ``y'' + 2 z w y' + w^2 y = w^2 u`` for piecewise linear u.
 
-    push : (n,) u at equal steps; it has stood at the first before.
+    push : (n,) u at equal steps; constant before the first.
     """
     w, z = FREQUENCY, DAMPING
     wd = w * np.sqrt(1 - z**2)
@@ -67,7 +67,7 @@ def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:
     a, b = decay * (c + z * w / wd * s), decay * s / wd
     d = decay * (c - z * w / wd * s)
     slope = np.diff(push) / step
-    begin = push[:-1] - 2 * z / w * slope     # where a ramp would have it run along
+    begin = push[:-1] - 2 * z / w * slope     # steady response to a ramp
     y, dy = np.empty(len(push)), np.empty(len(push))
     now, rate = float(push[0]), 0.0
     y[0], dy[0] = now, rate
@@ -80,7 +80,7 @@ def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:
 
 
 def drift(speed: Profile, yaw_rate: Profile, sideslip: float, t: Floats) -> Floats:
-    """Return the velocity to the left at times t, m/s: against the push of the tyres."""
+    """Return the velocity to the left at times t, m/s: against the force of the tyres."""
     v = speed(t)
     return -sideslip * v * yaw_rate(t) * np.abs(v)
 

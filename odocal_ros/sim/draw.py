@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Draw a vehicle as real ones are: what it is, then what its sensors do; docs/zoo.md has the sources.
+Draw a realistic vehicle: first its properties, then effects of its sensors (docs/zoo.md).
 
-Each effect draws from a stream of its own name: alone or among all others, it is the same.
+Each effect draws from a stream of its own name: alone or with others, it is the same.
 """
 
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
     there = []
     for name in names:
         changes, figures = (EFFECTS | RARE)[name](stream(seed, f'vehicle {name}'), vehicle)
-        if changes or figures:      # a draw may come out as none
+        if changes or figures:      # a draw may have no effect
             there.append(name)
         options |= changes
         real |= figures

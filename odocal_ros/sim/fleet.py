@@ -20,7 +20,7 @@ FATES = {'scale_factor': 0.1, 'yaw_mounting_angle': 0.05, 'counter': 1 / 30}
 
 @dataclass(frozen=True)
 class Model:
-    """A kind of vehicle: scale as its maker says and as it is, m/pulse; mounting angles, rad."""
+    """A kind of vehicle: nominal and true scale, m/pulse; mounting angles, rad."""
 
     name: str
     nominal: float
@@ -37,7 +37,7 @@ MODELS = (Model('shuttle', 0.0210, 0.0213, math.radians(1.0), math.radians(0.4))
 
 @dataclass(frozen=True)
 class FleetChange:
-    """What happened to a vehicle before one of its bags, the first being 0."""
+    """A change of a vehicle before one of its bags, the first being 0."""
 
     bag: int
     what: str            # scale_factor, yaw_mounting_angle or counter
@@ -46,7 +46,7 @@ class FleetChange:
 
 @dataclass(frozen=True, eq=False)
 class FleetVehicle:
-    """A vehicle and what its drives are made of."""
+    """A vehicle and the true values of its drives."""
 
     name: str
     model: Model
@@ -105,7 +105,7 @@ def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOpti
 
 
 def as_driven(drive: Drive, broken: bool) -> Drive:
-    """Return a drive as its bag has it: a broken counter stands from a third of it on."""
+    """Return a drive as in its bag: a broken counter stops after a third of it."""
     if not broken:
         return drive
     rows = drive.odometer

@@ -4,9 +4,9 @@
 """
 True motion of a vehicle on the WGS 84 ellipsoid, from a speed and a turn-rate profile.
 
-The rear axle's centre moves along the vehicle's x axis, but for a sway to the side and up if asked
-for. Speed, turn rate and sway are piecewise polynomials, so travel and yaw are exact; position is
-their integral by four-point Gauss rule between breaks, good to 1e-8 m over tens of kilometres.
+The rear axle's centre moves along the vehicle's x axis, except for an optional sway to the side
+and up. Speed, turn rate and sway are piecewise polynomials, so travel and yaw are exact; position
+is their integral by four-point Gauss rule between breaks, good to 1e-8 m over tens of kilometres.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ GAUSS = tuple(zip(*np.polynomial.legendre.leggauss(4), strict=True))     # defin
 
 @dataclass(frozen=True)
 class Start:
-    """Where the drive begins: rad, ellipsoidal m, ENU yaw in rad."""
+    """Start of the drive: rad, ellipsoidal m, ENU yaw in rad."""
 
     latitude: float
     longitude: float
@@ -43,7 +43,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What the vehicle truly does at (n,) times; its frame is v, at the rear axle."""
+    """True state of the vehicle at (n,) times; its frame is v, at the rear axle."""
 
     t: np.ndarray                # s
     travel: np.ndarray           # m, rolled by the axle's centre
@@ -67,9 +67,9 @@ class Motion:
     """
     The true drive: ``at(t)`` gives its state at any times between 0 and ``duration``.
 
-    sway : velocities along v's y and z axes (m/s), of a vehicle that slides and heaves.
-    tilt : roll and pitch (rad) of the body on it; empty: the body is stiff.
-    lean : roll (rad) of the road under its wheels, which is in ``tilt`` too.
+    sway : velocities along v's y and z axes (m/s).
+    tilt : roll and pitch (rad) of the body on the vehicle; empty: the body is rigid.
+    lean : roll (rad) of the road under its wheels, which ``tilt`` includes.
     """
 
     def __init__(self, speed: Profile, yaw_rate: Profile, start: Start,

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a simulated drive is made of: every choice with its default, checked in one place."""
+"""Options of a simulated drive, with defaults and checks."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
@@ -24,7 +24,7 @@ BY_SCENARIO: Any = None   # filled in by ``resolved``
 @dataclass(frozen=True, kw_only=True)
 class SimOptions:
     """
-    Choices for one drive; BY_SCENARIO is the scenario's own value.
+    Options of one drive; BY_SCENARIO: the scenario's own value.
 
     Lever arms are positions in base_link (rear axle, forward-left-up), m. Mounting angles are
     those of docs/conventions.md; ``mounting_rpy`` is the nominal rotation from the IMU's frame to
@@ -100,7 +100,7 @@ class SimOptions:
     velocity_scale_error: float = 0.0      # relative
     velocity_outliers: float = 0.0         # share of outliers
 
-    real: Real = Real()                    # what real sensors do beyond this
+    real: Real = Real()                    # further errors of real sensors
 
     @property
     def wheel_count(self) -> int:
@@ -136,7 +136,7 @@ NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise'
                 'outlier_size', 'seed', 'velocity_sigma', 'velocity_correlation_time',
                 'velocity_lag', 'velocity_outliers', 'reference_drift', 'drift_length',
                 'closure_time')
-# largest size, and how a person gives it: rad inside, degrees on the command line
+# largest absolute values; angles are rad in the options and degrees on the command line
 LIMITS = {'outliers': 0.5, 'start_slip': 0.5, 'sway': 1.0, 'wheel_difference': 0.5,
           'gyro_scale_error': 0.5, 'accel_scale_error': 0.5, 'odometer_delay': 10.0,
           'fix_delay': 10.0, 'velocity_delay': 10.0, 'velocity_lag': 10.0,

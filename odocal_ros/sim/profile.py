@@ -30,7 +30,7 @@ class Profile:
         return float(self.breaks[-1])
 
     def __call__(self, t: ArrayLike) -> Floats:
-        """Return the values at (...) times; at a jump, what follows it."""
+        """Return the values at (...) times; at a jump, the value after it."""
         return self._on(self._piece(t), t)
 
     def mean(self, t: ArrayLike) -> Floats:
@@ -116,5 +116,5 @@ def turn(duration: float, angle: float, blend: float) -> list[Piece]:
 
 
 def hold(duration: float) -> list[Piece]:
-    """Return the pieces of nothing happening."""
+    """Return pieces of zeros."""
     return [line(duration, 0.0, 0.0)]

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a real vehicle's sensors do beyond noise and bias: each figure with the value of none."""
+"""Errors of a real vehicle's sensors beyond noise and bias; each default means no error."""
 
 from dataclasses import dataclass, fields
 import difflib
@@ -32,7 +32,7 @@ POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_fa
 @dataclass(frozen=True, kw_only=True)
 class Real:
     """
-    The vehicle's own figures, SI and radians; the IMU's in its own frame i (the housing).
+    Figures of a vehicle, SI and radians; those of the IMU in its own frame i (the housing).
 
     The IMU reads ``w_m = (I + M_g) w + b_g + G f + n`` and ``f_m = (I + M_a) f + b_a + n``.
     """
@@ -112,7 +112,7 @@ class Real:
 
 
 def _checked(name: str, value: Any, default: Any) -> Any:
-    """Return a figure as numbers and tuples of them, or say what is wrong with it."""
+    """Return a figure as numbers and tuples of them, or raise BadUsage."""
     if name in WORDS:
         if value not in WORDS[name] and value != default:
             raise BadUsage(f'--real {name}={value}: required: one of {", ".join(WORDS[name])}')
@@ -132,7 +132,7 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 
 
 def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
-    """Return the numbers of a figure whose form is right."""
+    """Return the numbers of a figure of the required form."""
     if name in PAIRS:
         if not (isinstance(value, tuple) and all(isinstance(v, tuple) and len(v) == 2
                                                  and v[1] for v in value)):

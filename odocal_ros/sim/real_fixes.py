@@ -15,8 +15,8 @@ from odocal_ros.sim.motion import Motion, point
 from odocal_ros.sim.noise import gauss_markov, PHASE, stamps, stream, TRANSPORT
 from odocal_ros.sim.options import SimOptions
 
-# definition: ages, in time constants, and weights of a first-order filter: Gauss and Legendre on
-# pieces, so fine that the kinks of a route do no harm
+# definition: ages, in time constants, and weights of a first-order filter: Gauss-Legendre rule on
+# pieces, fine enough for the kinks of a route
 EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
                         np.arange(20.0, 41.0, 4.0)])
 NODES = (EDGES[:-1, None] + np.diff(EDGES)[:, None] * (0.5 + np.array([-1, 1]) / 12**0.5)).ravel()
@@ -50,7 +50,7 @@ def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floa
 
 def _filtered(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
               time: float) -> tuple[Floats, Floats, Floats]:
-    """Return positions weighted by their age; before the first sample the vehicle is at rest."""
+    """Return positions weighted by age; before the first sample the vehicle is at rest."""
     return tuple(sum(w * x for w, x in zip(weights, row, strict=True)) for row in zip(
         *(_antenna(motion, np.maximum(t - time * node, 0.0), options) for node in NODES),
         strict=True))
@@ -99,9 +99,9 @@ def burst_errors(t: Floats, options: SimOptions) -> Floats:
 
 def reckoned(t: Floats, error: Floats, place: Floats, options: SimOptions) -> Floats:
     """
-    Return errors of a receiver that dead-reckons in tunnels, and is right again after them.
+    Return errors of a receiver that dead-reckons in tunnels, without effect after them.
 
-    error, place : (n, 3) m, ENU; the error at the entry stays.
+    error, place : (n, 3) m, ENU; the error at the entry is kept in the tunnel.
     """
     real, out = options.real, error.copy()
     for begin, length in real.tunnels:
@@ -117,7 +117,7 @@ def reckoned(t: Floats, error: Floats, place: Floats, options: SimOptions) -> Fl
 
 
 def true_variance(white: Floats, options: SimOptions) -> Floats:
-    """Return the variance of the errors but for bursts, ENU: (3,) m^2. white: of the noise."""
+    """Return the variance of the errors without bursts, ENU: (3,) m^2. white: of the noise."""
     slow = sum(sigma**2 for sigma, _ in options.real.slow_errors)
     return white + slow * np.array([1.0, 1.0, UP**2])
 

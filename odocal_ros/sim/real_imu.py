@@ -32,8 +32,8 @@ def turn_and_push(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
     """
     Return the rotation that takes the turn-and-push frame to that of the matrices, (3, 3).
 
-    ``I + M`` is what the triads make of a vector. To first order it is ``I + [theta x]`` with
-    theta = (M_g,yz, -M_g,xz, -M_a,yx).
+    The triads measure ``I + M`` times a vector. To first order the rotation is ``I + [theta x]``
+    with theta = (M_g,yz, -M_g,xz, -M_a,yx).
     """
     gyro, accel = np.eye(3) + gyro_matrix, np.eye(3) + accel_matrix
     z = np.linalg.solve(gyro, [0.0, 0.0, 1.0])
@@ -82,7 +82,7 @@ def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float
 
 
 def _wander(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
-    """Return a walk about 0 from the bias at the first sample on, straight between draws."""
+    """Return a Gauss-Markov process that starts at 0, linear between draws."""
     knots = np.arange(0.0, t[-1] + 2.0, 1.0)    # s
     x = gauss_markov(rng, sigma, tau, knots)
     return np.stack([np.interp(t, knots, column) for column in (x - x[0]).T], -1)
@@ -90,9 +90,9 @@ def _wander(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Fl
 
 def vibration(rng: np.random.Generator, rms: float, rate: float, n: int) -> Floats:
     """
-    Return shaking of a body that goes nowhere, (n, 3): around its resonances, nothing at 0 Hz.
+    Return accelerations of a vibrating body, (n, 3): around its resonances, zero at 0 Hz.
 
-    Its power falls as f^4 below them, as for the acceleration of a bounded displacement.
+    Below them the power falls as f^4, as for a bounded displacement.
     """
     f = np.fft.rfftfreq(n, 1 / rate)
     power = np.zeros_like(f)
@@ -114,7 +114,7 @@ def stamped(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
     """
     Return stamps (ns) of samples measured at ``ns``: late, in order, and in batches.
 
-    The mean of the jitter is none, but no stamp is before its sample.
+    The jitter has zero mean, but no stamp is before its sample.
     """
     late = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
     stamp = ns + np.rint(late * 1e9).astype(np.int64)

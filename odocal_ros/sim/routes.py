@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Named routes: speed and turn rate by time. Stops, ramps, turns; nothing of sensors."""
+"""Named routes: speed and turn rate by time, with stops, ramps and turns."""
 
 from dataclasses import dataclass, replace
 import math
@@ -201,7 +201,7 @@ def _route(stretches: list[tuple[list[Piece], list[Piece]]]) -> Route:
 
 
 def _clean(speed: Profile) -> Profile:
-    """Take rounding out of standing and cruising: a stop is exactly 0 m/s."""
+    """Return a speed without rounding errors: a stop is exactly 0 m/s."""
     powers = speed.powers.copy()
     powers[:, 0] = np.round(powers[:, 0], 11)
     return Profile(speed.breaks, powers)

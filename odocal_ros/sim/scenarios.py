@@ -47,12 +47,12 @@ FORMS = {'counts': OdometerForm('cumulative', 2**64, 'm/pulse'),
 @dataclass(frozen=True, eq=False)
 class Truth:
     """
-    What a calibration of the drive should find.
+    True values of the drive, which a calibration should estimate.
 
     The scale of tyres that grow or slip is the mean of the leg by travel: true metres rolled
-    between the marks over the change of the count there, before anything made it coarse; so are
-    its ratio and the wheels' own. Yaw and pitch are those of the IMU's own axes (turn-and-push
-    frame, ``real_imu.py``), which are its housing's where the triads are square.
+    between the marks over the change of the count there, before quantisation; likewise its ratio
+    and those of the wheels. Yaw and pitch are those of the IMU's own axes (turn-and-push frame,
+    ``real_imu.py``), which equal those of its housing for perpendicular triads.
     """
 
     scale: float                 # m/pulse, 1 or m/rad; of two wheels that of their mean count
@@ -72,7 +72,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What all sensors sent in a drive, the options in force and the truth."""
+    """Samples of all sensors in a drive, its options and the truth."""
 
     options: SimOptions
     motion: Motion
@@ -165,7 +165,7 @@ def _kerbs(route: Route, options: SimOptions) -> tuple[tuple[float, float], ...]
 
 def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Profile, Profile]:
     """
-    Return velocities to the side and up: straight lines between draws, less below 1 m/s.
+    Return velocities to the side and up: linear between draws, smaller below 1 m/s.
 
     On a road that leans the axle's centre turns about the contact of the wheels below it.
     """

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Sensors on a true motion: what each would have sent.
+Samples of sensors on a true motion.
 
-The IMU gives point samples, not means over the interval: the rate and the specific force at the
-stamp; where the acceleration jumps, the mean of both sides. A trapezoid rule over the samples of a
+IMU samples are point samples, not means over the interval: rate and specific force at the stamp;
+if the acceleration jumps there, the mean of both sides. A trapezoid rule over the samples of a
 route whose kinks lie on them is then exact, a cubic one nearly so. White noise is drawn for the
-sample rate, so that sums over time have the stated density.
+sample rate, so that integrals have the stated density.
 """
 
 from dataclasses import replace
@@ -105,7 +105,7 @@ def _imu_stamps(ns: Ints, options: SimOptions) -> Ints:
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:
-    """Return an outside heading of b's x axis, as a dual-antenna receiver sends it."""
+    """Return an external heading of b's x axis, as a dual-antenna receiver sends it."""
     ns, t = stamps(motion.duration, options.heading_rate, PHASE['heading'])
     q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=NONE3), sigma, 'heading')
     stamp = options.start_ns + ns
@@ -114,14 +114,14 @@ def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples
 
 
 def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> Floats:
-    """Return q_ni with one heading error for the whole drive: a compass' does not average out."""
+    """Return q_ni with a constant heading error, like that of a compass."""
     q_ni = quat_from_matrix(attitude(state) @ imu_rotation(options))
     error = sigma * stream(options.seed, name).standard_normal()
     return quat_multiply(quat_from_rotvec([0.0, 0.0, error]), q_ni)
 
 
 def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
-    """Return the samples of each wheel; pulses are whole counts, so late by up to one."""
+    """Return the samples of each wheel; pulses are whole counts, rounded down."""
     ns, t = stamps(motion.duration, options.odometer_rate, PHASE['odometer'])
     state = motion.at(t)
     stamp = options.start_ns + _late(ns, options, 'odometer')
@@ -131,7 +131,7 @@ def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
 
 
 def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
-    """Return stamps that are late by a topic's delay, and by its jitter where it has one."""
+    """Return stamps that are late by a topic's delay and jitter."""
     delay, jitter = (getattr(owner, f'{name}_{what}') for owner, what in (
         (options, 'delay'), (options.real, 'jitter')))
     if not jitter:
@@ -147,7 +147,7 @@ def _reading(state: State, options: SimOptions, wheel: SimWheel,
     grown = 1 + growth(state, real)
     if options.odometer == 'speed':
         noise = options.speed_noise * stream(options.seed, 'speed').standard_normal(len(state.t))
-        # slip of the moment: of a speed sent twice a second differences would smear it
+        # current slip: differences of a speed sent twice a second would smooth it
         pulled = slip_share(state, real) * state.speed
         rate = (contact_speed(state, arm, lean) + pulled + np.gradient(spun, state.t)) / grown
         sent = low_passed(rate + noise, state.t, real.speed_filter)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a simulated drive says of itself: truth.yaml, and the settings an operator would have."""
+"""Truth of a simulated drive as in truth.yaml, and the settings of its operator."""
 
 from dataclasses import asdict
 import math
@@ -13,11 +13,11 @@ from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import Drive
 from odocal_ros.sim.wheels import effective_width, SIDEWAYS, wheels_of
 
-STANDS_FOR_PERFECT = 'navigation'   # the best grade there is in the settings
+STANDS_FOR_PERFECT = 'navigation'   # the best grade in the settings
 
 
 def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
-    """Return the content of truth.yaml: what is to be found, then how it was made."""
+    """Return the content of truth.yaml: true values, then the options of the drive."""
     truth, options = drive.truth, drive.options
     return {
         'bag': bag,

@@ -32,7 +32,7 @@ class SimWheel:
     A wheel.
 
     name : joint.   draws : name of its random numbers.   arm : (3,) m, contact point in base_link.
-    scale : true scale factor.   steered : it points where it rolls (Ackermann).
+    scale : true scale factor.   steered : it is turned to its rolling direction (Ackermann).
     """
 
     name: str
@@ -72,7 +72,7 @@ def wheels_of(options: SimOptions) -> list[SimWheel]:
 
 
 def steered_path(state: State, arm: Floats) -> Floats:
-    """Return the metres that a steered wheel rolls beyond a fixed one at its side: (n,)."""
+    """Return the path length of a steered wheel minus that of a fixed one at its side: (n,)."""
     x, y, z = arm
     along = contact_speed(state, (0.0, y, z))
     more = np.copysign(np.hypot(along, x * turn_rate(state)) - np.abs(along), along)

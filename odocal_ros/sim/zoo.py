@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What drawn vehicles are drawn from: a table by the class of the IMU, sources in docs/zoo.md."""
+"""Distributions of drawn vehicles by the class of the IMU; sources in docs/zoo.md."""
 
 from dataclasses import dataclass
 import math
@@ -49,7 +49,7 @@ ROWS: dict[str, tuple[tuple[float, ...], ...]] = {
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What an effect goes by."""
+    """Properties of a vehicle that effects depend on."""
 
     grade: str       # consumer, industrial or tactical
     kind: str        # of drive
@@ -60,7 +60,7 @@ class Vehicle:
     alone: bool      # the effect alone is requested: it must be present
 
     def size(self, name: str) -> float:
-        """Return the number that a table has for the vehicle's class."""
+        """Return the entry of SIZES for the vehicle's class."""
         return SIZES[name][GRADES.index(self.grade)]
 
     @property
@@ -70,7 +70,7 @@ class Vehicle:
                 'scale': self.options['scale'] / self.options['nominal_scale']}
 
     def row(self, name: str) -> tuple[float, ...]:
-        """Return the several numbers that a table has for the vehicle's class."""
+        """Return the entry of ROWS for the vehicle's class."""
         return ROWS[name][GRADES.index(self.grade)]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadConfig, BadUsage
-from odocal_ros.forecast.leg_so_far import fix_figures, profile_of
+from odocal_ros.forecast.leg_so_far import profile_of
 from odocal_ros.forecast.planned_drive import from_rates, PlannedDrive
 from odocal_ros.forecast.predict import metres_to_go, predict, Sigmas
 from odocal_ros.nav.alignment import Alignment
@@ -202,24 +202,6 @@ def test_fixes_without_height_cost_what_the_height_not_taken_costs():
                for r, s in zip(results, scales, strict=True)]
     assert budgets[1] == pytest.approx(500.0 / A, rel=0.01)
     assert budgets[0] < 1e-2 * budgets[1]
-
-
-def test_a_recorded_leg_predicts_itself():
-    drive = simulate(SimOptions(scenario='town', imu_grade='tactical', imu_rate=50.0, seed=3))
-    settled = with_settings(Config(), {
-        'imu.grade': 'tactical', 'gnss.correlation_time': 0.0, 'alignment.heading_source': 'fixed',
-        'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': HEADING})
-    leg = drive.leg()
-    result = calibrate(leg, settled).methods['two_point'].estimates
-    inputs, _ = screen(leg, settled)
-    predicted = predict(profile_of(inputs, settled), Sigmas(
-        config=settled, quantum=0.0213, **fix_figures(inputs)))
-    # the rough scale is good to a per cent: noise of the fixes lengthens chords of 20 m
-    assert predicted.distance == pytest.approx(drive.truth.distance, rel=0.01)
-    # as above, and speeds smoothed over a second
-    assert predicted.sigma(SCALE) == pytest.approx(
-        result[SCALE].sigma / result[SCALE].value, rel=0.05)
-    assert predicted.sigma(YAW) == pytest.approx(result[YAW].sigma, rel=0.03)
 
 
 def test_metres_to_go_are_enough_and_no_more_than_needed():
