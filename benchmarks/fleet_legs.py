@@ -23,8 +23,7 @@ import pyarrow.parquet as pq
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.engine import engine
-from odocal_ros.fleet.leg_text import leg_text
-from odocal_ros.fleet.rows import Row, row_schema
+from odocal_ros.fleet.rows import leg_text, Row, row_schema
 from odocal_ros.fleet.second_stage import vehicle_jobs, vehicles_together
 
 EACH = 50                    # legs of a vehicle

@@ -20,7 +20,7 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.draw import drawn, EFFECTS, ODOMETER_EFFECTS
 from odocal_ros.sim.scenarios import simulate
 from odocal_ros.sim.truth import settings
-from odocal_ros.sim.vehicle_wheels import wheels_of
+from odocal_ros.sim.wheels import wheels_of
 
 FIRST_SEED = 92_000_000
 GRADES = ('industrial', 'consumer')

@@ -19,7 +19,7 @@ within 1.96 sigma, the rms and the largest of error over sigma, the largest of a
 the median sigma; verdicts; in how many drives each reason was given.
 
 Kinds ROBOT_REFERENCE have no IMU: ``wheels`` is the differential robot, ``skid`` slides in turns
-and ``mecanum`` has four wheels and moves sideways (sim/robot_wheels.py). Their values: width is
+and ``mecanum`` has four wheels and moves sideways (sim/wheels.py). Their values: width is
 that on the spot (of mecanum the rotation lever), arc at a radius of two widths.
 """
 
@@ -73,8 +73,8 @@ def run_drive(seed):
     """Draw, drive, calibrate; return a row."""
     from odocal_ros.pipeline.calibrate import calibrate, combine
     from odocal_ros.settings.config import with_settings
-    from odocal_ros.sim.robot_wheels import effective_width, SIDEWAYS
     from odocal_ros.sim.scenarios import simulate
+    from odocal_ros.sim.wheels import effective_width, SIDEWAYS
     drive = simulate(options_of(seed))
     config = with_settings(configured(drive), {'odometer.track_width': 0.0})
     calibration = combine([calibrate(drive.leg(), config)], config)

@@ -149,44 +149,6 @@ def test_the_reference_is_the_pose(made, drive):
                                motion.velocity_n(state), atol=2e-4)
 
 
-def test_the_recording_at_hand_goes_there_and_back(data_dir, tmp_path):
-    """A folder made of the recorded bag becomes that bag; the original folder is not at hand."""
-    bag = data_dir / 'comma2k19_rav4' / 'bag'
-    names = {'odometer': '/vehicle/twist', 'fix': '/fix'}
-    sent = {topic: read_bag(bag, names | {'imu': topic}).samples('imu')
-            for topic in ('/imu/data', '/imu/data_uncalibrated')}
-    old = read_bag(bag, names | {'imu': '/imu/data'})
-    rows = np.genfromtxt(bag.parent / 'reference.csv', delimiter=',', names=True)
-    begin = rows['unix_s'][0]
-    folder, log = tmp_path / '40', tmp_path / '40' / 'processed_log'
-
-    def boot(ns):
-        return (ns - round(begin * 1e9)) * 1e-9 + BOOT
-    for topic, name in (('/imu/data', 'gyro'), ('/imu/data_uncalibrated', 'gyro_uncalibrated')):
-        put(log, f'IMU/{name}', t=boot(sent[topic].stamp_ns), value=sent[topic].w_i)
-    put(log, 'IMU/accelerometer', t=boot(sent['/imu/data'].stamp_ns), value=sent['/imu/data'].f_i)
-    speed, fix = old.samples('odometer'), old.samples('fix')
-    put(log, 'CAN/speed', t=boot(speed.stamp_ns), value=speed.value)
-    put(log, 'CAN/wheel_speed', t=boot(speed.stamp_ns), value=np.tile(speed.value[:, None], 4))
-    put(log, 'GNSS/live_gnss_ublox', t=boot(fix.received_ns), value=np.stack([
-        np.rad2deg(fix.latitude), np.rad2deg(fix.longitude), 0 * fix.height,
-        fix.stamp_ns * 1e-9, fix.height], -1))
-    put_frames(folder, rows['unix_s'], rows['unix_s'] - begin + BOOT, *pose(
-        np.deg2rad(rows['lat_deg']), np.deg2rad(rows['lon_deg']), rows['alt_m'],
-        np.stack([rows[v] for v in ('ve', 'vn', 'vu')], -1)))
-    made = comma2k19_bag.convert(folder, tmp_path / 'out')
-    new = read_bag(made, names | {'imu': '/imu/data'})
-    for slot in ('imu', 'odometer', 'fix'):
-        assert np.abs(new.samples(slot).stamp_ns - old.samples(slot).stamp_ns).max() < 2000
-    np.testing.assert_array_equal(new.samples('imu').w_i, old.samples('imu').w_i)
-    pulses = [read_bag(path, names | {'imu': '/imu/data', 'odometer': '/odometer/pulses_derived'})
-              .samples('odometer').value for path in (bag, made)]
-    assert np.abs(pulses[0] - pulses[1]).max() <= 1     # where a way ends on a whole pulse
-    truth, known = (yaml.safe_load((path.parent / 'truth.yaml').read_text())['scale']
-                    for path in (made, bag))
-    assert truth['value'] == pytest.approx(known['value'], abs=known['sigma'])
-
-
 @pytest.mark.parametrize(('spoil', 'says'), [
     (lambda log: (log / 'CAN/speed/t').unlink(), 'No such file.*want the folder of one segment'),
     (lambda log: (log / 'CAN/speed/t').write_bytes(b'no array'), 'speed/t: no numpy array'),

@@ -14,14 +14,14 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.smoother.wheel_result import wheel_estimates
 from odocal_ros.calib.smoother.wheels import Wheel
 from odocal_ros.calib.wheels.wheel_slips import of_axles, WheelSlips
-from odocal_ros.data.leg import WHEELS
+from odocal_ros.data.inputs import WHEELS
 from odocal_ros.output.summary import screen as printed
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.axles import axles_of, steering_path
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
-from odocal_ros.sim.vehicle_wheels import wheels_of
+from odocal_ros.sim.wheels import wheels_of
 
 pytestmark = pytest.mark.slow
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'industrial', 'seed': 3}

@@ -27,18 +27,24 @@ def screened(leg, made, **more):
     return inputs, {r.code: r.text for r in found}
 
 
+@pytest.fixture(scope='module')
+def clean(made):
+    """Return the inputs of the drive with nothing wrong."""
+    inputs, said = screened(made.leg(), made)
+    assert not said
+    return inputs
+
+
 def with_right(made, change, **more):
     return replace(made.leg(), odometer_right=changed(made.odometer_right, value=change), **more)
 
 
 @pytest.mark.parametrize('span', [65536, 4096, 256, 10_000, 9000])
 @pytest.mark.parametrize('signed', [False, True])
-def test_a_span_that_the_type_does_not_tell_is_found_and_undone_to_the_count(made, span, signed):
+def test_a_hidden_span_is_found_and_undone_to_the_count(made, clean, span, signed):
     half = span // 2 * signed
     leg = with_right(made, lambda a: (a + half) % span - half)
     inputs, said = screened(leg, made)
-    clean, none = screened(made.leg(), made)
-    assert not none
     text = said[Code.WHEEL_COUNTERS_DIFFER]
     assert f'right wheel counter rolls over at {span},' in text
     # bridging would lose counts; here none is
@@ -57,17 +63,15 @@ def test_the_wheel_and_the_first_time_are_named(made):
     assert f'{len(rolled)} jump' in text
 
 
-def test_both_wheels_of_one_hidden_span_are_both_undone(made):
+def test_both_wheels_of_one_hidden_span_are_both_undone(made, clean):
     leg = replace(with_right(made, lambda a: a % 4096),
                   odometer=changed(made.odometer, value=lambda a: a % 4096))
     inputs, _ = screened(leg, made)
-    clean, _ = screened(made.leg(), made)
     assert np.array_equal(inputs.travel.s, clean.travel.s)
 
 
-def test_a_span_of_no_round_number_is_taken_with_its_doubt(made):
+def test_a_span_of_no_round_number_is_taken_with_its_doubt(made, clean):
     inputs, said = screened(with_right(made, lambda a: a % 4321), made)
-    clean, _ = screened(made.leg(), made)
     assert 'about' in said[Code.WHEEL_COUNTERS_DIFFER]
     off = inputs.travels[1].s[-1] - clean.travels[1].s[-1]
     doubt = np.linalg.norm(inputs.doubt_sigma)          # of the mean: half the right wheel's
@@ -92,11 +96,10 @@ def test_a_reset_is_no_rollover_and_the_wheel_is_named(made):
     assert said[Code.COUNTER_RESET].startswith("the right wheel's counter jumps")
 
 
-def test_one_wheel_of_another_integer_type_rolls_over_at_its_own_span(made):
+def test_one_wheel_of_another_integer_type_rolls_over_at_its_own_span(made, clean):
     leg = with_right(made, lambda a: a % 2**16,
                      form_right=OdometerForm('cumulative', 2**16, 'm/pulse'))
     inputs, said = screened(leg, made)
-    clean, _ = screened(made.leg(), made)
     assert Code.WHEEL_COUNTERS_DIFFER not in said
     assert np.array_equal(inputs.travels[1].s, clean.travels[1].s)
 
@@ -128,7 +131,7 @@ def test_a_right_wheel_that_sends_no_number_is_dead(made):
     assert len(inputs.travel.t)
 
 
-def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made):
+def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made, clean):
     """Linear between rows: the mean errs by at most a(dt/2)^2/2 + a count, here 3 m/s^2, 0.1 s."""
     right = take(made.odometer_right, slice(101, 5001, 2))
     right = changed(right, stamp_ns=lambda a: a - 7_000_000, value=lambda a: a)
@@ -138,16 +141,14 @@ def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made):
     t = inputs.travel.t
     assert t[0] >= seconds(leg, right)[0]
     assert t[-1] <= seconds(leg, right)[-1]
-    clean, _ = screened(made.leg(), made)
     late = clean.travels[1].at(t + 0.007)
     want = (clean.travels[0].at(t) + late - clean.travels[0].at(t[0]) - late[0]) / 2
     bound = 3.0 / 8 * 0.1**2 / 0.02 / 2 + 1.5
     assert np.abs(inputs.travel.s - want).max() < bound
 
 
-def test_a_gap_of_the_right_wheel_is_said_though_the_mean_has_none(made):
+def test_a_gap_of_the_right_wheel_is_said_though_the_mean_has_none(made, clean):
     right = take(made.odometer_right, np.r_[0:2000, 2060:len(made.odometer_right.value)])
     inputs, said = screened(replace(made.leg(), odometer_right=right), made)
     assert said[Code.TOPIC_GAP].startswith('right odometer gap of 3.05 s')
-    clean, _ = screened(made.leg(), made)
     assert_allclose(inputs.travel.s[-1], clean.travel.s[-1])      # counts are not lost in a gap

@@ -4,10 +4,10 @@
 """What all files of a bag have: topics, messages, and how many of each were found."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.messages.raws import Raws
@@ -25,14 +25,6 @@ class Channel:
     count: int = 0
     serialization: str = 'cdr'
     definition: tuple[str, str] = ('', '')
-
-
-class Message(NamedTuple):
-    """One message as recorded: the first has the shape of what rosbags yields."""
-
-    channel: Channel
-    time_ns: int
-    raw: bytes
 
 
 # topic -> bag times and messages, in order of time
@@ -95,3 +87,16 @@ class Recording:
 def possible(time_ns: int) -> bool:
     """Return True if a bag time is valid."""
     return isinstance(time_ns, int) and 0 <= time_ns < LATEST_NS
+
+
+def overlapping(items: Iterable[Any]) -> Iterator[list[Any]]:
+    """Yield those that overlap in time together; their ``start_ns`` rises."""
+    together: list[Any] = []
+    end_ns = 0
+    for item in items:
+        if together and item.start_ns >= end_ns:
+            yield together
+            together, end_ns = [], 0
+        together.append(item)
+        end_ns = max(end_ns, item.end_ns)
+    yield together

@@ -10,20 +10,22 @@ from pathlib import Path
 import struct
 import zlib
 
-from odocal_ros.bagio.channels import Batch, Channel, Message
+from odocal_ros.bagio.channels import Batch, Channel, FORMATS, overlapping, Recording
 from odocal_ros.bagio.file_bytes import FileBytes
-from odocal_ros.bagio.mcap_chunk import Chunk, CHUNK_DAMAGED, unpacked
 from odocal_ros.bagio.mcap_gather import batches
 from odocal_ros.bagio.mcap_records import (
     apart,
     CHANNEL,
     CHUNK,
+    Chunk,
+    CHUNK_DAMAGED,
     CHUNK_INDEX,
     END,
     FOOTER,
     INDEX_DAMAGED,
     MAGIC,
     MESSAGE,
+    MESSAGE_HEAD,
     Place,
     place_of,
     RECORD,
@@ -31,13 +33,16 @@ from odocal_ros.bagio.mcap_records import (
     SCHEMA,
     STATISTICS,
     statistics_of,
+    text_at,
     TIMES,
+    unpacked,
 )
-from odocal_ros.bagio.mcap_walk import Entry, RecordWalk
 from odocal_ros.outside.limits import Allowance, Damaged, LATEST_NS
 
+Entry = tuple[int, int, bytes]     # time, channel, message
 
-class McapFile(RecordWalk):
+
+class McapFile(Recording):
     """
     A file of messages in chunks.
 
@@ -49,6 +54,7 @@ class McapFile(RecordWalk):
     def __init__(self, path: Path, allowance: Allowance) -> None:
         super().__init__(path)
         self._allowance = allowance
+        self._schemas: dict[int, tuple[str, tuple[str, str]]] = {}
         self._places: list[Place] = []
         self._counted = ''         # the damage known when messages were counted
         self._file = FileBytes(path)
@@ -102,14 +108,14 @@ class McapFile(RecordWalk):
 
     # ---- messages --------------------------------------------------------------------------
 
-    def messages(self, topics: Mapping[str, str]) -> Iterator[Message]:
+    def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
         """Yield the messages of some topics (name -> type) by time; by chunk without an index."""
         wanted = self._wanted(topics)
         self._allowance.again()
         entries = self._by_time(wanted) if self._places else (
             entry for entry in self._walk() if entry[1] in wanted)
         for time_ns, key, raw in entries:
-            yield Message(wanted[key], time_ns, raw)
+            yield wanted[key], time_ns, raw
         self._recount()
 
     def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
@@ -155,17 +161,9 @@ class McapFile(RecordWalk):
 
     def _by_time(self, wanted: Mapping[int, Channel]) -> Iterator[Entry]:
         """Yield the messages of the chunks in the index, those of chunks that overlap merged."""
-        together: list[Place] = []
-        end_ns = 0
-        for place in self._places:
-            if place.channels and not (place.channels & wanted.keys()):
-                continue
-            if together and place.start_ns >= end_ns:
-                yield from self._merged(together, wanted)
-                together, end_ns = [], 0
-            together.append(place)
-            end_ns = max(end_ns, place.end_ns)
-        yield from self._merged(together, wanted)
+        for together in overlapping(place for place in self._places
+                                    if not place.channels or place.channels & wanted.keys()):
+            yield from self._merged(together, wanted)
 
     def _merged(self, places: list[Place], wanted: Mapping[int, Channel]) -> Iterator[Entry]:
         if len(places) == 1:
@@ -211,6 +209,66 @@ class McapFile(RecordWalk):
     def _chunk(self, body: bytes, cut: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time; or Damaged. ``cut``: the file ends in it."""
         return self._walked(unpacked(body, 0, len(body), self._allowance, cut), cut)
+
+    # ---- records one by one ----------------------------------------------------------------
+
+    def _message(self, body: bytes) -> Entry:
+        key, _, time_ns, _ = MESSAGE_HEAD.unpack_from(body)
+        if key not in self._channels or time_ns >= LATEST_NS:
+            raise Damaged('a damaged record')
+        return time_ns, key, body[MESSAGE_HEAD.size:]
+
+    def _walked(self, chunk: Chunk, cut: bool = False) -> list[Entry]:
+        """Return the messages of a chunk by time, as a walk over its records finds them."""
+        found = self._entries(bytes(chunk.records), cut)
+        found.sort(key=itemgetter(0))
+        if found and not chunk.start_ns <= found[0][0] <= found[-1][0] <= max(
+                chunk.end_ns, chunk.start_ns):
+            raise Damaged(CHUNK_DAMAGED)
+        return found
+
+    def _entries(self, records: bytes, cut: bool) -> list[Entry]:
+        """Return the messages among the records of a chunk; all of them are right, or Damaged."""
+        found = []
+        channels, head, at, end = self._channels, RECORD.unpack_from, 0, len(records)
+        while at + 9 <= end:
+            op, size = head(records, at)
+            stop = at + 9 + size
+            if stop > end:
+                break
+            if op == MESSAGE:
+                if size < MESSAGE_HEAD.size:
+                    raise Damaged(CHUNK_DAMAGED)
+                key, _, time_ns, _ = MESSAGE_HEAD.unpack_from(records, at + 9)
+                if key not in channels or time_ns >= LATEST_NS:
+                    raise Damaged(CHUNK_DAMAGED)
+                found.append((time_ns, key, records[at + 31:stop]))
+            elif op in (SCHEMA, CHANNEL):
+                try:
+                    self._learn(op, records[at + 9:stop])
+                except (struct.error, UnicodeDecodeError):
+                    raise Damaged(CHUNK_DAMAGED) from None
+            else:       # nothing else may stand in a chunk
+                raise Damaged(CHUNK_DAMAGED)
+            at = stop
+        if at != end and not cut:
+            raise Damaged(CHUNK_DAMAGED)
+        return found
+
+    def _learn(self, op: int, body: bytes) -> None:
+        """Note a schema or a channel."""
+        (key,) = struct.unpack_from('<H', body)
+        if op == SCHEMA:
+            name, at = text_at(body, 2)
+            form, at = text_at(body, at)
+            text, _ = text_at(body, at)
+            self._schemas[key] = name, (FORMATS.get(form, ''), text)
+        elif key not in self._channels:
+            topic, at = text_at(body, 4)
+            form, _ = text_at(body, at)
+            (schema,) = struct.unpack_from('<H', body, 2)
+            name, definition = self._schemas.get(schema, ('', ('', '')))
+            self._channels[key] = Channel(topic, name, 0, form, definition)
 
     def close(self) -> None:
         """Let go of the file."""

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.bagio.channels import Batch, Channel
-from odocal_ros.bagio.mcap_chunk import Chunk
-from odocal_ros.bagio.mcap_records import MESSAGE, MESSAGE_INDEX, Place, RECORD
+from odocal_ros.bagio.mcap_records import Chunk, MESSAGE, MESSAGE_INDEX, Place, RECORD
 from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.messages.raws import Raws, Rows
 from odocal_ros.outside.limits import Damaged, LATEST_NS

@@ -1,16 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records of mcap files (mcap.dev/spec): their kinds, and what stands in them."""
+"""Records of mcap files (mcap.dev/spec): their kinds and content; chunks unpacked and checked."""
 
 from collections.abc import Iterator, Sequence
 from operator import attrgetter
 import struct
 from typing import NamedTuple
+import zlib
 
 from odocal_ros.bagio.file_bytes import FileBytes
 from odocal_ros.messages.raws import Bytes
-from odocal_ros.outside.limits import Damaged
+from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
 
 MAGIC = b'\x89MCAP0\r\n'
 # format: opcodes of the records, mcap.dev/spec
@@ -18,6 +19,7 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS 
     2, 3, 4, 5, 6, 7, 8, 11)
 USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
 INDEX_DAMAGED = 'a damaged index'
+CHUNK_DAMAGED = 'a damaged chunk'
 MOST_CUT = 2**26        # judgement: bytes taken of a chunk that the file ends in
 RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
 INDEX_HEAD, TIMES = struct.Struct('<QQQQ'), struct.Struct('<QQ')
@@ -91,3 +93,47 @@ def text_at(body: Bytes, at: int) -> tuple[str, int]:
     """Return a text of a record and where it ends."""
     (size,) = struct.unpack_from('<I', body, at)
     return bytes(body[at + 4:at + 4 + size]).decode(), at + 4 + size
+
+
+class Chunk(NamedTuple):
+    """
+    Where its records lie, the times it states, and the message index behind it, to be proved.
+
+    ``data`` may hold more than ``data[at:stop]``: several chunks that were read in one go.
+    """
+
+    data: Bytes
+    at: int
+    stop: int
+    start_ns: int
+    end_ns: int
+    begins: Bytes = b''
+
+    @property
+    def records(self) -> memoryview:
+        """Return its records."""
+        return memoryview(self.data)[self.at:self.stop]
+
+
+def unpacked(data: Bytes, at: int, stop: int, allowance: Allowance, cut: bool = False) -> Chunk:
+    """
+    Return the chunk that a record holds; or Damaged.
+
+    at, stop : where in the data the record's content lies.   cut : the file ends in it.
+    """
+    body = memoryview(data)[at:stop]
+    try:
+        start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)
+        packing, place = text_at(body, CHUNK_HEAD.size)
+        (length,) = struct.unpack_from('<Q', body, place)
+        packed = body[place + 8:place + 8 + length]
+        records = allowance.unpack(packing, packed, size)
+    except (LimitReached, MemoryError):
+        raise
+    except Exception:    # each compression has its own error; what is lost is lost
+        raise Damaged(CHUNK_DAMAGED) from None
+    if not cut and (len(records) != size or crc and zlib.crc32(records) != crc):
+        raise Damaged(CHUNK_DAMAGED)
+    if packing:
+        return Chunk(records, 0, len(records), start_ns, end_ns)
+    return Chunk(data, at + place + 8, at + place + 8 + len(records), start_ns, end_ns)

@@ -4,7 +4,7 @@
 """Read bags: rosbag1, rosbag2 (sqlite3, mcap), split, compressed, without metadata, cut off."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 import hashlib
 import heapq
@@ -13,7 +13,7 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from odocal_ros.bagio.channels import Batch
+from odocal_ros.bagio.channels import Batch, overlapping
 from odocal_ros.bagio.parts import group, Part
 from odocal_ros.bagio.sources import find, names, Source, unpack
 from odocal_ros.bagio.types import Types
@@ -171,15 +171,8 @@ class Bag:
     def _batches(self, topics: Collection[str]) -> Iterator[Batch]:
         """Yield messages of some topics in order of bag time, many at a time."""
         wanted = {t: self.topics[t].msgtype for t in topics if self.topics[t].count}
-        together: list[Part] = []      # files that overlap in time
-        end_ns = 0
-        for part in self._parts:
-            if together and part.start_ns >= end_ns:
-                yield from _merged(together, wanted)
-                together, end_ns = [], 0
-            together.append(part)
-            end_ns = max(end_ns, part.end_ns)
-        yield from _merged(together, wanted)
+        for together in overlapping(self._parts):
+            yield from _merged(together, wanted)
 
 
 def _merged(parts: list[Part], topics: Mapping[str, str]) -> Iterator[Batch]:
@@ -192,7 +185,8 @@ def _merged(parts: list[Part], topics: Mapping[str, str]) -> Iterator[Batch]:
         yield batch
 
 
-class open_bag:
+@contextmanager
+def open_bag(path: Path | str) -> Iterator[Bag]:
     """
     Open a bag: a folder or a file, of any kind that ``sources`` knows. Use it in ``with``.
 
@@ -202,60 +196,48 @@ class open_bag:
         Missing, unreadable, empty, or nothing usable left in it.
 
     """
-
-    def __init__(self, path: Path | str) -> None:
-        self._path = Path(path)
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Bag:
-        """Open the files."""
+    with ExitStack() as stack:
         try:
-            return self._open()
+            bag = _opened(Path(path), stack)
         except PermissionError as error:
-            self._stack.close()
-            raise BadBag(f'{error.filename or self._path}: no permission to read it') from None
+            raise BadBag(f'{error.filename or path}: no permission to read it') from None
         except OSError as error:
-            self._stack.close()
-            raise BadBag(f'{self._path}: cannot be read ({error.strerror or error})') from None
-        except BaseException:
-            self._stack.close()
-            raise
+            raise BadBag(f'{path}: cannot be read ({error.strerror or error})') from None
+        yield bag
 
-    def _open(self) -> Bag:
-        source, types = find(self._path), Types()
-        if source.foreign:
-            raise BadBag(f'{self._path}: its serialization format is {source.foreign!r}, only '
-                         'cdr is supported; convert the bag with ros2 bag convert')
-        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
-        parts, lost = [], []
-        total = sum(path.stat().st_size for path in source.files if is_file(path))
-        for path in source.files:
-            try:
-                part = Part(path, *unpack(path, folder, total), total, types.cdr_from_ros1)
-            except BadBag as error:
-                lost.append(error)
-                continue
-            self._stack.callback(part.close)
-            parts.append(part)
-        if not parts:
-            raise lost[0]
-        bag_notes = tuple(f'{error}; the other files are read' for error in lost)
-        formats = {c.serialization for part in parts for c in part.channels if c.count}
-        if formats and not formats & {'cdr', 'ros1'}:
-            raise BadBag(f'{self._path}: its serialization format is {", ".join(formats)!r}, '
-                         'only cdr is supported; convert the bag with ros2 bag convert')
-        if not any(part.count for part in parts):
-            damage = ' or '.join({part.damage for part in parts if part.damage})
-            topics = sum(len(part.channels) for part in parts)
-            raise BadBag(f'{self._path}: the bag is empty, 0 messages on {topics} topics in '
-                         f'{names(source.files)}{f" ({damage})" if damage else ""}; record again')
-        source = Source(source.name, source.files, source.notes + bag_notes, source.whole,
-                        source.of_file)
-        return Bag(source, parts, types)
 
-    def __exit__(self, *_: Any) -> None:
-        """Close the files."""
-        self._stack.close()
+def _opened(path: Path, stack: ExitStack) -> Bag:
+    """Return an open bag whose files are closed with the stack."""
+    source, types = find(path), Types()
+    if source.foreign:
+        raise BadBag(f'{path}: its serialization format is {source.foreign!r}, only '
+                     'cdr is supported; convert the bag with ros2 bag convert')
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
+    parts, lost = [], []
+    total = sum(path.stat().st_size for path in source.files if is_file(path))
+    for path in source.files:
+        try:
+            part = Part(path, *unpack(path, folder, total), total, types.cdr_from_ros1)
+        except BadBag as error:
+            lost.append(error)
+            continue
+        stack.callback(part.close)
+        parts.append(part)
+    if not parts:
+        raise lost[0]
+    bag_notes = tuple(f'{error}; the other files are read' for error in lost)
+    formats = {c.serialization for part in parts for c in part.channels if c.count}
+    if formats and not formats & {'cdr', 'ros1'}:
+        raise BadBag(f'{path}: its serialization format is {", ".join(formats)!r}, '
+                     'only cdr is supported; convert the bag with ros2 bag convert')
+    if not any(part.count for part in parts):
+        damage = ' or '.join({part.damage for part in parts if part.damage})
+        topics = sum(len(part.channels) for part in parts)
+        raise BadBag(f'{path}: the bag is empty, 0 messages on {topics} topics in '
+                     f'{names(source.files)}{f" ({damage})" if damage else ""}; record again')
+    source = Source(source.name, source.files, source.notes + bag_notes, source.whole,
+                    source.of_file)
+    return Bag(source, parts, types)
 
 
 def bag_sha256(bag: Bag) -> str:

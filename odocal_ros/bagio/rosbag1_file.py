@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.bagio.channels import Channel, Recording
-from odocal_ros.bagio.definitions import rosbags_for
+from odocal_ros.bagio.types import rosbags_for
 from odocal_ros.errors import BadBag, OdocalError
 from odocal_ros.outside.limits import Allowance, LATEST_NS, LimitReached
 

@@ -13,8 +13,8 @@ import zlib
 import numpy as np
 
 from odocal_ros.bagio import encode
-from odocal_ros.bagio.definitions import rosbags_for
 from odocal_ros.bagio.encode import Topic
+from odocal_ros.bagio.types import rosbags_for
 from odocal_ros.errors import BadUsage
 
 STORAGES = ('mcap', 'sqlite3', 'rosbag1')

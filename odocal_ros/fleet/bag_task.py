@@ -22,8 +22,7 @@ import numpy as np
 
 from odocal_ros.errors import OdocalError
 from odocal_ros.fleet.bags import at_hand, FleetBag, seen_as
-from odocal_ros.fleet.leg_text import leg_text
-from odocal_ros.fleet.rows import changed_settings, DONE, FAILED, key_of, Row, RowStore
+from odocal_ros.fleet.rows import changed_settings, DONE, FAILED, key_of, leg_text, Row, RowStore
 from odocal_ros.outside.names import said_by
 
 # error texts without memory for the stack of a thread, or for a library

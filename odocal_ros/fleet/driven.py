@@ -16,8 +16,7 @@ from odocal_ros.calib.combine import DRAWN_ANEW
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.changes import covariance, History, history
-from odocal_ros.fleet.leg_text import legs_from
-from odocal_ros.fleet.rows import Row
+from odocal_ros.fleet.rows import legs_from, Row
 from odocal_ros.fleet.tables import utc
 from odocal_ros.library.bags import unique_names
 from odocal_ros.nav.angles import wrap

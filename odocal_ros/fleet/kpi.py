@@ -10,8 +10,8 @@ vehicle is good if the 2-sigma interval is within all limits, and bad if it is o
 other vehicles are left out. Each leg is tested against the same limits.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
@@ -35,33 +35,17 @@ WIDTHS = 10, 7, 11, 9, 14, 14, 11     # definition: of the columns of the table
 Limits = dict[str, tuple[float, float]]
 
 
-@dataclass
-class Count:
-    """Numbers of legs by their decision and by the class of their vehicle."""
-
-    good_pass: int = 0
-    good_fail: int = 0
-    good_open: int = 0
-    bad_pass: int = 0
-    bad_fail: int = 0
-    bad_open: int = 0
-
-    def add(self, good: bool, decision: Decision) -> None:
-        """Count a leg."""
-        said = {'PASS': 'pass', 'FAIL': 'fail', 'UNDECIDED': 'open'}[decision.value]
-        name = f'{"good" if good else "bad"}_{said}'
-        setattr(self, name, getattr(self, name) + 1)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return counts and rates; None if a denominator is 0."""
-        good = self.good_pass + self.good_fail + self.good_open
-        bad = self.bad_pass + self.bad_fail + self.bad_open
-        return {
-            'legs': good + bad, 'legs_of_good': good, 'legs_of_bad': bad,
-            'precision': _ratio(self.good_pass, self.good_pass + self.bad_pass),
-            'recall': _ratio(self.good_pass, good), 'false_accept': _ratio(self.bad_pass, bad),
-            'false_reject': _ratio(self.good_fail, good),
-            'undecided': _ratio(self.good_open + self.bad_open, good + bad)}
+def _rates(counted: Counter[tuple[bool, Decision]]) -> dict[str, Any]:
+    """Return counts and rates of legs, by (good vehicle, decision); None if a denominator is 0."""
+    good, bad = ({d: counted[which, d] for d in Decision} for which in (True, False))
+    goods, bads = sum(good.values()), sum(bad.values())
+    passed = good[Decision.PASS]
+    return {
+        'legs': goods + bads, 'legs_of_good': goods, 'legs_of_bad': bads,
+        'precision': _ratio(passed, passed + bad[Decision.PASS]),
+        'recall': _ratio(passed, goods), 'false_accept': _ratio(bad[Decision.PASS], bads),
+        'false_reject': _ratio(good[Decision.FAIL], goods),
+        'undecided': _ratio(good[Decision.UNDECIDED] + bad[Decision.UNDECIDED], goods + bads)}
 
 
 def _ratio(part: int, whole: int) -> float | None:
@@ -82,8 +66,8 @@ def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
         if kept and leg['period'] != kept[-1]['period']:
             kept.clear()          # by date: a change of the vehicle starts a new reference
         kept.append(leg)
-    counts = {end: Count() for end in (*MINUTES, math.inf)}
-    whole, judged = Count(), {'good': 0, 'bad': 0, 'on_the_limit': 0}
+    counts = {end: Counter[tuple[bool, Decision]]() for end in (*MINUTES, math.inf)}
+    judged = {'good': 0, 'bad': 0, 'on_the_limit': 0}
     for row in vehicles:
         pieces = last.get(row['vehicle'], [])
         decision = _decision(row | _widened(row, pieces, limits), limits)
@@ -94,11 +78,11 @@ def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
         judged['good' if good else 'bad'] += 1
         for leg in pieces:
             end = next(end for end in counts if leg['duration_s'] / 60 <= end)
-            for count in (whole, counts[end]):
-                count.add(good, _decision(leg, limits))
-    return {'limits': limits, 'vehicles': judged, 'all': whole.as_dict(), 'by_minutes': [
-        {'up_to': None if math.isinf(end) else end} | count.as_dict()
-        for end, count in counts.items() if count.as_dict()['legs']]}
+            counts[end][good, _decision(leg, limits)] += 1
+    whole = sum(counts.values(), Counter[tuple[bool, Decision]]())
+    return {'limits': limits, 'vehicles': judged, 'all': _rates(whole), 'by_minutes': [
+        {'up_to': None if math.isinf(end) else end} | _rates(count)
+        for end, count in counts.items() if count]}
 
 
 def _estimate(row: dict[str, Any], name: str) -> Estimate:

@@ -11,8 +11,7 @@ from typing import Any
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import LegResult
 from odocal_ros.fleet.bags import FleetBag
-from odocal_ros.fleet.leg_text import legs_from
-from odocal_ros.fleet.rows import Row
+from odocal_ros.fleet.rows import legs_from, Row
 from odocal_ros.outside.names import one_line
 from odocal_ros.outside.whole import locked, whole_file
 

@@ -18,7 +18,6 @@ from odocal_ros.calib.choice import choose, deciding
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import take
-from odocal_ros.errors import BadData
 from odocal_ros.forecast.ability import stated_variance, with_heading
 from odocal_ros.forecast.forecast import (
     Abandoned,
@@ -28,9 +27,8 @@ from odocal_ros.forecast.forecast import (
     REST_FORESEEN_S,
     sources_of,
 )
-from odocal_ros.forecast.leg_profile import fix_figures, profile_of
-from odocal_ros.forecast.leg_so_far import screened_in_cells
-from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
+from odocal_ros.forecast.leg_so_far import count_size, fix_figures, profile_of, screened_in_cells
+from odocal_ros.forecast.planned_drive import inserted, PlannedDrive, REST_SPEED
 from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
 from odocal_ros.forecast.smoother_forecast import (
     gives_all,
@@ -44,8 +42,7 @@ from odocal_ros.forecast.smoother_forecast import (
     YAW,
 )
 from odocal_ros.forecast.smoother_so_far import SmootherSoFar
-from odocal_ros.screening.force import felt
-from odocal_ros.screening.inputs import Inputs, place
+from odocal_ros.screening.leg_kind import felt
 from odocal_ros.settings.config import Config
 
 DRIVE_ROWS = 1000         # judgement: of the drive that a prediction is made from
@@ -68,11 +65,7 @@ class DriveSoFar(PlannedDrive):
         point = int(moving[-1])
         usual = float(np.median(np.abs(self.speed[moving])))
         on = np.linspace(0.0, metres / usual, 50)[1:]
-        speed, yaw, slope = (
-            np.insert(row, point + 1, np.full(len(on), value)) for row, value in (
-                (self.speed, usual), (self.yaw, self.yaw[point]), (self.slope, self.slope[point])))
-        t = np.concatenate([self.t[:point + 1], self.t[point] + on, self.t[point + 1:] + on[-1]])
-        return replace(self, t=t, speed=speed, yaw=yaw, slope=slope)
+        return inserted(self, point, on, np.full_like(on, usual), np.zeros_like(on))
 
 
 def forecast_of(leg: Leg, fix_rate: float, config: Config,
@@ -85,11 +78,7 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
     frozen into the leg.   wanted : asked now and then; Abandoned is raised when it says no.
     smoother : that of this leg; looks go from the one before to the next.
 
-    Raises
-    ------
-    OdocalError
-        Nothing can be foreseen yet: no motion, no fixes, scale unknown.
-
+    Raises OdocalError: nothing can be foreseen yet: no motion, no fixes, scale unknown.
     """
     running = look(leg, config, smoother, wanted)
     if deciding(config.method) == ONLY or gives_all(running):     # the ends add nothing to it
@@ -115,7 +104,7 @@ def _by_ends(leg: Leg, fix_rate: float, config: Config,
     """Return the two_point forecast of the leg with its end points."""
     inputs = screened_in_cells(leg, config).inputs
     driven = profile_of(inputs, config)
-    sigmas = Sigmas(config=_heading_found(leg, config), quantum=_quantum(inputs, config),
+    sigmas = Sigmas(config=_heading_found(leg, config), quantum=count_size(inputs, config),
                     **fix_figures(inputs) | {'fix_rate': fix_rate})
     drive = _at_rest(_thinned(driven), wanted)
     now = predict(drive, sigmas)
@@ -160,14 +149,6 @@ def _heading_found(leg: Leg, config: Config) -> Config:
     return with_heading(config, {
         'heading_topic': stated_variance(take(leg.heading, before(leg.heading.stamp_ns))),
         'imu_orientation': stated_variance(take(leg.imu, before(leg.imu.stamp_ns)))})
-
-
-def _quantum(inputs: Inputs, config: Config) -> float:
-    """Return the size of a count, m; raise BadData while metres are not known at all."""
-    scale = place(inputs, config).rough
-    if not scale:   # what the profile takes instead, 1, would promise far too much
-        raise BadData('the scale is not known yet: drive on, or set odometer.nominal_scale')
-    return inputs.travel.quantum * scale
 
 
 def _thinned(drive: PlannedDrive) -> PlannedDrive:

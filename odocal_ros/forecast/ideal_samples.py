@@ -18,6 +18,7 @@ from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose
 from odocal_ros.settings.config import Config
@@ -98,19 +99,13 @@ def _motion(drive: PlannedDrive, t: Floats, origin: Origin, config: Config) -> _
     w_nb = np.stack([turn * np.sin(slope), -climb, turn * np.cos(slope)], -1)
     arm = np.subtract(config.imu.lever_arm, config.odometer.lever_arm)
     wheel_n = C_nb[:, :, 0] * speed[:, None]
-    p_n = _summed(wheel_n, t) + (C_nb - C_nb[0]) @ arm
+    p_n = running_integral(t, wheel_n) + (C_nb - C_nb[0]) @ arm
     v_n = wheel_n + (C_nb @ np.cross(w_nb, arm)[:, :, None])[:, :, 0]
     earth_n = earth_rate_n(origin.latitude)
     f_n = np.gradient(v_n, t, axis=0) + 2 * np.cross(earth_n, v_n) - gravity_n(p_n, origin)
     C_bn = transpose(C_nb)
     return _Motion(t, C_nb, p_n, v_n, np.einsum('kij,kj->ki', C_bn, f_n), w_nb + C_bn @ earth_n,
-                   _summed(speed[:, None], t)[:, 0])
-
-
-def _summed(x: Floats, t: Floats) -> Floats:
-    """Return the integral of x (m, d) from the first time on."""
-    step = (x[1:] + x[:-1]) / 2 * np.diff(t)[:, None]
-    return np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(step, axis=0)])
+                   running_integral(t, speed))
 
 
 def _times(begin: float, end: float, rate: float, spacing: float) -> Floats:

@@ -1,10 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A drive not yet driven, or only looked at: speed, direction and slope by time."""
+"""
+A drive that is planned or recorded: speed, direction and slope by time; manoeuvres to add to it.
+
+Manoeuvres determine what a straight run does not.
+"""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +16,20 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import runs
 from odocal_ros.errors import BadUsage
+from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.rotations import matrix_from_rpy
 
 REST_SPEED = 1e-6     # m/s, judgement: below it a planned drive stands
 DRIVE_STEP = 0.1      # s, judgement: of drives made here
+BRAKING = 1.5    # m/s^2, judgement: as in a town
+QUARTER = np.pi / 2    # definition: rad
+# judgement: a minute of town: still, up, cruise with a turn, down, still
+TOWN_T = np.array([0.0, 5.0, 15.0, 40.0, 50.0, 60.0])
+TOWN_SPEED = np.array([0.0, 0.0, 12.0, 12.0, 0.0, 0.0])
+TOWN_SIDES = 1.0, 1.0, -1.0, -1.0    # two to the left, then two to the right
+
+
+Drive = TypeVar('Drive', bound='PlannedDrive')
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +76,7 @@ class PlannedDrive:
     @property
     def travel(self) -> NDArray[np.float64]:
         """Return the signed travel at each time, 0 at the start mark, (m,) m."""
-        s = np.concatenate([[0.0], np.cumsum(
-            (self.speed[:-1] + self.speed[1:]) / 2 * np.diff(self.t))])
+        s = running_integral(self.t, self.speed)
         path_length: Floats = s - np.interp(0.0, self.t, s)
         return path_length
 
@@ -129,8 +142,8 @@ def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.p
     it is not given.
     """
     t, speed, yaw_rate = (np.asarray(x, dtype=float) for x in (t, speed, yaw_rate))
-    turned = np.concatenate([[0.0], np.cumsum((yaw_rate[:-1] + yaw_rate[1:]) / 2 * np.diff(t))])
-    return marked(t, speed, np.pi / 2 - heading + turned, more.pop('slope', np.zeros_like(t)),
+    yaw = np.pi / 2 - heading + running_integral(t, yaw_rate)
+    return marked(t, speed, yaw, more.pop('slope', np.zeros_like(t)),
                   **more)
 
 
@@ -139,3 +152,79 @@ def marked(t: Floats, speed: Floats, yaw: Floats, slope: Floats, **more: Any) ->
     moving = np.flatnonzero(np.abs(speed) > REST_SPEED)
     first = max(int(moving[0]) - 1, 0) if len(moving) else 0
     return PlannedDrive(np.asarray(t) - t[first], speed, yaw, slope, **more)
+
+
+def stop_and_start(drive: PlannedDrive) -> PlannedDrive:
+    """Return the drive with one more stop: braking, 5 s of standing, acceleration."""
+    k = _amid(drive)
+    v = drive.speed[k]
+    ramp = abs(v) / BRAKING
+    stop_time = 5.0    # s of a stop
+    t = _grid(2 * ramp + stop_time, ramp, ramp + stop_time)
+    return inserted(drive, k, t, np.interp(t, [0.0, ramp, ramp + stop_time, 2 * ramp + stop_time],
+                                           [v, 0.0, 0.0, v]), np.zeros_like(t))
+
+
+def left_and_right_turns(drive: PlannedDrive) -> PlannedDrive:
+    """Return the drive with a turn of 90 deg to the left and, a little later, one to the right."""
+    k = _amid(drive)
+    v = drive.speed[k]
+    turn_time, sideways_force = 8.0, 2.0    # s of 90 deg; m/s^2 to the side that make it longer
+    turn = max(turn_time, QUARTER * abs(v) / sideways_force)
+    turns_apart = 5.0    # s straight between the two turns
+    whole = 2 * turn + turns_apart
+    t = _grid(whole, turn, turn + turns_apart)
+    return inserted(drive, k, t, np.full_like(t, v), np.interp(
+        t, [0.0, turn, turn + turns_apart, whole], [0.0, QUARTER, QUARTER, 0.0]))
+
+
+def town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
+    """Return the drive with so many minutes of stop and go, with turns, before its last rest."""
+    moving = int(np.flatnonzero(np.abs(drive.speed) > REST_SPEED)[-1])
+    k = min(moving + 1, len(drive.t) - 1)
+    v, yaw = drive.speed[k], 0.0
+    t, speed, turned = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    brake = abs(v) / BRAKING
+    if brake > DRIVE_STEP:          # it ends in motion
+        own = _grid(brake)
+        t, speed, turned = [own], [v * (1 - own / brake)], [np.zeros_like(own)]
+    town_turn = 22.0, 30.0    # s, begin and end in the minute
+    for minute in range(minutes):
+        own = _grid(TOWN_T[-1], *TOWN_T[1:-1], *town_turn)
+        angle = QUARTER * TOWN_SIDES[minute % len(TOWN_SIDES)]
+        t.append(own + brake + minute * TOWN_T[-1])
+        speed.append(np.interp(own, TOWN_T, TOWN_SPEED))
+        turned.append(yaw + np.interp(own, town_turn, [0.0, angle]))
+        yaw += angle
+    return inserted(drive, k, *(np.concatenate(x) for x in (t, speed, turned)))
+
+
+def inserted(drive: Drive, k: int, t: Floats, speed: Floats, turned: Floats) -> Drive:
+    """
+    Return the drive with a piece after row k; what follows comes later and turned.
+
+    drive : as planned.   k : row between the marks.   t, speed, turned : (m,) s since row k, above
+    0 and rising; m/s; rad turned to the left since row k.
+    """
+    return replace(
+        drive, t=np.concatenate([drive.t[:k + 1], drive.t[k] + t, drive.t[k + 1:] + t[-1]]),
+        speed=np.insert(drive.speed, k + 1, speed),
+        slope=np.insert(drive.slope, k + 1, np.full(len(t), drive.slope[k])),
+        yaw=np.concatenate([drive.yaw[:k + 1], drive.yaw[k] + turned,
+                            drive.yaw[k + 1:] + turned[-1]]))
+
+
+def _amid(drive: PlannedDrive) -> int:
+    """Return the row nearest to the middle of the path among those near the greatest speed."""
+    speed = np.where(drive.t >= 0, np.abs(drive.speed), 0.0)
+    near_top = 0.9    # of the greatest speed: where there is room for a manoeuvre
+    fast = np.flatnonzero(speed >= near_top * speed.max())
+    path_length = np.cumsum(np.abs(np.diff(drive.travel, prepend=drive.travel[0])))
+    return int(fast[np.argmin(np.abs(path_length[fast] - path_length[-1] / 2))])
+
+
+def _grid(end: float, *knots: float) -> Floats:
+    """Return times above 0 up to the end, at most DRIVE_STEP apart, with the knots among them."""
+    t = np.linspace(0.0, end, max(2, int(np.ceil(end / DRIVE_STEP)) + 1))
+    t = np.union1d(t, [x for x in knots if 0 < x < end])
+    return t[np.diff(t, prepend=-1.0) > 1e-6][1:]

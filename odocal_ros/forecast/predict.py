@@ -117,11 +117,7 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     """
     Return the prediction of the two-point method for a drive.
 
-    Raises
-    ------
-    BadUsage
-        The drive is shorter than one fix interval.
-
+    Raises BadUsage: the drive is shorter than one fix interval.
     """
     config = sigmas.config
     if drive.duration < 1 / sigmas.fix_rate:

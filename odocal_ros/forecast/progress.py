@@ -2,29 +2,95 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the operator wants to know while driving: distance, speed, standing or not, clocks.
+What the operator needs while driving: distance, speed, standstill, clocks that differ.
 
 Light estimates from the blocks as they come; nothing here enters a result.
 """
 
+from collections import deque
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples
+from odocal_ros.data.arrays import Ints
+from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, Samples
 from odocal_ros.forecast.ability import Received, stated_variance
-from odocal_ros.forecast.clocks_so_far import Clocks
 from odocal_ros.nav.earth import radii
-from odocal_ros.screening.force import felt
-from odocal_ros.screening.odometer_steps import Steps
+from odocal_ros.screening.clocks import offsets, remedy
+from odocal_ros.screening.leg_kind import felt
+from odocal_ros.screening.odometer_care import Steps
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.levels import FASTEST
+from odocal_ros.settings.levels import CLOCK_APART, DAY_NS, FASTEST
 from odocal_ros.settings.nominal import nominal_scale
 
+IMU_BLOCKS = 40       # judgement: newest, that rows of others are laid beside: some seconds
+CLOCK_ROWS = 10       # judgement: newest of a topic that determine its clock
 SPEED_SPAN_NS = 10**9       # judgement: speeds are taken over that long, or longer
 STANDING_S = 0.5            # judgement: without a count, the vehicle stands
 SHORTEST_REST_NS = 10**9    # judgement: a shorter pause is no standstill
+
+
+class Clocks:
+    """
+    Compares the stamps of rows that arrived together: whose clock differs from the IMU's.
+
+    simulated : arrivals are times of the node's clock at reception, not at sending.
+    """
+
+    def __init__(self, simulated: bool = False) -> None:
+        self._simulated = simulated
+        self._imu: deque[tuple[Ints, Ints]] = deque(maxlen=IMU_BLOCKS)
+        self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the IMU's
+        self._ahead_s: dict[str, deque[float]] = {}
+
+    def feed(self, slot: str, block: Samples) -> None:
+        """Take a block."""
+        if slot != 'imu':
+            self._waiting[slot] = int(block.received_ns[-1]), int(block.stamp_ns[-1])
+            return
+        self._imu.append((block.received_ns, block.stamp_ns))
+        if not self._waiting:
+            return
+        # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
+        received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
+        first_received, first_stamp = int(received[0]), int(stamps[0])
+        received, stamps = received - first_received, stamps - first_stamp
+        # messages that queued for a node in simulated time arrive late, the IMU's more so than
+        # others': which of them belong together is not known then
+        queued = self._simulated and np.ptp(received - stamps) > CLOCK_APART * 1e9
+        for name, (row_ns, stamp_ns) in list(self._waiting.items()):
+            row = row_ns - first_received
+            if row > received.max():
+                continue
+            del self._waiting[name]
+            if row >= received.min() and not queued:
+                ahead = (stamp_ns - first_stamp - np.interp(row, received, stamps)) * 1e-9
+                self._ahead_s.setdefault(name, deque(maxlen=CLOCK_ROWS)).append(float(ahead))
+
+    def differing(self, config: Config) -> list[tuple[str, float]]:
+        """Return (slot, s ahead of the IMU) of topics whose clock differs, offsets applied."""
+        result = []
+        for slot, ahead in self._ahead_s.items():
+            offset = offsets(config)[slot]
+            # latency makes a row look older: only a clock whose freshest row is behind, is behind;
+            # that of an IMU's row makes others look newer: ahead are those of whom most are
+            value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
+            if abs(value) > CLOCK_APART:
+                result.append((slot, value))
+        return result
+
+
+def clocks_differ(clocks: list[tuple[str, float]]) -> str:
+    """Return the sentence about clocks that differ from the IMU's."""
+    seen = ', '.join(f'{slot} stamps are {_apart(abs(s))} {"ahead of" if s > 0 else "behind"} '
+                     'the IMU stamps' for slot, s in clocks)
+    return f'CLOCKS_DIFFER: {seen}. {remedy(max((s for _, s in clocks), key=abs))}'
+
+
+def _apart(seconds: float) -> str:
+    days = seconds / (DAY_NS * 1e-9)
+    return f'{seconds:.3g} s' if days < 2 else f'{days:.0f} days'
 
 
 def known_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
@@ -116,7 +182,7 @@ class Progress:
 
     def __init__(self, simulated: bool = False) -> None:
         self.clocks = Clocks(simulated)
-        self._travel: dict[str, Travel] = {}
+        self._travel: Travel | None = None
         self._path = FixPath()
         self._zero = 0.0
         self._scale = 0.0
@@ -131,15 +197,14 @@ class Progress:
         self._last[slot] = block
         if slot == 'odometer' and form is not None:
             self._scale = known_scale(config, form, found_scale)
-            self._travel.setdefault(slot, Travel(form)).feed(block, self._scale)
+            self._travel = self._travel or Travel(form)
+            self._travel.feed(block, self._scale)
         elif slot == 'fix':
-            travel = self._travel.get('odometer')
-            moving = travel is not None and bool(travel.moved_ns) and travel.still_s() < STANDING_S
+            moving = bool(self._travel and self._travel.moved_ns) and self.still_s() < STANDING_S
             self._path.feed(block, config.gnss.min_status, moving)
 
     def received_before(self, preroll_s: float) -> Received:
         """Return the samples so far that determine what a leg can estimate."""
-        travel = self._travel.get('odometer')
         fix = self._last.get('fix')
         place = Received({})
         if fix is not None and np.isfinite(fix.latitude[-1]):
@@ -151,30 +216,26 @@ class Progress:
                      for name, block in sent.items()}
         imu = self._last.get('imu')
         return replace(place, variances=variances, felt=imu is None or felt(imu.f_i),
-                       rested_s=travel.rested_s(preroll_s) if travel else 0.0)
+                       rested_s=self._travel.rested_s(preroll_s) if self._travel else 0.0)
 
     def begin_leg(self) -> None:
         """Count distance and speed from here."""
         self._path = FixPath()
-        travel = self._travel.get('odometer')
-        if travel is not None:
-            self._zero, travel.top = travel.total, 0.0
+        if self._travel is not None:
+            self._zero, self._travel.top = self._travel.total, 0.0
 
     def distance_m(self) -> float:
         """Return the distance of the leg so far: odometer where its scale is known, else fixes."""
-        travel = self._travel.get('odometer')
-        if travel is not None and self._scale > 0:
-            return (travel.total - self._zero) * self._scale
+        if self._travel is not None and self._scale > 0:
+            return (self._travel.total - self._zero) * self._scale
         return self._path.total
 
     def max_speed(self) -> float:
         """Return the highest speed of the leg so far, m/s, over a second or more."""
-        travel = self._travel.get('odometer')
-        if travel is not None and self._scale > 0:
-            return travel.top * self._scale
+        if self._travel is not None and self._scale > 0:
+            return self._travel.top * self._scale
         return self._path.top
 
     def still_s(self) -> float:
         """Return the duration of the standstill by the odometer."""
-        travel = self._travel.get('odometer')
-        return travel.still_s() if travel else 0.0
+        return self._travel.still_s() if self._travel else 0.0

@@ -12,6 +12,7 @@ import numpy as np
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.choice import ABOUT, choose, deciding
 from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.smoother import Running
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast.forecast import (
@@ -21,7 +22,7 @@ from odocal_ros.forecast.forecast import (
     sources_of,
     WheelsForecast,
 )
-from odocal_ros.forecast.smoother_so_far import Running, SmootherSoFar
+from odocal_ros.forecast.smoother_so_far import SmootherSoFar
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
 
@@ -42,11 +43,7 @@ def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
 
     leg : the data so far.   wanted : called between passes; if False, Abandoned is raised.
 
-    Raises
-    ------
-    OdocalError
-        There is no forecast yet, and the smoother is the only method.
-
+    Raises OdocalError: there is no forecast yet, and the smoother is the only method.
     """
     if smoother is None or 'smoother' not in deciding(config.method):
         return None

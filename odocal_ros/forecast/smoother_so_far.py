@@ -4,51 +4,25 @@
 """Running estimate of the smoother on a thinned leg, each update from the previous one."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 import time
 
-import numpy as np
-
-from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother import (
     GrowingFit,
+    Running,
     smoother_leg,
     SmootherLeg,
-    SoFar,
     too_little,
     too_little_of,
 )
-from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData
 from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.leg_so_far import screened_in_cells
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.standstill import standstills
 from odocal_ros.reasons import Reason
-from odocal_ros.screening.facing import axes_reasons, facing
+from odocal_ros.screening.facing import axes_reasons, facing, UNUSABLE
 from odocal_ros.screening.inputs import place
-from odocal_ros.screening.sanity import UNUSABLE
 from odocal_ros.settings.config import Config
-
-DRIVING_SPEED = 0.5    # m/s; judgement: slower steps between keyframes do not count
-
-
-@dataclass(frozen=True, eq=False)
-class Running:
-    """
-    The running estimate.
-
-    method : as the leg would come out, ended here.   sigmas : (3,) of ln scale, yaw, pitch, rad,
-    of what is not determined too.   distance : m.   agility : m^2/s^3, square of the horizontal
-    acceleration summed up.   speed : m/s, usual.
-    """
-
-    method: MethodResult
-    sigmas: Floats
-    distance: float
-    agility: float
-    speed: float
 
 
 class SmootherSoFar:
@@ -70,11 +44,7 @@ class SmootherSoFar:
         leg : the data so far: the earlier data, and more.   config : as frozen into the leg.
         wanted : asked between passes; Abandoned is raised when it says no.
 
-        Raises
-        ------
-        OdocalError
-            Too little of the drive yet, or no fit to it; the next update is a cold start.
-
+        Raises OdocalError: too little of the drive, or no fit; the next update is a cold start.
         """
         def trace(*_: object) -> None:
             if not wanted():
@@ -85,7 +55,7 @@ class SmootherSoFar:
         except BaseException:
             self._growing.forget()
             raise
-        return _running(self._growing.fit(view, config, trace))
+        return self._growing.fit(view, config, trace)
 
     def _view(self, leg: Leg, config: Config) -> SmootherLeg:
         seen = screened_in_cells(leg, config)
@@ -104,8 +74,7 @@ class SmootherSoFar:
         if vars(placed.origin) != (self._origin and vars(self._origin)):
             self._origin = placed.origin
             self._growing.forget()
-        spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
-                            config.leg.standstill)
+        spans = inputs.standstills(placed.rough, config)
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
@@ -120,13 +89,3 @@ def _refuse_unusable(found: Iterable[Reason]) -> None:
     why = [r.text for r in found if r.code in UNUSABLE]
     if why:
         raise BadData(why[0])
-
-
-def _running(so_far: SoFar) -> Running:
-    state = so_far.state
-    T, steps = np.diff(state.t), np.linalg.norm(np.diff(state.p_n, axis=0), axis=1)
-    moving = steps > DRIVING_SPEED * T
-    gained = np.diff(state.v_n[:, :2], axis=0)
-    return Running(so_far.method, so_far.sigmas, max(float(steps.sum()), 1.0),
-                   float((gained**2).sum(axis=1) @ (1 / T)),
-                   float(np.median((steps / T)[moving])) if moving.any() else 0.0)

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints, Values
-from odocal_ros.data.leg import COUNTER, Leg, WHEELS
+from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.leg import COUNTER, Leg
 from odocal_ros.data.samples import (
     ImuSamples,
     join,
@@ -25,6 +26,7 @@ from odocal_ros.data.samples import (
     SomeSamples,
     take,
 )
+from odocal_ros.nav.odometer import without_rollover
 from odocal_ros.screening.late_rows import on_time, ON_TIME_WINDOW
 
 # judgement: a tenth of what keyframes are apart; of a topic as many as 26 minutes of them,
@@ -114,10 +116,8 @@ class ThinnedLeg:
         if self.form.quantity == 'increment':
             step = value.copy()
         else:
-            step = np.diff(value, prepend=value[:1] if sent is None else sent)
-            if 0 < self.form.modulus < 2**63:
-                half = self.form.modulus // 2
-                step = (step + half) % self.form.modulus - half
+            step = without_rollover(np.diff(value, prepend=value[:1] if sent is None else sent),
+                                    self.form.modulus)
         total: Values = count + np.cumsum(step)  # type: ignore[assignment]
         self._last[slot] = value[-1:], total[-1]
         return replace(samples, value=total)

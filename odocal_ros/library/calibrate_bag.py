@@ -16,7 +16,7 @@ from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.legs import open_ended, OPEN_LEG
 from odocal_ros.library.listener import Listener, Notes
 from odocal_ros.library.read_bag import journal_notes, read_bag, readers_of, Recording
-from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
@@ -171,7 +171,7 @@ def _legs_of(bag: Recording, asked: _Asked, received: Notes) -> list[LegResult]:
 
 def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[Reason, ...]],
                 holdout: bool, received: Notes) -> list[LegResult]:
-    from odocal_ros.pipeline.parts import calibrate_parts
+    from odocal_ros.pipeline.calibrate import calibrate_parts
     results = []
     with received.phase('calibrating') as progress:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):

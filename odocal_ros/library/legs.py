@@ -13,11 +13,10 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.asked import EACH_STOP, LegSpan
-from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs, place
-from odocal_ros.screening.local_frame import settings_by_frame
+from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
@@ -205,7 +204,7 @@ def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         return np.empty((0, 2), np.int64), None
     scale = place(inputs, config).rough or 1.0
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, config.leg.standstill)
+    spans = inputs.standstills(scale, config)
     path_length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
     metres = np.interp(spans, inputs.travel.t, path_length) if len(spans) else np.empty((0, 2))
     return first + np.round(spans * 1e9).astype(np.int64), (metres, float(path_length[-1]))

@@ -191,7 +191,7 @@ def from_bag(path: Path, config: Config,
     """Return the drive of a recorded bag's first leg, and the figures of its own fixes."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.data.leg import LegRecorder
-    from odocal_ros.forecast.leg_profile import count_size, fix_figures, profile_of
+    from odocal_ros.forecast.leg_so_far import count_size, fix_figures, profile_of
     from odocal_ros.library.legs import find_legs, marked_legs
     from odocal_ros.library.topics import choose_topics
     from odocal_ros.messages.decode import make_reader

@@ -10,10 +10,14 @@ import math
 import numpy as np
 
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.forecast.manoeuvres import left_and_right_turns, stop_and_start, town_driving
-from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
-from odocal_ros.forecast.planned_methods import Plan, plan_methods
-from odocal_ros.forecast.planned_smoother import spacing_for
+from odocal_ros.forecast.planned_drive import (
+    left_and_right_turns,
+    PlannedDrive,
+    REST_SPEED,
+    stop_and_start,
+    town_driving,
+)
+from odocal_ros.forecast.planned_methods import Plan, plan_methods, spacing_for
 from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.pipeline.combination import together

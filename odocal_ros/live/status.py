@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from odocal_ros.calib.result import wheel_factors
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import as_keys
+from odocal_ros.live.console import losses_in_words
 from odocal_ros.live.guidance import (
     hint,
     manoeuvres,
@@ -21,8 +22,7 @@ from odocal_ros.live.guidance import (
 from odocal_ros.live.health import Health
 from odocal_ros.live.session import Session, State
 from odocal_ros.live.session_view import SessionView
-from odocal_ros.live.waiting_messages import losses_in_words
-from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Verdict
 
 SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a move in a yard is no fault

@@ -124,17 +124,12 @@ def C_nL(yaw: float) -> Floats:
 def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[float, float],
                   grade: Grade, gyro_noise: float) -> Level:
     """
-    Level from the mean specific force of a standstill.
+    Return the level near the end of a standstill, from its mean specific force.
 
     t, w_b, f_b : (n,), (n, 3), (n, 3) IMU rows, s, rad/s, m/s^2.   span : (2,) begin and end of
     the standstill, s.   grade : accelerometer bias, axes and noise.   gyro_noise : rad/s/sqrt(Hz).
-
-    Returns
-    -------
-    Level near the end of the standstill; an accelerometer bias tilts it by bias / g. The bias
-    walks while its mean is taken: by a third of its variance over the standstill, from the last
-    value.
-
+    An accelerometer bias tilts the level by bias / g. The gyro bias walks while its mean is taken:
+    by a third of its variance over the standstill, from the last value.
     """
     cut = min(REST_EDGE, (span[1] - span[0]) / 4)
     inside = (t >= span[0] + cut) & (t <= span[1] - cut)
@@ -153,7 +148,7 @@ def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[floa
 def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitude: float,
                     grade: Grade) -> Level:
     """
-    Level from the mean specific force of a stretch of driving, the odometer's speed taken out.
+    Return the level from the mean specific force of some driving, without the odometer's speed.
 
     In axes fixed at the start 0, the integral of C_0b f is the change of velocity plus g T up;
     the velocity lies along b's x axis but for the mounting angles, taken as within 3 deg.

@@ -98,15 +98,10 @@ class Track:
 
 def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
     """
-    Sum attitude over travel: docs/method.md (T1).
+    Return the track of attitude over travel: docs/method.md (T1).
 
     t, q_nb : (m,), (m, 4) epochs, s, and attitude at them.   travel : odometer travel,
-    interpolated to the epochs.
-
-    Returns
-    -------
-    Track; trapezoid rule, of second order in the turn per epoch.
-
+    interpolated to the epochs. Trapezoid rule, of second order in the turn per epoch.
     """
     s = travel.at(t)
     half, P = (np.diff(s) / 2)[:, None, None], room(len(t), 3, 3)

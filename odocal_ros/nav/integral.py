@@ -28,6 +28,11 @@ class Integral:
         return out
 
 
+def running_integral(t: Floats, x: Floats) -> Floats:
+    """Return the integral of x, (n, ...), from t[0] to each row, linear between rows."""
+    return Integral().over(t, x)
+
+
 def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     """
     Return the integral of x, (n, ...), from t[0] on, linear between rows.

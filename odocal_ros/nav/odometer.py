@@ -59,16 +59,11 @@ class Travel:
 def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool = False,
            name: str = 'the counter') -> tuple[Travel, tuple[Reason, ...]]:
     """
-    Sum an odometer's rows up to travel.
+    Return the travel of an odometer's rows, and reasons.
 
     t : (n,) times, s, rising.   value : (n,) as sent: int64 counters or float64.   form : what the
-    value means.   reversed_counts : positive values mean backwards.   name : what findings call
-    it.
-
-    Returns
-    -------
-    Travel, and what was found: rollovers (undone), resets (bridged at the speed beside them).
-
+    value means.   reversed_counts : positive values mean backwards.   name : of the counter in
+    reasons. Rollovers are undone, resets bridged at the speed beside them.
     """
     whole = np.issubdtype(value.dtype, np.integer)
     reasons: tuple[Reason, ...] = ()
@@ -112,16 +107,23 @@ def mean_travel(travels: Sequence[Travel]) -> Travel:
     return Travel(t, s - (s[0] if len(s) else 0.0), first.quantum / np.sqrt(len(travels)))
 
 
+def without_rollover(step: Values, modulus: int) -> Values:
+    """
+    Return steps of a counter (n,) with its rollovers undone.
+
+    modulus : span of the counter in counts, 0 for floats. 64 bits wrap in the subtraction.
+    """
+    half = modulus // 2
+    return (step + half) % modulus - half if 0 < modulus < 2**63 else step
+
+
 def _counter_steps(t: Floats, value: Values, modulus: int,
                    name: str) -> tuple[Floats, tuple[Reason, ...]]:
     """Return steps of a counter as floats, rollover undone, resets bridged; and what was found."""
     whole = np.issubdtype(value.dtype, np.integer)
-    raw = step = np.diff(value)                    # integers wrap at 2^64
-    if whole and 0 < modulus < 2**63:
-        half = modulus // 2
-        step = (raw + half) % modulus - half
-    rolled = step != raw
-    step = step.astype(float)
+    raw = np.diff(value)
+    counted = without_rollover(raw, modulus)
+    rolled, step = counted != raw, counted.astype(float)
     resets = _resets(t, step, whole)
     reasons: tuple[Reason, ...] = ()
     if resets.any():

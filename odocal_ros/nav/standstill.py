@@ -22,18 +22,12 @@ MOST_BIAS = 0.12      # rad/s, each axis, physical: no gyro at rest says more (c
 def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: float,
                 shortest: float) -> Floats:
     """
-    Find when the vehicle stands.
+    Return begin and end of the standstills in order: (k, 2) s.
 
     t_imu, w_b : (n,), (n, 3) IMU times, s, and turn rates, rad/s, bias and all.   travel :
     odometer travel.   metres_per_unit : rough scale of it, above 0.   shortest : least duration,
-    s.
-
-    Returns
-    -------
-    (k, 2) array of begin and end times, s, in order. The edges lie inside the true standstill by
-    up to the window; a start so slow that it takes longer than that to move REST_TRAVEL, or a
-    count and a half, is included as far.
-
+    s. The edges lie inside the true standstill by up to the window; of a start so slow that it
+    takes longer than that to move REST_TRAVEL, or a count and a half, that part is included.
     """
     if len(t_imu) < 2 or len(travel.t) < 2:
         return np.empty((0, 2))

@@ -163,20 +163,13 @@ def _products(t: Floats, w_b: Floats, every: int, bias: float | Floats) -> Pairs
 def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every: int = 1,
              bias: float | Floats = 0.0) -> tuple[Floats, Floats]:
     """
-    Propagate attitude through gyro samples.
+    Return times (m,), s, and attitudes (m, 4), unit quaternions, of propagated gyro samples.
 
     t : (n,) sample times, s, rising; the attitude ``q_nb0`` holds at ``t[0]``.   w_b : (n, 3) turn
     rate of b against inertial space, rad/s.   q_nb0 : (4,) attitude at t[0], x y z w.
     earth_rate_n : (3,) Earth rate in n, rad/s (n is fixed to the Earth).   every : keep one epoch
-    in this many.   bias : (3,) of the gyro, taken out, rad/s.
-
-    Returns
-    -------
-    t_out : (m,) array
-        Times of t[0], t[every], ...; the last sample is always kept. Empty where t is.
-    q_nb : (m, 4) array
-        Attitude there, unit quaternions.
-
+    in this many: t[0], t[every], ... and the last sample.   bias : (3,) of the gyro, subtracted,
+    rad/s.
     """
     t, w_b = np.asarray(t, dtype=float), np.asarray(w_b, dtype=float)
     if not len(t):

@@ -12,7 +12,8 @@ import numpy as np
 
 from odocal_ros.bagio.read import Bag, TopicInfo
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.leg import LegRecorder, WHEELS
+from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.pieces import medians
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
@@ -24,8 +25,7 @@ from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.messages.transforms import with_static
 from odocal_ros.offline import survey
 from odocal_ros.offline.fix_path import fix_path, FixPath, Match
-from odocal_ros.offline.inspection_drive import look
-from odocal_ros.offline.lacking import lacking
+from odocal_ros.offline.inspection_drive import lacking, look
 from odocal_ros.offline.odometer_search import (
     best_topic,
     configured,
@@ -44,7 +44,7 @@ from odocal_ros.offline.wheel_survey import (
 )
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond
-from odocal_ros.screening.local_frame import settings_by_frame
+from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config, SIDES
 
 # what only a method that begins with an alignment, or sees the ends alone, minds

@@ -7,8 +7,7 @@ import math
 import textwrap
 
 from odocal_ros.calib.smoother.slow_error import WHITE_SHARE
-from odocal_ros.forecast.planned_methods import Plan
-from odocal_ros.forecast.planned_smoother import SWAY_RATE
+from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE
 from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
 from odocal_ros.library.what_helps import Change, ranked, SCALE, YAW

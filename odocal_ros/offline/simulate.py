@@ -4,14 +4,12 @@
 """odocal simulate: a bag of a drive whose truth is known."""
 
 import argparse
-from collections.abc import Callable
 import math
 from pathlib import Path
-import sys
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.say import say
+from odocal_ros.offline.say import Phase, say
 from odocal_ros.outside.names import for_shell
 from odocal_ros.settings.levels import DAY_NS
 
@@ -199,10 +197,11 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.sim.truth import topic_arguments
     out = Path(args.out)
     truth, settings = beside(out)
-    drive = simulate(options_of(args), out, storage=args.storage,
-                     compression=args.compression, force=args.force,
-                     heading_sigma=None if known is None else math.radians(known),
-                     progress=_progress(args.quiet))
+    with Phase('writing', args.quiet) as progress:
+        drive = simulate(options_of(args), out, storage=args.storage,
+                         compression=args.compression, force=args.force,
+                         heading_sigma=None if known is None else math.radians(known),
+                         progress=progress)
     if not args.quiet:
         replay = ['odocal', 'replay', str(out), '--config', str(settings),
                   *topic_arguments(drive)]
@@ -210,14 +209,3 @@ def run(args: argparse.Namespace) -> int:
             f'{sum(len(t.time_ns) for t in drive_topics(drive))} messages; truth in {truth}; '
             f'next: {for_shell(replay)}')
     return 0
-
-
-def _progress(quiet: bool) -> Callable[[float], None] | None:
-    """Return a function that shows the share done on a terminal, or None."""
-    if quiet or not sys.stderr.isatty():
-        return None
-
-    def show(share: float) -> None:
-        end = '\r\x1b[K' if share >= 1 else ''
-        print(f'\rwriting {share:4.0%}{end}', end='', file=sys.stderr, flush=True)
-    return show

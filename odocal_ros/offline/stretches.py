@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.drive import white_noise
-from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.settings.config import Config
 
@@ -42,8 +41,7 @@ def survey_drive(inputs: Inputs, config: Config) -> Drive:
     fixes_n, sigma, scale = placed.fixes_n, placed.fix_sigma, placed.rough or None
     stops, slowest, fastest = np.empty((0, 2)), 0.0, 0.0
     if len(inputs.travel.t) > 1 and len(inputs.t_imu) > 3:
-        stops = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale or 1.0,
-                            config.leg.standstill)
+        stops = inputs.standstills(scale or 1.0, config)
         at_speed = 1.0    # s, over which a speed is taken
         t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - at_speed, at_speed / 2)
         if scale and len(t):

@@ -32,8 +32,8 @@ from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.force import TILT_SIGMA
 from odocal_ros.screening.inputs import Inputs
+from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
 
@@ -43,15 +43,10 @@ Found = tuple[tuple[float, float] | None, str]      # yaw and sigma, rad; or Non
 def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats, origin: Origin,
           config: Config) -> tuple[Alignment, tuple[Reason, ...]]:
     """
-    Align a leg.
+    Return the alignment of a leg, and reasons.
 
     inputs : screened leg.   spans : (k, 2) standstills, s.   metres_per_unit : rough scale.
     fixes_n : (n, 3) fixes in n, m.   origin : where n is fixed.   config : heading source, grade.
-
-    Returns
-    -------
-    Alignment, reasons.
-
     """
     grade = grade_of(config.imu)
     if not inputs.felt:

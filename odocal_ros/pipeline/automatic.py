@@ -22,7 +22,7 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, Samples
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason, Verdict
-from odocal_ros.screening.odometer_steps import Steps
+from odocal_ros.screening.odometer_care import Steps
 from odocal_ros.settings.config import Config
 
 SECOND = 10**9    # definition: ns

@@ -4,7 +4,8 @@
 """
 The pipeline: one pure function from a leg to its result, one from results to a calibration.
 
-No state, no clock, no files: the live node and the replay call these and nothing else.
+No state, no clock, no files: the live node and the replay call these and nothing else. A leg with
+gaps of the IMU is cut at them; its parts are legs of the same vehicle.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,25 +16,26 @@ import numpy as np
 
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
-from odocal_ros.data.arrays import Floats
-from odocal_ros.data.leg import Leg
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.leg import Leg, part_of
 from odocal_ros.data.mapped import let_go
+from odocal_ros.data.pieces import by_step
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.combination import combine
-from odocal_ros.pipeline.leg_run import leg_result, run_leg
-from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.methods import leg_result, run_leg
 from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
+from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.facing import imu_sanity, UNUSABLE
 from odocal_ros.screening.inputs import Inputs
-from odocal_ros.screening.local_frame import settings_by_frame
+from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
-from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
-__all__ = ['calibrate', 'combine', 'faults', 'Screened', 'screened']
+__all__ = ['calibrate', 'calibrate_parts', 'combine', 'faults', 'Screened', 'screened']
 # of a leg that is not over
 NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX}
 
@@ -50,18 +52,13 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
               notes: tuple[Reason, ...] = (), holdout: bool = False,
               progress: Callable[[Stage], None] | None = None) -> LegResult:
     """
-    Take one leg from samples to result.
+    Return the result of one leg; if it cannot be calibrated, its reasons say why.
 
     leg : raw samples between two marks, with pre-roll.   config : settings in force.   alignment :
     used instead of the leg's own (a simulation puts errors in it).   notes : what the door knows
     of the data already (a truncated bag).   holdout : keep the last fifth of the distance back
     from the fit and check the correction on it.   progress : called with each stage of the work,
     and with each pass of a fit.
-
-    Returns
-    -------
-    LegResult; a leg that cannot be calibrated says why in its reasons.
-
     """
     progress, config = progress or (lambda stage: None), settings_by_frame(leg.fix, config)
     if is_planar(leg, config):
@@ -142,3 +139,74 @@ def _turned_over(inputs: Inputs) -> Inputs:
     """Return inputs with a forward-right-down IMU read as what it is."""
     C = matrix_from_rpy([np.pi, 0.0, 0.0])
     return replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)
+
+
+def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
+    """Return a leg cut where its IMU is silent for longer; itself without gaps, or of many."""
+    gaps = _gaps(leg, limit_s)
+    most_parts = 20    # an IMU with more gaps stutters: its leg is rejected
+    if not 0 < len(gaps) < most_parts:
+        return [leg]
+    begins = [None, *gaps[:, 1].tolist()]
+    ends = [*gaps[:, 0].tolist(), leg.stop_ns]
+    spans = [(max(first or leg.start_ns, leg.start_ns), last, first)
+             for first, last in zip(begins, ends, strict=True)]
+    shortest_ns = 10**9    # of a part: less is lost with the gap
+    return [part_of(leg, *span) for span in spans if span[1] - span[0] >= shortest_ns] or [leg]
+
+
+def _gaps(leg: Leg, limit_s: float) -> Ints:
+    """Return begin and end of the gaps of the IMU, ns: (k, 2); one up to a mark is one, too."""
+    near_start_ns = 60 * 10**9    # what lies nearer to the start mark belongs to the leg
+    near = _near(leg.imu.stamp_ns, leg.start_ns - near_start_ns, leg.stop_ns)
+    if len(near) < 2:
+        return np.empty((0, 2), np.int64)
+    gap_margin_ns = 1000    # below the limit: more than seconds in floating point are off
+    least_ns = round(limit_s * 1e9) - gap_margin_ns
+    k = np.flatnonzero(by_step(lambda stamps: np.diff(stamps) > least_ns, near))
+    begin, end = np.append(near[k], near[-1]), np.append(near[k + 1], leg.stop_ns)
+    if ((begin < leg.start_ns) & (leg.start_ns < end)).any():
+        begin, end = (np.sort(np.append(stamps, leg.start_ns)) for stamps in (begin, end))
+    t = (np.stack([begin, end], -1) - leg.start_ns) * 1e-9
+    return np.stack([begin, end], -1)[t[:, 1] - t[:, 0] > limit_s]
+
+
+def _near(stamps: Ints, first_ns: int, stop_ns: int) -> Ints:
+    """Return the stamps between two, rising: a view where they rise as they came."""
+    if by_step(lambda stamps: np.diff(stamps) > 0, stamps).all():
+        return stamps[slice(*np.searchsorted(stamps, [first_ns, stop_ns + 1]))]
+    return np.unique(stamps[(stamps >= first_ns) & (stamps <= stop_ns)])
+
+
+def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
+                    holdout: bool = False,
+                    progress: Callable[[Stage], None] | None = None) -> list[LegResult]:
+    """
+    Return the results of a leg: one, or one of each part long enough to calibrate.
+
+    Arguments as for ``calibrate``. Where no part is long enough, or a gap is not what rejects the
+    leg, the result is that of the whole.
+    """
+    parts = parts_of(leg, config.leg.max_gap)
+    results = []
+    for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):
+        def report(stage: Stage, k: int = k) -> None:
+            if progress is not None:
+                progress(replace(stage, done=(k + stage.done) / len(parts)))
+        results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
+    good = [one for one in results if one.verdict is not Verdict.REJECTED]
+    if not good:
+        return [calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)]
+    if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:
+        return good      # the gap lay before the mark
+    return [replace(one, reasons=(*one.reasons, _cut(leg, one, len(good))),
+                    cut_from_ns=leg.start_ns) for one in good]
+
+
+def _cut(leg: Leg, one: LegResult, count: int) -> Reason:
+    begin, end = ((t - leg.start_ns) * 1e-9 for t in (one.start_ns, one.stop_ns))
+    return Reason(Code.LEG_CUT, f'this section covers {begin:.1f} to {end:.1f} s of the '
+                  f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s leg'
+                  + (f', one of {count} '
+                     'sections' if count > 1 else ', the only section long enough '
+                     'to calibrate'))

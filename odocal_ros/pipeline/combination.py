@@ -32,16 +32,11 @@ OF_ALL = {Code.LEGS_DISAGREE, Code.SCALE_CHANGED}
 def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None = None,
             imu: Carried | None = None) -> Calibration:
     """
-    Combine legs of one vehicle.
+    Return the calibration of one vehicle from its legs.
 
     legs : at least one. Rejected legs are left out while any other is left, and named.   config :
     limits, frames.   carried : information of earlier legs on the vehicle.   imu : information of
     other legs on its IMU, if nothing is carried.
-
-    Returns
-    -------
-    Calibration: what is published and written.
-
     """
     legs = tuple(legs)
     good = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]

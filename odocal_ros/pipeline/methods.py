@@ -1,25 +1,41 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The methods of a leg: each a pure function of it, and what becomes of one that breaks."""
+"""
+The methods of a leg: each is a pure function of it; their results together are that of the leg.
 
-from collections.abc import Callable, Iterable
+A method that fails costs itself only.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
+import numpy as np
+
+from odocal_ros.calib.agreement import disagreements
+from odocal_ros.calib.choice import choose, deciding, passed_over
+from odocal_ros.calib.drive import way_and_chord
 from odocal_ros.calib.failed import failed, raised_if_wild
-from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.result import LegResult, MethodResult
 from odocal_ros.calib.two_point import unsolved
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
-from odocal_ros.pipeline.coarse_odometer import held_steps
-from odocal_ros.pipeline.delay_note import delay_notes
-from odocal_ros.pipeline.method_run import MethodRun, Passed
-from odocal_ros.pipeline.prepared import PreparedLeg
-from odocal_ros.pipeline.scale_error import held, upright
+from odocal_ros.pipeline.beyond_model import delay_notes, held, held_steps, upright
+from odocal_ros.pipeline.prepare import judged_by
+from odocal_ros.pipeline.prepared import MethodRun, Passed, PreparedLeg, Stage
+from odocal_ros.pipeline.tracks import check_of, tracks
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.inputs import Inputs
+
+# judgement: of the time that methods take, and of the tracks after them
+METHOD_EFFORT = {'two_point': 1, 'smoother': 20}
+TRACKS = 2
 
 
 def _smoother(prepared: PreparedLeg, passed: Passed) -> MethodRun:
@@ -44,15 +60,10 @@ UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
 def run_methods(names: Iterable[str], prepared: PreparedLeg,
                 begun: Callable[[str], Passed]) -> dict[str, MethodRun]:
     """
-    Run methods on a leg; what breaks in one costs this method, not the leg.
+    Return the runs of methods on a leg; an error in one costs this method, not the leg.
 
     names : in any order.   begun : called with the name of each before it runs, returns what to
     call with each pass of its fit.
-
-    Returns
-    -------
-    What each found.
-
     """
     runs = {}
     for name in names:
@@ -105,3 +116,88 @@ def _guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) ->
             'samples')))
     except Exception as error:      # what it said of the data may be as wrong: nothing of it stays
         return MethodRun(failed(lambda why: UNKNOWN[name](inputs, why), name, error))
+
+
+def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
+               methods: dict[str, MethodResult] | None = None, **more: Any) -> LegResult:
+    """Return the result of a leg: its counts, findings and what more there is."""
+    between = (inputs.t_fix >= -0.5) & (inputs.t_fix <= inputs.t_stop + 0.5)
+    if 'distance' not in more:
+        more['distance'] = _path_of(inputs.t_fix[between], inputs.geodetic[between],
+                                    inputs.least_motion)
+    return LegResult(
+        start_ns=leg.start_ns, stop_ns=leg.stop_ns, duration=inputs.t_stop,
+        imu_samples=len(inputs.t_imu),
+        pulses=len(inputs.travel.t), fixes=int(between.sum()),
+        rejected_fixes=inputs.fixes_rejected, reasons=tuple(reasons), methods=methods or {},
+        C_bi=inputs.C_bi, **more)
+
+
+def _path_of(t_fix: Floats, geodetic: Floats, least: float) -> float:
+    """Return the path length by the fixes, m, for a leg that is refused."""
+    if not len(t_fix):
+        return 0.0
+    fixes_n = origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic))
+    return way_and_chord(t_fix, fixes_n, least)[0]
+
+
+def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
+    """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
+    leg, inputs, asked = prepared.leg, prepared.inputs, prepared.config.method
+    names = _methods_of(prepared)
+    runs = run_methods(names, prepared, _teller(names, progress))
+    progress(Stage('tracks', 1.0 - TRACKS / _effort(names)))
+    methods = {name: run.result for name, run in runs.items()}
+    found = [*found_by(runs, prepared), *disagreements(methods)]
+    found += passed_over(methods, asked, {r.code for r in (*prepared.reasons, *found)})
+    estimates, _ = choose(methods, asked)
+    scale = estimates.get('scale_factor')
+    paths = None if scale is None else runs[scale.method].paths
+    plain = None if prepared.rough == prepared.nominal else prepared.rough
+    if scale is None or paths is None:
+        return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
+                          distance=prepared.distance, deciding=deciding(asked), path_ratio=plain)
+    distance_sigma = 0.05    # relative sigma up to which a scale gives the distance
+    # truer than the rough scale
+    if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
+        prepared = judged_by(prepared, scale.value)
+    shown, said = tracks(prepared, paths)
+    found += said
+    for name, run in runs.items():
+        if run.paths is not None:
+            check, said = check_of(prepared, run.paths.after)
+            methods[name] = replace(run.result, details=run.result.details | check)
+            found += said
+    return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
+                      distance=prepared.distance, deciding=deciding(asked), path_ratio=plain,
+                      **shown)
+
+
+def _once(found: Sequence[Reason]) -> list[Reason]:
+    """Return the reasons of methods and tracks; those on outlier fixes only from the first."""
+    far = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
+    return [r for k, r in enumerate(found) if k not in far[1:]]
+
+
+def _methods_of(prepared: PreparedLeg) -> list[str]:
+    """Return the methods to run: those asked for, of auto those that the leg can carry."""
+    wanted = deciding(prepared.config.method, shown=True)
+    return [name for name in METHODS if name in wanted]
+
+
+def _effort(names: Iterable[str]) -> int:
+    return sum(METHOD_EFFORT[name] for name in names) + TRACKS
+
+
+def _teller(names: Iterable[str],
+            progress: Callable[[Stage], None]) -> Callable[[str], Passed]:
+    """Return a callback that reports the start of a method and returns one for its passes."""
+    done = 0.0
+
+    def begun(name: str) -> Passed:
+        nonlocal done
+        stage = Stage(name, done)
+        progress(stage)
+        done += METHOD_EFFORT[name] / _effort(names)
+        return lambda passes, change: progress(replace(stage, passes=passes, change=change))
+    return begun

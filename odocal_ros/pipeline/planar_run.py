@@ -18,8 +18,8 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
 from odocal_ros.nav.integral import integral_at
-from odocal_ros.pipeline.leg_run import leg_result
-from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.methods import leg_result
+from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.inputs import Inputs
@@ -148,8 +148,7 @@ def _gyro(inputs: Inputs, t: Floats) -> Floats:
     if not inputs.felt or len(inputs.t_imu) < 2 or inputs.t_imu[0] > t[0] \
             or inputs.t_imu[-1] < t[-1]:
         return np.empty(0)
-    up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
-    rate = np.einsum('ij,j->i', inputs.w_b, up_b)       # by BLAS it depends on its threads
+    rate = np.einsum('ij,j->i', inputs.w_b, inputs.up_b)       # by BLAS it depends on its threads
     out: Floats = np.diff(integral_at(t, inputs.t_imu, rate))
     return out
 

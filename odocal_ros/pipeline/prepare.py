@@ -18,9 +18,8 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
-from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.align import align
-from odocal_ros.pipeline.coarse_odometer import coarse_reasons
+from odocal_ros.pipeline.beyond_model import coarse_reasons
 from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import axles_of
@@ -37,16 +36,11 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
             alignment: Alignment | None = None,
             holdout: bool = False) -> tuple[PreparedLeg | None, tuple[Reason, ...]]:
     """
-    Prepare a leg for the methods.
+    Return a leg prepared for the methods, None if none can be run on it, and all reasons.
 
     leg, inputs, config : the leg, screened, and the settings in force.   reasons : what was found
     of it so far.   alignment : used instead of the leg's own.   holdout : keep the last fifth of
     the distance back from the fit.
-
-    Returns
-    -------
-    PreparedLeg, None where no method can be run on it, and all that was found, a tuple.
-
     """
     placed = place(inputs, config)
     let_go()
@@ -69,8 +63,7 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
               reasons: Sequence[Reason], alignment: Alignment | None,
               holdout: bool) -> PreparedLeg:
     """Return the leg aligned, dead reckoned, and the drive judged."""
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
-                        config.leg.standstill)
+    spans = inputs.standstills(placed.rough, config)
     about: tuple[Reason, ...] = ()
     if alignment is None:
         alignment, about = align(inputs, spans, placed.rough, placed.fixes_n, placed.origin,
@@ -118,8 +111,7 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
 
 def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ...]:
     """Return the reason for a gyro that does not turn with the fixes or with gravity."""
-    up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
-    ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ up_b, inputs.w_b),
+    ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)
     scale_or_sign = gyro_reasons(ratio, config.imu.gyro_scale)
     if any(r.code is Code.GYRO_SIGN for r in scale_or_sign):

@@ -1,14 +1,18 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A leg made ready for the methods: aligned, reckoned, judged; nothing of it changes later."""
+"""A leg prepared for the methods, which does not change later; the result of a method on it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import nan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
+from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.reversal import level_track
 from odocal_ros.calib.wheels.wheel_slips import WheelSlips
 from odocal_ros.data.arrays import Floats
@@ -19,11 +23,68 @@ from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.strapdown import attitude
-from odocal_ros.pipeline.method_run import Path
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.facing import Facing
 from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.settings.config import Config
+
+Passed = Callable[[int, float], None]      # called with the passes made, and Stage.change
+Path = Callable[[Floats], Floats]     # t (n,) s to (n, 3) m, or t () to (3,)
+WHOLE_FROM = 10.0     # judgement: sigmas from which their decimals mean nothing
+
+
+class Paths(NamedTuple):
+    """
+    The antenna's path as configured and as calibrated: t (n,) to (n, 3) m, but for a constant.
+
+    Both have one attitude, and the fit's angles where it determines none: they differ in what
+    the calibration changes and in nothing else.
+    """
+
+    before: Path
+    after: Path
+
+
+class MethodRun(NamedTuple):
+    """
+    A method's result and what it found beside it.
+
+    paths : None where it refuses.   found : of the data, said of the leg.   delays : 'gnss' or
+    'odometer' to s late and sigma; None from a method that sees none.   odometer : slip or
+    lateness that its track shows beside the IMU, said of the leg unless a better method has
+    looked; None: it does not look.
+    """
+
+    result: MethodResult
+    paths: Paths | None = None
+    found: tuple[Reason, ...] = ()
+    delays: dict[str, tuple[float, float]] | None = None
+    odometer: tuple[Reason, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """
+    A stage of the work on a leg.
+
+    name : the method at work, or ``tracks``; empty before the first.   done : share of the work
+    in the stages before it, 0 to 1; when a fit ends cannot be foreseen.   passes : that its fit
+    has made.   change : the largest change of a constant in the last of them, in sigmas; NaN
+    before the first.
+    """
+
+    name: str = ''
+    done: float = 0.0
+    passes: int = 0
+    change: float = nan
+
+    def words(self) -> str:
+        """Return it for people."""
+        if not self.passes:
+            return self.name
+        change = f'{self.change:.0f}' if self.change >= WHOLE_FROM else f'{self.change:.2f}'
+        return (f'{self.name}, {self.passes} pass{"es" * (self.passes > 1)} done, remaining '
+                f'change {change} sigma')
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +132,8 @@ class PreparedLeg(Placed):
     def level_path(self, t: Floats) -> Floats:
         """Return travel along the gyro's heading on level ground, but for a rotation: (n, 2)."""
         inputs, epochs = self.inputs, self.track.t
-        up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
         turned = integral_at(epochs, inputs.t_imu, by_row(
-            lambda w_b: (w_b - self.alignment.gyro_bias) @ up_b, inputs.w_b))
+            lambda w_b: (w_b - self.alignment.gyro_bias) @ inputs.up_b, inputs.w_b))
         path = level_track(self.track.s, turned)
         return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
 

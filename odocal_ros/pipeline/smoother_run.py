@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The smoother on one leg: all samples at once, no outside heading."""
+"""The smoother on one leg: all samples, no external heading; the search of patent CN104359492A."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,15 +13,15 @@ import numpy as np
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.slip import slip_reasons
 from odocal_ros.calib.smoother import smooth, smoother_leg
+from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
+from odocal_ros.calib.wheel_search.search import search, SearchResult
+from odocal_ros.calib.wheel_search.space import ranges_of
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
-from odocal_ros.pipeline.method_run import MethodRun, Passed, Path, Paths
-from odocal_ros.pipeline.patent_run import search_of
-from odocal_ros.pipeline.prepared import PreparedLeg
-from odocal_ros.pipeline.slip_check import slip_check
-from odocal_ros.pipeline.tracks import as_configured
+from odocal_ros.pipeline.prepared import MethodRun, Passed, Path, Paths, PreparedLeg
+from odocal_ros.pipeline.tracks import as_configured, slip_check
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 
@@ -114,3 +114,38 @@ def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
         for name, section in (('antenna', config.gnss), ('odometer', config.odometer)))
     arm: Floats = antenna - odometer
     return arm
+
+
+def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
+    """
+    Return a leg as the patent sees it: two tracks in the plane, and fixes.
+
+    ready : PreparedLeg.   pitch : rad, of the IMU on the vehicle.   None without two wheels, or
+    without a fix at the start.
+    """
+    inputs = ready.inputs
+    two = 2
+    if len(inputs.travels) != two:
+        return None
+    left, right = inputs.travels
+    begin, end = (pick([float(x.t[at]) for x in (ready.track, left, right)])
+                  for pick, at in ((max, 0), (min, -1)))
+    begin, end = max(0.0, begin), min(ready.t_fit, end)
+    start = ready.mark(begin, ready.path(np.array([ready.rough, 0.0, 0.0])), 'start')
+    if start is None or end <= begin:
+        return None
+    between = (inputs.t_fix >= begin) & (inputs.t_fix <= end)
+    scale = ready.nominal or ready.rough
+    return planar_leg(ready.reckon(left), ready.reckon(right), inputs.t_fix[between],
+                      ready.fixes_n[between], inputs.covariance_n[between],
+                      (start.t, start.position_n), (scale, scale), pitch, ready.lever_b)
+
+
+def search_of(ready: PreparedLeg, pitch: float) -> SearchResult | None:
+    """Return the result of the search, None with too few fixes; arguments as in planar_of."""
+    leg = planar_of(ready, pitch)
+    if leg is None:
+        return None
+    a, wheels = ready.alignment, ready.config.wheels
+    course = None if a.heading_separable else a.heading_sigma     # holds the mounting angle too
+    return search(leg, ranges_of(wheels, course), wheels.robust)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The tracks of a leg, as configured and as calibrated, and their deviation from the fixes."""
+"""Tracks of a leg, as configured and as calibrated: deviation from the fixes, slips, checks."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,10 +13,10 @@ from odocal_ros.calib.evidence import evidence, KEPT_ROWS
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.per_distance import check_worse, per_distance
 from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.slip import find_slips, rounding, Slips, SPIN_WINDOW
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
-from odocal_ros.pipeline.method_run import Path, Paths
-from odocal_ros.pipeline.prepared import PreparedLeg
+from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Track
+from odocal_ros.pipeline.prepared import Path, Paths, PreparedLeg
 from odocal_ros.reasons import Code, Reason
 
 FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
@@ -37,14 +37,7 @@ def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimat
 
 def near(ready: PreparedLeg, path: Path, pin: MarkFix,
          between: Bools) -> tuple[Bools, tuple[Reason, ...]]:
-    """
-    Return a mask of fixes without gross outliers from a fitting path.
-
-    Returns
-    -------
-    (k,) bool, and what is to be said of the others, a tuple.
-
-    """
+    """Return a mask of fixes, (k,), without gross outliers from a fitting path, and reasons."""
     if not between.any():
         return between, ()
     off = np.hypot(*stray(path, pin, (ready.inputs.t_fix, ready.fixes_n))[:, :2].T)
@@ -128,3 +121,20 @@ def driven(ready: PreparedLeg) -> tuple[Floats, Floats]:
     """Return times of the track, s, and the path length until then, m."""
     path_length = np.append(0.0, np.cumsum(np.abs(np.diff(ready.track.s))))
     return ready.track.t, path_length * ready.metres_per_unit
+
+
+def slip_check(ready: PreparedLeg, track: Track, f: Floats,
+               between: tuple[float, float]) -> Slips:
+    """
+    Return the slips of the mean of the wheels, without those of one wheel, which are named.
+
+    ready : PreparedLeg.   track : Track, of a method.   f : (3,) scale times forward axis.
+    between : s.
+    """
+    if not ready.inputs.felt:
+        return Slips(np.empty(0), np.empty(0))
+    slips = find_slips(ready.inputs.t_imu, ready.inputs.f_b, track, f, ready.origin.latitude,
+                       rounding(ready.inputs.travel))
+    known = (np.abs(slips.t[:, None] - ready.wheel_slips.t) < SPIN_WINDOW).any(axis=1)
+    held = (slips.t >= between[0]) & (slips.t <= between[1]) & ~known
+    return slips._replace(t=slips.t[held], size=slips.size[held])

@@ -31,10 +31,8 @@ from odocal_ros.calib.two_point import (
     unsolved,
 )
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.pipeline.method_run import MethodRun, Passed, Paths
-from odocal_ros.pipeline.prepared import PreparedLeg
-from odocal_ros.pipeline.slip_check import slip_check
-from odocal_ros.pipeline.tracks import as_configured, near
+from odocal_ros.pipeline.prepared import MethodRun, Passed, Paths, PreparedLeg
+from odocal_ros.pipeline.tracks import as_configured, near, slip_check
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import toward
 

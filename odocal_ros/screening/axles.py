@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.odometer import mean_travel, Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import broken_wheels, STILL_SHARE
@@ -133,7 +134,7 @@ def steering_path(t: Floats, turn: Floats, s: Floats, ahead: float = 0.0,
     along = speed - left * rate
     more = np.sign(along) * rate**2 / (np.hypot(along, ahead * rate) + np.abs(along) + 1e-12)
     more[np.abs(speed) < SLOW * np.abs(speed).max()] = 0.0
-    return np.append(0.0, np.cumsum((more[1:] + more[:-1]) / 2 * np.diff(t)))
+    return running_integral(t, more)
 
 
 def _listed(wheels: Sequence[Travel]) -> str:

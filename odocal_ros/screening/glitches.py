@@ -94,15 +94,10 @@ def about_clumps(wild: Bools) -> Bools:
 
 def alone(t: Floats, x: Floats, least: float) -> Bools:
     """
-    Return a mask of rows that jump away from their neighbours and back.
+    Return a mask of rows that jump away from their neighbours and back: (n,) bool.
 
     t : (n,) times, s, rising.   x : (n, k) values.   least : smallest bound, from one row to the
-    next, that may be a glitch.
-
-    Returns
-    -------
-    (n,) bool; all false where so many rows do so that it is the sensor's nature.
-
+    next, that may be a glitch. All false where so many rows do so that it is the sensor's nature.
     """
     found = np.zeros(len(x), bool)
     bound = by_step(lambda x: across(np.maximum, np.abs(np.diff(x, axis=0))), x)

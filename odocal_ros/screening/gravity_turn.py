@@ -21,12 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Bools, Complexes, Floats
 from odocal_ros.data.pieces import bin_means
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.settings.grades import G
 
-Complexes = NDArray[np.complex128]
 ROW_S, ROWS_A_SECOND = 0.25, 4       # s, judgement: the yaw between rows stays small
 # tuned by benchmarks/zoo.py, 90 drives of 150 to 600 s: shorter or longer segments detect less
 SEGMENTS, SHORTEST_S, LONGEST_S = 12, 10, 30

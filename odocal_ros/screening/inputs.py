@@ -15,6 +15,7 @@ from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.earth import rate_without_north
 from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
@@ -55,9 +56,19 @@ class Inputs:
         return medians(self.f_b)
 
     @property
+    def up_b(self) -> Floats:
+        """Return the direction of the usual specific force: (3,) unit vector."""
+        return self.usual_f_b / np.linalg.norm(self.usual_f_b)
+
+    @property
     def least_motion(self) -> float:
         """Return the distance over which positions surely move, m."""
         return LOCAL_MOVES if self.local else GNSS_MOVES
+
+    def standstills(self, metres_per_unit: float, config: Config) -> Floats:
+        """Return the standstills of ``leg.standstill`` or longer, begin and end: (k, 2) s."""
+        return standstills(self.t_imu, self.w_b, self.travel, metres_per_unit,
+                           config.leg.standstill)
 
     def mirrored(self, spans: Floats) -> 'Inputs':
         """Return them with the counts in spans, (m, 2) s, reversed."""

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Odometer rows that do not say what they seem to: false rows, hung counters, lost increments.
+Odometer rows with false values: false counts, frozen counters, lost increments.
 
 False rows are dropped if the counter continues normally after them; unknown travel (a reset, a gap
 of speeds or increments) is an uncertainty in the error budget.
@@ -14,14 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Floats, Values
+from odocal_ros.data.arrays import Bools, Floats, Ints, Values
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
-from odocal_ros.nav.gaps import MISSING_INTERVALS
-from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel
+from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel, without_rollover
+from odocal_ros.nav.statistics import MISSING_INTERVALS
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.glitches import speed_glitches
+from odocal_ros.screening.glitches import beyond, speed_glitches
 
 STEPS_BESIDE = 5    # judgement: steps next to a jump or gap that give the speed there
+# counts, rad, m: less is not called motion
+STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
 def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -48,11 +50,7 @@ def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[
 
 def counter_steps(value: Values, modulus: int) -> Floats:
     """Return the steps of a counter, rollover undone, as floats: (n,) to (n - 1,)."""
-    step = np.diff(value)
-    if np.issubdtype(value.dtype, np.integer) and 0 < modulus < 2**63:
-        half = modulus // 2
-        step = (step + half) % modulus - half
-    return step.astype(float)
+    return without_rollover(np.diff(value), modulus).astype(float)
 
 
 def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
@@ -177,3 +175,37 @@ def _stall(step: Floats, j: int) -> int:
 
 def _usual(rate: Floats) -> float:
     return float(np.median(rate)) if len(rate) else 0.0
+
+
+class Steps:
+    """Rows to steps, in odometer units; ``nav.odometer.travel`` does it with all rows at hand."""
+
+    def __init__(self, form: OdometerForm) -> None:
+        self.form = form
+        self._last: tuple[Ints, Values] | None = None
+
+    @property
+    def still(self) -> float:
+        """Return the travel up to which one that stands may seem to move."""
+        return STILL_TRAVEL.get(self.form.scale_unit, 0.02)
+
+    def of(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
+        """
+        Return the step of each row since the row before, its stamp, ns, and its duration, s.
+
+        Rows without a possible value are passed over.
+        """
+        good = ~beyond('value', block.value)
+        stamps, values = block.stamp_ns[good], block.value[good]
+        if self._last is not None:
+            stamps = np.r_[self._last[0], stamps]
+            values = np.r_[self._last[1], values]
+        self._last = (stamps[-1:], values[-1:])
+        seconds = np.diff(stamps) * 1e-9
+        if self.form.quantity == 'increment':
+            steps = values[1:]
+        elif self.form.quantity == 'rate':
+            steps = values[1:] * seconds
+        else:
+            steps = without_rollover(np.diff(values), self.form.modulus)
+        return np.asarray(steps, dtype=np.float64), stamps[1:], seconds

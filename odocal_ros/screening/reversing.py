@@ -31,17 +31,12 @@ BY_FIT = 'IMU and fixes move backwards'
 def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
                     between: tuple[float, float]) -> Floats:
     """
-    Return the intervals of reversing in which the counter counts up: (m, 2) s.
+    Return begin and end of reversing in which the counter counts up: (m, 2) s.
 
     travel : of the odometer, any unit.   t_imu, w_b, f_b : (n,), (n, 3), (n, 3) s, turn rate,
     rad/s, bias and all, specific force, m/s^2.   between : (2,) the marks, s; earlier travel gives
-    the usual values.
-
-    Returns
-    -------
-    Begin and end of each such stretch. Travel that counts down in reverse gives none, nor does an
-    IMU whose x axis lies across the vehicle.
-
+    the usual values. Travel that counts down in reverse gives none, nor does an IMU whose x axis
+    lies across the vehicle.
     """
     none = np.empty((0, 2))
     if len(travel.t) < 3 or len(t_imu) < 3:

@@ -29,15 +29,10 @@ OTHER_WHEEL_COUNTS = 8    # judgement: the other wheel makes meanwhile, at least
 def broken_wheels(axle: Sequence[Travel], imu: Imu,
                   between: tuple[float, float]) -> tuple[Reason, ...]:
     """
-    Return WHEEL_DEAD and WHEEL_REVERSED where one wheel fails, empty where both count.
+    Return WHEEL_DEAD and WHEEL_REVERSED, once each, where one wheel fails; () if both count.
 
     axle : (2,) Travel of the left and the right wheel, scale units.   imu : (t, w_b, f_b)
     (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.   between : (2,) the marks, s.
-
-    Returns
-    -------
-    Reasons, at most one of each code.
-
     """
     two = pair(axle, imu, between, FAULT_GRID)
     if two is None:

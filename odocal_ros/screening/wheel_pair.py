@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import medians
-from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.statistics import robust_sigma
+from odocal_ros.nav.statistics import GAP_INTERVALS, robust_sigma
 from odocal_ros.settings.config import SIDES
 
 Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2
@@ -81,16 +80,11 @@ def pair(axle: Sequence[Travel], imu: Imu, between: tuple[float, float], step: f
 def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floats | None = None,
                start: Sequence[float] | Floats | None = None) -> tuple[Floats, Floats, float]:
     """
-    Return the coefficients of y = A x by least squares, rows far off left out by Tukey's weights.
+    Return x of y = A x by least squares with Tukey's weights, its covariance, sigma of a value.
 
     A, y : (n, k), (n,) design and values.   floor : least sigma of a value.   prior : (k,) sigmas
     of the coefficients about zero, inf: free.   start : (k,) coefficients that many rows are known
-    to follow; default: least squares.
-
-    Returns
-    -------
-    x : (k,).   covariance : (k, k).   sigma : of a value, by the median of the residuals.
-
+    to follow; default: least squares. The sigma is by the median of the residuals.
     """
     size = np.abs(A).max(axis=0)
     size[size == 0] = 1.0

@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.sim import draw_imu, draw_road
+from odocal_ros.sim.draw_effects import EFFECTS, RARE
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.zoo import GRADES, plain, ROWS, SIZES, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')
-EFFECTS = draw_imu.EFFECTS | draw_road.EFFECTS     # all are part of a drawn vehicle
-RARE = draw_road.RARE
 ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each asks for an odometer of its own
 
 
@@ -31,22 +29,12 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
     """
     Return SimOptions of a drawn vehicle, and the names of the effects that it has.
 
-    Parameters
-    ----------
-    seed : int
-        Of the vehicle, and of the noise of its drive.
-    kind, grade : str
-        Scenario, and class of the IMU: consumer, industrial or tactical.
-    effects : sequence of str, optional
-        Those to be drawn; None: all, ``()``: the clean vehicle.
-    given : dict
-        SimOptions that are not drawn but as given; ``real`` a dict of its figures.
+    seed : of the vehicle, and of the noise of its drive.   kind, grade : scenario, and class of
+    the IMU: consumer, industrial or tactical.   effects : those to be drawn; None: all, ``()``:
+    the clean vehicle.   given : SimOptions that are not drawn but as given; ``real`` a dict of its
+    figures.
 
-    Raises
-    ------
-    BadUsage
-        A name is unknown.
-
+    Raises BadUsage: a name is unknown.
     """
     if grade not in GRADES:
         raise BadUsage(f'--vehicle real with --imu-grade {grade}: required: one of '

@@ -180,15 +180,10 @@ def _velocity_v(state: State) -> Floats:
 def inertial_v(state: State,
                lever_arm_v: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
     """
-    Return the output of a perfect IMU at ``lever_arm_v`` (m, in v), in axes v.
+    Return the output of a perfect IMU at ``lever_arm_v`` (m, in v), in axes v: w_v, f_v.
 
-    Returns
-    -------
-    w_v : (n, 3) array
-        Turn rate against inertial space, rad/s.
-    f_v : (n, 3) array
-        Specific force, m/s^2: +g along z at rest on the level.
-
+    w_v : (n, 3) turn rate against inertial space, rad/s.   f_v : (n, 3) specific force, m/s^2: +g
+    along z at rest on the level.
     """
     C_nv, v_n = attitude(state), velocity_n(state)
     s, c = np.sin(state.slope), np.cos(state.slope)

@@ -1,13 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Random numbers with a stream for each sensor, and the noises made of them."""
+"""Sample times, random numbers with a stream for each sensor, and the noises made of them."""
 
 import zlib
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
+
+# s from the first IMU sample, so that no two topics sample together
+PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004}
+TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measuring to arriving
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
@@ -44,3 +48,10 @@ def gauss_markov(rng: np.random.Generator, sigma: float, tau: float, t: Floats) 
     for k, (d, push) in enumerate(zip(decay, drive, strict=True)):
         x[k] = last = d * last + push
     return x
+
+
+def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floats]:
+    """Return sample times: whole ns from the start (n,), and the same in s."""
+    n = int(np.floor((duration - phase) * rate + 1e-9)) + 1
+    ns = np.rint(phase * 1e9 + np.arange(n) * (1e9 / rate)).astype(np.int64)
+    return ns, ns * 1e-9

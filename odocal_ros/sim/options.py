@@ -151,11 +151,7 @@ def resolved(options: SimOptions) -> SimOptions:
     """
     Return options with the scenario's own values filled in.
 
-    Raises
-    ------
-    BadUsage
-        A name is unknown or a figure is out of range.
-
+    Raises BadUsage: a name is unknown or a figure is out of range.
     """
     _choice('--scenario', options.scenario, DEFAULTS)
     _choice('--odometer', options.odometer, ODOMETERS)

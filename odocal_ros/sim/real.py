@@ -148,11 +148,7 @@ def parsed(text: str) -> tuple[str, Any]:
     """
     Return name and value of ``NAME=VALUE``.
 
-    Raises
-    ------
-    BadUsage
-        No such figure, or its value is no number, tuple or word.
-
+    Raises BadUsage: no such figure, or its value is no number, tuple or word.
     """
     import ast
     name, _, value = text.partition('=')

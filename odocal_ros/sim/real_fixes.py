@@ -1,14 +1,18 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Effects of a real receiver: lag, correlated errors, multipath, wrong stated sigmas."""
+"""A real receiver: filters, correlated errors, multipath, wrong stated sigmas, velocity."""
+
+from dataclasses import replace
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.samples import VelocitySamples
+from odocal_ros.nav.earth import radii
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point
-from odocal_ros.sim.noise import gauss_markov, stream
+from odocal_ros.sim.noise import gauss_markov, PHASE, stamps, stream, TRANSPORT
 from odocal_ros.sim.options import SimOptions
 
 # definition: ages, in time constants, and weights of a first-order filter: Gauss and Legendre on
@@ -24,6 +28,8 @@ TRACKING /= TRACKING.sum()
 UP = 2.0             # judgement: errors of the height over those of east and north
 SPREAD = 0.9         # judgement: of the logarithm of a burst's size and length
 ONSET = (0.5, 1.5)   # judgement: of the mean time in which a burst comes and goes
+HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e-4 m/s
+OUTLIER = 5.0           # m/s, judgement: a wrong Doppler in a street
 
 
 def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
@@ -114,3 +120,32 @@ def true_variance(white: Floats, options: SimOptions) -> Floats:
     """Return the variance of the errors but for bursts, ENU: (3,) m^2. white: of the noise."""
     slow = sum(sigma**2 for sigma, _ in options.real.slow_errors)
     return white + slow * np.array([1.0, 1.0, UP**2])
+
+
+def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
+    """Return the published velocity of the antenna; none without a sigma."""
+    sigma = options.velocity_sigma
+    if sigma is None:
+        return VelocitySamples.none()
+    ns, t = stamps(motion.duration, options.velocity_rate, PHASE['fix'])
+    smoothed = replace(options, real=replace(options.real, receiver_lag=options.velocity_lag))
+    before, after = (np.stack(places(motion, np.maximum(t + by, 0.0), smoothed), -1)
+                     for by in (-HALF_STEP, HALF_STEP))
+    latitude, _, height = after.T
+    meridian, normal = radii(latitude)
+    north, east, up = ((after - before) / (2 * HALF_STEP)).T
+    true = np.stack([east * (normal + height) * np.cos(latitude), north * (meridian + height), up],
+                    -1)
+    sent = true * (1 + options.velocity_scale_error) + _velocity_errors(t, options, sigma)
+    stamp = options.start_ns + ns + round(options.velocity_delay * 1e9)
+    return VelocitySamples(stamp, stamp + round(TRANSPORT['fix'] * 1e9), sent,
+                           np.full(sent.shape, sigma**2))
+
+
+def _velocity_errors(t: Floats, options: SimOptions, sigma: float) -> Floats:
+    time, rng = options.velocity_correlation_time, stream(options.seed, 'velocity')
+    error = (gauss_markov(rng, sigma, time, t) if time
+             else sigma * rng.standard_normal((len(t), 3)))
+    far = rng.uniform(size=(len(t), 1)) < options.velocity_outliers
+    out: Floats = error + far * OUTLIER * rng.standard_normal((len(t), 3))
+    return out

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.leg import Leg, WHEELS
+from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
     ImuSamples,
-    no_heading,
-    no_imu,
-    no_odometer,
     OdometerForm,
     OdometerSamples,
     VelocitySamples,
@@ -26,17 +24,17 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.local_frame import local_fixes
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.settings.config import MECANUM
-from odocal_ros.sim import body, real_wheels, sensors
-from odocal_ros.sim.housing import own_angles
+from odocal_ros.sim import body, sensors
 from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
-from odocal_ros.sim.noise import stream
+from odocal_ros.sim.noise import stamps, stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Profile
+from odocal_ros.sim.real_fixes import velocity
+from odocal_ros.sim.real_imu import own_angles
 from odocal_ros.sim.references import Reference, REFERENCES
 from odocal_ros.sim.road import Hills
 from odocal_ros.sim.routes import mecanum, Route, ROUTES
-from odocal_ros.sim.vehicle_wheels import wheels_of
-from odocal_ros.sim.velocity import velocity
+from odocal_ros.sim.wheels import leg_factor, wheels_of
 
 __all__ = ['Drive', 'SCENARIOS', 'SimOptions', 'Truth', 'motion_of', 'simulate']
 
@@ -54,7 +52,7 @@ class Truth:
     The scale of tyres that grow or slip is the mean of the leg by travel: true metres rolled
     between the marks over the change of the count there, before anything made it coarse; so are
     its ratio and the wheels' own. Yaw and pitch are those of the IMU's own axes (turn-and-push
-    frame, ``housing.py``), which are its housing's where the triads are square.
+    frame, ``real_imu.py``), which are its housing's where the triads are square.
     """
 
     scale: float                 # m/pulse, 1 or m/rad; of two wheels that of their mean count
@@ -99,7 +97,7 @@ class Drive:
     @property
     def odometer_right(self) -> OdometerSamples:
         """Return the samples of the right wheel, no rows without one."""
-        return self.wheels[1] if len(self.wheels) > 1 else no_odometer()
+        return self.wheels[1] if len(self.wheels) > 1 else OdometerSamples.none()
 
     @property
     def reference(self) -> Reference:
@@ -197,33 +195,29 @@ def simulate(options: SimOptions | None = None) -> Drive:
     """
     Return a drive; equal options give equal drives, to the last bit.
 
-    Raises
-    ------
-    BadUsage
-        An option is unknown or out of range.
-
+    Raises BadUsage: an option is unknown or out of range.
     """
     options = resolved(options or SimOptions())
     motion = motion_of(options)
     imu = sensors.imu(motion, options)
     return Drive(
         options=options, motion=motion, truth=_truth(motion, options, imu),
-        form=FORMS[options.odometer], imu=imu if options.imu else no_imu(),
+        form=FORMS[options.odometer], imu=imu if options.imu else ImuSamples.none(),
         wheels=tuple(sensors.odometers(motion, options)),
         fix=sensors.fixes(motion, options),
-        heading=(no_heading() if options.heading_sigma is None
+        heading=(HeadingSamples.none() if options.heading_sigma is None
                  else sensors.heading(motion, options, options.heading_sigma)),
         velocity=velocity(motion, options))
 
 
 def _truth(motion: Motion, options: SimOptions, imu: ImuSamples) -> Truth:
     gyro_bias, accel_bias = sensors.turn_on_biases(options)
-    _, t = sensors.stamps(motion.duration, options.imu_rate)    # true, however late the stamps
+    _, t = stamps(motion.duration, options.imu_rate)    # true, however late the stamps
     start = int(np.searchsorted(t, _first_move(motion) + 1e-9, side='right')) - 1
     C_vb = matrix_from_rpy([options.roll, options.pitch, options.yaw])
     x_n = (attitude(motion.at(t[start:start + 1])) @ C_vb)[0, :, 0]
     # a sum in steps of 0.02 s is the true scale of growing tyres
-    factor = real_wheels.leg_factor(motion.at(np.arange(0.0, motion.duration, 0.02)),
+    factor = leg_factor(motion.at(np.arange(0.0, motion.duration, 0.02)),
                                     options.real)
     scale = options.scale * factor
     yaw, pitch, yaw_housing, pitch_housing = _angles(options)

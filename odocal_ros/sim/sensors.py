@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
+from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples, take
 from odocal_ros.nav.earth import radii
 from odocal_ros.nav.rotations import (
     matrix_from_rpy,
@@ -24,29 +24,28 @@ from odocal_ros.nav.rotations import (
     quat_multiply,
 )
 from odocal_ros.settings.config import DIFFERENTIAL, MECANUM
-from odocal_ros.sim import body, real_fixes, real_imu, real_wheels
+from odocal_ros.sim import body, real_fixes, real_imu
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State
-from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
+from odocal_ros.sim.noise import gauss_markov, PHASE, random_walk, stamps, stream, TRANSPORT, white
 from odocal_ros.sim.options import SIM_GRADES, SimOptions
 from odocal_ros.sim.real import NONE3
 from odocal_ros.sim.references import drift, REFERENCES, stationary_sigma
-from odocal_ros.sim.robot_wheels import robot_path
-from odocal_ros.sim.vehicle_wheels import SimWheel, steered_path, wheels_of
+from odocal_ros.sim.wheels import (
+    coarse,
+    growth,
+    low_passed,
+    robot_path,
+    SimWheel,
+    slip_share,
+    steered_path,
+    tyre_slip,
+    wheels_of,
+)
 
-# s from the first IMU sample, so that no two topics sample together
-PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004}
-TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measuring to arriving
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
 WHITE_SHARE = 0.2        # judgement: of the correlated sigma: receiver noise on top
 SIGMA_FLOOR = 0.001      # m, judgement: no receiver reports zero
 AT_REST = 1e-9           # m/s and rad/s, judgement
-
-
-def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floats]:
-    """Return sample times: whole ns from the start (n,), and the same in s."""
-    n = int(np.floor((duration - phase) * rate + 1e-9)) + 1
-    ns = np.rint(phase * 1e9 + np.arange(n) * (1e9 / rate)).astype(np.int64)
-    return ns, ns * 1e-9
 
 
 def imu_rotation(options: SimOptions) -> Floats:
@@ -145,17 +144,17 @@ def _reading(state: State, options: SimOptions, wheel: SimWheel,
              lean: Floats | float) -> Floats | Ints:
     arm, scale = wheel.arm, wheel.scale
     real, spun = options.real, slip(state, options, wheel.draws)
-    grown = 1 + real_wheels.growth(state, real)
+    grown = 1 + growth(state, real)
     if options.odometer == 'speed':
         noise = options.speed_noise * stream(options.seed, 'speed').standard_normal(len(state.t))
         # slip of the moment: of a speed sent twice a second differences would smear it
-        pulled = real_wheels.slip_share(state, real) * state.speed
+        pulled = slip_share(state, real) * state.speed
         rate = (contact_speed(state, arm, lean) + pulled + np.gradient(spun, state.t)) / grown
-        sent = real_wheels.low_passed(rate + noise, state.t, real.speed_filter)
-        return real_wheels.coarse(sent / scale, real)
+        sent = low_passed(rate + noise, state.t, real.speed_filter)
+        return coarse(sent / scale, real)
     path = (contact_travel(state, arm, lean) if options.drive == DIFFERENTIAL else
             robot_path(state, options, wheel))
-    rolled = path + spun + real_wheels.tyre_slip(state, real)
+    rolled = path + spun + tyre_slip(state, real)
     if wheel.steered:
         rolled = rolled + steered_path(state, arm)
     if np.ndim(grown):
@@ -231,9 +230,7 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
         seen &= (t < begin) | (t >= end)
     if real.drops:
         seen &= stream(options.seed, 'real drops').uniform(size=n) >= real.drops
-    return FixSamples(*(getattr(samples, name)[seen] for name in (
-        'stamp_ns', 'received_ns', 'latitude', 'longitude', 'height', 'covariance_n',
-        'covariance_type', 'status')))
+    return take(samples, seen)
 
 
 def _axes(options: SimOptions) -> Floats:

@@ -10,9 +10,8 @@ from typing import Any
 from odocal_ros.settings.config import DIFFERENTIAL, MECANUM, SIDES
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
-from odocal_ros.sim.robot_wheels import effective_width, SIDEWAYS
 from odocal_ros.sim.scenarios import Drive
-from odocal_ros.sim.vehicle_wheels import wheels_of
+from odocal_ros.sim.wheels import effective_width, SIDEWAYS, wheels_of
 
 STANDS_FOR_PERFECT = 'navigation'   # the best grade there is in the settings
 
@@ -110,8 +109,6 @@ def settings(drive: Drive,
     grade = options.real.told_grade or options.imu_grade
     odometer: dict[str, Any] = {'nominal_scale': float(options.nominal_scale),
                       'lever_arm': _told_arm(options, 'odometer')}
-    if options.drive != DIFFERENTIAL:
-        odometer['drive'] = options.drive
     if options.drive != DIFFERENTIAL:
         odometer['drive'] = options.drive
     if options.wheel_count > len(SIDES):

@@ -63,6 +63,12 @@ class Vehicle:
         """Return the number that a table has for the vehicle's class."""
         return SIZES[name][GRADES.index(self.grade)]
 
+    @property
+    def speed_options(self) -> dict[str, Any]:
+        """Return the options of an odometer that sends speeds with the same relative error."""
+        return {'odometer': 'speed', 'nominal_scale': 1.0,
+                'scale': self.options['scale'] / self.options['nominal_scale']}
+
     def row(self, name: str) -> tuple[float, ...]:
         """Return the several numbers that a table has for the vehicle's class."""
         return ROWS[name][GRADES.index(self.grade)]

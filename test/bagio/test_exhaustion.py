@@ -14,7 +14,7 @@ import pytest
 import ros_bags
 from ros_bags import T0
 
-from odocal_ros.bagio import definitions
+from odocal_ros.bagio import types
 from odocal_ros.bagio.mcap_records import MAGIC
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.errors import BadBag, BadData
@@ -181,7 +181,7 @@ def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
 
 def test_annotations_cost_nothing():
     strings = '"a (b" ' * 20_000
-    found = definitions.parsed('a/msg/B', 'idl', f'module a {{ module msg {{ @verbatim(text='
+    found = types.parsed('a/msg/B', 'idl', f'module a {{ module msg {{ @verbatim(text='
                                f'{strings}) @x struct B {{ @y(z=(1)) long x; /* ( */ }}; }}; }};')
     assert [name for name, _ in found['a/msg/B'][1]] == ['x']
 

@@ -19,7 +19,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.slow_errors import slow_variance
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.reasons import Code
-from odocal_ros.screening.sanity import imu_sanity
+from odocal_ros.screening.facing import imu_sanity
 from odocal_ros.settings.config import Config, ImuConfig, with_settings
 from odocal_ros.settings.nominal import nominal_scale
 

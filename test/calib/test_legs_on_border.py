@@ -17,8 +17,8 @@ from odocal_ros.calib.smoother import several, smooth
 from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
 from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS
+from odocal_ros.pipeline.beyond_model import held
 from odocal_ros.pipeline.combination import combine
-from odocal_ros.pipeline.scale_error import held
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import with_settings
 

@@ -16,9 +16,8 @@ from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
 from odocal_ros.errors import BadConfig
 from odocal_ros.forecast.ideal_samples import ideal
-from odocal_ros.forecast.manoeuvres import TOWN_SIDES, TOWN_SPEED, TOWN_T
-from odocal_ros.forecast.planned_drive import from_rates
-from odocal_ros.forecast.planned_smoother import (
+from odocal_ros.forecast.planned_drive import from_rates, TOWN_SIDES, TOWN_SPEED, TOWN_T
+from odocal_ros.forecast.planned_methods import (
     planned_levels,
     predict_smoother,
     spacing_for,

@@ -27,7 +27,7 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.real_wheels import G
+from odocal_ros.sim.wheels import G
 
 
 @pytest.fixture(scope='module')

@@ -6,7 +6,7 @@
 from drives import drive, settings
 import pytest
 
-from odocal_ros.fleet.leg_text import leg_text, legs_from
+from odocal_ros.fleet.rows import leg_text, legs_from
 from odocal_ros.output.files import as_json
 from odocal_ros.pipeline.calibrate import calibrate, combine
 

@@ -8,6 +8,7 @@ import math
 import time
 from types import SimpleNamespace
 
+from cells import SECOND, thinned
 import numpy as np
 import pytest
 
@@ -32,7 +33,6 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
-SECOND = 1_000_000_000
 HEADING = 0.003         # rad
 
 
@@ -50,10 +50,10 @@ def odometer_rows(t, value):
 
 
 def fed(form, slot, rows, chop):
-    thinned = ThinnedLeg(form)
+    cells = ThinnedLeg(form)
     for first in range(0, len(rows.stamp_ns), chop):
-        thinned.feed(slot, take(rows, slice(first, first + chop)))
-    return thinned
+        cells.feed(slot, take(rows, slice(first, first + chop)))
+    return cells
 
 
 def turned(leg):
@@ -128,18 +128,13 @@ def config(drive):
 
 
 def sketched(drive, t_stop):
-    """Return the thinned of a drive up to a time after the start mark, s."""
-    whole = drive.leg()
-    thinned = ThinnedLeg(whole.form)
-    for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(whole, slot)
-        thinned.feed(slot, take(rows, rows.stamp_ns <= whole.start_ns + t_stop * SECOND))
-    return thinned, whole.start_ns
+    """Return the cells of a drive up to a time after the start mark, s, and the mark."""
+    return thinned(drive.leg(), t_stop), drive.leg().start_ns
 
 
 def foreseen(drive, config, t_stop, **more):
-    thinned, start_ns = sketched(drive, t_stop)
-    return forecast_of(thinned.leg(start_ns), thinned.fix_rate(), config, **more)
+    cells, start_ns = sketched(drive, t_stop)
+    return forecast_of(cells.leg(start_ns), cells.fix_rate(), config, **more)
 
 
 def test_a_leg_at_its_end_is_foreseen_as_it_comes_out(drive, config):
@@ -185,33 +180,29 @@ def test_the_only_heading_is_the_course(drive, config):
 
 def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
     """10 s after a mark set in motion; with another 15 s of such driving the smoother tells it."""
-    whole = drive.leg()
-    start_ns = whole.start_ns + 100 * SECOND
-    thinned = ThinnedLeg(whole.form)
-    for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(whole, slot)
-        thinned.feed(slot, take(rows, np.abs(rows.stamp_ns - start_ns - 4 * SECOND) < 6 * SECOND))
+    start_ns = drive.leg().start_ns + 100 * SECOND
+    cells = thinned(drive.leg(), 110.0, 98.0)
     config = with_settings(Config(), {'odometer.nominal_scale': drive.truth.scale})
-    leg = thinned.leg(start_ns)
-    told = forecast_of(leg, thinned.fix_rate(), config, smoother=SmootherSoFar())
+    leg = cells.leg(start_ns)
+    told = forecast_of(leg, cells.fix_rate(), config, smoother=SmootherSoFar())
     assert told.methods == {}
     assert 'yaw is not determined yet' in told.words()
     assert told.lacks == ['drive on with stops, starts and turns']
     assert not told.complete
     still = replace(leg, imu=replace(leg.imu, f_i=np.zeros_like(leg.imu.f_i)))    # none to come
-    never = forecast_of(still, thinned.fix_rate(), config, smoother=SmootherSoFar())
+    never = forecast_of(still, cells.fix_rate(), config, smoother=SmootherSoFar())
     assert 'yaw: not separable from the course over ground' in never.words()
 
 
 def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
     auto = with_settings(config, {'alignment.heading_source': 'auto',
                                   'alignment.heading': math.nan})
-    thinned, start_ns = sketched(drive, 150.0)
-    leg = thinned.leg(start_ns)
+    cells, start_ns = sketched(drive, 150.0)
+    leg = cells.leg(start_ns)
     n = len(leg.imu.stamp_ns)
     told = replace(leg, imu=replace(leg.imu, yaw_variance=np.full(n, 0.004**2),
                                     q_ni=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))))
-    forecast = forecast_of(told, thinned.fix_rate(), auto)
+    forecast = forecast_of(told, cells.fix_rate(), auto)
     assert forecast.yaw.sources[0] == ('initial_heading', pytest.approx(0.004))
 
 
@@ -389,18 +380,11 @@ def two():
                                seed=4, imu_grade='tactical'))
 
 
-
-
 def looked_at(made, t_stop, **settings):
     """Return what is foreseen after so many seconds of a drive."""
-    whole = made.leg()
-    thinned = ThinnedLeg(whole.form)
-    for slot in ('imu', 'odometer', 'odometer_right', 'fix'):
-        rows = getattr(whole, slot)
-        thinned.feed(slot, take(rows, rows.stamp_ns <= whole.start_ns + t_stop * SECOND))
+    cells, start_ns = sketched(made, t_stop)
     config = with_settings(Config(), {'imu.grade': made.options.imu_grade} | settings)
-    return forecast_of(thinned.leg(whole.start_ns), thinned.fix_rate(), config,
-                       smoother=SmootherSoFar())
+    return forecast_of(cells.leg(start_ns), cells.fix_rate(), config, smoother=SmootherSoFar())
 
 
 @pytest.mark.parametrize('method', ['smoother', 'auto', 'wheels'])

@@ -1,22 +1,25 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What would reject a leg is said while it is driven, as the result will have it."""
+"""Faults, distance and standstill of a leg while it is driven, as the result will have them."""
 
 from dataclasses import replace
 
+from cells import thinned
 from drives import changed, drive, held_up, seconds, settings
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import take
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps
+from odocal_ros.forecast.progress import Travel
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.core
+SECOND = 10**9
 
 
 @pytest.fixture(scope='module')
@@ -55,14 +58,6 @@ def sound(leg):
     return leg
 
 
-def sketched(leg):
-    """Return the leg as the node's cells have it."""
-    thinned = ThinnedLeg(leg.form)
-    for slot in ('imu', 'odometer', 'fix'):
-        thinned.feed(slot, getattr(leg, slot))
-    return thinned.leg(leg.start_ns)
-
-
 @pytest.mark.parametrize('wrong', [reversed_counter, reset_counter, gap, dead_counter, in_g,
                                    sound])
 def test_the_faults_so_far_are_those_of_the_result(made, wrong):
@@ -72,7 +67,7 @@ def test_the_faults_so_far_are_those_of_the_result(made, wrong):
     lowering = {r.code for r in result.reasons
                 if r.code.gravity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
     assert {r.code for r in faults(leg, screened(leg, config), config)} == lowering
-    assert {r.code for r in faults_in_cells(sketched(leg), config)} == lowering
+    assert {r.code for r in faults_in_cells(thinned(leg).leg(leg.start_ns), config)} == lowering
     assert (lowering == set()) == (wrong is sound)
 
 
@@ -80,13 +75,13 @@ def test_late_rows_are_put_back_so_far_as_in_the_result(made):
     leg = made.leg()
     late = replace(leg, odometer=held_up(leg.odometer, how_long_s=0.4)[0])
     wanted = screen(late, settings(made))[0].travel
-    thinned = ThinnedLeg(leg.form)
+    cells = ThinnedLeg(leg.form)
     sent_ns = late.odometer.stamp_ns
     for begin in np.arange(sent_ns[0], sent_ns[-1] + 1, 5 * 10**9):       # look by look
-        thinned.feed('odometer', take(late.odometer, (sent_ns >= begin)
-                                     & (sent_ns < begin + 5 * 10**9)))
-    thinned.feed('imu', leg.imu)
-    cells = thinned.leg(leg.start_ns).odometer
+        cells.feed('odometer', take(late.odometer, (sent_ns >= begin)
+                                   & (sent_ns < begin + 5 * 10**9)))
+    cells.feed('imu', leg.imu)
+    cells = cells.leg(leg.start_ns).odometer
     count = np.interp(seconds(leg, cells), wanted.t, wanted.s)
     # a row is 0.05 s; as sent, cells are off by up to 0.4 s of driving
     speed = np.gradient(wanted.s, wanted.t).max()
@@ -112,3 +107,21 @@ def test_a_gap_of_the_imu_is_seen_at_once_and_stays(made):
     whole = replace(leg, imu=without(leg.imu, leg, 40.0, 43.0), stop_ns=int(rows.stamp_ns[-1]))
     result = calibrate(whole, settings(made, leg__max_gap=limit))
     assert told in result.reasons                    # to the last digit
+
+
+@pytest.mark.parametrize('odd', [np.nan, np.inf, -np.inf, 1e300])
+@pytest.mark.parametrize('quantity', ['cumulative', 'rate'])
+def test_impossible_values_change_no_distance_and_no_standstill(odd, quantity):
+    t = np.arange(0, 20 * SECOND, SECOND // 10)
+    speed = np.where(t < 15 * SECOND, 2.0, 0.0)
+    value = speed if quantity == 'rate' else np.cumsum(speed) * 0.1
+    found = []
+    for bad in ([], [20, 21, 100, 190]):
+        sent = value.copy()
+        sent[bad] = odd
+        travel = Travel(OdometerForm(quantity, 0, '1'))
+        for k in range(0, len(t), 3):
+            travel.feed(take(OdometerSamples(t + SECOND, t + SECOND, sent), slice(k, k + 3)), 1.0)
+        found.append((travel.total, travel.still_s(), travel.top))
+    assert found[1] == pytest.approx(found[0], abs=0.2)
+    assert found[0][0] == pytest.approx(30.0, abs=0.3)

@@ -6,8 +6,12 @@
 import numpy as np
 import pytest
 
-from odocal_ros.forecast.manoeuvres import left_and_right_turns, stop_and_start, town_driving
-from odocal_ros.forecast.planned_drive import from_rates
+from odocal_ros.forecast.planned_drive import (
+    from_rates,
+    left_and_right_turns,
+    stop_and_start,
+    town_driving,
+)
 
 pytestmark = pytest.mark.core
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadConfig, BadUsage
-from odocal_ros.forecast.leg_profile import fix_figures, profile_of
+from odocal_ros.forecast.leg_so_far import fix_figures, profile_of
 from odocal_ros.forecast.planned_drive import from_rates, PlannedDrive
 from odocal_ros.forecast.predict import metres_to_go, predict, Sigmas
 from odocal_ros.nav.alignment import Alignment

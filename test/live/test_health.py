@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.forecast.clocks_so_far import Clocks
-from odocal_ros.forecast.progress import FixPath, known_scale, Progress, Travel
+from odocal_ros.forecast.progress import Clocks, FixPath, known_scale, Progress, Travel
 from odocal_ros.live.health import Health
 from odocal_ros.settings.config import Config, with_settings
 

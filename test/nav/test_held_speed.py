@@ -11,7 +11,7 @@ from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.held_speed import held_speed
 from odocal_ros.nav.odometer import travel
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.real_wheels import coarse, held
+from odocal_ros.sim.wheels import coarse, held
 
 STEP = 0.5 / 3.6
 RATE = OdometerForm('rate', 0, '1')

@@ -4,7 +4,6 @@
 """Planes and geodesics; the printed series of Shi et al. 2015, eq. (1)-(5), as reference."""
 
 import numpy as np
-from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.nav.earth import ecef_from_geodetic
@@ -124,15 +123,3 @@ def test_height_stretches_a_geodesic():
     # the line is within 0.4 % of the mean one, and h / R 1.6e-4 of that: 6e-7
     straight = np.linalg.norm(ecef_from_geodetic(*start) - ecef_from_geodetic(*end))
     assert length == pytest.approx(straight, rel=7e-7)
-
-
-def test_no_distance():
-    here = np.array([0.7, 2.0, 30.0])
-    assert geodesic_chord(here, here)[0] == 0.0
-    assert plane_chord(Plane(115.0), here, here)[0] == 0.0
-
-
-def test_plane_of_arrays():
-    north, east = Plane(0.0).forward(np.array([0.1, 0.2]), np.array([0.0, 0.0]))
-    assert north.shape == east.shape == (2,)
-    assert_allclose(east, 500_000.0, atol=1e-6)

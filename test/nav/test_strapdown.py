@@ -247,12 +247,6 @@ def test_equal_stamps_turn_nothing_and_spoil_nothing():
     assert_allclose(phi[:, 2], 0, atol=0)
 
 
-def test_a_turn_of_more_than_half_a_circle_between_samples():
-    t = np.array([0.0, 1.0, 2.0])
-    _, q = attitude(t, np.tile([0.0, 0.0, 4.0], (3, 1)), ONE, STILL)
-    assert_allclose(matrix_from_quat(q[-1]), matrix_from_rpy([0, 0, 8.0]), atol=1e-15)
-
-
 @pytest.mark.parametrize('n', [1, 2, 3, 4, 5, 8, 9, 1000, 1001])
 @pytest.mark.parametrize('every', [1, 2, 3, 4, 7, 5000])
 def test_every_keeps_epochs_of_the_full_answer(n, every):

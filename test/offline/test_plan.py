@@ -12,9 +12,8 @@ import shlex
 import numpy as np
 import pytest
 
-from odocal_ros.forecast.manoeuvres import stop_and_start
-from odocal_ros.forecast.planned_methods import plan_methods
-from odocal_ros.forecast.planned_smoother import predict_smoother
+from odocal_ros.forecast.planned_drive import stop_and_start
+from odocal_ros.forecast.planned_methods import plan_methods, predict_smoother
 from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
 from odocal_ros.nav.dead_reckoning import Origin

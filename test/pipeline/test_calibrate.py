@@ -125,17 +125,6 @@ def test_several_legs_of_one_vehicle(made):
     assert abs(whole.estimates[SCALE].value - made.truth.scale) < 4 * whole.estimates[SCALE].sigma
 
 
-def test_a_bad_leg_among_good_ones_is_left_out(made):
-    good = calibrate(made.leg(), settings(made))
-    bad = calibrate(replace(made.leg(), odometer=changed(
-        made.odometer, value=lambda a: a * 0)), settings(made))
-    whole = combine([good, bad], settings(made))
-    assert whole.estimates[SCALE].value == good.methods['two_point'].estimates[SCALE].value
-    assert whole.verdict.value == 'caution'
-    assert any(r.text.startswith('leg 2: rejected and not used: the fixes move')
-               for r in whole.reasons)
-
-
 @pytest.mark.parametrize(('option', 'value'), [
     ('outliers', 0.05), ('outages', ((70.0, 90.0), (100.0, 104.0))), ('slip_walk', 0.01),
     ('two_wheels', True), ('odometer', 'speed'), ('odometer', 'angle'), ('roll', 0.05),

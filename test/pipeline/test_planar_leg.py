@@ -21,9 +21,9 @@ from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.pipeline.planar_run import shortened_by_slopes
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.sim.robot_wheels import effective_width, SIDEWAYS
 from odocal_ros.sim.scenarios import SimOptions, simulate
 from odocal_ros.sim.truth import settings
+from odocal_ros.sim.wheels import effective_width, SIDEWAYS
 
 ROOT = Path(__file__).resolve().parents[2]
 TEST = ROOT / 'test'

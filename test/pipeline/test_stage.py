@@ -5,7 +5,7 @@
 
 import pytest
 
-from odocal_ros.pipeline.method_run import Stage
+from odocal_ros.pipeline.prepared import Stage
 
 pytestmark = pytest.mark.core
 

@@ -13,7 +13,7 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening import late_rows
-from odocal_ros.screening.late_rows import LEAST_JITTER, ROUNDING_COUNTS
+from odocal_ros.screening.late_rows import ROUNDING_COUNTS
 from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.slow
@@ -33,6 +33,23 @@ def spun(made, samples):
     return replace(samples, value=samples.value + np.round(more).astype(np.int64))
 
 
+def screened(made, odometer, **more):
+    """Return inputs and reasons of the drive with other odometer rows."""
+    return screen(replace(made.leg(), odometer=odometer, **more), settings(made))
+
+
+@pytest.fixture(scope='module')
+def true(made):
+    """Return the inputs of the drive with each row in its place."""
+    return screened(made, made.odometer)[0]
+
+
+def increments(made):
+    """Return the counts of the drive as increments, and their form."""
+    step = np.diff(made.odometer.value, prepend=made.odometer.value[:1])
+    return replace(made.odometer, value=step), OdometerForm('increment', 0, 'm/pulse')
+
+
 def of_smoother(made, samples):
     leg = replace(made.leg(), odometer=samples)
     result = calibrate(leg, settings(made, heading_sigma=None, method='smoother'))
@@ -41,16 +58,15 @@ def of_smoother(made, samples):
 
 @pytest.mark.parametrize(('how_long_s', 'drain_s'), [(0.12, 1e-4), (0.12, 0.01), (1.5, 0.012)],
                          ids=['at once', 'slow line', 'starved'])
-def test_late_rows_are_put_where_they_were_taken(made, how_long_s, drain_s):
+def test_late_rows_are_put_where_they_were_taken(made, true, how_long_s, drain_s):
     late, held = held_up(made.odometer, how_long_s=how_long_s, drain_s=drain_s)
-    inputs, found = screen(replace(made.leg(), odometer=late), settings(made))
-    sent, _ = screen(made.leg(), settings(made))
-    assert len(inputs.travel.t) == len(sent.travel.t)
-    moving = np.abs(np.gradient(sent.travel.s, sent.travel.t)) * made.truth.scale > 2.0
+    inputs, found = screened(made, late)
+    assert len(inputs.travel.t) == len(true.travel.t)
+    moving = np.abs(np.gradient(true.travel.s, true.travel.t)) * made.truth.scale > 2.0
     at = held & moving
     assert at.sum() > 50
-    assert np.abs(inputs.travel.t - sent.travel.t)[at].max() < 0.003      # they were 0.12 s late
-    np.testing.assert_array_equal(inputs.travel.s, sent.travel.s)
+    assert np.abs(inputs.travel.t - true.travel.t)[at].max() < 0.003      # they were 0.12 s late
+    np.testing.assert_array_equal(inputs.travel.s, true.travel.s)
     text, = (r.text for r in found if r.code is Code.ODOMETER_LATE)
     worst = float(text.split('by up to ')[1].split(' s')[0])
     assert how_long_s - 0.03 < worst <= how_long_s
@@ -67,19 +83,6 @@ def test_late_rows_are_no_slip(made):
     assert a.sigma == pytest.approx(b.sigma, rel=0.05)
 
 
-def test_rows_that_are_all_some_milliseconds_late_are_put_on_their_rhythm(made):
-    """A busy machine stamps each row when it comes to it: at 12 m/s a millisecond is 12 mm."""
-    late_s = np.random.default_rng(3).exponential(0.0015, len(made.odometer.stamp_ns)) % 0.0039
-    late = replace(made.odometer, stamp_ns=made.odometer.stamp_ns + np.round(
-        late_s * 1e9).astype(np.int64))
-    inputs, _ = screen(replace(made.leg(), odometer=late), settings(made))
-    sent, _ = screen(made.leg(), settings(made))
-    later = inputs.travel.t - sent.travel.t
-    np.testing.assert_allclose(later, np.median(later), atol=2 * LEAST_JITTER)
-    _, said = of_smoother(made, late)
-    assert Code.WHEEL_SLIP not in said
-
-
 def arrivals(samples, seconds, lost=0.0, seed=3):
     """Return rows stamped at arrival, in order, late by an exponential time of that mean."""
     rng = np.random.default_rng(seed)
@@ -90,13 +93,12 @@ def arrivals(samples, seconds, lost=0.0, seed=3):
 
 
 @pytest.mark.parametrize(('seconds', 'off_s'), [(0.005, 0.0005), (0.02, 0.002), (0.05, 0.01)])
-def test_rows_that_all_arrive_late_by_chance_are_put_on_their_rhythm(made, seconds, off_s):
+def test_rows_that_all_arrive_late_by_chance_are_put_on_their_rhythm(made, true, seconds, off_s):
     """Up to several intervals late, some together: 1000 rows have a mean to 50 ms / sqrt(100)."""
     late = arrivals(made.odometer, seconds)
-    inputs, found = screen(replace(made.leg(), odometer=late), settings(made))
-    sent, _ = screen(made.leg(), settings(made))
-    assert len(inputs.travel.t) == len(sent.travel.t)
-    later = inputs.travel.t - sent.travel.t
+    inputs, found = screened(made, late)
+    assert len(inputs.travel.t) == len(true.travel.t)
+    later = inputs.travel.t - true.travel.t
     assert np.abs(later - np.median(later)).max() < off_s
     assert {r.code for r in found} == {Code.ODOMETER_LATE}
 
@@ -124,37 +126,32 @@ def test_arrival_jitter_is_no_slip(made):
     assert method.details['slips'][0]['metres'] == pytest.approx(SLIP_M, rel=0.25)
 
 
-def test_lost_rows_keep_their_place_among_late_ones(made):
+def test_lost_rows_keep_their_place_among_late_ones(made, true):
     """The rows after a lost one are an interval later: 0.02 s, at 12 m/s 0.24 m."""
     late = arrivals(made.odometer, 0.002, lost=0.002)
-    inputs, _ = screen(replace(made.leg(), odometer=late), settings(made))
-    truth, _ = screen(made.leg(), settings(made))
+    inputs, _ = screened(made, late)
     moving = np.gradient(inputs.travel.s, inputs.travel.t) * made.truth.scale > 2.0
     # the time at which the vehicle was where a row says
-    at = np.interp(inputs.travel.s, truth.travel.s, truth.travel.t)
+    at = np.interp(inputs.travel.s, true.travel.s, true.travel.t)
     later = (inputs.travel.t - at)[moving]
     assert np.percentile(np.abs(later - np.median(later)), 95) < 0.006
 
 
 def test_increments_that_arrive_together_are_all_counted(made):
-    form = OdometerForm('increment', 0, 'm/pulse')
-    steps = replace(made.odometer, value=np.diff(made.odometer.value,
-                                                 prepend=made.odometer.value[:1]))
-    inputs, found = screen(replace(made.leg(), odometer=arrivals(steps, 0.05), form=form),
-                           settings(made))
+    steps, form = increments(made)
+    inputs, found = screened(made, arrivals(steps, 0.05), form=form)
     assert inputs.travel.s[-1] == steps.value[1:].sum()
     assert Code.STAMPS_NOT_RISING not in {r.code for r in found}
 
 
 def test_equal_increments_that_arrive_together_are_both_counted(made):
     """At an even speed they are equal, which is no sign of a row that was sent twice."""
-    form = OdometerForm('increment', 0, 'm/pulse')
-    value = np.diff(made.odometer.value, prepend=made.odometer.value[:1])
+    steps, form = increments(made)
+    value = steps.value
     k = int(np.flatnonzero((np.diff(value) == 0) & (value[1:] > 0))[100])
     stamps = made.odometer.stamp_ns.copy()
     stamps[k + 1] = stamps[k]
-    inputs, _ = screen(replace(made.leg(), odometer=OdometerSamples(stamps, stamps, value),
-                               form=form), settings(made))
+    inputs, _ = screened(made, OdometerSamples(stamps, stamps, value), form=form)
     assert inputs.travel.s[-1] == value[1:].sum()
 
 
@@ -164,7 +161,7 @@ def test_rows_with_a_header_that_repeat_a_stamp_are_said(made):
     k = int(np.flatnonzero(np.diff(made.odometer.value))[1000])
     stamps[k + 1] = stamps[k]
     twice = OdometerSamples(stamps, made.odometer.stamp_ns, made.odometer.value)
-    _, found = screen(replace(made.leg(), odometer=twice), settings(made))
+    _, found = screened(made, twice)
     assert Code.STAMPS_NOT_RISING in {r.code for r in found}
 
 
@@ -172,7 +169,7 @@ def test_a_sender_that_changes_its_rate_stays_where_it_is(made):
     """Half of the drive at 25 Hz, half at 50 Hz: no row is late."""
     n = len(made.odometer.stamp_ns)
     changed = take(made.odometer, (np.arange(n) > n // 2) | (np.arange(n) % 2 == 0))
-    inputs, found = screen(replace(made.leg(), odometer=changed), settings(made))
+    inputs, found = screened(made, changed)
     sent = (changed.stamp_ns - made.leg().start_ns) * 1e-9
     np.testing.assert_allclose(inputs.travel.t, sent, atol=1e-3)
     assert not found
@@ -201,7 +198,7 @@ def test_rows_that_are_taken_at_uneven_times_stay_where_they_are(made):
                              ).astype(np.int64)
     taken = replace(made.odometer, stamp_ns=uneven,
                     value=np.floor(np.interp(uneven, even, counts)).astype(np.int64))
-    inputs, found = screen(replace(made.leg(), odometer=taken), settings(made))
+    inputs, found = screened(made, taken)
     np.testing.assert_allclose(inputs.travel.t, (uneven - made.leg().start_ns) * 1e-9, atol=1e-9)
     assert not found
 
@@ -233,41 +230,37 @@ def test_a_slip_between_late_rows_is_found(made):
     assert largest['t'] - 1.5 < SLIP_S < largest['t'] + largest['duration'] + 1.5
 
 
-def test_lost_rows_within_a_burst(made):
+def test_lost_rows_within_a_burst(made, true):
     """A queue that runs over: of a burst some rows are lost, and its rhythm tells nothing."""
     late, held = held_up(made.odometer)
     lost = held & (np.arange(len(held)) % 3 == 0)
-    inputs, _ = screen(replace(made.leg(), odometer=take(late, ~lost)), settings(made))
-    straight, _ = screen(made.leg(), settings(made))
+    inputs, _ = screened(made, take(late, ~lost))
     raw = (take(late, ~lost).stamp_ns - made.leg().start_ns) * 1e-9
-    off = np.abs(inputs.travel.s - straight.travel.at(inputs.travel.t)).max() * made.truth.scale
-    as_sent = np.abs(inputs.travel.s - straight.travel.at(raw)).max() * made.truth.scale
+    off = np.abs(inputs.travel.s - true.travel.at(inputs.travel.t)).max() * made.truth.scale
+    as_sent = np.abs(inputs.travel.s - true.travel.at(raw)).max() * made.truth.scale
     assert as_sent > 1.0
     assert off < 0.3 * as_sent
 
 
 def test_increments_that_are_late_are_not_lost(made):
     """Half a second of silence is a lost increment, unless what comes makes up for it."""
-    form = OdometerForm('increment', 0, 'm/pulse')
-    steps = replace(made.odometer, value=np.diff(made.odometer.value,
-                                                 prepend=made.odometer.value[:1]))
+    steps, form = increments(made)
     late, _ = held_up(steps, how_long_s=0.5)
-    inputs, found = screen(replace(made.leg(), odometer=late, form=form), settings(made))
-    straight, _ = screen(replace(made.leg(), odometer=steps, form=form), settings(made))
+    inputs, found = screened(made, late, form=form)
+    straight, _ = screened(made, steps, form=form)
     assert inputs.travel.s[-1] == straight.travel.s[-1]
     assert not len(inputs.doubt_t)
     assert {r.code for r in found} == {Code.ODOMETER_LATE}
 
 
-def test_fresh_counts_at_odd_times_stay_where_they_are(made):
+def test_fresh_counts_at_odd_times_stay_where_they_are(made, true):
     """A sender that is busy and then reads what the counter is at: stamps and counts agree."""
     t = (made.odometer.stamp_ns - made.odometer.stamp_ns[0]) * 1e-9
     kept = (t % 15.0 > 0.12) | (np.arange(len(t)) % 7 == 0)
     odd = take(made.odometer, kept)
-    inputs, _ = screen(replace(made.leg(), odometer=odd), settings(made))
+    inputs, _ = screened(made, odd)
     sent = (odd.stamp_ns - made.leg().start_ns) * 1e-9
-    truth, _ = screen(made.leg(), settings(made))
-    off = np.abs(inputs.travel.s - truth.travel.at(inputs.travel.t))
+    off = np.abs(inputs.travel.s - true.travel.at(inputs.travel.t))
     assert off.max() <= ROUNDING_COUNTS + 0.5
     assert (inputs.travel.t <= sent).all()
 

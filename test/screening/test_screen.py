@@ -368,17 +368,6 @@ class TestOdometerCare:
                                    rtol=1e-6)
 
 
-def test_two_wheels_give_their_mean(made):
-    two = drive(**STRAIGHT, two_wheels=True)
-    inputs, codes, _ = said(two.leg(), settings(two))
-    assert codes == {}
-    np.testing.assert_allclose(
-        inputs.travel.s[-1], (inputs.travels[0].s[-1] + inputs.travels[1].s[-1]) / 2)
-    _, codes, _ = said(replace(two.leg(), odometer_right=changed(
-        two.odometer_right, stamp_ns=lambda a: a * 0)))
-    assert Code.NO_ODOMETER in codes
-
-
 @pytest.mark.parametrize('q', [1e200, np.nan, 5e-324, 0.0, 7.0])
 @pytest.mark.parametrize('variance', [0.01, np.nan, 1e300])
 def test_an_orientation_that_is_none_is_not_used(leg, q, variance):

@@ -13,7 +13,7 @@ from odocal_ros.nav.angles import heading_from_yaw, wrap
 from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy
 from odocal_ros.settings.grades import Grade, GRADES
 from odocal_ros.sim import sensors
-from odocal_ros.sim.motion import attitude, contact_travel, inertial_v, Motion, Start
+from odocal_ros.sim.motion import attitude, inertial_v, Motion, Start
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.profile import chain, hold, ramp
@@ -181,22 +181,6 @@ def test_an_angle_is_not_quantised_and_a_speed_is_the_true_one_over_scale():
         0.05**2, rel=sure(len(noisy)))
 
 
-def test_two_wheels_roll_on_their_own_sides_with_their_own_scales():
-    drive = simulate(replace(TOWN, two_wheels=True, wheel_difference=0.01, odometer='angle'))
-    left, right = drive.odometer, drive.odometer_right
-    assert np.array_equal(left.stamp_ns, right.stamp_ns)
-    k_left, k_right = drive.truth.wheel_scales
-    assert k_right / k_left == pytest.approx(1.01)
-    # the mean of both counts times the scale is the way: the harmonic mean of the two
-    assert 2 / (1 / k_left + 1 / k_right) == pytest.approx(drive.truth.scale)
-    t = (left.stamp_ns - drive.options.start_ns) * 1e-9
-    state = drive.motion.at(t)
-    apart = k_right * (right.value - right.value[0]) - k_left * (left.value - left.value[0])
-    assert_allclose(apart, drive.options.track_width * (state.turned - state.turned[0]),
-                    atol=1e-10)
-    assert np.ptp(state.turned) > 1.0
-
-
 def test_late_stamps_change_no_value():
     plain = simulate(TOWN)
     late = simulate(replace(TOWN, odometer_delay=0.05, fix_delay=0.1))
@@ -331,15 +315,6 @@ def test_topics_are_not_sampled_together():
     drive = simulate(TOWN)
     assert not set(drive.imu.stamp_ns.tolist()) & set(drive.odometer.stamp_ns.tolist())
     assert not set(drive.odometer.stamp_ns.tolist()) & set(drive.fix.stamp_ns.tolist())
-
-
-def test_contact_point_beside_the_axle_sees_the_turn():
-    drive = simulate(replace(TOWN, odometer='angle', odometer_lever_arm=(0.0, 0.7, 0.0)))
-    t = (drive.odometer.stamp_ns - drive.options.start_ns) * 1e-9
-    rolled = (drive.odometer.value - drive.odometer.value[0]) * drive.truth.scale
-    wanted = contact_travel(drive.motion.at(t), (0.0, 0.7, 0.0))
-    assert_allclose(rolled, wanted - wanted[0], atol=1e-10)
-    assert abs(rolled[-1] - drive.motion.distance) > 0.1
 
 
 def test_heading_topic_is_of_the_body_frame_and_the_orientation_of_the_sensors():

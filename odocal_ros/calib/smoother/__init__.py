@@ -8,7 +8,7 @@ The GNSS / IMU / odometer smoother: a batch maximum likelihood over all samples 
 of screened samples, where ``too_little_of`` says no. ``bound`` is the covariance without a fit.
 """
 
-from odocal_ros.calib.smoother.growing import GrowingFit, SoFar
+from odocal_ros.calib.smoother.growing import GrowingFit, Running
 from odocal_ros.calib.smoother.leg import smoother_leg, SmootherLeg
 from odocal_ros.calib.smoother.smoother import (
     bound,
@@ -18,5 +18,5 @@ from odocal_ros.calib.smoother.smoother import (
     too_little_of,
 )
 
-__all__ = ['GrowingFit', 'SmootherLeg', 'SoFar', 'bound', 'keyframe_times', 'smooth',
+__all__ = ['GrowingFit', 'Running', 'SmootherLeg', 'bound', 'keyframe_times', 'smooth',
            'smoother_leg', 'too_little', 'too_little_of']

@@ -122,9 +122,6 @@ class Solved:
         moved = self.covariance @ rest
         return square + rest.T @ moved, moved
 
-    def forget(self) -> None:
-        """Release the factorisation."""
-        self._chain = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,11 +90,6 @@ class Weighted:
         taken, moves = solved.products(sides.chain, sides.border)
         return LevelInformation(sides.names, (sides.square - taken) / 2, moves)
 
-    def forget(self) -> None:
-        """Release memory that can be recomputed."""
-        for part in self.parts.values():
-            part.forget()
-
     def cost(self) -> float:
         """Return the weighted sum of squares of all rows; point rows with their robust loss."""
         return float(sum(part.cost() for part in self.parts.values()))

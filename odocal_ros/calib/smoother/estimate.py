@@ -91,10 +91,6 @@ class Fit(FitSummary):
     solved: Solved
     by_levels: Floats        # (M, L) what unit errors of levels do to the constants, sizes last
 
-    def __post_init__(self) -> None:
-        self.weighted.forget()
-        self.solved.forget()
-
     @property
     def covariance(self) -> Floats:
         """Return the covariance of the constants including that by the levels, (S27b): (M, M)."""
@@ -106,8 +102,8 @@ class Fit(FitSummary):
                        self.settled, self.creeping, self.iterations, self.likelihood)
 
     def marginals(self) -> JointMarginals:
-        """Return the joint marginals of adjacent keyframes; not stored, since they are large."""
-        return solve(self.weighted.normal()).marginals()
+        """Return the joint marginals of adjacent keyframes; once, since they are large."""
+        return self.solved.marginals()
 
 
 def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, frozen: bool = False,

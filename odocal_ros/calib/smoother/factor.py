@@ -104,9 +104,6 @@ class Factor:
         """Apply a step (N, n), (M,) to the residuals, to first order."""
         self.state = reached
 
-    def forget(self) -> None:
-        """Release memory that can be recomputed."""
-
     def cost(self) -> float:
         """Return the weighted sum of squares of the residuals."""
         return 0.0

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The fit of a leg that grows: each starts from the one before.
+The fit of a leg that grows, in windows of ten minutes.
 
-It takes over state, noise levels, priors and slips, is extended over what is new, and converges
-in two passes. Whether it has found the right minimum is checked against a coarse fit from a cold
-start whenever the leg has grown by half.
+A finished window contributes its marginal information on the constants, (S33). Only the window in
+progress is fitted, from the result of the fit before: a look at a leg of an hour costs no more
+than one at ten minutes.
 """
 
 from collections.abc import Callable
@@ -14,50 +14,57 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.failed import raised_if_wild
+from odocal_ros.calib.linked_legs import LinkedLegs
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive
 from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit, Trace, WarmStart
+from odocal_ros.calib.smoother.factor import WANTED
 from odocal_ros.calib.smoother.leg import SmootherLeg
-from odocal_ros.calib.smoother.outcome import floored, outcome
+from odocal_ros.calib.smoother.outcome import outcome
 from odocal_ros.calib.smoother.problem import NO_ERROR, Problem, SPACING
+from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
+from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.calib.smoother.smoother import best_fit
-from odocal_ros.calib.smoother.state import LN_K, PITCH, State, YAW
+from odocal_ros.calib.smoother.state import BY_TIME, CONSTANTS, LN_K, State
 from odocal_ros.calib.smoother.warm_start import carried, steps_of
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
+from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
 
-# s, judgement: from which keyframes lie twice SPACING apart; its cost: docs/decisions/0005
-LONG_LEG = 660.0
-# judgement: keyframes of a fit from nothing, which takes ten times the passes
-FEW_KEYS = 150
+# s, judgement: length from which a window is finished, once the next has this length
+LONG_WINDOW, NEXT_WINDOW = 600.0, 120.0
 LOOK_PASSES = 2         # judgement: from the last fit; AGAIN_PASSES where that is too few
-ANEW_GROWTH = 1.5       # judgement: of the leg, until what is decided once is decided anew
-CONFIRM_SIGMAS = 3.0  # statistical: of three values chance reaches it once in 120 at most
+ANEW_GROWTH = 1.5       # judgement: growth of the window after which a fit is a cold start
+DRIVING_SPEED = 0.5     # m/s; judgement: slower steps between keyframes do not count
 
 
 @dataclass(frozen=True, eq=False)
-class SoFar:
+class Running:
     """
-    The result of a fit of the leg so far.
+    The running estimate.
 
-    method : as the leg would come out.   sigmas : (3,) of ln scale, yaw, pitch, rad, of what is
-    not determined too.   state : at the keyframes.
+    method : as the leg would come out, ended here.   sigmas : (3,) of ln scale, yaw, pitch, rad,
+    also of what is not determined; inf: fixed.   distance : m.   agility : m^2/s^3, integral of
+    the squared horizontal acceleration.   speed : m/s, median while driving.
     """
 
     method: MethodResult
     sigmas: Floats
-    state: State
+    distance: float
+    agility: float
+    speed: float
 
 
 class GrowingFit:
     """
     The fit of one leg while it grows.
 
-    cpu_s : tells the seconds of CPU used so far.   ``once_s``: those in the last one for what is
-    done ever less often as a leg grows.
+    cpu_s : returns the CPU time used so far, s.   ``once_s``: CPU time of the last fit if it was a
+    cold start, which becomes rarer as a window grows.
     """
 
     def __init__(self, cpu_s: Callable[[], float]) -> None:
@@ -65,86 +72,122 @@ class GrowingFit:
         self.once_s = 0.0
         self._last: WarmStart | None = None
         self._per_effective: dict[str, float] = {}
-        self._judged = 0.0       # s of the leg when it was last fit from nothing
+        self._cold_at = 0.0      # s, length of the window at its last cold start
+        # the finished windows, and with the one in progress, and where they end, s
+        self._past: tuple[Running, float] | None = None
+        self._next: tuple[Running, float] | None = None
 
     def forget(self) -> None:
         """Make the next fit a cold start."""
         self._last, self.once_s = None, 0.0
 
-    def fit(self, view: SmootherLeg, config: Config, trace: Trace) -> SoFar:
+    def fit(self, view: SmootherLeg, config: Config, trace: Trace) -> Running:
         """
-        Return the result of the leg so far.
+        Return the running estimate.
 
-        view : the leg, what came before in the same frame and more.   trace : called between
-        passes; what it raises goes through.   BadData is raised where no fit is found; the next
-        one starts from nothing then.
+        view : the leg so far: the earlier leg in the same frame, and more.   trace : called
+        between passes; its exceptions are passed on.
+
+        Raises
+        ------
+        BadData
+            There is no fit, and no finished window; the next fit is a cold start.
+
         """
         self.once_s = 0.0
+        if self._next is not None and view.t_stop - self._next[1] > NEXT_WINDOW:
+            self._past, self._next, self._last = self._next, None, None
+        if self._past is not None:
+            view = replace(view, t_begin=self._past[1])
         last, self._last = self._last, None
         try:
+            now = self._window(last, view, config, trace)
+        except BadData:
+            if self._past is None:
+                raise
+            return self._past[0]
+        if self._past is not None:
+            now = _joined(self._past[0], now, config)
+        if (self._next is None and view.t_stop - view.t_begin > LONG_WINDOW
+                and now.method.verdict is not Verdict.REJECTED):
+            self._next = now, view.t_stop
+        return now
+
+    def _window(self, last: WarmStart | None, view: SmootherLeg, config: Config,
+                trace: Trace) -> Running:
+        try:
             with raised_if_wild():
-                best, problem = self._fit(last, view, config, trace)
+                problem = Problem.of(view, config, steps_of(view, SPACING))
+                best = self._fit(last, problem, config, trace)
                 if not best.settled:
                     raise BadData('the smoother has not converged on the data so far')
-                so_far = _so_far(view, problem, best, config)
+                method = outcome(view, problem, best, config)
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
             raise BadData(f'the smoother cannot solve the data so far: {error}') from None
         self._last = WarmStart(best.state, best.levels, best.priors, best.first, best.spread)
         self._per_effective = problem.per_effective
-        return so_far
+        return Running(method, _sigmas(method), *_driven(best.state))
 
-    def _fit(self, last: WarmStart | None, view: SmootherLeg, config: Config,
-             trace: Trace) -> tuple[Fit, Problem]:
-        duration = view.t_stop - view.t_begin
-        spacing = SPACING if duration < LONG_LEG else 2 * SPACING
-        problem = Problem.of(view, config, steps_of(view, spacing))
+    def _fit(self, last: WarmStart | None, problem: Problem, config: Config, trace: Trace) -> Fit:
         problem.per_effective = self._per_effective
-        begun = None if last is None else carried(last, problem)
+        duration = problem.leg.t_stop - problem.leg.t_begin
+        grown = duration > ANEW_GROWTH * self._cold_at
+        begun = None if last is None or grown else carried(last, problem)
         if begun is None:
-            begin = self._cpu_s()
+            begin, self._cold_at = self._cpu_s(), duration
             best = best_fit(problem, config, trace)
-            self._judged = duration
-            if last is not None:      # other cells, as a leg has them each time it doubles
-                self.once_s += self._cpu_s() - begin
-            return best, problem
-        # the levels are let alone until the state is on the new stretch too
+            self.once_s = self._cpu_s() - begin if last is not None else 0.0
+            return best
+        # the levels are kept until the state is on the new section too
         near = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun,
                    trace=trace).summary()
         best = fit(problem, near.state, near.levels, LOOK_PASSES, about=near, trace=trace)
         if not best.settled or best.creeping:
             best = fit(problem, best.state, best.levels, AGAIN_PASSES, about=best, trace=trace)
-        if duration > ANEW_GROWTH * self._judged:
-            best = self._confirmed(best, problem, config, trace)
-        return best, problem
-
-    def _confirmed(self, best: Fit, problem: Problem, config: Config, trace: Trace) -> Fit:
-        """Return the fit if a coarse cold start confirms it, else a new fit."""
-        begin = self._cpu_s()
-        view = problem.leg
-        duration = view.t_stop - view.t_begin
-        other = Problem.of(view, config, steps_of(view, max(SPACING, duration / FEW_KEYS)))
-        anew = best_fit(other, config, trace)
-        self._judged = duration
-        if anew.settled:
-            problem.per_effective = other.per_effective
-            sigma = np.sqrt(np.diag(anew.covariance))
-            apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
-            if apart.max() > CONFIRM_SIGMAS:
-                best = best_fit(problem, config, trace)
-        self.once_s += self._cpu_s() - begin
         return best
 
 
-def _so_far(view: SmootherLeg, problem: Problem, best: Fit, config: Config) -> SoFar:
-    method = outcome(view, problem, best, config)
-    covariance = floored(best.covariance * method.details['widened']**2)
-    sigmas: Floats = np.sqrt(np.diag(covariance))[[LN_K, YAW, PITCH]]
-    # an angle that is as set is none that the drive knows
-    sigmas[best.first.constants[[LN_K, YAW, PITCH]] <= NO_ERROR] = np.inf
-    found = dict(method.estimates)
-    for name, sigma in zip(PARAMETERS, sigmas, strict=True):
-        e = found[name]
-        if e.value is not None:
-            factor = abs(e.value) if name == PARAMETERS[0] else 1.0
-            found[name] = replace(e, sigma=float(sigma * factor))
-    return SoFar(replace(method, estimates=found), sigmas, best.state)
+def _joined(past: Running, now: Running, config: Config) -> Running:
+    """Return the running estimate of finished windows and the one in progress."""
+    # tyres warm up from the begin of a leg: each window has its own rate
+    legs = [replace(one.method, border=_border(one.method).loosened({CONSTANTS[BY_TIME]: np.inf}))
+            for one in (past, now)]
+    whole = combine_legs(legs, [0] * len(legs), config)
+    sigmas = _sigmas(whole)
+    # the largest sources are those of the window in progress
+    smaller = np.where(np.isfinite(now.sigmas), sigmas / now.sigmas, 1.0)[:, None]
+    reasons = {(r.code, r.text): r for r in (*now.method.reasons, *whole.reasons)}
+    method = replace(
+        now.method, estimates=now.method.estimates | whole.estimates, border=whole.border,
+        reasons=tuple(reasons.values()),
+        sources=tuple(replace(s, effects=s.effects * smaller) for s in now.method.sources))
+    return Running(method, sigmas, past.distance + now.distance, past.agility + now.agility,
+                   now.speed)
+
+
+def _sigmas(method: MethodResult) -> Floats:
+    """Return the sigmas of ln scale, yaw and pitch, of what is not determined too: (3,)."""
+    border = _border(method)
+    legs = LinkedLegs([border], CONSTANTS[LN_K], np.empty(0))
+    at = legs.place(0)[:WANTED]
+    sigmas: Floats = np.hypot(np.sqrt(np.diag(legs.solve()[1])[at]), MODEL_FLOOR)
+    sigmas[border.sigma[:WANTED] <= NO_ERROR] = np.inf
+    for i, name in enumerate(PARAMETERS):
+        e = method.estimates[name]
+        if e.value is not None and e.sigma is not None:
+            sigmas[i] = e.sigma / abs(e.value) if i == LN_K else e.sigma
+    return sigmas
+
+
+def _border(method: MethodResult) -> Border:
+    assert method.border is not None, 'a fit has one'
+    return method.border
+
+
+def _driven(state: State) -> tuple[float, float, float]:
+    """Return distance, agility and speed of a window, as ``Running`` has them."""
+    T, steps = np.diff(state.t), np.linalg.norm(np.diff(state.p_n, axis=0), axis=1)
+    moving = steps > DRIVING_SPEED * T
+    gained = np.diff(state.v_n[:, :2], axis=0)
+    return (max(float(steps.sum()), 1.0), float((gained**2).sum(axis=1) @ (1 / T)),
+            float(np.median((steps / T)[moving])) if moving.any() else 0.0)

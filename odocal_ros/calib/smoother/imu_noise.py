@@ -12,7 +12,7 @@ from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import by_step
-from odocal_ros.screening.force import TILT_SIGMA
+from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.grades import G, Grade
 
 # m/s^2/sqrt(Hz) minimum, and m/s^2/sqrt(s): accelerations of the vehicle, 1.5 m/s^2 for some

@@ -114,11 +114,6 @@ class MotionRows(Factor):
             self.signals.fit(rows, constants, begin[:, :, BG], gyro, found)
         return begin, end, constants
 
-    def forget(self) -> None:
-        """Release the derivatives and the results computed from them."""
-        self.__dict__.pop('J', None)
-        self._found = None
-
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
         n = self.n

@@ -97,10 +97,6 @@ class PointRows(Factor):
         out *= self._root
         return out
 
-    def forget(self) -> None:
-        """Release the derivatives; they are recomputed when needed."""
-        self.__dict__.pop('J', None)
-
     def _sizes(self, white: Floats) -> Iterator[tuple[slice, Floats]]:
         for columns in self.levels_of.values():
             yield columns, np.abs(np.hypot.reduce(white[:, columns], axis=1))

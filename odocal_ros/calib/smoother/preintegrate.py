@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.smoother.imu_steps import AT_A_TIME, ImuSteps
+from odocal_ros.calib.smoother.imu_steps import ImuSteps
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     ACCEL_AXIS,
@@ -40,6 +40,8 @@ from odocal_ros.nav.rotations import (
 from odocal_ros.nav.strapdown import prefix_product
 
 Floats = NDArray[np.float64]
+# judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
+STEPS_AT_A_TIME = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +123,7 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
     points: list[Points] = []
     t, K = imu.t, len(imu.key) - 1
     owner = np.clip(np.searchsorted(t[imu.key], t_points, side='right') - 1, 0, K - 1)
-    per = max(1, int(AT_A_TIME * K / len(t)))
+    per = max(1, int(STEPS_AT_A_TIME * K / len(t)))
     for first in range(0, K, per):
         last = min(first + per, K)
         mine = slice(np.searchsorted(owner, first), np.searchsorted(owner, last))
@@ -147,6 +149,22 @@ def _cross(a: Floats, M: Floats) -> Floats:
     out[:, 1] = z * M[:, 0] - x * M[:, 2]
     out[:, 2] = x * M[:, 1] - y * M[:, 0]
     return out
+
+
+def _by(step: Floats, signals: Floats) -> Floats:
+    """Return the columns of (n, 3, 3) times each of signals (n, s): (n, 3, 3, s)."""
+    return step[:, :, :, None] * signals[:, None, None, :]
+
+
+def _gyro(x: Floats) -> Floats:
+    """Return what bias and constants of the gyro do, from (n, 3, 3, 6): (n, 3, 3 + g)."""
+    out: Floats = x[:, :, [0, 1, 2, *GYRO_AXIS], [0, 0, 0, *np.add(GYRO_SIGNAL, 1)]]
+    return out
+
+
+def _accel(x: Floats) -> tuple[Floats, Floats]:
+    """Return what bias and constants of the accelerometer do, from (n, 3, 3, 4)."""
+    return x[:, :, :, 0], x[:, :, ACCEL_AXIS, np.add(ACCEL_SIGNAL, 1)]
 
 
 class _Chunk:
@@ -180,15 +198,12 @@ class _Chunk:
         self.step_v, self.step_p = turn(self.R, dv), turn(self.R, dp)
         self.v, self.dv = self._running(self.step_v)
         self.p, self.dp = self._running(self.v * dt + self.step_p)
-        dt, by = dt[:, None], self.signals[:, None, 3:][:, :, list(ACCEL_SIGNAL)]
-        # sums of R over time, and of what the errors of the accelerometer add
-        self.mean, twice = self.R @ self.G, self.R @ self.GG * dt
-        self.step_AA, self.step_FF = twice * dt, twice[:, :, ACCEL_AXIS] * by
-        self.step_F = self.mean[:, :, ACCEL_AXIS] * by
-        self.A_before, self.A = self._running(self.mean * dt)
-        self.AA_before, self.AA = self._running(self.A_before * dt + self.step_AA)
-        self.F_before, self.F = self._running(self.step_F)
-        self.FF_before, self.FF = self._running(self.F_before * dt + self.step_FF)
+        # integrals of R over a step, single and double
+        self.mean, self.twice = self.R @ self.G, self.R @ self.GG * dt[:, None]
+        # what biases and constants of gyro and accelerometer multiply
+        self.by_gyro, self.by_accel = (np.concatenate([dt, self.signals[:, columns]], axis=1)
+                                       for columns in (slice(5), slice(3, 6)))
+        self.since = self.t[:-1] - self.t[self.key[:-1]][self.own]      # s, begin of the interval
 
     def _errors(self, gyro_bias: Floats, accel_bias: Floats,
                 constants: Floats | None) -> tuple[Floats, Floats]:
@@ -214,27 +229,34 @@ class _Chunk:
         return np.add.reduceat(step, self.key[:-1])
 
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
-        """Return the sums of each interval."""
-        T, dt, ds = np.diff(self.t[self.key]), self.dt[:, None, None], np.diff(travel(self.t))
-        by = np.concatenate([np.repeat(self.dt[:, None], 3, axis=1),
-                             self.signals[:, GYRO_SIGNAL]], axis=1)
-        axes = [0, 1, 2, *GYRO_AXIS]
-        step = self.mean[:, :, axes] * by[:, None, :]
-        before, turned = self._running(step)
-        grows = (self.R @ self.grows)[:, :, axes] * by[:, None, :]
-        moment = self.step_v - self.step_p / self.dt[:, None]
-        dv_before, dv_by = self._running(_cross(self.step_v, before) + _cross(moment, grows))
-        dp_by = self._sum(dv_before * dt + _cross(self.step_p, before)
-                          + _cross(self.step_v, grows) * (dt / 6))
-        way = self.mean * ds[:, None, None]
+        """
+        Return the sums of each interval.
+
+        An error in a step acts on what follows it in the interval: a turn on the rest of dv, dp
+        and S, a force for the rest of the time.
+        """
+        T, dt, ds = np.diff(self.t[self.key]), self.dt[:, None], np.diff(travel(self.t))[:, None]
+        rest = T[self.own, None] - self.since[:, None] - dt
+        v, way = self.v + self.step_v, self.mean * ds[:, :, None]
+        walked, walk = self._running(way @ forward)
+        dv_rest = self.dv[self.own] - v
+        dp_rest = self.dp[self.own] - self.p - self.v * dt - self.step_p - v * rest
+        S_rest = walk[self.own] - walked - way @ forward
+        grown, moment = self.R @ self.grows, self.step_v - self.step_p / dt
         cross, ahead = skew(self.turn), skew(forward)
         own = ahead / 2 + (cross @ ahead + skew(np.cross(self.turn, forward))) / 6
-        own = (self.R @ own * ds[:, None, None])[:, :, axes] * by[:, None, :]
-        S_by = self._sum(_cross(way @ forward, before) + own)
+        by_turn = (self.mean, _cross(dv_rest, self.mean) + _cross(moment, grown),
+                   _cross(dp_rest, self.mean)
+                   + _cross(moment * rest + self.step_v * (dt / 6), grown),
+                   _cross(S_rest, self.mean) + self.R @ own * ds[:, :, None])
+        turned, dv_by, dp_by, S_by = (_gyro(self._sum(_by(step, self.by_gyro)))
+                                      for step in by_turn)
+        by_force = (self.mean, self.mean * rest[:, :, None] + self.twice)
+        (A, F), (AA, FF) = (_accel(self._sum(_by(step, self.by_accel))) for step in by_force)
         measured = self._sum(self.signals) / T[:, None]
-        return Intervals(T, self.R_end, self.dv, self.dp, self.A, self.AA, self.F, self.FF,
-                         turned, dv_by, dp_by, self._sum(way), S_by, measured[:, :3],
-                         measured[:, 3:], np.maximum.reduceat(self.longest, self.key[:-1]))
+        return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, turned, dv_by, dp_by,
+                         self._sum(way), S_by, measured[:, :3], measured[:, 3:],
+                         np.maximum.reduceat(self.longest, self.key[:-1]))
 
     def points(self, t: Floats, interval: Ints, first: int) -> Points:
         """Return the sums to times in given intervals: rate and force change evenly in a step."""
@@ -248,9 +270,19 @@ class _Chunk:
         spin = 6 * (self.turn[j] - 2 * self.turn_mean[j]) / dt**2
         rate = self.turn[j] / dt - spin * dt / 2
         R = self.R[j] @ exp_so3(rate * h + spin * h**2 / 2)
-        after, share = h[:, None], (h / dt)[:, None]
-        AA = self.AA_before[j] + self.A_before[j] * after + self.step_AA[j] * share**2
-        F = self.F_before[j] + self.step_F[j] * share
-        FF = self.FF_before[j] + self.F_before[j] * after + self.step_FF[j] * share**2
+        # those of the steps before, and of the step
+        begin, share = self.key[interval], (h / dt)[:, None]
+        tau = (self.since[j, None] + h)[:, :, None, None]
+
+        def before(step: Floats) -> Floats:
+            step = _by(step, self.by_accel)
+            total = np.cumsum(step, axis=0) - step
+            out: Floats = total[j] - total[begin]
+            return out
+
+        single, by = before(self.mean), self.by_accel[j]
+        _, F = _accel(single + _by(self.mean[j] * share, by))
+        AA, FF = _accel(single * tau + _by(self.twice[j] * share**2, by) + before(
+            self.twice - self.mean * (self.since + self.dt)[:, None, None]))
         return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, AA,
                       F, FF, force + rise * h, rate + spin * h, spin)

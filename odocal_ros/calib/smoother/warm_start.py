@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The smoother's last look carried on: keyframes that stay, a state reckoned on over what is new.
+Start of the running estimate from the previous one: keyframes that stay, the state extended.
 
-What is added to a leg moves what was there only a little, so that few passes do where a state,
-noise levels and slips are taken over from the look before.
+New samples change the earlier states only a little, so few passes are enough.
 """
 
 from dataclasses import replace

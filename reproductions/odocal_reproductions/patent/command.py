@@ -52,8 +52,8 @@ def driven(fix_noise: str, seed: int, **more: Any) -> 'PlanarLeg':
     more : options of the simulation that replace these.
     """
     from odocal_reproductions.patent.embodiment import FOUND, RADIUS
-    from odocal_ros.pipeline.patent_run import planar_of
     from odocal_ros.pipeline.prepare import prepare
+    from odocal_ros.pipeline.smoother_run import planar_of
     from odocal_ros.screening.screen import screen
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.scenarios import SimOptions, simulate

@@ -1,11 +1,80 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Effects of a drawn vehicle's wheels, body and receiver, after the tables of docs/zoo.md."""
+"""Effects of a drawn vehicle, after the tables of docs/zoo.md: IMU, wheels, body, receiver."""
+
+import math
 
 import numpy as np
 
+from odocal_ros.settings.grades import GRADES
 from odocal_ros.sim.zoo import DEG, Drawn, G, KMH, lognormal, plain, Vehicle
+
+
+def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Scale of each axis, axes that are not square, a gyro turned against its accelerometer."""
+    x, y, z = rng.normal(0.0, vehicle.size('between') / math.sqrt(2), 3)
+    turned = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])    # half of it to each side
+    figures = {}
+    for name, sensor, sign in (('gyro_matrix', 'gyro', 1), ('accel_matrix', 'accelerometer', -1)):
+        M = rng.normal(0.0, vehicle.size('cross'), (3, 3)) + sign * turned / math.sqrt(2)
+        # the limit of a data sheet cuts at three sigmas
+        np.fill_diagonal(M, vehicle.size(f'{sensor} scale')
+                         * np.clip(rng.standard_normal(3), -3.0, 3.0))
+        figures[name] = plain(M)
+    return {}, figures
+
+
+def g_sensitivity(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Draw the g-sensitivity of the gyro."""
+    return {}, {'g_sensitivity': plain(rng.normal(0.0, vehicle.size('g sensitivity'), 9))}
+
+
+def bias(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Turn-on biases of the vehicle's table, and their drift during the run."""
+    return {}, {
+        'gyro_bias': plain(rng.normal(0.0, vehicle.size('gyro bias'), 3)),
+        'accel_bias': plain(rng.normal(0.0, vehicle.size('accelerometer bias'), 3) * [1, 1, 1.3]),
+        'gyro_wander': vehicle.size('gyro wander'),
+        'accel_wander': vehicle.size('accelerometer wander')}
+
+
+def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Biases that ramp while the IMU warms; it may have been on for some minutes."""
+    tau = lognormal(rng, 300.0, 0.5)
+    since = rng.uniform(0.0, 600.0)
+    figures = {}
+    for name, sensor in (('gyro_slope', 'gyro'), ('accel_slope', 'accelerometer')):
+        median, spread = vehicle.row(f'{sensor} slope')
+        sign = rng.choice([-1, 1], 3)
+        figures[name] = plain(sign * (median * np.exp(spread * rng.standard_normal(3))))
+    least, most = vehicle.row('warmth')
+    rise = rng.uniform(least, most) * math.exp(-since / tau)
+    return {}, figures | {'warm_rise': float(rise), 'warm_time': tau}
+
+
+def vibration(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Vibration of the IMU by road and engine."""
+    rms = G * rng.uniform(0.02, 0.1)
+    return {}, {'vibration': float(rms), 'gyro_vibration': float(DEG * rng.uniform(0.1, 0.5)),
+                'rectification': float(vehicle.size('rectified') * rng.choice([-1, 1]))}
+
+
+def imu_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Stamps late by filter and transport delay, with jitter, in batches."""
+    shortest, longest = vehicle.row('filter')
+    latency = rng.uniform(shortest, longest) + lognormal(rng, *vehicle.row('latency'))
+    batches = vehicle.grade == 'industrial' and rng.uniform() < 0.3
+    return {}, {'imu_latency': float(latency), 'imu_jitter': vehicle.size('imu jitter'),
+                'imu_batch': 2 if batches else 1}
+
+
+def grade(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Set ``imu.grade`` to the true one, or one better or worse (at most navigation, consumer)."""
+    names = list(GRADES)
+    stated = names.index(vehicle.grade) + int(rng.integers(-1, 2))
+    told_grade = names[max(0, min(stated, len(names) - 1))]
+    return {}, {} if told_grade == vehicle.grade else {'told_grade': told_grade}
 
 
 def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -17,16 +86,14 @@ def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     chance = rng.uniform()
     band = (0.0 if chance < 0.3 else rng.uniform(0.3, 1) if chance < 0.8 else rng.uniform(1, 3.5))
     rate = float(rng.choice([1.0, 2.0, 5.0, 10.0] if whole else [10.0, 20.0, 50.0]))
-    ratio = vehicle.options['scale'] / vehicle.options['nominal_scale']
-    return ({'odometer': 'speed', 'odometer_rate': rate, 'scale': ratio, 'nominal_scale': 1.0},
+    return (vehicle.speed_options | {'odometer_rate': rate},
             real | {'dead_band': 0.0 if whole else band * KMH})
 
 
 def coarse_pulses(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Count few pulses per metre: the teeth of a brake's tone wheel."""
     nominal = 1 / rng.uniform(15, 50)
-    ratio = vehicle.options['scale'] / vehicle.options['nominal_scale']
-    return {'scale': ratio * nominal, 'nominal_scale': float(nominal)}, {}
+    return {'scale': vehicle.speed_options['scale'] * nominal, 'nominal_scale': float(nominal)}, {}
 
 
 def odometer_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -137,15 +204,12 @@ def tracked_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 def held_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Hold a published speed until it has changed by a step, as many buses do."""
-    ratio = vehicle.options['scale'] / vehicle.options['nominal_scale']
-    return ({'odometer': 'speed', 'scale': ratio, 'nominal_scale': 1.0},
-            {'speed_hold': KMH * float(rng.choice((0.2, 0.5)))})
+    return vehicle.speed_options, {'speed_hold': KMH * float(rng.choice((0.2, 0.5)))}
 
 
 def filtered_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Send speeds behind a low-pass filter, as most speed signals of cars are."""
-    ratio = vehicle.options['scale'] / vehicle.options['nominal_scale']
-    return ({'odometer': 'speed', 'odometer_rate': 20.0, 'scale': ratio, 'nominal_scale': 1.0},
+    return (vehicle.speed_options | {'odometer_rate': 20.0},
             {'speed_filter': float(rng.uniform(0.2, 0.6))})
 
 
@@ -176,6 +240,7 @@ def kerbs(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 EFFECTS = {f.__name__: f for f in (
+    triads, g_sensitivity, bias, temperature, vibration, imu_stamps, grade,
     coarse_speed, coarse_pulses, odometer_stamps, speed_law, warming, slip, sideslip, squat,
     lever_arms, receiver_lag, fix_stamps, slow_errors, multipath, covariance, outages)}
 # only with --effect NAME: receivers and buses of some vehicles

@@ -1,13 +1,16 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Fixes that a receiver reckons in a tunnel are found, and no measured ones."""
 
-from drives import configured
+"""Fixes that a receiver dead-reckons are found, and velocities that contradict the fixes."""
+
+from dataclasses import replace
+
+from drives import changed, configured, settings
 import numpy as np
 import pytest
 
 from odocal_ros.reasons import Code
-from odocal_ros.screening.dead_reckoned import reckoned
+from odocal_ros.screening.fix_screen import reckoned
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
@@ -23,7 +26,7 @@ def turned(t):
     return 0.8 * np.sin(0.03 * np.asarray(t))
 
 
-def drive(sigma, tunnel, scale=0.02):
+def received(sigma, tunnel, scale=0.02):
     """Return what a receiver sends at 15 m/s: (n, 3) m; in the tunnel by its own odometer."""
     fine = np.arange(0.0, 400.0, 0.01)
     path = np.cumsum(15 * 0.01 * np.exp(1j * turned(fine)))
@@ -41,7 +44,7 @@ def drive(sigma, tunnel, scale=0.02):
 @pytest.mark.parametrize('sigma', [0.05, 0.5])
 def test_a_tunnel_is_found_with_its_ends(sigma, length):
     begin = 150.0
-    found, why = reckoned(at_s, drive(sigma, (begin, begin + length)), 15 * at_s, turned)
+    found, why = reckoned(at_s, received(sigma, (begin, begin + length)), 15 * at_s, turned)
     inside = (at_s >= begin) & (at_s < begin + length)
     assert [r.code for r in why] == [Code.FIXES_DEAD_RECKONED]
     assert f'to {begin + length - 1:.0f} s' in why[0].text
@@ -53,7 +56,7 @@ def test_a_tunnel_is_found_with_its_ends(sigma, length):
 
 @pytest.mark.parametrize('sigma', [0.01, 0.05, 0.5])
 def test_noise_and_a_wrong_fix_are_none(sigma):
-    fixes = drive(sigma, (0, 0))
+    fixes = received(sigma, (0, 0))
     fixes[200:230, 0] += 20.0          # a false fix, and back
     found, why = reckoned(at_s, fixes, 15 * at_s, turned)
     assert not found.any()
@@ -71,3 +74,52 @@ def test_fixes_of_a_tunnel_are_not_used_and_said():
     inside = (inputs.t_fix > 125.0 - off) & (inputs.t_fix < 175.0 - off)
     assert not inside.any()
     assert inputs.fixes_rejected == len(made.fix.stamp_ns) - len(inputs.t_fix)
+
+
+@pytest.fixture(scope='module', params=['town', 'straight'])
+def drive(request):
+    return simulate(SimOptions(scenario=request.param, duration=200.0, imu_rate=50.0,
+                               velocity_sigma=0.05, velocity_delay=0.2))
+
+
+def screened(drive, change, **options):
+    leg = drive.leg()
+    leg = replace(leg, fix_velocity=changed(leg.fix_velocity, velocity_n=change))
+    inputs, found = screen(leg, settings(drive, None, **options))
+    said = [r.text for r in found if r.code is Code.VELOCITY_UNUSABLE]
+    assert len(said) == (not len(inputs.t_velocity))
+    return said
+
+
+@pytest.mark.parametrize('factor', [1.0, 1.05, 0.95])
+def test_that_of_the_fixes_is_used(drive, factor):
+    assert not screened(drive, lambda v: np.multiply(v, factor, out=v))
+
+
+def test_wheel_speeds_units_and_axes_are_found(drive):
+    def forward(v):
+        v[:] = np.linalg.norm(v, axis=1)[:, None] * [1.0, 0.0, 0.0]
+
+    def down(v):            # north, east: on a road to the north-east the same
+        v[:, :2] = v[:, 1::-1] * [1.0, -1.0]
+
+    for change in (forward, down, lambda v: np.multiply(v, 3.6, out=v),
+                   lambda v: np.negative(v, out=v)):
+        assert 'contradicts the fixes' in screened(drive, change)[0]
+
+
+def test_nothing_is_said_of_a_velocity_that_is_not_wanted(drive):
+    leg = drive.leg()
+    leg = replace(leg, fix_velocity=changed(leg.fix_velocity, velocity_n=lambda v: v.fill(9.0)))
+    _, found = screen(leg, settings(drive, None, gnss__use_velocity=False))
+    assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
+
+
+def test_a_vehicle_that_stands_says_nothing(drive):
+    leg = drive.leg()
+    keep = leg.fix.stamp_ns < drive.options.start_ns + 5 * 10**9
+    still = replace(leg, fix=type(leg.fix)(*(getattr(leg.fix, f)[keep] for f in (
+        'stamp_ns', 'received_ns', 'latitude', 'longitude', 'height', 'covariance_n',
+        'covariance_type', 'status'))))
+    inputs, _ = screen(still, settings(drive, None))
+    assert len(inputs.t_velocity)

@@ -1,0 +1,179 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Errors that no method models: coarse speeds, slow wheel slip, unknown slopes; delays that it saw.
+
+Errors of the scale go into the sigmas and the budget of a method, delays into a note with the
+setting that corrects them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.judge import judge
+from odocal_ros.calib.result import MethodResult, Source, wheel_factors
+from odocal_ros.nav.coarse_speed import CoarseSpeed
+from odocal_ros.pipeline.prepared import PreparedLeg
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.inputs import Inputs, Placed
+from odocal_ros.settings.levels import REMARK_SIGMAS
+
+SCALES = ('scale_factor', 'scale_ratio')
+WHAT = {'gnss': 'fix', 'odometer': 'odometer'}
+
+
+def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
+                     relative: Mapping[str, float], shared: bool = False) -> MethodResult:
+    """
+    Return a method's result with an error in the sigmas of its scales.
+
+    method, prepared : the result, and the leg.   name : of the source.   relative : 1 sigma of
+    each of SCALES, relative; of a wheel by default that of the scale factor.   shared : the same
+    in every leg of the vehicle.
+    """
+    relative = dict.fromkeys(wheel_factors(method.estimates),
+                             relative['scale_factor']) | dict(relative)
+    K = method.estimates['scale_factor'].value
+    if not K:
+        return method
+    effects = np.array([[relative.get(name_, 0.0)] for name_ in method.parameters])
+    estimates = {name_: replace(e, sigma=float(np.hypot(e.sigma, relative[name_] * e.value)))
+                 if name_ in relative and e.value is not None and e.sigma is not None else e
+                 for name_, e in method.estimates.items()}
+    row = {name_: relative.get(name_, 0.0) * (method.estimates[name_].value or 0.0)
+           for name_ in method.parameters} | {'shared': shared}
+    judged = [r for r in judge(estimates, prepared.nominal, prepared.config)
+              if r.code is Code.SCALE_SIGMA_TOO_LARGE]
+    return replace(
+        method, estimates=estimates, sources=(*method.sources, Source(name, effects, shared)),
+        details=method.details | {'budget': method.details.get('budget', {}) | {name: row}},
+        border=method.border and method.border.loosened({'scale_factor':
+                                                         relative['scale_factor']}),
+        reasons=(*(r for r in method.reasons if r.code is not Code.SCALE_SIGMA_TOO_LARGE),
+                 *judged))
+
+
+def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+    """
+    Return a method's result with the change of one wheel in its sigmas, or as it was.
+
+    A wheel that slips all along from some moment on, or loses air, leaves a scale between that of
+    before and that of after; the fixes do not determine which of them is the vehicle's.
+    """
+    change = abs(prepared.wheel_slips.change)
+    if not change:
+        return method
+    # halves of the path half the change apart in the mean of two wheels: the mean is a quarter off
+    mean, own = change / 2 / prepared.wheel_slips.count, change / 2
+    return with_scale_error(method, prepared, 'slow_wheel_slip', dict.fromkeys(SCALES, mean)
+                            | dict.fromkeys(wheel_factors(method.estimates), own))
+
+
+def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+    """
+    Return a method's result as it was, or of an IMU without force: hills in, no angles.
+
+    ``screening/leg_kind.py`` says why.
+    """
+    if prepared.inputs.felt:
+        return method
+    hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a path longer
+    method = with_scale_error(method, prepared, 'hills', dict.fromkeys(SCALES, hills))
+    # what NO_ACCELEROMETER says of the angles, with another remedy
+    said = {Code.PITCH_NOT_DETERMINED} | (
+        set() if prepared.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
+    return replace(
+        method, reasons=tuple(r for r in method.reasons if r.code not in said), estimates={
+            name: replace(e, value=None, sigma=None) if name == 'pitch_mounting_angle' else e
+            for name, e in method.estimates.items()})
+
+
+def half_step(inputs: Inputs) -> float:
+    """
+    Return half a step of the speed relative to the path length, 0.0 without steps.
+
+    Speeds sent are too low by that on the mean where the sender truncates, by nothing where it
+    rounds, and the grid does not say which.
+    """
+    coarse = _coarse(inputs)
+    if coarse is None:
+        return 0.0
+    pick = (coarse.t >= 0.0) & (coarse.t <= inputs.t_stop) & (coarse.value != 0)
+    mean = float(np.abs(coarse.value[pick]).mean()) if pick.any() else 0.0
+    return coarse.truncation / mean if mean else 0.0
+
+
+def held_steps(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+    """Return the result of a method that adds up speeds, what truncation takes in its sigmas."""
+    size = half_step(prepared.inputs)
+    if method.name != 'two_point' or not size:
+        return method
+    return with_scale_error(method, prepared, 'speed_truncation', dict.fromkeys(SCALES, size),
+                            shared=True)
+
+
+def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
+    """Return the reasons for coarse steps of speed or counts."""
+    K, size = placed.nominal or placed.rough, half_step(inputs)
+    count = inputs.travel.quantum * K
+    coarse_count_m = 0.2    # m, a count that is
+    if count > coarse_count_m:
+        return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m, so each reading lags '
+                       'by up to this distance')]
+    coarse = _coarse(inputs)
+    coarse_worth = 5e-4    # of the scale: half a step that is worth a word
+    if coarse is None or coarse.truncation and size < coarse_worth:
+        return []
+    metres = coarse.step * K
+    sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \
+        else f'{coarse.step:.3g} m/s ({3.6 * coarse.step:.3g} km/h)'
+    if not coarse.truncation:
+        return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed repeats until it has changed by '
+                       f'{sent}; half a step is added in the direction of the last change')]
+    between = ', with interpolated values between' if coarse.interpolated else ''
+    return [Reason(Code.SPEED_COARSE, f'odometer resolution is {sent}{between}; if truncated, '
+                   f'the distance is {100 * size:.2g} % too short')]
+
+
+def _coarse(inputs: Inputs) -> CoarseSpeed | None:
+    """Return the grid of the speed, of one of several wheels, None where there is none."""
+    return next((one.coarse for one in (inputs.travel, *inputs.travels) if one.coarse), None)
+
+
+def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
+                scale: float) -> list[Reason]:
+    """
+    Return DELAY_SEEN for each delay that is there for certain and matters at the speed driven.
+
+    prepared : the leg.   seen : 'gnss' or 'odometer' -> by how many s its stamps are late, with
+    what is set, and sigma.   scale : as the method that saw them found it.
+    """
+    speed = _speed(prepared) * scale
+    notes = []
+    least_delay_path = 0.1    # m: a lever arm need not be known better either
+    hidden_by_fix = 0.25    # of a fix's sigma: what a delay makes of less, no fix shows
+    for name, (late, sigma) in seen.items():
+        metres = abs(late) * speed
+        worth = max(least_delay_path, hidden_by_fix * prepared.fix_sigma)
+        if not (abs(late) > REMARK_SIGMAS * sigma and metres > worth):
+            continue
+        set_to = getattr(prepared.config, name).time_offset
+        notes.append(Reason(
+            Code.DELAY_SEEN, f'{WHAT[name]} stamps are {abs(late):.3f} s (+-{sigma:.3f} s) '
+            f'{"late" if late > 0 else "early"} relative to the other sensors, {metres:.2g} m at '
+            f'{speed:.1f} m/s; accounted for. To remove the delay, set {name}.time_offset to '
+            f'{set_to - late:.3f}'
+            + (f' (now {set_to:g})' if set_to else '')))
+    return notes
+
+
+def _speed(prepared: PreparedLeg) -> float:
+    """Return the speed driven, scale units per s: nine tenths of the leg are slower."""
+    travel = prepared.inputs.travel
+    grid = np.arange(max(0.0, travel.t[0]), min(prepared.inputs.t_stop, travel.t[-1]), 1.0)
+    if len(grid) < 2:
+        return 0.0
+    return float(np.percentile(np.abs(np.diff(travel.at(grid))), 90))

@@ -1,0 +1,97 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Legs without an accelerometer, or with positions in a local frame.
+
+An IMU may send turn rates only: the yaw rate of a car on the bus, the gyro of a robot. The ground
+is then assumed level and the IMU upright: gravity replaces the specific force, so the rest of the
+code needs no other case. The errors of this assumption are added to the level
+(``pipeline/align.py``) and to the scale (``pipeline/beyond_model.py``).
+
+The y axis of a local frame does not point north: what needs north is left out.
+"""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.pieces import chunks
+from odocal_ros.data.samples import FixSamples, HeadingSamples, LOCAL, VelocitySamples
+from odocal_ros.nav.earth import OMEGA
+from odocal_ros.nav.local_frame import LARGEST_FRAME
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.grades import G
+
+TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
+
+
+def felt(f_i: Floats) -> bool:
+    """Return True if any of the (n, 3) forces is valid, or none has arrived yet."""
+    if not len(f_i):
+        return True
+    with np.errstate(invalid='ignore'):      # a NaN that signals
+        return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all()
+                   for rows in chunks(len(f_i)))
+
+
+def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
+    """
+    Return a leg whose IMU, where it sends no force, stands upright on level ground; and why.
+
+    None is sent where each value is zero or NaN (as REP-145's covariance[0] of -1 is read).
+    """
+    f_i = leg.imu.f_i
+    if felt(f_i):
+        return leg, ()
+    up_i = matrix_from_rpy(config.imu.mounting_rpy).T[:, 2]
+    gravity_i = np.tile(up_i * G / (config.imu.accel_scale or 1.0), (len(f_i), 1))
+    return replace(leg, imu=replace(leg.imu, f_i=gravity_i)), (Reason(
+        Code.NO_ACCELEROMETER, 'the IMU publishes turn rates but no acceleration. The scale is '
+        'estimated from gyro, odometer and fixes on assumed level ground; yaw and pitch mounting '
+        'need an accelerometer (yaw: or an external heading)'),)
+
+
+def settings_by_frame(fix: FixSamples, config: Config) -> Config:
+    """Return the settings that apply to positions, by their frame."""
+    return config.in_local_frame() if is_local(fix) else config
+
+
+def is_local(fix: FixSamples) -> bool:
+    """Return True if positions are in a local frame."""
+    return bool((fix.status == LOCAL).any())
+
+
+def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
+    """
+    Return a leg and LOCAL_FRAME if its positions are in a local frame, otherwise nothing.
+
+    The leg is without GNSS velocities, which are east and north, and without a heading topic
+    unless the settings ask for it: that is a heading in the local frame then.
+    """
+    if not is_local(leg.fix):
+        return leg, ()
+    left_out = ['GNSS velocities'] * bool(len(leg.fix_velocity.stamp_ns))
+    leg = replace(leg, fix_velocity=VelocitySamples.none())
+    if config.alignment.heading_source == 'auto' and len(leg.heading.stamp_ns):
+        left_out += ['external headings']
+        leg = replace(leg, heading=HeadingSamples.none())
+    latitude = math.radians(config.reference.latitude_deg)
+    unknown = OMEGA if math.isnan(latitude) else OMEGA * math.cos(latitude)
+    text = ('positions are in a local frame, so north is unknown: up to '
+            f'{math.degrees(unknown) * 3600:.1f} deg/h of the Earth rate are estimated as gyro '
+            'bias')
+    if left_out:
+        text += f'; {" and ".join(left_out)} are not used'
+    found = Reason(Code.LOCAL_FRAME, text)
+    if not np.isnan(leg.fix.latitude).all():
+        return leg, (found,)
+    return leg, (found, Reason(
+        Code.FIXES_UNUSABLE, f'all {len(leg.fix.latitude)} positions are NaN or more than '
+        f'{LARGEST_FRAME / 1000:g} km from the origin of their frame, as map coordinates are',
+        'Publish positions in a frame with its origin near the site.'))

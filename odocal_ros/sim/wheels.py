@@ -1,0 +1,182 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Wheels of a simulated vehicle: places, paths that they roll, growth, slip, published speeds."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.integral import running_integral
+from odocal_ros.settings.config import MECANUM, SIDES, SKID
+from odocal_ros.sim.motion import contact_speed, State, turn_rate
+from odocal_ros.sim.noise import stream
+from odocal_ros.sim.options import SimOptions
+from odocal_ros.sim.real import Real
+from odocal_ros.sim.zoo import G
+
+AXLES = {1: ('rear',), 2: ('front', 'rear'), 3: ('front', 'middle', 'rear'),
+         4: ('front', 'second', 'third', 'rear')}
+# of skid steering: effective over geometric track width in a turn on the spot and straight on.
+# Judgement: published centres of rotation are 1.3 to 2 times as far apart as the wheels
+SPOT, STRAIGHT = 1.7, 1.4
+SIDEWAYS = 0.95     # judgement: motion over rolling of mecanum wheels sideways: rollers slip
+REST = 0.01          # physical: rolling resistance over load, of tyres on asphalt
+AIR = 1e-5           # judgement: air drag over load, per (m/s)^2
+
+
+@dataclass(frozen=True, eq=False)
+class SimWheel:
+    """
+    A wheel.
+
+    name : joint.   draws : name of its random numbers.   arm : (3,) m, contact point in base_link.
+    scale : true scale factor.   steered : it points where it rolls (Ackermann).
+    """
+
+    name: str
+    draws: str
+    arm: Floats
+    scale: float
+    steered: bool = False
+
+
+def wheels_of(options: SimOptions) -> list[SimWheel]:
+    """
+    Return the wheels of resolved options, left before right of each axle from front to rear.
+
+    An odd number has a single front wheel, the last one. ``options.scale`` turns the mean of the
+    wheels that do not steer into metres: it is the harmonic mean of theirs.
+    """
+    n, middle = options.wheel_count, np.asarray(options.odometer_lever_arm, dtype=float)
+    if n == 1:
+        return [SimWheel('wheel_joint', 'L', middle, options.scale)]
+    half = np.array([0.0, options.track_width / 2, 0.0])
+    if n == len(SIDES):
+        ratio = 1 + options.wheel_difference        # right over left
+        left = options.scale * (1 + 1 / ratio) / 2
+        return [SimWheel(f'{side}_wheel_joint', draws, middle + arm, scale)
+                for side, draws, arm, scale in zip(SIDES, 'LR', (half, -half),
+                                                   (left, left * ratio), strict=True)]
+    places = [(f'{axle}_{side}', axle, arm) for axle in AXLES[n // 2]
+              for side, arm in zip(SIDES, (half, -half), strict=True)]
+    places += [('front', 'front', 0 * half)] * (n % 2)
+    front = np.array([options.wheelbase, 0.0, 0.0])
+    steered = np.array([axle == 'front' and options.front_steers for _, axle, _ in places])
+    scales = 1 + options.wheel_difference * stream(options.seed, 'wheels').standard_normal(n)
+    scales *= options.scale * np.mean(1 / scales[~steered])
+    return [SimWheel(name, name, middle + arm + front * (axle == 'front'), float(scale), steers)
+            for (name, axle, arm), scale, steers in zip(places, scales, steered.tolist(),
+                                                        strict=True)]
+
+
+def steered_path(state: State, arm: Floats) -> Floats:
+    """Return the metres that a steered wheel rolls beyond a fixed one at its side: (n,)."""
+    x, y, z = arm
+    along = contact_speed(state, (0.0, y, z))
+    more = np.copysign(np.hypot(along, x * turn_rate(state)) - np.abs(along), along)
+    return running_integral(state.t, more)
+
+
+def effective_width(options: SimOptions, radius: float = 0.0) -> float:
+    """Return the effective track width, m, at a turn radius, m."""
+    if options.drive == MECANUM:
+        return 2 * options.track_width      # a robot as long as wide
+    if options.drive == SKID:
+        return options.track_width * float(_widening(np.array(radius), options.track_width))
+    return options.track_width
+
+
+def _widening(radius: Floats, width: float) -> Floats:
+    """Return the effective over the geometric track width of skid steering, by turn radii."""
+    out: Floats = SPOT + (STRAIGHT - SPOT) * radius / (radius + width)
+    return out
+
+
+def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
+    """Return the metres that a wheel of skid steering or a mecanum wheel has rolled: (n,)."""
+    side = -1.0 if wheel.name.split('_joint')[0].removesuffix('_wheel').endswith(SIDES[0]) else 1.0
+    if options.drive == MECANUM:
+        lateral = running_integral(state.t, state.sway[:, 0]) / SIDEWAYS
+        rollers = side if wheel.name.startswith('front') else -side
+        return (state.travel + rollers * lateral
+                + side * effective_width(options) / 2 * state.turned)
+    rate = np.maximum(np.abs(state.yaw_rate), 1e-9)
+    half = options.track_width * _widening(np.abs(state.speed) / rate, options.track_width) / 2
+    turns = np.diff(state.turned, prepend=state.turned[:1])
+    by_turn: Floats = np.cumsum((half + np.append(half[:1], half[:-1])) / 2 * turns)
+    return state.travel + side * by_turn
+
+
+def growth(state: State, real: Real) -> Floats | float:
+    """Return by how much the rolling radius exceeds that of a cold, slow tyre: (n,), or 0.0."""
+    grown: Floats | float = 0.0
+    if real.speed_law:
+        grown = grown + real.speed_law * (state.speed / 36.0)**2    # as stated
+    if real.warming:
+        steps = np.diff(state.t, prepend=state.t[:1]) * (np.abs(state.speed) > 1e-9)
+        grown = grown - real.warming * np.expm1(-np.cumsum(steps) / real.warming_time)
+    return grown
+
+
+def slip_share(state: State, real: Real) -> Floats:
+    """Return the metres spun beyond each metre of ground as the tyres pull or brake: (n,)."""
+    forward = np.where(state.speed < 0, -1.0, 1.0)
+    # over load; up a slope they pull too
+    force = forward * (state.acceleration / G + state.slope) + REST + AIR * state.speed**2
+    # half of the load is on the driven axle; all wheels brake
+    pull = 2 * np.maximum(force, 0.0) if real.driven else np.zeros_like(force)
+    share: Floats = real.tyre_slip * (pull + np.minimum(force, 0.0))
+    return share
+
+
+def tyre_slip(state: State, real: Real) -> Floats:
+    """Return the metres spun beyond the ground by then: (n,)."""
+    path_length = np.diff(state.travel, prepend=state.travel[:1])
+    return np.cumsum(slip_share(state, real) * path_length)
+
+
+def leg_factor(state: State, real: Real) -> float:
+    """
+    Return true metres rolled over those of a wheel that neither grew nor slipped.
+
+    state : between the marks of the leg. The mean is by travel in both directions.
+    """
+    if not (real.speed_law or real.warming or real.tyre_slip):
+        return 1.0
+    path_length = np.diff(state.travel)
+    spun = np.diff(tyre_slip(state, real)) if real.tyre_slip else 0.0
+    grown = growth(state, real) + np.zeros_like(state.t)
+    counted = (path_length + spun) / (1 + (grown[1:] + grown[:-1]) / 2)
+    return float(np.abs(path_length).sum() / np.abs(counted).sum())
+
+
+def low_passed(speed: Floats, t: Floats, time: float) -> Floats:
+    """Return speeds behind a first-order filter of a time constant, s; 0: none."""
+    if not time:
+        return speed
+    out, share = speed.tolist(), -np.expm1(-np.diff(t) / time)
+    for k, a in enumerate(share.tolist(), 1):
+        out[k] = out[k - 1] + a * (out[k] - out[k - 1])
+    return np.array(out)
+
+
+def coarse(speed: Floats, real: Real) -> Floats:
+    """Return the published speeds: in steps, 0 below the dead band, or held."""
+    if real.speed_step:
+        steps = np.abs(speed) / real.speed_step
+        steps = np.floor(steps) if real.speed_rounding == 'floor' else np.floor(steps + 0.5)
+        speed = np.sign(speed) * steps * real.speed_step
+    if real.dead_band:
+        speed = np.where(np.abs(speed) < real.dead_band, 0.0, speed)
+    return held(speed, real.speed_hold) if real.speed_hold else speed
+
+
+def held(speed: Floats, step: float) -> Floats:
+    """Return speeds that repeat until one is 0 or differs by a step."""
+    out = speed.tolist()
+    for k, now in enumerate(out[1:], 1):
+        if now and abs(now - out[k - 1]) < step:
+            out[k] = out[k - 1]
+    return np.array(out)

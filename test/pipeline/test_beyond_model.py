@@ -1,0 +1,221 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Delays, slip of a coarse speed and lasting slip of one wheel: reported, and in the sigmas."""
+
+from dataclasses import replace
+import re
+from types import SimpleNamespace
+
+from drives import drive, everything_said, settings
+import numpy as np
+import pytest
+
+from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.data.samples import OdometerSamples
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.pipeline.beyond_model import delay_notes
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.pipeline.methods import found_by
+from odocal_ros.pipeline.prepared import MethodRun
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+
+pytestmark = pytest.mark.slow
+ROUTE = {'scenario': 'town', 'duration': 180.0, 'seed': 6, 'two_wheels': True}
+SAID = re.compile(r'(\w+) stamps are ([\d.]+) s \(\+-([\d.]+) s\) (late|early).*? '
+                  r'set (gnss|odometer)\.time_offset to (-?[\d.]+)')
+
+
+def said(made, method, **changes):
+    """Return what is said of a delay: (sensor, seconds late, sigma, setting, its value)."""
+    result = calibrate(made.leg(), settings(made, method=method, heading_sigma=None, **changes))
+    text = everything_said(result).get(Code.DELAY_SEEN)
+    if text is None:
+        return None
+    what, size, sigma, way, name, offset = SAID.search(text).groups()
+    return what, float(size) * (1 if way == 'late' else -1), float(sigma), name, float(offset)
+
+
+@pytest.mark.parametrize('late', [0.12, -0.12])
+def test_late_and_early_fixes_are_said(late):
+    made = drive(**ROUTE, fix_delay=late)
+    what, size, sigma, name, offset = said(made, 'smoother')
+    assert (what, name) == ('fix', 'gnss')
+    # a belief of 50 ms (gnss.time_sigma) pulls it towards none by (sigma / prior)^2 of itself
+    pull = abs(late) * (sigma / 0.05)**2
+    assert abs(size - late) < 4 * sigma + pull + 0.001
+    assert offset == pytest.approx(-size, abs=0.001)
+    assert said(made, 'smoother', gnss__time_offset=offset) is None
+
+
+def test_a_late_odometer_is_said():
+    made = drive(**ROUTE, odometer_delay=0.04, fix_noise='rtk')
+    what, size, sigma, name, offset = said(made, 'smoother')
+    assert (what, name) == ('odometer', 'odometer')
+    assert abs(size - 0.04) < 4 * sigma + 0.04 * (sigma / 0.01)**2 + 0.001
+    assert said(made, 'smoother', odometer__time_offset=offset) is None
+
+
+def test_what_is_set_already_is_counted_in():
+    made = drive(**ROUTE, fix_delay=0.12)
+    *_, offset = said(made, 'smoother', gnss__time_offset=0.05)
+    assert said(made, 'smoother', gnss__time_offset=offset) is None
+
+
+def test_of_no_delay_nothing_is_said():
+    assert said(drive(**ROUTE), 'smoother') is None
+
+
+@pytest.mark.parametrize(('late', 'sigma', 'fix_sigma', 'is_said'), [
+    (0.02, 0.005, 0.02, True),       # 0.2 m at 10 m/s, 4 sigmas
+    (0.02, 0.008, 0.02, False),      # 2.5 sigmas
+    (-0.009, 0.001, 0.02, False),    # 9 cm: a lever arm need not be known better
+    (0.02, 0.005, 1.5, False),       # fixes of 1.5 m do not show 0.2 m
+    (-0.04, 0.005, 1.5, True)])
+def test_it_must_be_there_and_matter(late, sigma, fix_sigma, is_said):
+    t = np.arange(0.0, 60.0, 0.1)
+    run = SimpleNamespace(config=Config(), fix_sigma=fix_sigma, inputs=SimpleNamespace(
+        travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0))       # 10 m/s
+    assert bool(delay_notes(run, {'gnss': (late, sigma)}, scale=0.5)) == is_said
+
+
+def test_one_method_says_it_once():
+    made = drive(**ROUTE, fix_delay=0.12)
+    result = calibrate(made.leg(), settings(made, method='all', heading_sigma=None))
+    assert [r.code for r in result.reasons].count(Code.DELAY_SEEN) == 1
+
+
+SPUN, SLID = (Reason(Code.WHEEL_SLIP, f'the wheel {what}') for what in ('spun', 'slid'))
+REJECTED = (Reason(Code.NOT_CONVERGED, 'it did not'),)
+SPEED = {'scenario': 'town', 'odometer': 'speed', 'scale': 1.01, 'nominal_scale': 1.0,
+         'duration': 300.0, 'imu_grade': 'industrial', 'seed': 7}
+
+
+def run(name, odometer, reasons=()):
+    method = MethodResult(name, reasons, {'scale_factor': Estimate(1.0, 0.01, '1')}, (), (), {})
+    return MethodRun(method, odometer=odometer)
+
+
+@pytest.mark.parametrize(('smoother', 'said'), [
+    (run('smoother', ()), []),                          # it fitted the leg and saw none
+    (run('smoother', (SLID,)), [SLID]),
+    (run('smoother', None), [SPUN]),                    # it did not look
+    (run('smoother', (), REJECTED), [SPUN])])
+def test_slip_is_by_the_smoother_where_it_gives_the_value(smoother, said):
+    runs = {'smoother': smoother, 'two_point': run('two_point', (SPUN,), REJECTED)}
+    assert found_by(runs, None) == said
+
+
+def test_slip_is_by_two_point_where_it_is_alone():
+    assert found_by({'two_point': run('two_point', (SPUN,), REJECTED)}, None) == [SPUN]
+
+
+def whole_kmh(leg, spun=0.0):
+    """Return a leg of speeds in whole km/h, 10 Hz; spun: m in 2 s at 8 m/s and more."""
+    sent = leg.odometer
+    t, value = (sent.stamp_ns - leg.start_ns) * 1e-9, sent.value.copy()
+    fast = t[(value > 8.0) & (t > 60.0)][0]
+    value[(t > fast) & (t < fast + 2.0)] += spun / 2.0
+    return replace(leg, odometer=replace(sent, value=np.trunc(3.6 * value) / 3.6)), fast
+
+
+@pytest.mark.parametrize('spun', [0.0, 4.0])
+def test_slip_of_a_coarse_speed_is_seen_by_the_smoothers_own_track(spun):
+    made = drive(**SPEED)
+    leg, at = whole_kmh(made.leg(), spun)
+    result = calibrate(leg, settings(made, None, method='auto'))
+    said = [r.text for r in result.reasons if r.code is Code.WHEEL_SLIP]
+    assert len(said) == (spun > 0)
+    if spun:
+        assert float(said[0].split('t = ')[1].split(' s')[0]) == pytest.approx(at + 1.0, abs=1.5)
+    assert Code.SPEED_COARSE in everything_said(result)
+
+
+STRAIGHT = {'scenario': 'straight', 'duration': 400.0, 'two_wheels': True, 'seed': 3}
+SLIP_M = 20.0
+WHEELS = ('scale_factor_left', 'scale_factor_right')
+
+
+def with_slip(made, extra_m):
+    """Return the leg, extra_m(t, way) more metres counted by the right wheel; way from 0 to 1."""
+    leg, right = made.leg(), made.odometer_right
+    t = (right.stamp_ns - leg.start_ns) * 1e-9
+    way = (right.value - right.value[0]) / (right.value[-1] - right.value[0])
+    more = extra_m(t, way) / made.truth.wheel_scales[1]
+    return replace(leg, odometer_right=OdometerSamples(
+        right.stamp_ns, right.received_ns, right.value + np.round(more).astype(np.int64)))
+
+
+def slow(made):
+    """One per cent from half of the way on."""
+    return with_slip(made, lambda t, way: 0.01 * made.truth.distance * np.clip(way - 0.5, 0, None))
+
+
+def drawn_out(made):
+    """Twenty metres within forty seconds about the middle."""
+    return with_slip(made, lambda t, way: SLIP_M * np.clip(
+        (t - np.interp(0.5, way, t)) / 40.0 + 0.5, 0.0, 1.0))
+
+
+@pytest.fixture(scope='module', params=[slow, drawn_out], ids=['slow', 'drawn out'])
+def slipped(request):
+    made = drive(**STRAIGHT)
+    return made, request.param, calibrate(request.param(made), settings(made, method='all'))
+
+
+@pytest.mark.parametrize('method', ['two_point', 'smoother'])
+def test_the_sigma_of_each_method_holds_it(slipped, method):
+    made, _, result = slipped
+    estimates = result.methods[method].estimates
+    truth = dict(zip(('scale_factor', *WHEELS), (made.truth.scale, *made.truth.wheel_scales),
+                     strict=True))
+    for name in truth.keys() & estimates.keys():
+        e = estimates[name]
+        # without any slip the error would be 0.1 sigma: it is all of this slip, whole or less
+        assert abs(e.value - truth[name]) < 1.5 * e.sigma, name
+        assert e.sigma < 0.01 * e.value
+    ratio = estimates['scale_ratio']
+    assert ratio.sigma / ratio.value == pytest.approx(
+        estimates['scale_factor'].sigma / estimates['scale_factor'].value, rel=1e-6)
+
+
+def test_the_sigma_is_that_of_the_sources_and_in_the_budget(slipped):
+    _, _, result = slipped
+    for name, method in result.methods.items():
+        e = method.estimates['scale_factor']
+        row = method.parameters.index('scale_factor')
+        of_sources = np.sqrt(sum((s.effects[row]**2).sum() for s in method.sources))
+        assert e.sigma / e.value == pytest.approx(of_sources, rel=1e-6), name
+        budget = np.sqrt(sum(line['scale_factor']**2
+                             for line in method.details['budget'].values()))
+        assert budget == pytest.approx(e.sigma, rel=1e-6), name
+
+
+def test_it_is_said_with_its_size(slipped):
+    _, how, result = slipped
+    text = next(r.text for r in result.reasons if r.code is Code.WHEEL_SLIP)
+    if how is slow:
+        assert 'the right wheel counts 1.0' in text
+        assert ('0.25 % is added to the uncertainty of the scale, 0.50 % to that of each '
+                'wheel') in text
+    else:
+        assert 1800 < float(text.split(' by ')[1].split(' cm')[0]) < 2200
+    # 0.25 % is more than the 0.1 % asked for: settings of these tests ask for 10 %
+    assert Code.SCALE_SIGMA_TOO_LARGE not in everything_said(result)
+
+
+def test_a_widened_sigma_is_judged_again():
+    made = drive(**STRAIGHT)
+    result = calibrate(slow(made), settings(made, method='smoother',
+                                            verdict__max_scale_sigma=1e-3))
+    text, = (r.text for r in result.methods['smoother'].reasons
+             if r.code is Code.SCALE_SIGMA_TOO_LARGE)
+    assert float(text.split()[3]) > 2400           # ppm
+
+
+def test_without_slip_nothing_is_widened():
+    made = drive(**STRAIGHT)
+    result = calibrate(made.leg(), settings(made, method='all'))
+    assert not any(s.name == 'slow_wheel_slip' for m in result.methods.values()
+                   for s in m.sources)
