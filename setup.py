@@ -16,6 +16,7 @@ VERSION = re.search(r"^__version__ = '(.+)'$", (HERE / NAME / '__init__.py').rea
 SHARE = f'share/{NAME}'
 # where the repository is published: <url type="repository"> of package.xml
 REPOSITORY = re.search(r'<url type="repository">(.+)</url>', (HERE / 'package.xml').read_text())
+ROS = ('common-interfaces', 'rclpy', 'rmw-fastrtps-cpp')
 SITE = ['furo>=2024', 'myst-parser>=3', 'sphinx>=7']
 # pyarrow: 24 and later refuse numpy 1.26, which is Ubuntu 24.04's
 # ament's linters as a build farm has them; of flake8's plugins all but docstrings, pep257's work
@@ -78,12 +79,9 @@ setup(
         'tqdm>=4',
     ],
     extras_require={
-        # ROS 2 Jazzy itself, for machines without a ROS installation (Linux x86-64)
-        'ros': [
-            'ros-jazzy-common-interfaces',
-            'ros-jazzy-rclpy',
-            'ros-jazzy-rmw-fastrtps-cpp',
-        ],
+        # ROS 2 itself, for machines without a ROS installation (Linux x86-64)
+        'ros': [f'ros-jazzy-{name}' for name in ROS],
+        'kilted': [f'ros-kilted-{name}' for name in ROS],
         # Calibration.to_frame, --export of Parquet
         'tables': [
             'pandas>=2',

@@ -25,9 +25,9 @@ def rviz_displays() -> list[dict]:
     return rviz()['Visualization Manager']['Displays']
 
 
-def foxglove() -> dict:
-    """Return the Foxglove layout."""
-    return json.loads((CONFIG / 'odocal_foxglove.json').read_text(encoding='utf-8'))
+def foxglove(name: str = 'odocal_foxglove.json') -> dict:
+    """Return a Foxglove layout, that of the node unless named."""
+    return json.loads((CONFIG / name).read_text(encoding='utf-8'))
 
 
 def foxglove_paths() -> list[str]:

@@ -82,7 +82,7 @@ def test_the_wheel_holds_the_package_and_its_files(distributions):
                          if name.startswith(('config/', 'launch/')))}
     assert set(re.findall(r'^(\w+) = odocal_ros', entries, re.MULTILINE)) >= {
         'calibrator', 'drive_pattern', 'odocal', 'odometry'}
-    assert {'fleet', 'ros', 'tables', 'watch'} <= set(about.get_all('Provides-Extra'))
+    assert {'fleet', 'kilted', 'ros', 'tables', 'watch'} <= set(about.get_all('Provides-Extra'))
     assert about['Description-Content-Type'] == 'text/markdown'
 
 
@@ -138,7 +138,7 @@ def test_conda_files_name_what_setup_requires():
 def test_the_container_is_of_files_that_exist():
     text = (ROOT / 'Dockerfile').read_text()
     targets = re.findall(r'^FROM \S+ AS (\w+)$', text, re.MULTILINE)
-    assert targets == ['offline', 'jazzy']
+    assert targets == ['offline', 'ros']
     container = json.loads((ROOT / '.devcontainer' / 'devcontainer.json').read_text())
     folder = ROOT / '.devcontainer'
     assert (folder / container['build']['dockerfile']).samefile(ROOT / 'Dockerfile')

@@ -5,6 +5,7 @@
 
 import re
 
+import pytest
 import shown
 
 from odocal_ros.settings.config import SETTINGS
@@ -60,14 +61,16 @@ def test_rviz_shows_both_paths_in_their_own_frame_latched():
     assert len({d['Color'] for d in paths}) == 2
 
 
-def test_foxglove_places_every_panel_once_and_knows_its_type():
-    layout = shown.foxglove()
+@pytest.mark.parametrize(('name', 'panels'), [
+    ('odocal_foxglove.json', PANELS), ('odocal_result_foxglove.json', {'map', 'Plot'})])
+def test_foxglove_places_every_panel_once_and_knows_its_type(name, panels):
+    layout = shown.foxglove(name)
     placed = leaves(layout['layout'])
     for panel in layout['configById'].values():
         for tab in panel.get('tabs', ()):
             placed += leaves(tab['layout'])
     assert sorted(placed) == sorted(layout['configById'])
-    assert {name.partition('!')[0] for name in placed} == PANELS
+    assert {name.partition('!')[0] for name in placed} == panels
 
 
 def test_foxglove_draws_paths_status_and_curves():

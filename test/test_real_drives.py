@@ -36,7 +36,9 @@ def data(tmp_path, monkeypatch):
 def test_the_page_gets_a_row_for_each_odometer(data, monkeypatch):
     page = data / 'page.md'
     page.write_text(f'before\n{real_drives.BEGIN}old\n{real_drives.END}after\n')
+    (data / 'pictures').mkdir()
     monkeypatch.setattr(real_drives, 'PAGE', page)
+    monkeypatch.setattr(real_drives, 'GALLERY', data / 'gallery.md')
     monkeypatch.setattr(sys, 'argv', ['real_drives', '--write'])
     real_drives.main()
     text = page.read_text()
@@ -44,5 +46,10 @@ def test_the_page_gets_a_row_for_each_odometer(data, monkeypatch):
     assert text.endswith(f'{real_drives.END}after\n')
     rows = [line.split(' | ') for line in text.splitlines() if line.startswith('| `a_drive`')]
     assert [row[1] for row in rows] == ['`/ticks`', '`/speed`']
+    gallery = (data / 'gallery.md').read_text()
+    assert gallery.count('\n## ') == gallery.count('pictures/a_drive.svg') == 1
+    assert 'odometer: /ticks, because' in gallery
+    assert 'scale factor' in gallery
+    assert 'corrected' in (data / 'pictures' / 'a_drive.svg').read_text()
     assert abs(float(rows[0][4])) < 4           # sigmas, of the counter beside its own truth
     assert all(row[-2] in ('accepted', 'caution') for row in rows)

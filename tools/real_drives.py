@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Generate the table of docs/recordings.md: the result of each real drive and its reference.
+Generate the table of docs/recordings.md and the page docs/gallery.md from the real drives.
 
-``python -m tools.real_drives`` prints the table, ``--write`` updates the page. Drives are the
+``python -m tools.real_drives`` prints the table, ``--write`` updates both pages. Drives are the
 folders of ``$ODOCAL_DATA`` (else ``../shared/data``) with ``bag`` and ``truth.yaml``; each is
 calibrated by ``odocal try``, once for each odometer topic in the truth.
 """
@@ -29,9 +29,17 @@ from odocal_ros.output.figures import with_sigma
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'recordings.md'
+GALLERY = ROOT / 'docs' / 'gallery.md'
 BEGIN, END = '<!-- made by tools/real_drives.py -->\n', '<!-- end -->\n'
 HEAD = ('| drive | odometer | scale factor, found | reference | off by, sigma | yaw, deg, found | '
         'reference | verdict | s |\n|---|---|---|---|---|---|---|---|---|\n')
+GALLERY_HEAD = """# Gallery of real drives
+
+The first answer of `odocal try BAG`, without options, for each public drive of
+[recordings.md](recordings.md), which has the references, the sources and the licences. The printed
+result continues with warnings, budget and files; the report shows more curves.
+`python -m tools.real_drives --write` generates this page.
+"""
 DEG = math.degrees(1.0)    # definition
 
 
@@ -92,17 +100,45 @@ def _stated(reference: dict[str, float]) -> str:
     return with_sigma(float(reference['value']), float(reference['sigma']))
 
 
+def gallery(data: Path, pictures: Path) -> str:
+    """Return the page of all drives in a folder; write a map of each."""
+    from odocal_ros.library.export_map import map_figure
+    from odocal_ros.output.pictures import save_figure
+    from odocal_ros.output.plots_svg import look
+    page = GALLERY_HEAD
+    for folder in sorted(path.parent for path in data.glob('*/truth.yaml')):
+        said = io.StringIO()
+        with tempfile.TemporaryDirectory() as out, look():
+            with contextlib.redirect_stdout(said):
+                odocal(['try', str(folder / 'bag'), '--no-browser', '--output', out])
+            shapes = json.loads((Path(out) / 'track.geojson').read_text(encoding='utf-8'))
+            for shape in shapes['features']:
+                shape['geometry']['coordinates'] = _few(shape['geometry']['coordinates'])
+            save_figure(map_figure(shapes['features']), pictures / f'{folder.name}.svg')
+        text = said.getvalue().partition('\n  leg  start')[0].strip()
+        page += (f'\n## {folder.name}\n\n![Track and fixes](pictures/{folder.name}.svg)\n\n'
+                 f'```text\n{text}\n```\n')
+    return page
+
+
+def _few(coordinates: list[Any]) -> list[Any]:
+    """Return at most 400 of the points of a line, for a small file."""
+    return coordinates[::1 + len(coordinates) // 400]
+
+
 def main() -> None:
-    """Print the table, or update the page."""
+    """Print the table, or update both pages."""
     parser = argparse.ArgumentParser(description='real drives against their references')
-    parser.add_argument('--write', action='store_true', help='into docs/recordings.md')
+    parser.add_argument('--write', action='store_true', help='into the pages of docs')
     args = parser.parse_args()
-    made = table(Path(os.environ.get('ODOCAL_DATA') or ROOT.parent / 'shared' / 'data'))
+    data = Path(os.environ.get('ODOCAL_DATA') or ROOT.parent / 'shared' / 'data')
+    made = table(data)
     if not args.write:
         sys.stdout.write(made)
         return
     before, _, rest = PAGE.read_text(encoding='utf-8').partition(BEGIN)
     PAGE.write_text(before + BEGIN + made + END + rest.partition(END)[2], encoding='utf-8')
+    GALLERY.write_text(gallery(data, GALLERY.parent / 'pictures'), encoding='utf-8')
 
 
 if __name__ == '__main__':

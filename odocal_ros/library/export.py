@@ -17,6 +17,7 @@ from odocal_ros.bagio.write import write_bag
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
+from odocal_ros.library.export_map import draw_map
 from odocal_ros.library.export_rerun import INSTALL as RERUN, rrd
 from odocal_ros.library.export_speed import draw_scale_by_speed, scale_by_speed
 from odocal_ros.library.residuals import Left, left_in, residuals
@@ -147,7 +148,8 @@ SERIES: dict[str, Callable[[Calibration], Series]] = {
 TEXTS = {'tum': tum, 'csv': csv, 'kml': kml}
 KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
     f'{name}.{ending}' for name in ('trajectory', 'states', 'residuals', 'scale_by_speed')
-    for ending in ('csv', 'parquet')), *(f'scale_by_speed{ending}' for ending in PICTURES))
+    for ending in ('csv', 'parquet')), *(f'{name}{ending}' for name in ('scale_by_speed', 'map')
+                                         for ending in PICTURES))
 
 
 def check_names(files: Iterable[Path | str]) -> None:
@@ -185,7 +187,7 @@ def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
 def _write(result: Calibration, file: Path) -> None:
     name, ending = file.stem, file.suffix[1:]
     if file.suffix in PICTURES:
-        draw_scale_by_speed(result, file)
+        (draw_map if name == 'map' else draw_scale_by_speed)(result, file)
     elif ending == 'mcap':
         mcap(result, file)
     elif ending == 'rrd':

@@ -15,7 +15,7 @@ def _run(command: str, module: str) -> int:
     except ModuleNotFoundError as error:
         print(f'{command}: a live node needs ROS 2 (Python module {error.name} is missing). Run '
               "'source /opt/ros/jazzy/setup.bash', or 'pip install \".[ros]\"' in the source "
-              'folder with Python 3.11 or 3.12 (Linux x86-64). Recorded bags need no ROS: '
+              'folder with Python 3.11 to 3.13 (Linux x86-64). Recorded bags need no ROS: '
               'odocal try BAG',
               file=sys.stderr)
         return 2

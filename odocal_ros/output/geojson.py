@@ -30,17 +30,18 @@ def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -
     """Return the file by name, nothing when no leg has a track."""
     most_of_all = 150_000    # of a file: it stays small however many legs there are
     most = max(2, min(MOST, most_of_all // (3 * max(1, len(calibration.legs)))))
-    features = [feature for n, leg in enumerate(calibration.legs, 1)
-                for feature in _features(n, leg, most)]
-    if not features:
+    shapes = [feature for n, leg in enumerate(calibration.legs, 1)
+              for feature in features(n, leg, most)]
+    if not shapes:
         return {}
     whole = {'type': 'FeatureCollection', 'name': 'odocal', 'about': ABOUT,
              'software': content['software'], 'created': content['created'],
-             'result': sentence(calibration), 'features': features}
+             'result': sentence(calibration), 'features': shapes}
     return {TRACK: json.dumps(whole, allow_nan=False, ensure_ascii=False) + '\n'}
 
 
-def _features(number: int, leg: LegResult, most: int) -> list[dict[str, Any]]:
+def features(number: int, leg: LegResult, most: int) -> list[dict[str, Any]]:
+    """Return the features of a leg, of at most ``most`` points; none in a local frame."""
     if leg.origin is None:
         return []
     out = []

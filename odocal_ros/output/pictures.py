@@ -33,7 +33,10 @@ def save_figure(figure: Any, path: Path) -> None:
     """
     part = path.with_name(f'.{path.name}.part')
     try:
-        figure.savefig(part, format=path.suffix[1:].lower(), dpi=150)
+        ending = path.suffix[1:].lower()
+        # without a date, the same result gives the same file
+        figure.savefig(part, format=ending, dpi=150,
+                       metadata={'Date': None} if ending == 'svg' else None)
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)

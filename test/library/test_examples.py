@@ -114,9 +114,13 @@ def test_the_notebook_runs_from_top_to_bottom(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv('MPLBACKEND', 'agg')
     cells = json.loads((EXAMPLES / 'first_look.ipynb').read_text())['cells']
     names: dict = {}
+    shown: list = []
     for cell in cells:
         if cell['cell_type'] == 'code':
             exec(compile(''.join(cell['source']), 'first_look.ipynb', 'exec'), names)   # noqa: S102
+            shown += [out.get('data', {}) for out in cell['outputs']]
+            assert all(out['output_type'] != 'error' for out in cell['outputs'])
+    assert any('image/png' in data for data in shown), 'outputs are missing: run the notebook'
     assert all(abs(off) < 4 for off in names['off'].values())
     assert {'trajectory.tum', 'track.kml', 'states.csv', 'result'} <= {
         p.name for p in tmp_path.iterdir()}

@@ -4,16 +4,21 @@
 """Each exported file as its own program reads it, or by the rule of its format."""
 
 import csv
+import operator
 import re
 from xml.etree import ElementTree
 
 import numpy as np
+from pyproj import Geod
 import pytest
 from rosbags.highlevel import AnyReader
+import shown
 
 from odocal_ros import OdocalError
 from odocal_ros.library.export import KNOWN
+from odocal_ros.library.export_map import map_figure
 from odocal_ros.offline.cli import main
+from odocal_ros.output.geojson import features
 
 
 @pytest.fixture(scope='module')
@@ -106,6 +111,45 @@ def test_mcap_is_a_bag(calibration, exported):
         np.testing.assert_array_equal(values[:, names.index(joint)], left['value'][one])
         sigma = joint.replace('_', '_sigma_', 1)
         np.testing.assert_array_equal(values[:, names.index(sigma)], left['sigma'][one])
+
+
+def test_foxglove_draws_what_the_mcap_holds(exported):
+    layout = shown.foxglove('odocal_result_foxglove.json')['configById']
+    topics, drawn = set(layout['map!track']['topicColors']), {}
+    for panel in layout.values():
+        for path in panel.get('paths', ()):
+            topic, _, field = path['value'].partition('.')
+            drawn.setdefault(topic, []).append((field, path['label']))
+    with AnyReader([exported / 'debug.mcap']) as bag:
+        assert topics | set(drawn) <= set(bag.topics)
+        for link in [c for c in bag.connections if c.topic in drawn]:
+            _, _, raw = next(bag.messages([link]))
+            message = bag.deserialize(raw, link.msgtype)
+            for field, label in drawn[link.topic]:
+                if number := re.fullmatch(r'position\[(\d+)]', field):
+                    assert message.name[int(number[1])].startswith(f'{label}_')
+                    assert 'sigma' not in message.name[int(number[1])]
+                else:
+                    assert np.isfinite(operator.attrgetter(field)(message))
+
+
+def test_the_map_has_one_scale_and_a_true_bar(calibration, exported):
+    """The bar against the geodesic on the ellipsoid; a degree of both axes in metres a pixel."""
+    figure = map_figure(features(1, calibration.result.legs[0], 400))
+    ax, = figure.axes
+    bar = next(line for line in ax.lines if line.get_linewidth() == 3)
+    length, unit = ax.texts[0].get_text().split()
+    (west, east), south = bar.get_xdata(), bar.get_ydata()[0]
+    metres = Geod(ellps='WGS84').inv(west, south, east, south)[2]
+    assert metres == pytest.approx(float(length) * {'m': 1, 'km': 1000}[unit], rel=1e-3)
+    corner, along, up = ax.transData.transform([(west, south), (east, south),
+                                                (west, south + east - west)])
+    north = Geod(ellps='WGS84').inv(west, south, west, south + east - west)[2]
+    assert metres / (along - corner)[0] == pytest.approx(north / (up - corner)[1], rel=0.01)
+    track = next(line for line in ax.lines if line.get_label() == 'corrected')
+    pose = calibration.trajectory()
+    assert np.ptp(track.get_ydata()) == pytest.approx(np.ptp(pose['latitude_deg']), rel=0.01)
+    assert b'corrected' in (exported / 'map.svg').read_bytes()
 
 
 def test_rerun_reads_what_was_written(calibration, tmp_path):

@@ -186,7 +186,9 @@ def test_samples_of_a_bag_are_those_sent(town):
 def test_settings_may_come_in_any_form(town):
     path = town[1].parent / 'calibrator.yaml'
     names = {'imu.grade': 'tactical', 'leg.standstill': 3.0}
-    assert config_of(names) == with_settings(Config(), names) == config_of(config_of(names))
+    # as text: since Python 3.13 dataclasses with a NaN are unequal
+    assert repr(config_of(names)) == repr(with_settings(Config(), names)) == repr(
+        config_of(config_of(names)))
     assert config_of(path).odometer.nominal_scale == town[0].options.nominal_scale
     assert config_of(names, {'leg.standstill': 5.0, 'leg.preroll': 7.0}).leg.preroll == 7.0
     assert config_of(names, {'leg.standstill': 5.0}).leg.standstill == 3.0
