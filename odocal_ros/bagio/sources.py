@@ -4,7 +4,7 @@
 """From a path that a user gives to the files of a bag, unpacked where they are compressed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import re
 import shutil
@@ -40,15 +40,28 @@ class Span:
 
 
 @dataclass(frozen=True)
+class Known:
+    """
+    What metadata.yaml says of a bag.
+
+    foreign : a serialization format that is not cdr.   trouble : why it cannot be used.
+    """
+
+    names: tuple[str, ...] = ()
+    whole: Span | None = None
+    of_file: tuple[tuple[str, Span], ...] = ()
+    foreign: str = ''
+    trouble: str = ''
+
+
+@dataclass(frozen=True)
 class Source:
     """The files of a bag, in the order they were recorded, and what metadata.yaml says."""
 
     name: str
     files: tuple[Path, ...]
     notes: tuple[str, ...] = ()
-    whole: Span | None = None
-    of_file: tuple[tuple[str, Span], ...] = ()
-    foreign: str = ''                    # a serialization format that is not cdr
+    known: Known = Known()
 
 
 def find(path: Path) -> Source:
@@ -74,7 +87,7 @@ def find(path: Path) -> Source:
         return Source(_stem(path), (path,))
     whole = dict(known.of_file).get(path.name) or (
         known.whole if known.names == (path.name,) else None)
-    return Source(_stem(path), (path,), whole=whole, foreign=known.foreign)
+    return Source(_stem(path), (path,), known=replace(known, whole=whole, of_file=()))
 
 
 def _folder(path: Path) -> Source:
@@ -99,9 +112,7 @@ def _folder(path: Path) -> Source:
         if known is None or wanted:
             notes.append(f'{path}: metadata.yaml {what}; read {len(files)} file'
                          f'{"s" * (len(files) > 1)} in name order')
-    known = known or Known()
-    return Source(path.resolve().name, tuple(files), tuple(notes), known.whole, known.of_file,
-                  known.foreign)
+    return Source(path.resolve().name, tuple(files), tuple(notes), known or Known())
 
 
 def _distinct(files: list[Path]) -> list[Path]:
@@ -131,17 +142,6 @@ def _stem(path: Path) -> str:
     for ending in ('.zstd', '.mcap', '.db3', '.bag'):
         name = name.removesuffix(ending)
     return name or path.name
-
-
-@dataclass(frozen=True)
-class Known:
-    """What metadata.yaml says; ``trouble`` is what is wrong with it where it cannot be used."""
-
-    names: tuple[str, ...] = ()
-    whole: Span | None = None
-    of_file: tuple[tuple[str, Span], ...] = ()
-    foreign: str = ''
-    trouble: str = ''
 
 
 def _read_metadata(path: Path) -> Known:
