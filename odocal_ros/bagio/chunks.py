@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Write mcap files chunk by chunk (mcap.dev/spec), without rosbags: quick, and sure of the disk.
+Write mcap files chunk by chunk (mcap.dev/spec), without rosbags: fast, and flushed to the disk.
 
 A chunk holds messages of one topic as they will stand in every file that it is part of, so
 joining files copies chunks and packs nothing again.
@@ -146,7 +146,7 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chu
 
 
 def _chunk_index(chunk: Chunk, at: int) -> bytes:
-    """Return the record that says where in a file a chunk stands."""
+    """Return the index record of a chunk at an offset of the file."""
     _, _, size, _, form, packed = _chunk_body(chunk.record)
     return _record(CHUNK_INDEX, struct.pack(
         '<QQQQIHQQ', chunk.start_ns, chunk.end_ns, at, len(chunk.record), 10, chunk.channel,

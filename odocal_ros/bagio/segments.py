@@ -103,7 +103,7 @@ class SegmentedBag:
         self.segments = [whole]
 
     def _join(self, segments: list[Segment]) -> None:
-        """Put one file in the place of several."""
+        """Replace several files by one."""
         first, last = segments[0].first, segments[-1].last
         joined = self._write(part_name(first, last), first, last, _chunks_of(segments))
         at = self.segments.index(segments[0])

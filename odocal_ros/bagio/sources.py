@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From a path that a user gives to the files of a bag, unpacked where they are compressed."""
+"""The files of a bag from the path that a user gives, decompressed if necessary."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -125,7 +125,7 @@ def _distinct(files: list[Path]) -> list[Path]:
 
 
 def _hint(path: Path) -> str:
-    """Name the bags one folder below, which is the usual slip."""
+    """Return a hint with the bags one folder below, or an empty text."""
     below = [sub for sub in sorted(path.iterdir()) if sub.is_dir()
              and any(file.name.endswith(ENDINGS) for file in sub.iterdir())]
     return f'; did you mean {" or ".join(map(str, below[:3]))}?' if below else ''
@@ -145,7 +145,7 @@ def _stem(path: Path) -> str:
 
 
 def _read_metadata(path: Path) -> Known:
-    """Return the content of a metadata.yaml; raise an error for any invalid content."""
+    """Return the content of a metadata.yaml; with ``trouble`` if it is invalid."""
     import yaml
     if not is_file(path):
         return Known(trouble=f'{path}: is not a regular file and is ignored')
@@ -258,5 +258,5 @@ def _with_wal(path: Path, wal: Path, folder: Path) -> Path:
 
 
 def names(paths: Sequence[Path]) -> str:
-    """Name some files for people."""
+    """Return the names of files as one text."""
     return ', '.join(path.name for path in paths)
