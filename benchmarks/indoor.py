@@ -19,7 +19,7 @@ within 1.96 sigma, the rms and the largest of error over sigma, the largest of a
 the median sigma; verdicts; in how many drives each reason was given.
 
 Kinds ROBOT_REFERENCE have no IMU: ``wheels`` is the differential robot, ``skid`` slides in turns
-and ``mecanum`` has four wheels and moves sideways (sim/robot_wheels.py). Their values: width is
+and ``mecanum`` has four wheels and moves sideways (sim/wheels.py). Their values: width is
 that on the spot (of mecanum the rotation lever), arc at a radius of two widths.
 """
 

@@ -243,6 +243,16 @@ class Reason:
         return {'code': self.code.name, 'text': self.text, 'remedy': self.remedy}
 
 
+def gravest_first(reasons: Iterable['Reason']) -> list['Reason']:
+    """Return reasons by their gravity; those of the same gravity stay in order."""
+    return sorted(reasons, key=lambda r: -GRAVITY.index(r.code.gravity))
+
+
+def cautions(reasons: Iterable['Reason']) -> list['Reason']:
+    """Return the reasons that lower the verdict, the gravest first."""
+    return [r for r in gravest_first(reasons) if r.code.gravity is not NOTE]
+
+
 def verdict_of(reasons: Iterable['Reason']) -> Verdict:
     """Return the gravest verdict that the reasons ask for."""
     return Verdict.worst(r.code.gravity for r in reasons)

@@ -26,7 +26,7 @@ from drives import (
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import no_fix, no_imu, no_odometer, OdometerForm, take
+from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples, take
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
@@ -94,10 +94,12 @@ UNUSABLE = [
      Code.NO_ODOMETER, 'none of the 4000 odometer messages is usable'),
     (spoilt('fix', latitude=lambda a: a * np.nan), Code.FIXES_UNUSABLE,
      'none of the 1000 fix messages is usable'),
-    (lambda leg: replace(leg, imu=no_imu()), Code.NO_IMU, 'no IMU message between the marks'),
-    (lambda leg: replace(leg, odometer=no_odometer()), Code.NO_ODOMETER,
+    (lambda leg: replace(leg, imu=ImuSamples.none()), Code.NO_IMU,
+     'no IMU message between the marks'),
+    (lambda leg: replace(leg, odometer=OdometerSamples.none()), Code.NO_ODOMETER,
      'no odometer message between the marks'),
-    (lambda leg: replace(leg, fix=no_fix()), Code.NO_FIX, 'no fix message between the marks'),
+    (lambda leg: replace(leg, fix=FixSamples.none()), Code.NO_FIX,
+     'no fix message between the marks'),
     (lambda leg: replace(leg, fix=take(leg.fix, slice(500, 501))), Code.NO_FIX,
      '1 usable fix between the marks'),
     (spoilt('imu', w_i=lambda a: 0 * a), Code.NO_IMU, 'all turn rates are zero'),

@@ -14,7 +14,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.smoother.wheel_result import wheel_estimates
 from odocal_ros.calib.smoother.wheels import Wheel
 from odocal_ros.calib.wheels.wheel_slips import of_axles, WheelSlips
-from odocal_ros.data.leg import WHEELS
+from odocal_ros.data.inputs import WHEELS
 from odocal_ros.output.summary import screen as printed
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict

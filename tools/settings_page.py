@@ -78,7 +78,7 @@ def config_yaml(node: str) -> str:
             lines += ['', f'    {here}:']
             group = here
         indent = '      ' if here else '    '
-        about = setting.about + (' Fixed at start-up.' if setting.read_only else '')
+        about = setting.about + (' Fixed at start-up.' if setting.ro else '')
         notes = [about, f'[{limits(setting)}]'] if limits(setting) else [about]
         for note in notes:
             lines += textwrap.wrap(note, 97, initial_indent=f'{indent}# ',
@@ -98,7 +98,7 @@ def settings_md() -> str:
                      '| parameter | type | default | unit, values | meaning |',
                      '|---|---|---|---|---|']
             group = here
-        fixed = ' (ro)' if setting.read_only else ''
+        fixed = ' (ro)' if setting.ro else ''
         default = scalar_text(setting.default).replace("''", "`''`")
         rows.append(f'| `{name}` | {TYPES[setting.kind]}{fixed} | {default} | {limits(setting)} | '
                     f'{setting.about} |')

@@ -25,7 +25,7 @@ class Arrivals:
     """
     The stamps of one topic against their arrival.
 
-    Lag is arrival less stamp. Its least value so far, slowly forgotten, shows how early a stamp
+    Lag is arrival minus stamp. Its least value so far, slowly forgotten, shows how early a stamp
     may be: one further ahead is false, or the clock was set. ``anew`` is True once ODD_ROWS in
     turn are odd; ``odd_from`` is then the first of them in the last block.
     """

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How dead reckoning errs: covariance of position, attitude, sensors and calibration.
+Covariance of dead reckoning: position, attitude, sensors and calibration.
 
 True attitude is exp(phi) the reckoned one, in n (the odom frame); true rate (reading - bias) less
 g times itself; true path (1 + k) on an axis turned by m in b. Position, scale, mounting and gyro
@@ -39,7 +39,7 @@ GRAVITY = 9.81    # m/s^2; physical: its last digits tilt nothing
 
 class Errors:
     """
-    The errors' covariance, (16, 16), and what stops and gravity say of them.
+    The covariance of the errors, (16, 16), and its updates by stops and gravity.
 
     grade : of the IMU.   tilt, bias_sigma : rad, rad/s, sigmas at the start.   earth_left : the
     Earth's turn is in the gyro's bias.

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Odometry as the samples come: screened streams, a start, and the path from it on.
+Odometry of a stream: screened samples, a start, and the path from there.
 
 If the path cannot be continued, it restarts at its origin, with a note.
 """
@@ -62,7 +62,7 @@ class Odometry:
         return max(ahead, key=abs, default=0.0) * 1e-9
 
     def begin_anew(self, why: str) -> None:
-        """Begin where a first message would, and say why."""
+        """Restart at the origin, with a note of the cause."""
         self.restarts += 1
         self._notes.append(f'{BEGINS_ANEW}, from the origin: {why}')
         self._anew()

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is sent of odometry: poses and twists, each with its covariance."""
+"""Poses and twists of the odometry, with their covariances."""
 
 from dataclasses import dataclass
 import math
@@ -18,7 +18,7 @@ from odocal_ros.settings.levels import SWAY
 @dataclass(frozen=True, eq=False)
 class Pose:
     """
-    Where the vehicle is, and how it moved since the pose before.
+    Pose of the vehicle, and mean motion since the previous pose.
 
     stamp_ns : of the IMU.   position : (3,) m of base_link in odom.   q : (4,) x y z w of
     base_link in odom.   velocity, rate : (3,) m/s, rad/s in base_link, of base_link.

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Dead reckoning from a start on: the calibration's own strapdown and sum, corrected at stops.
+Dead reckoning with the strapdown of the calibration, corrected at stops.
 
 From one IMU sample to the next attitude is turned by the calibration's rotation increments
 (``nav/strapdown.py``) and travel summed by the trapezoid rule along the calibrated forward axis,
@@ -39,9 +39,9 @@ TILT_LOST = 0.5           # rad; judgement: sigma beyond which a straight line l
 
 class Reckoning:
     """
-    A path from a start on.
+    A path from a start.
 
-    ``failed`` says why it cannot be gone on with, for people; empty as long as it can.
+    ``failed`` is the cause why it cannot continue, for people; empty as long as it can.
     """
 
     def __init__(self, start: Start, imu: ImuStream, wheels: Wheels, vehicle: Vehicle,

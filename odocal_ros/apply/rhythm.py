@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Arrival jitter of a counter, as its rows come: times on the sender's rhythm, and what is left.
+Arrival jitter of a counter in a stream: times on the sender's rhythm, and remaining error.
 
 A counter without a header is stamped at arrival. A leg is de-jittered as a whole
 (``screening/late_rows.py``); a stream has its past: the rhythm is a line through the arrivals of

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Rows of the IMU that no vehicle makes, found as they come.
+Implausible rows of the IMU, detected in a stream.
 
 A leg is screened as a whole (``screening/glitches.py``); a stream has its past, and what follows
 within the time that a spike may take. The limits are those of the leg.
@@ -45,7 +45,7 @@ def beyond_sensor(w_b: Floats, f_b: Floats) -> Bools:
 
 class SpikeScreen:
     """
-    Sifts rows by what precedes and follows them.
+    Selects rows by the rows before and after them.
 
     A row that leaves the last one by more than a vehicle does is held until it is known whether
     the values come back (a spike: dropped) or stay (motion, or a fault that stays: released).

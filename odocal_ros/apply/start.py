@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where odometry begins: attitude, gyro bias and what is certain of them."""
+"""Start of the odometry: attitude, gyro bias and their uncertainties."""
 
 from dataclasses import dataclass
 

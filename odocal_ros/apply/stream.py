@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The IMU's samples that odometry has not left behind."""
+"""The IMU samples that the odometry still needs."""
 
 import numpy as np
 

@@ -2,29 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A leg: what the sensors said between two marks, and the recorder that collects it.
+A leg: the samples between two marks, and the recorder that collects them.
 
-The recorder is the only thing in the package that remembers; both doors feed it.
+The recorder is used live and in replay.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields, MISSING, replace
 from typing import Any, final
 
 import numpy as np
 
 from odocal_ros.data.arrays import Ints
+from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.pieces import by_row, runs
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
     ImuSamples,
-    no_fix,
-    no_heading,
-    no_imu,
-    no_odometer,
-    no_other_imu,
-    no_velocity,
     OdometerForm,
     OdometerSamples,
     OtherImuSamples,
@@ -36,13 +31,6 @@ from odocal_ros.data.samples import (
 from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
 
-# slots of the wheels, in the order of odometer.wheels. Judgement: an 8x8 truck has most
-WHEELS = ('odometer', 'odometer_right', *(f'odometer_{k}' for k in range(3, 9)))
-EMPTY: dict[str, Callable[[], Samples]] = {
-    'imu': no_imu, 'imu_other': no_other_imu, **dict.fromkeys(WHEELS, no_odometer),
-    'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
-}
-SLOTS = tuple(EMPTY)
 MOST_DAYS = 7          # judgement: of a leg
 COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
 
@@ -50,7 +38,7 @@ COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
 @dataclass(frozen=True, eq=False)
 class Leg:
     """
-    What the sensors said between two marks, with the pre-roll before the first.
+    The samples between two marks, with the pre-roll before the first.
 
     Each topic holds the rows from ``start_ns`` minus the pre-roll to the first row after
     ``stop_ns``, in order of arrival, as sent. ``odometer`` is the only wheel or the first of
@@ -60,19 +48,19 @@ class Leg:
 
     start_ns: int
     stop_ns: int
-    imu: ImuSamples = field(default_factory=no_imu)
-    imu_other: OtherImuSamples = field(default_factory=no_other_imu)
-    odometer: OdometerSamples = field(default_factory=no_odometer)
-    odometer_right: OdometerSamples = field(default_factory=no_odometer)
-    odometer_3: OdometerSamples = field(default_factory=no_odometer)
-    odometer_4: OdometerSamples = field(default_factory=no_odometer)
-    odometer_5: OdometerSamples = field(default_factory=no_odometer)
-    odometer_6: OdometerSamples = field(default_factory=no_odometer)
-    odometer_7: OdometerSamples = field(default_factory=no_odometer)
-    odometer_8: OdometerSamples = field(default_factory=no_odometer)
-    fix: FixSamples = field(default_factory=no_fix)
-    fix_velocity: VelocitySamples = field(default_factory=no_velocity)
-    heading: HeadingSamples = field(default_factory=no_heading)
+    imu: ImuSamples = field(default_factory=ImuSamples.none)
+    imu_other: OtherImuSamples = field(default_factory=OtherImuSamples.none)
+    odometer: OdometerSamples = field(default_factory=OdometerSamples.none)
+    odometer_right: OdometerSamples = field(default_factory=OdometerSamples.none)
+    odometer_3: OdometerSamples = field(default_factory=OdometerSamples.none)
+    odometer_4: OdometerSamples = field(default_factory=OdometerSamples.none)
+    odometer_5: OdometerSamples = field(default_factory=OdometerSamples.none)
+    odometer_6: OdometerSamples = field(default_factory=OdometerSamples.none)
+    odometer_7: OdometerSamples = field(default_factory=OdometerSamples.none)
+    odometer_8: OdometerSamples = field(default_factory=OdometerSamples.none)
+    fix: FixSamples = field(default_factory=FixSamples.none)
+    fix_velocity: VelocitySamples = field(default_factory=VelocitySamples.none)
+    heading: HeadingSamples = field(default_factory=HeadingSamples.none)
     form: OdometerForm = COUNTER
     form_right: OdometerForm | None = None
 
@@ -86,9 +74,15 @@ class Leg:
         return self.form_right or self.form if slot == WHEELS[1] else self.form
 
 
+# slot -> function that returns no rows
+EMPTY = {one.name: one.default_factory for one in fields(Leg)
+         if one.default_factory is not MISSING}
+SLOTS = tuple(EMPTY)
+
+
 @final
 class LegRecorder:
-    """Collects blocks until a leg is closed; how a stream was chopped leaves no trace."""
+    """Collects blocks until a leg is closed; the result does not depend on their sizes."""
 
     def __init__(self) -> None:
         self._rows = {slot: Rows(nothing) for slot, nothing in EMPTY.items()}
@@ -103,7 +97,7 @@ class LegRecorder:
             self._newest[slot] = int(block.stamp_ns[-1])
 
     def adopt(self, slot: str, other: 'LegRecorder', own: str) -> None:
-        """Hold the rows that another recorder has of a slot of its own, where it has any."""
+        """Use the rows of a slot of another recorder, if it has any."""
         if len(other.rows(own).stamp_ns):
             self._rows[slot] = other._rows[own].snapshot()
             self._newest[slot] = other._newest[own]

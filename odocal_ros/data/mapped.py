@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Arrays that lie in files without a name: hours of samples, and what is worked in for so long.
+Arrays in files without a name: hours of samples, and work space of that length.
 
 For readers they are normal arrays. ``let_go`` gives back the memory of all of them
 once they are large: released data is read again on access. If the disk takes no more, arrays are
@@ -52,7 +52,7 @@ def room(*shape: int, dtype: DTypeLike = float) -> NDArray[Any]:
 
 
 def let_go() -> None:
-    """Give back the memory of arrays in files, if it is much; they can be used as before."""
+    """Release the memory of arrays in files if it is large; they stay usable."""
     with _lock:
         maps = list(_maps)
     if sum(map(len, maps)) > HELD_BYTES:

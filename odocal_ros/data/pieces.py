@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Long columns some rows at a time: row by row, step by step, medians; to the last bit as if at once.
+Long columns processed in pieces, with the same bits as at once.
 
 The IMU of a long leg is most of the memory that a computation takes, and each column as long as it
 is as much again.
@@ -23,7 +23,7 @@ PIECE_ROWS = 2**16    # judgement: rows
 
 
 def chunks(n: int) -> Iterator[slice]:
-    """Yield slices of n rows; what lies in files is let go after each."""
+    """Yield slices of n rows; memory of arrays in files is released after each."""
     for first in range(0, n, PIECE_ROWS):
         yield slice(first, min(first + PIECE_ROWS, n))
         let_go()

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Samples: what the sensors said, as frozen arrays, one row or a million.
+Samples of the sensors as read-only arrays, of one row or a million.
 
 Rows stand in order of arrival and hold what was sent, NaN and stale stamps included;
 ``screening/screen.py`` decides what is usable. ``stamp_ns`` is the header stamp (arrival where a
@@ -11,8 +11,8 @@ is used to compare clocks and never enters a result.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, Field, field, fields
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,66 +21,84 @@ from odocal_ros.data.arrays import Bools, Floats, Ints, Values
 from odocal_ros.errors import BadData
 
 Stamps = Ints
-# definition: of no rows
-NO_STAMPS = np.empty(0, np.int64)
 FRAME_BYTES = 48     # judgement: of a frame_id that is shown
-FRAME = f'S{FRAME_BYTES}'
 # format: status of a position in a local frame; that of a NavSatFix is an int8
 LOCAL = 1000
-NONE, NONE_OF_3, NONE_OF_4 = np.empty(0), np.empty((0, 3)), np.empty((0, 4))
+
+
+def column(*shape: int, dtype: Any = np.float64) -> Any:
+    """Declare a column of samples: the shape of each row, and the type of its values."""
+    return field(metadata={'shape': shape, 'dtype': np.dtype(dtype)})
 
 
 @dataclass(frozen=True, eq=False)
-class ImuSamples:
+class Samples:
+    """Rows of one topic; all columns are read-only arrays of the same length n."""
+
+    stamp_ns: Stamps = column(dtype=np.int64)       # (n,)
+    received_ns: Stamps = column(dtype=np.int64)    # (n,)
+
+    def __post_init__(self) -> None:
+        """Copy each column to a read-only array; raise BadData for a wrong shape."""
+        n = len(self.stamp_ns)
+        for one in fields(self):
+            shape = n, *one.metadata['shape']
+            array = np.array(getattr(self, one.name), dtype=self._dtype(one), order='C')
+            if array.shape != shape:
+                raise BadData(f'{type(self).__name__}.{one.name}: required shape {shape}, found '
+                              f'{array.shape}')
+            array.setflags(write=False)
+            object.__setattr__(self, one.name, array)
+
+    def _dtype(self, one: Field[Any]) -> Any:
+        return one.metadata['dtype']
+
+    @classmethod
+    def none(cls) -> Self:
+        """Return a block without rows."""
+        return cls(*(np.empty((0, *one.metadata['shape']), one.metadata['dtype'])
+                     for one in fields(cls)))
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples(Samples):
     """IMU rows, in the sensor's own frame i (before the nominal mounting rotation)."""
 
-    stamp_ns: Stamps      # (n,)
-    received_ns: Stamps   # (n,)
-    w_i: Floats           # (n, 3) rad/s, turn rate against inertial space
-    f_i: Floats           # (n, 3) m/s^2, specific force
-    q_ni: Floats          # (n, 4) x y z w, orientation as sent: takes i to ENU
-    yaw_variance: Floats  # (n,)   rad^2, orientation_covariance[8]; 0 unknown, NaN no orientation
-
-    def __post_init__(self) -> None:
-        freeze(self, w_i=(3,), f_i=(3,), q_ni=(4,), yaw_variance=())
+    w_i: Floats = column(3)        # rad/s, turn rate against inertial space
+    f_i: Floats = column(3)        # m/s^2, specific force
+    q_ni: Floats = column(4)       # x y z w, orientation as sent: takes i to ENU
+    yaw_variance: Floats = column()    # rad^2; 0 unknown, NaN no orientation
 
 
 @dataclass(frozen=True, eq=False)
-class OtherImuSamples:
+class OtherImuSamples(Samples):
     """Messages on the IMU topic that are of another frame_id than the IMU in use."""
 
-    stamp_ns: Stamps      # (n,)
-    received_ns: Stamps   # (n,)
-    frame: NDArray[np.bytes_]     # (n,) frame_id as sent, the first FRAME_BYTES
-    used: NDArray[np.bytes_]      # (n,) frame_id of the IMU in use
-
-    def __post_init__(self) -> None:
-        freeze(self, frame=((), FRAME), used=((), FRAME))
+    frame: NDArray[np.bytes_] = column(dtype=f'S{FRAME_BYTES}')    # as sent, the first bytes
+    used: NDArray[np.bytes_] = column(dtype=f'S{FRAME_BYTES}')     # of the IMU in use
 
 
 @dataclass(frozen=True, eq=False)
-class OdometerSamples:
-    """Odometer rows as sent; ``OdometerForm`` says what the value means."""
+class OdometerSamples(Samples):
+    """Odometer rows as sent; ``OdometerForm`` defines the meaning of the values."""
 
-    stamp_ns: Stamps     # (n,)
-    received_ns: Stamps  # (n,)
-    value: Values        # (n,) int64 for counters (uint64 as its int64 bits), else float64
+    value: Values = column()       # int64 for counters (uint64 as its int64 bits), else float64
 
-    def __post_init__(self) -> None:
-        whole = np.issubdtype(np.asarray(self.value).dtype, np.integer)
-        freeze(self, value=((), np.int64 if whole else np.float64))
+    def _dtype(self, one: Field[Any]) -> Any:
+        whole = one.name == 'value' and np.issubdtype(np.asarray(self.value).dtype, np.integer)
+        return np.int64 if whole else super()._dtype(one)
 
 
 @dataclass(frozen=True)
 class OdometerForm:
     """
-    What an odometer value means.
+    Meaning of an odometer value.
 
     ``quantity`` is ``cumulative`` (a counter or angle), ``increment`` (since the row before) or
     ``rate`` (m/s, or rad/s of a joint). ``modulus`` is the counter's span in counts, 0 for values
     that do not roll over. ``scale_unit`` is the unit of the scale factor: ``m/pulse``, ``m/rad``
     or ``1``. ``sides`` is false for two values with unknown sides (left or right wheel):
-    only their mean has a meaning. ``chosen`` says what the reader took of a message, unasked.
+    only their mean has a meaning. ``chosen`` explains the automatic selection of wheels.
     """
 
     quantity: str
@@ -91,7 +109,7 @@ class OdometerForm:
 
 
 @dataclass(frozen=True, eq=False)
-class FixSamples:
+class FixSamples(Samples):
     """
     GNSS fixes, or positions in a local frame: those have the status LOCAL.
 
@@ -99,65 +117,32 @@ class FixSamples:
     and z are then east, north and up, but its y axis does not point to north.
     """
 
-    stamp_ns: Stamps           # (n,)
-    received_ns: Stamps        # (n,)
-    latitude: Floats           # (n,) rad
-    longitude: Floats          # (n,) rad
-    height: Floats             # (n,) m, ellipsoidal
-    covariance_n: Floats       # (n, 3, 3) m^2, ENU
-    covariance_type: Ints      # (n,) 0 unknown .. 3 known
-    status: Ints               # (n,) NavSatStatus: -1 no fix .. 2; or LOCAL
-
-    def __post_init__(self) -> None:
-        freeze(self, latitude=(), longitude=(), height=(), covariance_n=(3, 3),
-               covariance_type=((), np.int64), status=((), np.int64))
+    latitude: Floats = column()                     # rad
+    longitude: Floats = column()                    # rad
+    height: Floats = column()                       # m, ellipsoidal
+    covariance_n: Floats = column(3, 3)             # m^2, ENU
+    covariance_type: Ints = column(dtype=np.int64)  # 0 unknown .. 3 known
+    status: Ints = column(dtype=np.int64)           # NavSatStatus: -1 no fix .. 2; or LOCAL
 
 
 @dataclass(frozen=True, eq=False)
-class VelocitySamples:
+class VelocitySamples(Samples):
     """GNSS velocity, ENU."""
 
-    stamp_ns: Stamps     # (n,)
-    received_ns: Stamps  # (n,)
-    velocity_n: Floats   # (n, 3) m/s
-    variance_n: Floats   # (n, 3) (m/s)^2, 0 unknown
-
-    def __post_init__(self) -> None:
-        freeze(self, velocity_n=(3,), variance_n=(3,))
+    velocity_n: Floats = column(3)   # m/s
+    variance_n: Floats = column(3)   # (m/s)^2, 0 unknown
 
 
 @dataclass(frozen=True, eq=False)
-class HeadingSamples:
-    """Outside heading of the IMU's x axis, as ENU yaw."""
+class HeadingSamples(Samples):
+    """External heading of the IMU's x axis, as ENU yaw."""
 
-    stamp_ns: Stamps      # (n,)
-    received_ns: Stamps   # (n,)
-    q_ni: Floats          # (n, 4) x y z w, as sent
-    yaw_variance: Floats  # (n,) rad^2; 0 unknown, NaN no orientation
-
-    def __post_init__(self) -> None:
-        freeze(self, q_ni=(4,), yaw_variance=())
+    q_ni: Floats = column(4)           # x y z w, as sent
+    yaw_variance: Floats = column()    # rad^2; 0 unknown, NaN no orientation
 
 
-Samples = (ImuSamples | OtherImuSamples | OdometerSamples | FixSamples | VelocitySamples
-           | HeadingSamples)
 SomeSamples = TypeVar('SomeSamples', bound=Samples)
 Index = slice | Ints | Bools      # of rows
-
-
-def freeze(owner: Samples, **rows: Any) -> None:
-    """Swap each field for a read-only array; rows give the shape after n, or (shape, dtype)."""
-    n = len(owner.stamp_ns)
-    wanted = {'stamp_ns': ((), np.int64), 'received_ns': ((), np.int64)} | rows
-    for name, row in wanted.items():
-        shape, dtype = row if row and isinstance(row[0], tuple) else (row, np.float64)
-        given = np.asarray(getattr(owner, name))
-        array = np.array(given, dtype=dtype, order='C')
-        if array.shape != (n, *shape):
-            raise BadData(f'{type(owner).__name__}.{name}: required shape {(n, *shape)}, found '
-                          f'{array.shape}')
-        array.setflags(write=False)
-        object.__setattr__(owner, name, array)
 
 
 def take(samples: SomeSamples, index: Index) -> SomeSamples:
@@ -186,34 +171,3 @@ def of_columns(kind: type[SomeSamples], *columns: NDArray[Any]) -> SomeSamples:
         array.setflags(write=False)
         object.__setattr__(samples, name, array)
     return samples
-
-
-def no_imu() -> ImuSamples:
-    """Return an empty block."""
-    return ImuSamples(NO_STAMPS, NO_STAMPS, NONE_OF_3, NONE_OF_3, NONE_OF_4, NONE)
-
-
-def no_other_imu() -> OtherImuSamples:
-    """Return an empty block."""
-    return OtherImuSamples(NO_STAMPS, NO_STAMPS, np.empty(0, FRAME), np.empty(0, FRAME))
-
-
-def no_odometer() -> OdometerSamples:
-    """Return an empty block."""
-    return OdometerSamples(NO_STAMPS, NO_STAMPS, NONE)
-
-
-def no_fix() -> FixSamples:
-    """Return an empty block."""
-    return FixSamples(NO_STAMPS, NO_STAMPS, NONE, NONE, NONE, np.empty((0, 3, 3)), NO_STAMPS,
-                      NO_STAMPS)
-
-
-def no_velocity() -> VelocitySamples:
-    """Return an empty block."""
-    return VelocitySamples(NO_STAMPS, NO_STAMPS, NONE_OF_3, NONE_OF_3)
-
-
-def no_heading() -> HeadingSamples:
-    """Return an empty block."""
-    return HeadingSamples(NO_STAMPS, NO_STAMPS, NONE_OF_4, NONE)

@@ -94,7 +94,7 @@ class Rows:
             self._fresh = blocks[keep + large:]
 
     def _hold(self, blocks: list[Samples]) -> None:
-        """Hold these blocks, and no file."""
+        """Store these blocks in memory, without a file."""
         self._blocks, self._fresh, self._file, self._stop = blocks, [], None, 0
         self._size, self._fresh_size = sum(map(_size, blocks)), 0
 

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.data.leg import WHEELS
 from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, Samples
 from odocal_ros.forecast.ability import Received, stated_variance
 from odocal_ros.nav.earth import radii
-from odocal_ros.screening.clocks import remedy
+from odocal_ros.screening.clocks import offsets, remedy
 from odocal_ros.screening.leg_kind import felt
 from odocal_ros.screening.odometer_care import Steps
 from odocal_ros.settings.config import Config
@@ -71,11 +70,9 @@ class Clocks:
 
     def differing(self, config: Config) -> list[tuple[str, float]]:
         """Return (slot, s ahead of the IMU) of topics whose clock differs, offsets applied."""
-        offsets = {'fix': config.gnss.time_offset, 'fix_velocity': config.gnss.time_offset,
-                   **dict.fromkeys(WHEELS, config.odometer.time_offset)}
         result = []
         for slot, ahead in self._ahead_s.items():
-            offset = offsets.get(slot, 0.0) - config.imu.time_offset
+            offset = offsets(config)[slot]
             # latency makes a row look older: only a clock whose freshest row is behind, is behind;
             # that of an IMU's row makes others look newer: ahead are those of whom most are
             value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)

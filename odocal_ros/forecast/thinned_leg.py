@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints, Values
-from odocal_ros.data.leg import COUNTER, Leg, WHEELS
+from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.leg import COUNTER, Leg
 from odocal_ros.data.samples import (
     ImuSamples,
     join,

@@ -11,6 +11,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
+from odocal_ros.data.inputs import TOPICS
 from odocal_ros.errors import BadUsage
 from odocal_ros.outside.limits import LATEST_NS
 from odocal_ros.outside.names import brief_line, said_by
@@ -60,11 +61,10 @@ def topics_of(asked: Any) -> dict[str, str]:
     if asked is not None and not isinstance(asked, Mapping):
         raise BadUsage("topics: required: a mapping of slot to topic such as {'imu': "
                        f"'/imu/data'}}, not {type(asked).__name__}")
-    from odocal_ros.library.topics import OPTION
-    unknown = [one for one in asked or () if one not in OPTION]
+    unknown = [one for one in asked or () if one not in TOPICS]
     if unknown:
         raise BadUsage(f'topics: {brief_line(repr(unknown[0])[:100])} is no slot; required: '
-                       f'{", ".join(OPTION)}')
+                       f'{", ".join(TOPICS)}')
     return dict(asked or {})
 
 

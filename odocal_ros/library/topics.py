@@ -7,15 +7,13 @@ from collections.abc import Iterable
 import re
 
 from odocal_ros.bagio.read import TopicInfo
+from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, TRANSFORMS, VELOCITY
-from odocal_ros.settings.config import Config, DIFFERENTIAL, SIDES
+from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, TRANSFORMS, types_of
+from odocal_ros.settings.config import Config, DIFFERENTIAL, OdometerConfig, SIDES
 
-OPTION = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic',
-          'odometer_right': '--odometer-right-topic', 'heading': '--heading-topic',
-          'fix_velocity': '--fix-velocity-topic'}
 NEVER = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
 COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # asked of a vehicle, not measured
 # poses that a person sets: Nav2 and RViz
@@ -26,7 +24,7 @@ GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
 
 # an Odometry is the reference only if it is named: most are the wheel odometry itself
 REFERENCES = (FIX, *(kind for kind in LOCAL_TYPES if kind not in ODOMETERS))
-SENSORS = {'imu': (IMU,), 'heading': (IMU,), 'fix': REFERENCES, 'fix_velocity': VELOCITY}
+FIRST = ('odometer_right', 'odometer', 'heading')     # chosen first, for what they leave to others
 
 Topics = dict[str, TopicInfo]
 
@@ -76,14 +74,12 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
 
 
 def wanted(config: Config, marked: bool = False) -> tuple[str, ...]:
-    """Return the slots to fill; odometers and heading first, for what they leave to others."""
+    """Return the slots to fill, in order."""
     surveyed = config.reference.start and config.reference.end or (
         config.reference.marks or marked)
-    return (*(('odometer_right',) if config.odometer.own_topics else ()), 'odometer',
-            *(('heading',) if config.alignment.heading_source in ('auto', 'heading_topic')
-              else ()),
-            'imu', *(() if surveyed else ('fix',)),
-            *(('fix_velocity',) if config.gnss.use_velocity else ()))
+    slots = [slot for slot in config.inputs if not (slot == 'fix' and surveyed)]
+    return (*(slot for slot in FIRST if slot in slots),
+            *(slot for slot in slots if slot not in FIRST))
 
 
 def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]) -> list[str]:
@@ -121,9 +117,9 @@ def _check_reference(chosen: dict[str, str]) -> None:
     """Refuse one topic as both odometer and reference: its scale would be exactly 1."""
     for slot in ('odometer', 'odometer_right'):
         if 'fix' in chosen and chosen.get(slot) == chosen['fix']:
-            raise BadUsage(f'{chosen["fix"]} is both {OPTION[slot]} and {OPTION["fix"]}: an '
-                           'odometer cannot be calibrated against itself; name another topic for '
-                           'one of them')
+            raise BadUsage(f'{chosen["fix"]} is both {topic_option(slot)} and '
+                           f'{topic_option("fix")}: an odometer cannot be calibrated against '
+                           'itself; name another topic for one of them')
 
 
 def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str, str]) -> str:
@@ -132,7 +128,7 @@ def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str,
     if not fix or 'fix' in overrides or topics[fix].msgtype == FIX:
         return ''
     return (f'no NavSatFix with messages in the bag; position reference: {fix} '
-            f'({topics[fix].msgtype}); another one: {OPTION["fix"]}')
+            f'({topics[fix].msgtype}); another one: {topic_option("fix")}')
 
 
 def imu_needed(config: Config) -> bool:
@@ -156,25 +152,24 @@ def _of_receiver(name: str) -> bool:
 
 
 def _types(slot: str, config: Config) -> Iterable[str]:
-    if slot in ('odometer', 'odometer_right'):
-        asked = config.odometer.type
-        return ODOMETERS if asked == 'auto' else (full_type(asked),)
-    return SENSORS[slot]
+    if slot == 'fix':
+        return REFERENCES
+    return tuple(map(full_type, types_of(slot, config.odometer))) or ODOMETERS
 
 
 def named(topics: Topics, slot: str, topic: str) -> str:
     """Return the topic that a user named, with or without its leading slash."""
-    for name in (topic, f'/{topic}'):
-        if name in topics:
-            if not topics[name].count:
-                raise BadUsage(f'{OPTION[slot]} {topic}: the topic has no message; the bag has '
-                               f'{_described(topics, topics)}')
-            if not _may_serve(topics[name].msgtype, slot):
-                raise BadUsage(f'{OPTION[slot]} {topic}: the topic is of {topics[name].msgtype}, '
-                               f'which cannot be used as {_label(slot)}; the bag has '
-                               f'{_described(topics, topics)}')
-            return name
-    raise BadUsage(f'{OPTION[slot]} {topic}: no such topic; the bag has '
+    name = next((name for name in (topic, f'/{topic}') if name in topics), '')
+    if not name:
+        wrong = 'no such topic'
+    elif not topics[name].count:
+        wrong = 'the topic has no message'
+    elif not _may_serve(topics[name].msgtype, slot):
+        wrong = (f'the topic is of {topics[name].msgtype}, which cannot be used as '
+                 f'{INPUTS[slot].label}')
+    else:
+        return name
+    raise BadUsage(f'{topic_option(slot)} {topic}: {wrong}; the bag has '
                    f'{_described(topics, topics)}')
 
 
@@ -182,40 +177,34 @@ def _may_serve(msgtype: str, slot: str) -> bool:
     """Return True if a type fits a slot; odometers can have a foreign type."""
     if slot in ('odometer', 'odometer_right'):
         return full_type(msgtype) not in (IMU, FIX)
-    return full_type(msgtype) in SENSORS[slot] or slot == 'fix' and full_type(
-        msgtype) in (*LOCAL_TYPES, TRANSFORMS)
+    return full_type(msgtype) in types_of(slot, OdometerConfig())
 
 
 def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: str) -> str:
     """Return the explanation why a slot is open and the option that selects it."""
     if slot == 'odometer' and fix and not found and topics[fix].msgtype in ODOMETERS:
         return (f'no odometer in the bag besides {fix}, which is the position reference '
-                f'({OPTION["fix"]}): an odometer cannot be calibrated against itself')
+                f'({topic_option("fix")}): an odometer cannot be calibrated against itself')
     if found:
         hint = ''
         if slot == 'odometer' and {'left', 'right'} <= {
                 side for name in found for side in ('left', 'right') if side in _last(name)}:
             hint = '; for two wheels set odometer.left and odometer.right to topic'
-        return (f'{len(found)} topics can be the {_label(slot)}; choose one with {OPTION[slot]}: '
-                f'{_described(topics, found)}{hint}')
+        return (f'{len(found)} topics can be the {INPUTS[slot].label}; choose one with '
+                f'{topic_option(slot)}: {_described(topics, found)}{hint}')
     types = tuple(_types(slot, config))
     if slot == 'fix':
-        return (f'no {_label(slot)} in the bag: a topic of {" or ".join(types)}, or a '
-                f'{TRANSFORMS} or nav_msgs/msg/Odometry that is named with {OPTION[slot]}')
+        return (f'no {INPUTS[slot].label} in the bag: a topic of {" or ".join(types)}, or a '
+                f'{TRANSFORMS} or nav_msgs/msg/Odometry that is named with {topic_option(slot)}')
     what = ' or '.join(types) if len(types) < 3 else 'an odometer type'
     beside = ' besides the IMU' if slot == 'heading' else ''
-    return f'no {_label(slot)} (a topic of {what}{beside}) in the bag'
+    return f'no {INPUTS[slot].label} (a topic of {what}{beside}) in the bag'
 
 
 def _described(topics: Topics, names: Iterable[str]) -> str:
     """List topics with their types for people; those without a message are none."""
     return ', '.join(f'{name} ({topics[name].msgtype})' for name in names
                      if topics[name].count and name not in NEVER) or 'no topic with messages'
-
-
-def _label(slot: str) -> str:
-    return {'imu': 'IMU', 'odometer_right': 'right odometer', 'fix_velocity': 'GNSS velocity'
-            }.get(slot, slot)
 
 
 def _last(name: str) -> str:

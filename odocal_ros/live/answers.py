@@ -1,17 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a service answers, in one line."""
+"""Answers of the services, each as one line."""
 
 from collections.abc import Iterable, Sequence
 
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
-from odocal_ros.live.restored import Restored
+from odocal_ros.live.session import Restored
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.output.summary import sentence, values_in_words
 from odocal_ros.outside.names import said_by
-from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.reasons import cautions, Verdict
 
 MOST_REASONS = 3     # judgement: in an answer
 
@@ -31,7 +31,7 @@ def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: i
         text = (f'leg {leg_id}{cut}, {sum(one.distance for one in parts):.0f} m, '
                 f'{verdict.value}; all legs {text}')
     said = [text, good]
-    for reason in _worth_telling(calibration)[:MOST_REASONS]:
+    for reason in cautions(calibration.reasons)[:MOST_REASONS]:
         said += [f'{reason.code.name}: {reason.text}', reason.remedy]
     if advice and advice not in said:
         said.append(f'Next: {advice}')
@@ -72,15 +72,8 @@ def _sentences(parts: Iterable[str]) -> str:
     return ' '.join([*(f'{part.rstrip(".")}.' for part in before), last])
 
 
-def _worth_telling(calibration: Calibration) -> list[Reason]:
-    """Return the reasons that lowered the verdict, the gravest first."""
-    order = list(Verdict)
-    grave = [r for r in calibration.reasons if r.code.gravity is not Verdict.ACCEPTED]
-    return sorted(grave, key=lambda r: -order.index(r.code.gravity))
-
-
 def one_line(error: BaseException) -> str:
-    """Return an error as one line; one that was not foreseen says so."""
+    """Return an error as one line; an unexpected one is named an internal error."""
     text = said_by(error)
     if isinstance(error, OdocalError):
         return text

@@ -6,10 +6,9 @@
 from typing import Any
 
 from odocal_ros.data.samples import Samples
-from odocal_ros.live.filing import latest_of
+from odocal_ros.live.filing import iso, latest_of
 from odocal_ros.live.jobs import Computed, LeftOut
 from odocal_ros.live.leg_completion import LegCompletion
-from odocal_ros.live.result_files import iso
 from odocal_ros.live.session import State
 from odocal_ros.output.stored import Stored
 from odocal_ros.pipeline.automatic import LegSearch
@@ -33,7 +32,7 @@ class AutomaticWay(LegCompletion):
         self._recording.tap = self._receive
 
     def tick(self) -> None:
-        """Take over what the worker has done and what time has brought."""
+        """Process finished jobs, new messages and the time."""
         super().tick()
         self._keep_search()
         if self._search is not None and self._search.spans:
@@ -45,7 +44,7 @@ class AutomaticWay(LegCompletion):
             self._search.feed(slot, block, self._recording.inputs.form)
 
     def _keep_search(self) -> None:
-        """Have a search of the settings in force, none where nobody asks for it."""
+        """Create the search for the settings in force; none without leg.automatic."""
         leg = self._config().leg
         wanted = leg if leg.automatic else None
         if wanted == self._searched:
@@ -56,7 +55,7 @@ class AutomaticWay(LegCompletion):
             self._go_on()
 
     def _go_on(self) -> None:
-        """Take up what earlier runs of the node have left."""
+        """Continue with the carried result of earlier runs of the node."""
         found = latest_of(self._config(), self._node_name)
         if not found or not found.carried:
             return
@@ -86,7 +85,7 @@ class AutomaticWay(LegCompletion):
                 self._begin_leg(span.start_ns, by_itself=True)
 
     def end_leg_now(self) -> None:
-        """End the leg by the operator's wish, or for its length; it counts as one of his."""
+        """End the leg, by service or for its length; it counts as a leg of the operator."""
         self.session.by_itself = False
         super().end_leg_now()
         self._look_after(self.session.stop_ns, at_rest=False)

@@ -21,7 +21,7 @@ PATIENCE_S = 4.0
 
 class Computing:
     """
-    At most one job that counts; what a dropped one brings is thrown away.
+    At most one active job; the result of a dropped one is ignored.
 
     ``failed(trouble)`` is called for a job that raised, or whose result could not be taken;
     ``done()`` is called after each that counted. ``alive()`` is false while the node is shut
@@ -36,7 +36,7 @@ class Computing:
         self.at = Stage()
 
     def report(self, stage: Stage) -> None:
-        """Take over how far the job is; called by the worker's thread."""
+        """Store the progress of the job; called by the worker's thread."""
         self.at = stage
         give_back()      # what the pass before needed
 
@@ -63,7 +63,7 @@ class Computing:
         self._worker.submit(job, then)
 
     def drop(self) -> None:
-        """Let the job count no more."""
+        """Drop the job: its result will be ignored."""
         self._job = None
 
     def promise(self, patience_s: float = math.inf) -> Future:
@@ -73,7 +73,7 @@ class Computing:
         return future
 
     def answer(self, success: bool, text: str) -> None:
-        """Answer all who wait."""
+        """Answer all waiting callers."""
         waiting, self._waiting = self._waiting, []
         for future, _ in waiting:
             future.set_result((success, text))

@@ -4,21 +4,80 @@
 """Console log of the node: missing inputs, readiness, failures."""
 
 import re
+from typing import Any
 
-from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
-from odocal_ros.live.waiting_messages import LossReport
+from odocal_ros.outside.names import brief_line
 from odocal_ros.reasons import Code
 
 # judgement: of waiting, until it is said, and said again
 SILENCE_FIRST_NS, SILENCE_SELDOM_NS = 5 * 10**9, 3600 * 10**9
+# judgement: growth of a count of lost messages after which it is reported again
+LOSS_FACTOR = 10
 NUMBER = re.compile(r'\d+')
+
+
+class PlainLog:
+    """A logger of rclpy that only gets single lines without control characters."""
+
+    def __init__(self, logger: Any) -> None:
+        self._logger = logger
+
+    # rclpy distinguishes callers by their lines, and wants one severity of each
+    def debug(self, text: str) -> None:
+        """Log for developers."""
+        self._logger.debug(brief_line(text))
+
+    def info(self, text: str) -> None:
+        """Log normal events."""
+        self._logger.info(brief_line(text))
+
+    def warning(self, text: str) -> None:
+        """Log problems that the operator can fix."""
+        self._logger.warning(brief_line(text))
+
+    def error(self, text: str) -> None:
+        """Log failures."""
+        self._logger.error(brief_line(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._logger, name)
+
+
+class LossReport:
+    """Reports counts of lost messages; a topic again at LOSS_FACTOR times the count."""
+
+    def __init__(self) -> None:
+        self._said: dict[str, int] = {}
+
+    def news(self, lost: dict[str, int]) -> list[str]:
+        """
+        Return the new sentences.
+
+        lost : topic -> messages so far; fewer than before: a new count.
+        """
+        found = []
+        for topic, count in lost.items():
+            said = self._said.get(topic, 0)
+            if count < said:
+                said = self._said[topic] = 0
+            if count >= max(1, LOSS_FACTOR * said):
+                self._said[topic] = count
+                found.append(f'{losses_in_words({topic: count})}. Likely cause: CPU load or '
+                             'network. Reduce the load, or set the QoS of the topic to reliable')
+        return found
+
+
+def losses_in_words(lost: dict[str, int]) -> str:
+    """Return the counts as text, empty if nothing was lost in a queue or on the network."""
+    return ', '.join(f'{count} message{"s" * (count != 1)} of {topic} lost'
+                     for topic, count in lost.items() if count)
 
 
 class Console:
     """
-    Turns what changes into lines of the log; what stays is repeated seldom.
+    Logs changes of the status; what persists is repeated at growing intervals.
 
     ``report`` receives every view, with the time of a steady clock.
     """

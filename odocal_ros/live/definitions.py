@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Message classes by name, and their definitions, so that a journal can be read anywhere."""
+"""Message classes by name, and their definitions for the journal."""
 
 import importlib
 from importlib.machinery import PathFinder

@@ -1,20 +1,15 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node that drives a robot along a pattern, between ``~/start`` and whatever stops it."""
+"""The node that drives a robot along a pattern, from ``~/start`` to a cause to stop."""
 
 import math
 import signal
-import sys
 import time
 from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.executors import Executor
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -25,7 +20,6 @@ from odocal_ros.live.definitions import message_class
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.pattern.follow import command, moved, Pose, Progress, why_stop
 from odocal_ros.pattern.route import Piece, rectangle_of, route_of
-from odocal_ros.settings.config import settings_of
 from odocal_ros.settings.pattern_config import PatternConfig
 
 PERIOD_S = 0.05       # judgement: base controllers stop after 0.2 s or more without a command
@@ -70,14 +64,13 @@ class DrivePattern(SettledNode):
                                                 'cmd_vel', 1)
         self.create_service(Trigger, '~/start', self._start)
         self.create_service(Trigger, '~/stop', self._stop)
-        self.add_on_set_parameters_callback(self._refuse)
-        # on the steady clock: a paused or missing /clock must not keep the robot driving
-        self.create_timer(PERIOD_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.add_on_set_parameters_callback(params.fixed(PatternConfig))
+        self.steady_timer(PERIOD_S, self._tick)
         self.get_logger().info(f'ready: {self.config.pattern} in the rectangle {self._rectangle}, '
                                f'at most {self.config.speed:g} m/s; call ~/start')
 
     def spin(self, executor: Executor) -> None:
-        """Handle what comes until a signal; the robot is stopped before the context ends."""
+        """Process callbacks until a signal; the robot is stopped before the context ends."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._end)
         while self.context.ok() and not self._ending:
@@ -188,16 +181,7 @@ class DrivePattern(SettledNode):
         stamped.header.frame_id = 'base_link'
         self._publisher.publish(stamped)
 
-    def _refuse(self, parameters: list[Parameter]) -> SetParametersResult:
-        ours = [p.name for p in parameters if p.name in settings_of(PatternConfig)]
-        return SetParametersResult(successful=not ours, reason=(
-            f'{ours[0]} is only read at start-up: restart the node with it') if ours else '')
-
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until it must stop; see ``process.run``."""
     return run('drive_pattern', HELP, DrivePattern, args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -4,27 +4,88 @@
 """Result files: written by the worker, answered by a future."""
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
+from datetime import datetime, UTC
 from functools import partial
+import os
 from pathlib import Path
 from typing import Any
 
 from rclpy.task import Future
 
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.live import answers, result_files as outputs
-from odocal_ros.live.plain_log import PlainLog
+from odocal_ros.errors import OdocalError
+from odocal_ros.live import answers
+from odocal_ros.live.console import PlainLog
 from odocal_ros.live.result_folders import LATEST, ResultFolders
 from odocal_ros.live.worker import Worker
 from odocal_ros.output.stored import Stored
 from odocal_ros.output.worse import stored_in
+from odocal_ros.outside.whole import new_folder
 from odocal_ros.settings.config import Config
+
+
+def iso(stamp_ns: int) -> str:
+    """Return a stamp as ISO 8601, UTC, seconds."""
+    return f'{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}'
+
+
+def output_root(config: Config, node: str) -> Path:
+    """Return the folder of results: the setting, else the node's own folder in the ROS home."""
+    home = os.environ.get('ROS_HOME') or '~/.ros'
+    own = Path(home) / 'odocal' / node.lstrip('/')
+    return Path(config.output.directory or own).expanduser()
+
+
+def _save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]], imu_frame: str,
+         now_ns: int, folders: ResultFolders, force: bool,
+         ) -> tuple[Path, str, Callable[[], str] | None]:
+    """
+    Write the result files into a folder named by the time, and point ``latest`` at it.
+
+    ``inputs`` name the node. ``imu_frame`` is that of the IMU's headers, for a ``frames.imu``
+    left empty. Returns the folder, why ``latest`` stays where it was, empty when it does not
+    (``force`` moves it), and what adds the report, which takes long to draw.
+
+    Raises
+    ------
+    OdocalError
+        The folder cannot be written.
+
+    """
+    from odocal_ros.output.files import Results
+    from odocal_ros.output.ros_files import framed
+    calibration, config = framed(calibration, config, imu_frame)
+    root = output_root(config, inputs[0]['node'])
+    name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
+    try:
+        folder = new_folder(root, name)
+        try:
+            results = Results(calibration, config, folder, inputs, iso(now_ns))
+            results.write()
+        except OdocalError:
+            with suppress(OSError):
+                folder.rmdir()      # empty: its name was only reserved
+            raise
+        stays = folders.file(folder, marks(calibration.legs), force)
+        if config.leg.automatic:
+            folders.prune(folder, config.output.automatic_kept)
+    except OSError as error:
+        raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
+                          'output.directory to a writable folder') from None
+    return folder, stays, results.draw if results.has_report else None
+
+
+def marks(legs: Iterable[LegResult]) -> frozenset[int]:
+    """Return the start marks of legs, ns: by them a session knows its legs."""
+    return frozenset(leg.start_ns for leg in legs)
 
 
 class Filing:
     """
     Saves results and takes them back.
 
-    saved : the newest folder that still stands.   trouble : why the newest result has none.
+    saved : the newest folder that is not withdrawn.   trouble : of the newest result.
     """
 
     def __init__(self, worker: Worker, log: PlainLog, show: Callable[[], None], node: str) -> None:
@@ -41,7 +102,7 @@ class Filing:
         """
         Write the result files in the worker; the future has (success, text).
 
-        asked : by the operator. ``latest`` does not go to a worse result, unless he asks again.
+        asked : by the operator. ``latest`` moves to a worse result only at the second request.
         """
         future = Future()
         self._under_way += 1
@@ -76,7 +137,7 @@ class Filing:
 
     def _write(self, *values: Any) -> tuple[Path, str]:
         """Write the numbers; for the worker."""
-        folder, stays, draw = outputs.save(*values)
+        folder, stays, draw = _save(*values)
         if draw is not None:
             self._artist.submit(draw, self._drawn)
         return folder, stays
@@ -87,15 +148,15 @@ class Filing:
                               f'{answers.one_line(error) if error else why}')
 
     def poll(self) -> None:
-        """Take over what has been drawn."""
+        """Log reports that could not be drawn."""
         self._artist.poll()
 
     def close(self, grace_s: float) -> bool:
-        """Let the report be drawn, waiting a moment for it; return whether it is."""
+        """Wait up to ``grace_s`` for the report; return True if it is drawn."""
         return self._artist.close(grace_s)
 
     def withdraw(self, left: Iterable[LegResult]) -> None:
-        """Let ``latest`` and ``saved`` go back to what holds only the legs left."""
+        """Move ``latest`` and ``saved`` back to the newest result of the remaining legs only."""
         self.trouble = ''
 
         def then(folder: Path | None, error: Exception | None) -> None:
@@ -105,9 +166,9 @@ class Filing:
                                   f'{answers.one_line(error)}')
             self._show()
 
-        self._worker.submit(partial(self._folders.withdraw, outputs.marks(left)), then)
+        self._worker.submit(partial(self._folders.withdraw, marks(left)), then)
 
 
 def latest_of(config: Config, node: str) -> Stored | None:
     """Return the result that earlier runs of a node hold for the best, None without."""
-    return stored_in(outputs.output_root(config, node) / LATEST)
+    return stored_in(output_root(config, node) / LATEST)

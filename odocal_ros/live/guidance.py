@@ -11,7 +11,7 @@ from odocal_ros.forecast.forecast import REST_FORESEEN_S
 from odocal_ros.forecast.progress import clocks_differ
 from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
-from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.reasons import cautions, Reason
 
 KMH = 3.6    # definition: km/h in a m/s
 FORECAST_OLD_S = 15.0    # judgement: age from which what is foreseen is said to be old
@@ -45,7 +45,7 @@ def hint(now: SessionView) -> str:
 
 
 def action_first(now: SessionView) -> str:
-    """Return the hint for one line to watch: in a leg what to do stands before what is known."""
+    """Return the hint for a single line: in a leg the action comes before the estimate."""
     fine = not (now.lost_cause or now.missing or now.clocks)
     if now.session.state is State.RECORDING and fine:
         actions, facts = _while_recording(now)
@@ -163,10 +163,7 @@ def after_result(now: SessionView) -> str:
     lacking = config.verdict.min_legs - len(now.session.legs)
     if lacking > 0:
         return f'drive {lacking} more leg{"s" * (lacking > 1)}'
-    order = list(Verdict)
-    grave = sorted((r for r in reasons if r.code.gravity is not Verdict.ACCEPTED),
-                   key=lambda r: -order.index(r.code.gravity))
-    if grave:
+    if grave := cautions(reasons):
         return grave[0].remedy
     saved = config.output.autosave or now.saved
     text = 'drive on: legs start and end automatically'

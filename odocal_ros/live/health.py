@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How well one topic arrives: counts, rate, gaps, losses. Knows nothing of ROS."""
+"""Health of one topic: counts, rate, gaps, losses; without ROS."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ WILD_STAMP_NS = 30 * 10**9
 
 class Health:
     """
-    What is known of one topic's arrival.
+    Counts and times of the messages of one topic.
 
-    ``newest_ns`` is the newest usable stamp, on the sender's clock; ``heard_ns`` when the last
+    ``newest_ns`` is the newest usable stamp, on the sender's clock; ``received_ns`` when the last
     message came, on the node's steady clock: the age of a topic must not depend on sim time.
     """
 
@@ -60,9 +60,9 @@ class Health:
 
     def decoded(self, block: Samples, max_gap_s: float | None = None) -> Bools:
         """
-        Take over the stamps of a block; a gap is a step beyond the limit (or 5 intervals).
+        Process the stamps of a block; a gap is a step beyond the limit (or 5 intervals).
 
-        Returns which rows have a stamp to reckon with: none that is zero, or wild.
+        Returns a mask of rows with a plausible stamp: not zero, not far ahead or behind.
         """
         self.count += len(block.stamp_ns)
         if isinstance(block, FixSamples) and len(block.status):

@@ -1,26 +1,21 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node's inputs: the topics that a configuration asks for."""
+"""The node's inputs: the topics that a configuration uses."""
 
 from rclpy.node import Node
 
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.errors import BadUsage
-from odocal_ros.live.static_transforms import StaticTransforms
-from odocal_ros.live.topic_input import Input
-from odocal_ros.messages.sensor_types import LOCAL_TYPES, TRANSFORMS
+from odocal_ros.live.topic_input import Input, StaticTransforms
+from odocal_ros.messages.sensor_types import types_of
 from odocal_ros.settings.config import Config
-
-IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
-REFERENCES = (FIX, *LOCAL_TYPES, TRANSFORMS)
-VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
 
 LOOK_AROUND_S = 1.0     # judgement: between two looks for publishers
 
 
 class Inputs:
-    """All topics of the node, those that a configuration asks for."""
+    """All topics of the node that a configuration uses."""
 
     def __init__(self, node: Node, config: Config) -> None:
         self._node = node
@@ -42,7 +37,7 @@ class Inputs:
                                'against itself; remap one of them to another topic')
 
     def update(self, config: Config) -> None:
-        """Add the topics that the configuration asks for, and look for publishers."""
+        """Add the topics that the configuration uses, and look for publishers."""
         for slot, allowed in _wanted(config).items():
             if slot not in self.by_slot:
                 self.by_slot[slot] = Input(self._node, slot, allowed)
@@ -101,15 +96,6 @@ class Inputs:
 
 def _wanted(config: Config) -> dict[str, tuple[str, ...]]:
     """Return slot -> message types allowed (empty: any) for the topics a configuration needs."""
-    odometer: tuple[str, ...] = () if config.odometer.type == 'auto' else (config.odometer.type,)
-    wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer,
-                                          'fix': REFERENCES}
-    if config.reference.points:     # the positions are those of marks
-        del wanted['fix']
-    if config.odometer.own_topics:
-        wanted['odometer_right'] = odometer
-    if config.gnss.use_velocity:
-        wanted['fix_velocity'] = VELOCITY
-    if config.alignment.heading_source in ('auto', 'heading_topic'):
-        wanted['heading'] = (IMU,)
-    return wanted
+    by_marks = bool(config.reference.points)    # the positions are those of marks
+    return {slot: types_of(slot, config.odometer) for slot in config.inputs
+            if not (slot == 'fix' and by_marks)}

@@ -1,19 +1,21 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The heavy work, as the worker thread runs it: pure of the node and its state."""
+"""The computations of the worker thread, without access to the node and its state."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import Path as PathMessage
+import numpy as np
 from std_msgs.msg import Header
 
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
-from odocal_ros.live.result_files import paths
 from odocal_ros.live.session import LEGS_HELD
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold, refusal
@@ -22,13 +24,14 @@ from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
+MOST_POSES = 2000    # judgement: of a path shown
 Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, reference
 
 
 @dataclass(frozen=True, eq=False)
 class Computed:
     """
-    What a leg gave.
+    Result of a leg.
 
     results : one, or one of each part where the IMU had a gap.
     carried, folded : information of earlier legs, and how many kept legs are in it.
@@ -75,6 +78,20 @@ def recombine(kept: list[LegResult], config: Config, carried: Carried | None = N
 def leg_paths(result: LegResult | None, config: Config) -> Paths:
     """Return the two paths of a leg, empty ones without a leg."""
     header = Header(frame_id=config.frames.local)
-    if result is not None:
-        header.stamp.sec, header.stamp.nanosec = divmod(result.stop_ns, 10**9)
-    return paths(result, header)
+    if result is None:
+        return PathMessage(header=header), PathMessage(header=header)
+    header.stamp.sec, header.stamp.nanosec = divmod(result.stop_ns, 10**9)
+    return _path(result.track_n, header), _path(result.reference_n, header)
+
+
+def _path(track_n: Floats | None, header: Header) -> PathMessage:
+    """Return a track, (m, 3) in n, as a Path of at most MOST_POSES, the last row included."""
+    if track_n is None or not len(track_n):
+        return PathMessage(header=header)
+    few = min(len(track_n), MOST_POSES)
+    rows = np.linspace(0, len(track_n) - 1, few).round().astype(int)
+    upright = Quaternion(w=1.0)
+    return PathMessage(header=header, poses=[
+        PoseStamped(header=header, pose=Pose(
+            position=Point(x=float(x), y=float(y), z=float(z)), orientation=upright))
+        for x, y, z in track_n[rows]])

@@ -4,26 +4,24 @@
 """
 The journal: each leg as a bag on the disk while it is driven, so that nothing of it is lost.
 
-This side runs with the callbacks and only collects; ``JournalWriter`` has a thread of its own.
+This part runs with the callbacks and only collects; ``JournalWriter`` has its own thread.
 """
 
 from datetime import datetime, UTC
+import time
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 
 from odocal_ros import __version__
 from odocal_ros.live.definitions import message_class
+from odocal_ros.live.filing import output_root
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_writer import JournalWriter, Received
 from odocal_ros.live.recording import PREROLL_MARGIN_S
-from odocal_ros.live.result_files import output_root
 from odocal_ros.live.session import Session
-from odocal_ros.live.static_transforms import StaticTransforms
-from odocal_ros.live.topic_input import Input
+from odocal_ros.live.topic_input import Input, StaticTransforms
 from odocal_ros.outside.names import for_shell
 from odocal_ros.outside.yaml_text import parameters
 from odocal_ros.settings.config import Config, flat
@@ -50,7 +48,6 @@ class Journal:
     def __init__(self, node: Node, topic: str) -> None:
         self._log, self._clock, self._topic = node.get_logger(), node.get_clock(), topic
         self._node = node.get_fully_qualified_name()
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._writer = JournalWriter()
         self._batch: dict[str, Received] = {}
         self._marks: Received | None = None
@@ -86,8 +83,8 @@ class Journal:
         received.newest_ns = source.newest_ns
 
     def tick(self, config: Config, busy: bool) -> None:
-        """Hand over what has come if it is time to; join a leg's files once nobody waits."""
-        now_ns = self._steady.now().nanoseconds
+        """Hand over new messages if due; join the files of a leg once nobody waits for it."""
+        now_ns = time.monotonic_ns()
         if not self._limit_from(config):
             return
         if now_ns >= self._due_ns:
@@ -101,7 +98,7 @@ class Journal:
                 self._log.warning(f'the journal cannot be written: {self._reported}')
 
     def _limit_from(self, config: Config) -> int:
-        """Take over what the settings say; return the limit, 0 for no journal."""
+        """Update limit and reach from the settings; return the limit, 0 for no journal."""
         if self._limit and not config.journal.max_bytes:
             self.start_anew()
         self._limit = config.journal.max_bytes
@@ -110,7 +107,7 @@ class Journal:
         return self._limit
 
     def _hand_over(self) -> None:
-        self._due_ns = self._steady.now().nanoseconds + BATCH_NS
+        self._due_ns = time.monotonic_ns() + BATCH_NS
         batch, self._batch = self._batch, {}
         marks, self._marks = self._marks, None
         if batch or marks:
@@ -137,24 +134,22 @@ class Journal:
         dropped = event in DROPPED and leg_id not in self._dropped
         if event in DROPPED:
             self._dropped.add(leg_id)
-        if leg_id == self._leg_id:
-            self._marks = self._marks or self._no_marks()
-            self._marks.raws.append(serialize_message(array))
-            self._marks.sent_ns.append(self._clock.now().nanoseconds)
-            if event != self._last_event:
-                self._last_event = event
-                self._hand_over()
-        elif dropped:
-            late = self._no_marks()
-            late.raws.append(serialize_message(array))
-            late.sent_ns.append(self._clock.now().nanoseconds)
-            self._writer.submit(self._writer.add, leg_id, late)
-
-    def _no_marks(self) -> Received:
-        return Received(self._topic, STATUS_TYPE, DiagnosticArray)
+        if leg_id != self._leg_id and not dropped:
+            return
+        marks = self._marks if leg_id == self._leg_id else None
+        marks = marks or Received(self._topic, STATUS_TYPE, DiagnosticArray)
+        marks.raws.append(serialize_message(array))
+        marks.sent_ns.append(self._clock.now().nanoseconds)
+        if leg_id != self._leg_id:      # of a journal that is closed
+            self._writer.submit(self._writer.add, leg_id, marks)
+            return
+        self._marks = marks
+        if event != self._last_event:
+            self._last_event = event
+            self._hand_over()
 
     def end(self) -> None:
-        """Take note that the leg's samples are complete: what comes now belongs to no leg."""
+        """Note that the leg's samples are complete: later ones belong to no leg."""
         if self._leg_id and not self._ended:
             self._hand_over()
             self._ended = True
@@ -166,7 +161,7 @@ class Journal:
         self._writer.submit(self._writer.start_anew)
 
     def close(self) -> bool:
-        """Write what is left; a long leg's files may stay apart; return whether all is done."""
+        """Write the rest; files of a long leg may stay separate; return True if all is done."""
         self._hand_over()
         self._writer.submit(self._writer.finish)
         return self._writer.close(JOURNAL_GRACE_S)

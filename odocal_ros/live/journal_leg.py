@@ -1,9 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The journal of one leg, as the journal's thread writes it."""
+"""The journal of one leg, written by the journal's thread."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 import shutil
@@ -22,7 +22,7 @@ HEADS_BYTES = 2**20            # judgement: for metadata and file heads
 
 @dataclass(frozen=True)
 class Plan:
-    """Where a leg's journal goes and what it may take."""
+    """Folder, settings and size limit of a leg's journal."""
 
     leg_id: int
     root: Path
@@ -33,7 +33,7 @@ class Plan:
 
 class LegJournal:
     """
-    Writes the journal of one leg; ``trouble`` says why it cannot, empty while it can.
+    Writes the journal of one leg; ``trouble`` is the cause while it cannot, else empty.
 
     What the disk does not take waits in memory and is tried again with the next second, until
     there is too much of it: then the journal ends with what it has, and the trouble stays.
@@ -62,7 +62,7 @@ class LegJournal:
         return bool(self._late)
 
     def put(self, chunks: list[Chunk]) -> None:
-        """Write chunks, and those that wait."""
+        """Write chunks, after those that wait."""
         if self._over:
             return
         self._waiting += chunks
@@ -73,7 +73,7 @@ class LegJournal:
             self._give_up(f'{self.trouble}; no further attempt in this leg')
 
     def finish(self) -> None:
-        """Make one whole bag of it."""
+        """Join the files to one complete bag."""
         if not self._over:
             self.put([])
             if self._bag is not None and not self._waiting:
@@ -154,9 +154,3 @@ class LegJournal:
         else:
             if not self._over:
                 self.trouble = ''
-
-
-def in_order(held: Mapping[str, list[Chunk]]) -> list[Chunk]:
-    """Return the chunks of all topics in the order of their times."""
-    return sorted((chunk for chunks in held.values() for chunk in chunks),
-                  key=lambda chunk: chunk.start_ns)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How much disk the journals of a folder take, and which go when it is too much."""
+"""Disk space of the journals of a folder; the oldest are deleted beyond the limit."""
 
 from contextlib import suppress
 import fcntl
@@ -30,7 +30,7 @@ def journals(root: Path) -> list[Path]:
 
 
 def clear_empty(root: Path) -> None:
-    """Remove journals in which nothing is: their nodes died before, or the disk took no more."""
+    """Remove journals without data: their nodes were killed early, or the disk was full."""
     for folder in list(root.iterdir()):
         with suppress(OSError):
             named = JOURNAL_NAME.fullmatch(folder.name) and not folder.is_symlink()
@@ -58,7 +58,7 @@ def make_room(root: Path, limit: int, needed: int = 0) -> int:
     """
     Delete the oldest journals until all of them and ``needed`` more bytes stay within the limit.
 
-    One that a node is writing to stays. Returns the bytes taken then.
+    A journal in use stays. Returns the bytes taken after that.
     """
     sizes = {folder: size_of(folder) for folder in journals(root)}
     for folder in list(sizes):
@@ -71,7 +71,7 @@ def make_room(root: Path, limit: int, needed: int = 0) -> int:
 
 
 def claim(folder: Path) -> TextIO:
-    """Mark a journal as written to, until the file returned is closed or its process ends."""
+    """Lock a journal as in use, until the returned file is closed or the process ends."""
     file = (folder / JOURNAL).open(encoding='utf-8')
     with suppress(OSError):      # a file system without locks: then it is unknown
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -13,7 +13,7 @@ from typing import Any
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk, pack
 from odocal_ros.live.definitions import definition_of
-from odocal_ros.live.journal_leg import in_order, LegJournal, Plan
+from odocal_ros.live.journal_leg import LegJournal, Plan
 
 ALWAYS_NS = 1      # definition: stamp of messages that hold at all times
 PREROLL_BYTES = 256 * 2**20    # judgement: 1 kHz for 600 s are 55 MB
@@ -54,19 +54,20 @@ class PreRoll:
 
     def chunks(self) -> list[Chunk]:
         """Return all chunks in order of time."""
-        return in_order({slot: [chunk for _, chunk in held] for slot, held in self._held.items()})
+        return sorted((chunk for held in self._held.values() for _, chunk in held),
+                      key=lambda chunk: chunk.start_ns)
 
     def clear(self) -> None:
-        """Forget all but what holds at all times."""
+        """Forget all except static messages."""
         self._held = {slot: held for slot, held in self._held.items() if held[-1][0] == ALWAYS_NS}
         self.size = sum(chunk.size for held in self._held.values() for _, chunk in held)
 
 
 class JournalWriter:
     """
-    What the thread does; no other thread calls anything but ``submit`` and ``close``.
+    The jobs of the journal's thread; other threads call only ``submit`` and ``close``.
 
-    ``trouble`` and ``folder`` may be read by anyone.
+    Any thread may read ``trouble`` and ``folder``.
     """
 
     def __init__(self) -> None:
@@ -83,11 +84,11 @@ class JournalWriter:
         self._thread.start()
 
     def submit(self, job: Callable[..., None], *values: Any) -> None:
-        """Have the thread call one of the methods below."""
+        """Queue a call of one of the methods below."""
         self._jobs.put((job, values))
 
     def close(self, grace_s: float) -> bool:
-        """Let the thread end after the jobs it was given; return whether it has, in that time."""
+        """Let the thread end after its queue; return True if it ended within ``grace_s``."""
         self._jobs.put(None)
         self._thread.join(grace_s)
         return not self._thread.is_alive()
@@ -109,7 +110,7 @@ class JournalWriter:
             self.trouble, self.folder = self._leg.trouble, self._leg.folder
 
     def _show_late(self) -> None:
-        """Try marks of closed legs again that the disk did not take: what is dropped stays so."""
+        """Retry unwritten marks of closed legs, so that dropped legs stay dropped."""
         for leg in [leg for leg in self._closed.values() if leg.marks_wait]:
             leg.retry()
             self.trouble = leg.trouble
@@ -137,7 +138,7 @@ class JournalWriter:
         self._leg, self._listening = LegJournal(plan, self._channels, self._preroll.chunks()), True
 
     def end(self) -> None:
-        """Write no more samples to the open leg: what may come are marks."""
+        """Write only marks to the open leg from now on."""
         self._listening = False
 
     def add(self, leg_id: int, marks: Received) -> None:

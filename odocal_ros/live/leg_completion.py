@@ -9,8 +9,6 @@ from functools import partial
 from math import nan
 import time
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.task import Future
 
 from odocal_ros.calib.result import Calibration, LegResult
@@ -19,10 +17,10 @@ from odocal_ros.forecast.ability import Ability, ability
 from odocal_ros.forecast.leg_so_far import SILENT_TIME
 from odocal_ros.forecast.progress import clocks_differ
 from odocal_ros.forecast.quantities import words
-from odocal_ros.live import answers, jobs, result_files as outputs
+from odocal_ros.live import answers, jobs
 from odocal_ros.live.computing import Computing
 from odocal_ros.live.console import Console
-from odocal_ros.live.filing import Filing
+from odocal_ros.live.filing import Filing, iso
 from odocal_ros.live.guidance import after_result, hint, quantities_ok
 from odocal_ros.live.journal import Journal, replay_command
 from odocal_ros.live.params import restored_from
@@ -44,8 +42,7 @@ class LegCompletion:
     """
     Process a leg from mark to answer; the operator's commands are in ``Operation``.
 
-    Nothing blocks: the heavy work runs in the worker thread, and ``tick`` takes over what it has
-    done.
+    Nothing blocks: the computations run in the worker thread; ``tick`` takes their results.
     """
 
     def __init__(self, node: SettledNode, recording: Recording, publishing: Publishing,
@@ -68,7 +65,6 @@ class LegCompletion:
         self._silent = False                  # the IMU, in the leg
         self._console = Console(self._log)
         self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     @property
     def awaited(self) -> bool:
@@ -76,7 +72,7 @@ class LegCompletion:
         return self.session.state is State.COMPUTING or self._filing.busy
 
     def tick(self) -> None:
-        """Take over what the worker has done and what time has brought."""
+        """Process finished jobs, new messages and the time."""
         self._worker.poll()
         self._filing.poll()
         self.pump()
@@ -92,7 +88,7 @@ class LegCompletion:
         self._journal.tick(self._config(), self.session.busy)
 
     def _report_silence(self) -> None:
-        """Log immediately that the IMU is silent, or back."""
+        """Publish the status immediately when the IMU falls silent or returns."""
         silent = self._recording.imu_silent_s() > SILENT_TIME
         if silent is not self._silent:
             self._silent = silent
@@ -105,7 +101,7 @@ class LegCompletion:
         self._recording.pump(self._config(), found or self._publishing.scale_factor())
 
     def close(self) -> bool:
-        """Let the worker end; return whether it has."""
+        """Let the worker end; return True if it ended."""
         self._watch.end()
         until = time.monotonic() + (FILES_GRACE_S if self._filing.busy else JOB_GRACE_S)
         done = self._worker.close(until - time.monotonic())
@@ -121,7 +117,7 @@ class LegCompletion:
         return f'leg {self.session.leg_id} was not stopped: {kept}'
 
     def _start_time_anew(self) -> None:
-        """Drop what was recorded on the old time; a running leg cannot go on."""
+        """Drop all samples of the old time; a running leg is cancelled."""
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
             self._log.warning(f'time jumped: leg {self.session.leg_id} is cancelled')
             self._drop_leg(lost='time jumped back')
@@ -134,29 +130,35 @@ class LegCompletion:
 
     def view(self) -> SessionView:
         """Return the current view of the node."""
-        session = self.session
-        recording = session.state is State.RECORDING
-        if recording:
-            self._distance_m = self._recording.progress.distance_m()
-        end_ns = session.stop_ns or self._recording.newest_imu_ns
+        session, recording = self.session, self._recording
+        inputs, progress = recording.inputs, recording.progress
+        in_leg = session.state is State.RECORDING
+        if in_leg:
+            self._distance_m = progress.distance_m()
+        end_ns = session.stop_ns or recording.newest_imu_ns
         forecast = self._watch.forecast
         if self._at_stop is not None and session.state is State.COMPUTING:
             forecast = self._at_stop.forecast
-        return self._publishing.view(
-            self._recording, session=session, saved=self._filing.saved,
-            computed=self._computing.at,
-            save_trouble=self._filing.trouble, distance_m=self._distance_m,
-            config=session.config if session.busy else self._config(), lost=self._lost_leg(),
-            ability=self._ability if recording else None, forecast=forecast,
-            faults=self._watch.faults(self._recording.imu_silent_s()) if recording else (),
-            forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
-            journal=self._journal.folder, journal_trouble=self._journal.trouble,
-            duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
+        config = session.config if session.busy else self._config()
+        return SessionView(
+            session, config, missing=inputs.missing(config), doubled=inputs.doubled(),
+            lost_messages=inputs.lost(), clocks=progress.clocks.differing(config),
+            rates_hz=recording.rates_hz(), results=self._publishing.results(),
+            restored=session.restored_since(), distance_m=self._distance_m,
+            duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0,
+            max_speed=progress.max_speed(), still_s=progress.still_s(),
+            two_wheels=recording.two_wheels(), ability=self._ability if in_leg else None,
+            forecast=forecast, forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
+            faults=self._watch.faults(recording.imu_silent_s()) if in_leg else (),
+            computed=self._computing.at, saved=self._filing.saved, lost=self._lost_leg(),
+            save_trouble=self._filing.trouble, journal=self._journal.folder,
+            journal_trouble=self._journal.trouble, received=recording.received(),
+            local=recording.local)
 
     def show_status(self) -> None:
-        """Publish the status as it is now, and say what is new in it."""
+        """Publish the current status and log what is new in it."""
         now = self.view()
-        self._console.report(now, self._steady.now().nanoseconds)
+        self._console.report(now, time.monotonic_ns())
         array = self._publishing.show_status(now)
         self._journal.receive(self.session, array)
 
@@ -184,7 +186,7 @@ class LegCompletion:
         return '; '.join(missing) or (clocks_differ(clocks) if clocks else '')
 
     def _begin_leg(self, mark_ns: int, by_itself: bool = False) -> str:
-        """Open a leg at a mark and return what there is to say."""
+        """Open a leg at a mark and return the text for log and answer."""
         session = self.session
         config = self._config()
         session.start(mark_ns, with_marks(config) if config.reference.points else config,
@@ -197,7 +199,7 @@ class LegCompletion:
         self._ability = ability(session.config, self._recording.received_before(
             session.config.leg.preroll))
         self.show_status()
-        text = (f'recording leg {session.leg_id} since {outputs.iso(mark_ns)}; '
+        text = (f'recording leg {session.leg_id} since {iso(mark_ns)}; '
                 f'{hint(self.view())}. With these settings, {self._ability.words()}')
         self._log.info(text)
         return text
@@ -211,7 +213,7 @@ class LegCompletion:
         self._at_stop = replace(now, forecast=now.forecast and now.forecast.ended())
         self.session.stop(mark_ns)
         self._watch.end()
-        self._close_by_ns = self._steady.now().nanoseconds + round(LATE_TOPIC_S * 1e9)
+        self._close_by_ns = time.monotonic_ns() + round(LATE_TOPIC_S * 1e9)
         self.show_status()
         self._close_when_complete()
 
@@ -219,7 +221,7 @@ class LegCompletion:
         """Hand the leg to the worker once each topic has passed the stop mark, or time is up."""
         if self._close_by_ns is None:
             return
-        late = self._steady.now().nanoseconds > self._close_by_ns
+        late = time.monotonic_ns() > self._close_by_ns
         if late or self._recording.passed(self.session.stop_ns):
             self._close_by_ns = None
             self._journal.end()
@@ -259,7 +261,7 @@ class LegCompletion:
 
     def _take_result(self, calibration: Calibration, paths: jobs.Paths,
                      parts: Sequence[LegResult] = ()) -> tuple[bool, str]:
-        """Publish a result and answer those who wait for it."""
+        """Publish a result and answer the waiting callers."""
         self._publishing.set_results(calibration)
         self._publishing.show_paths(paths)
         now = self.view()

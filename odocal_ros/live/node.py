@@ -5,18 +5,17 @@
 
 from collections.abc import Callable
 from functools import partial
-import sys
 import threading
+import time
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from odocal_ros.data.inputs import TOPICS
 from odocal_ros.errors import OdocalError
 from odocal_ros.live import params
 from odocal_ros.live.inputs import LOOK_AROUND_S
@@ -25,7 +24,6 @@ from odocal_ros.live.operation import Operation
 from odocal_ros.live.process import complain, run, SettledNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
-from odocal_ros.live.topic_input import TOPICS
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.floor_marks import check_points
 
@@ -56,7 +54,7 @@ class Calibrator(SettledNode):
     """
     Calibrates an odometer over legs that the operator marks by service.
 
-    Works in any executor; SingleThreadedExecutor is meant. ``Session`` remembers legs,
+    Works in any executor; SingleThreadedExecutor is recommended. ``Session`` remembers legs,
     ``Recording`` samples; the node itself only joins them. ``at_work``: destroyed while one of its
     threads was, which will end with the process.
     """
@@ -79,7 +77,6 @@ class Calibrator(SettledNode):
         self.operation = Operation(self, self.recording, self.publishing, self.journal,
                                    lambda: self.config)
         self._lock = threading.RLock()  # for executors with several threads
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._due_ns = dict.fromkeys(('look', 'diagnostics', 'status'), 0)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
@@ -88,8 +85,7 @@ class Calibrator(SettledNode):
             act = getattr(self.operation, name)
             self.create_service(Trigger, f'~/{name}', partial(self._serve, act),
                                 callback_group=group)
-        # on the steady clock: a paused or missing /clock must not silence the status
-        self._timer = self.create_timer(TURN_S, self._tick, clock=self._steady)
+        self._timer = self.steady_timer(TURN_S, self._tick)
 
     def destroy_node(self) -> None:
         """End worker, journal and clock callbacks with the node."""
@@ -103,7 +99,7 @@ class Calibrator(SettledNode):
     # parameters
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse what may not be set; changes nothing."""
+        """Refuse parameters that cannot be set now; changes nothing."""
         if self.publishing.setting_results:
             return SetParametersResult(successful=True)
         refused = params.refused(self.config, self.publishing.results(), parameters)
@@ -140,7 +136,7 @@ class Calibrator(SettledNode):
             self._pace()
 
     def _pace(self) -> None:
-        """Take messages as often as needed now."""
+        """Set the period of ``_tick``: shorter while a caller waits."""
         awaited = self.operation.awaited
         period_s = AWAITED_TURN_S if awaited else min(TURN_S, 1 / self.config.publish.rate)
         period_ns = round(period_s * 1e9)
@@ -149,7 +145,7 @@ class Calibrator(SettledNode):
             self._timer.reset()
 
     def _due(self, task: str, period_s: float) -> bool:
-        now_ns, period_ns = self._steady.now().nanoseconds, round(period_s * 1e9)
+        now_ns, period_ns = time.monotonic_ns(), round(period_s * 1e9)
         if now_ns < self._due_ns[task]:
             return False
         # from the time it was due, so that the mean rate is right; but never make up for a pause
@@ -175,7 +171,3 @@ class Calibrator(SettledNode):
 def main(args: list[str] | None = None) -> int:
     """Run the node until it must stop; see ``process.run``."""
     return run('calibrator', HELP, Calibrator, args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -6,15 +6,12 @@
 from collections.abc import Callable
 import re
 import struct
-import sys
 import time
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 import numpy as np
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import Executor
 from rclpy.node import Node
@@ -25,15 +22,16 @@ from odocal_ros.apply.odometry import BEGINS_ANEW, Odometry
 from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.inputs import WHEELS
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
-from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS
+from odocal_ros.live.console import LossReport, SILENCE_FIRST_NS, SILENCE_SELDOM_NS
 from odocal_ros.live.definitions import message_class
-from odocal_ros.live.inputs import IMU, LOOK_AROUND_S
+from odocal_ros.live.inputs import LOOK_AROUND_S
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
-from odocal_ros.live.waiting_messages import LossReport
 from odocal_ros.messages.cdr import layout_of
+from odocal_ros.messages.sensor_types import types_of
 from odocal_ros.outside.names import said_by
 from odocal_ros.settings.apply_config import ApplyConfig, OdomFrames
 
@@ -59,7 +57,7 @@ class NumbersPublisher:
     """
     Publishes copies of one message with another stamp and other numbers.
 
-    To set the fields of a message object and to serialise it costs many times as much.
+    Setting the fields of a message object and serialising it takes many times as long.
     """
 
     def __init__(self, node: Node, topic: str, message: Any) -> None:
@@ -102,8 +100,9 @@ class OdometryNode(SettledNode):
         for text in vehicle.guessed:
             self.get_logger().warning(text)
         self._odometry = Odometry(vehicle, self.config)
-        self._inputs = {slot: Input(self, slot, allowed)
-                        for slot, allowed in _wanted(self.config).items()}
+        wheels = WHEELS[:2] if self.config.odometer.own_topics else WHEELS[:1]
+        self._inputs = {slot: Input(self, slot, types_of(slot, self.config.odometer))
+                        for slot in ('imu', *wheels)}
         params.check_qos(self, (one.topic for one in self._inputs.values()))
         for one in self._inputs.values():
             one.check(self.config)
@@ -117,15 +116,14 @@ class OdometryNode(SettledNode):
         self._said_ns: dict[str, int] = {}      # when, by kind of sentence
         self._doubled: set[str] = set()         # said
         self._losses = LossReport()
-        self.add_on_set_parameters_callback(params.fixed)
+        self.add_on_set_parameters_callback(params.fixed(ApplyConfig))
         self._tf = self._transforms() if self.config.publish_tf else None
         self._due_ns = self._reckoned_ns = 0
-        self._timer = self.create_timer(
-            LOOK_S, self._turn, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = self.steady_timer(LOOK_S, self._turn)
         self.get_logger().info(f'applies the {kept.words("")}')
 
     def spin(self, executor: Executor) -> None:
-        """Take messages when a pose may be due; let the executor serve the rest, seldom."""
+        """Take messages when a pose may be due; the executor handles the rest at a low rate."""
         self.destroy_timer(self._timer)      # for executors of others
         serve_at = 0.0
         while self.context.ok():
@@ -183,7 +181,7 @@ class OdometryNode(SettledNode):
             self.get_logger().warning(text)
 
     def _pump(self, source: Input) -> None:
-        """Hand on what has come on a topic."""
+        """Feed the new messages of a topic to the odometry."""
         raws, sent_ns = source.take()
         if not raws:
             return
@@ -195,7 +193,7 @@ class OdometryNode(SettledNode):
             source.health.forget()
 
     def _look_around(self, now_ns: int) -> None:
-        """Look for publishers, and say what is missing, seldom."""
+        """Look for publishers, and log missing inputs at a low rate."""
         for one in self._inputs.values():
             one.look()
             if not one.flowing():
@@ -250,17 +248,6 @@ def transform_of(pose: Pose, frames: OdomFrames) -> TransformStamped:
     return out
 
 
-def _wanted(config: ApplyConfig) -> dict[str, tuple[str, ...]]:
-    """Return slot -> message types allowed, empty: any."""
-    odometer = () if config.odometer.type == 'auto' else (config.odometer.type,)
-    wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer}
-    return wanted | ({'odometer_right': odometer} if config.odometer.own_topics else {})
-
-
 def main(args: list[str] | None = None) -> int:
     """Run the node until it must stop; see ``process.run``."""
     return run('odometry', HELP, OdometryNode, args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

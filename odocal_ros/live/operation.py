@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The operator's commands: what each does in each state, and what it answers."""
+"""The operator's commands and their answers in each state."""
 
 from functools import partial
 
@@ -9,9 +9,10 @@ from rclpy.task import Future
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.forecast.quantities import words
-from odocal_ros.live import answers, jobs, result_files as outputs
+from odocal_ros.live import answers, jobs
 from odocal_ros.live.automatic_way import AutomaticWay
 from odocal_ros.live.computing import PATIENCE_S
+from odocal_ros.live.filing import iso
 from odocal_ros.live.guidance import after_result, hint, quantities_ok
 from odocal_ros.live.session import Refused, State
 from odocal_ros.pipeline.floor_marks import mark_positions, place_of, WITHIN
@@ -32,7 +33,7 @@ class Operation(AutomaticWay):
         """Open a leg at the newest IMU stamp."""
         session, mark_ns = self.session, self._mark_ns()
         if session.state is State.RECORDING and not session.by_itself:
-            return True, (f'recording since {outputs.iso(session.start_ns)}, leg '
+            return True, (f'recording since {iso(session.start_ns)}, leg '
                           f'{session.leg_id}; {hint(self.view())}')
         if why := self._why_not():
             raise Refused(f'no leg can be started: {why}')
@@ -41,7 +42,7 @@ class Operation(AutomaticWay):
         return True, self._begin_leg(mark_ns)
 
     def mark(self) -> tuple[bool, str]:
-        """Note that the robot stands on the next point of ``reference.points``."""
+        """Record a mark: the robot stands on the next point of ``reference.points``."""
         session, newest_ns = self.session, self._mark_ns()
         if not self._config().reference.points:
             raise Refused('reference.points is empty: set x and y of each point, and restart the '

@@ -3,7 +3,7 @@
 
 """Settings as ROS parameters, and the result as parameters that only the node may set."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 import difflib
 import math
 from typing import Any
@@ -20,7 +20,7 @@ from rclpy.parameter import Parameter
 
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.errors import BadConfig
-from odocal_ros.live.restored import Restored
+from odocal_ros.live.session import Restored
 from odocal_ros.output.stored import check_estimate
 from odocal_ros.outside.names import one_line
 from odocal_ros.reasons import Verdict
@@ -63,10 +63,10 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
     declared read-only: rclpy would refuse it without a remedy, the on-set callback names one.
     """
     about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
-    about += ' Fixed at start-up.' if setting.read_only else ''
+    about += ' Fixed at start-up.' if setting.ro else ''
     result = ParameterDescriptor(description=about)
     result.dynamic_typing = setting.kind in ('floats', 'strs') and not (
-        setting.read_only and setting.default)
+        setting.ro and setting.default)
     limits = []
     if setting.choices:
         limits.append('one of ' + ', '.join(setting.choices))
@@ -108,7 +108,7 @@ def declare(node: Node, kind: type = Config) -> Any:
 
 
 def _warn_of_unknown(node: Node, settings: dict[str, Setting]) -> None:
-    """Name overrides in our groups that are no settings; ROS passes over what nobody declares."""
+    """Warn of overrides in our groups that are no settings; ROS ignores undeclared ones."""
     groups = {name.partition('.')[0] for name in settings if '.' in name}
     for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public access to them
         group, dot, _ = name.partition('.')
@@ -120,9 +120,9 @@ def _warn_of_unknown(node: Node, settings: dict[str, Setting]) -> None:
 
 def check_qos(node: Node, topics: Iterable[str]) -> None:
     """
-    Raise BadConfig for an override of the QoS of a topic listened to that rclpy would fail at.
+    Raise BadConfig for a QoS override of an input that rclpy would refuse.
 
-    It would do so with a word of its insides, and for a topic found later only then.
+    Its message is internal, and comes only when the topic is subscribed.
     """
     overrides = getattr(node, '_parameter_overrides', {})
     for topic in topics:
@@ -149,7 +149,7 @@ def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]
         if p.name in RESULTS and not (p.value == now or str(p.value) == str(now) == 'nan'):
             return (f'{p.name} is set by the node after each leg; to restore a result, start the '
                     'node with --params-file calibration.yaml')
-        if p.name in SETTINGS and SETTINGS[p.name].read_only:
+        if p.name in SETTINGS and SETTINGS[p.name].ro:
             group, _, key = p.name.rpartition('.')
             if _plain(p.value) != getattr(getattr(config, group) if group else config, key):
                 return (f'{p.name} is fixed at start-up: restart the node with '
@@ -157,11 +157,14 @@ def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]
     return ''
 
 
-def fixed(parameters: list[Parameter]) -> SetParametersResult:
-    """Refuse to set what holds as long as the node runs."""
-    ours = [p.name for p in parameters if p.name.startswith(PREFIX) or p.name in SETTINGS]
-    return SetParametersResult(successful=not ours, reason=(
-        f'{ours[0]} is only read at start-up: restart the node with it') if ours else '')
+def fixed(kind: type) -> Callable[[list[Parameter]], SetParametersResult]:
+    """Return the on-set callback of a node that reads settings of a kind only at start-up."""
+    def refuse(parameters: list[Parameter]) -> SetParametersResult:
+        ours = [p.name for p in parameters
+                if p.name.startswith(PREFIX) or p.name in settings_of(kind)]
+        return SetParametersResult(successful=not ours, reason=(
+            f'{ours[0]} is only read at start-up: restart the node with it') if ours else '')
+    return refuse
 
 
 def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restored | None:
@@ -255,7 +258,7 @@ def _plain(value: Any) -> Any:
 
 
 def _refusal(name: str, setting: Setting, error: Exception) -> str:
-    """Return one line that says what rclpy refused and what to write instead."""
+    """Return the refusal of rclpy as one line, with the action."""
     text = ' '.join(str(error).split()).removesuffix(f': {name}').split('Reason: ')[-1]
     if setting.kind in ('float', 'floats') and isinstance(error, InvalidParameterTypeException):
         return f'{text}; write it as a decimal number such as 3.0'

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A node as a process: its start, its end, and the one line that says why there is none."""
+"""A node as a process: start, end, and one line of error if it cannot start."""
 
 from collections.abc import Callable
 import os
@@ -17,11 +17,12 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
+from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
 from odocal_ros import __version__
 from odocal_ros.errors import BadConfig, OdocalError
-from odocal_ros.live.plain_log import PlainLog
+from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import hold_little
 from odocal_ros.outside.names import brief_line, said_by
 
@@ -29,15 +30,14 @@ LOOK_FOR_NAMESAKE_S = 5.0      # judgement: s between looks for another node of 
 
 
 class SettledNode(Node):
-    """A node that builds itself of its parameters, or says in one line which is wrong."""
+    """A node that raises BadConfig, as one line, if a parameter is wrong."""
 
     def __init__(self, node_name: str, **kwargs: Any) -> None:
         try:
             super().__init__(node_name, **kwargs)
             try:
                 self._build()
-                self._alone = self.create_timer(LOOK_FOR_NAMESAKE_S, self._look_for_namesake,
-                                                clock=Clock(clock_type=ClockType.STEADY_TIME))
+                self._alone = self.steady_timer(LOOK_FOR_NAMESAKE_S, self._look_for_namesake)
             except Exception:
                 self.destroy_node()  # type: ignore[no-untyped-call]
                 raise
@@ -46,6 +46,10 @@ class SettledNode(Node):
 
     def _build(self) -> None:
         raise NotImplementedError
+
+    def steady_timer(self, period_s: float, turn: Callable[[], None]) -> Timer:
+        """Create a timer that also runs while /clock is paused or missing."""
+        return self.create_timer(period_s, turn, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def spin(self, executor: Executor) -> None:
         """Handle what comes until the context ends."""
@@ -120,7 +124,7 @@ def run(name: str, about: str, make: Callable[[], SettledNode],
 
 
 def _init(args: list[str] | None) -> None:
-    """Start rclpy; of an error only the exception is left, not rcl's own line on stderr."""
+    """Start rclpy; an error raises an exception, without rcl's own line on stderr."""
     sys.stderr.flush()
     stderr = os.dup(2)
     with tempfile.TemporaryFile() as held:

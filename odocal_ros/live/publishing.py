@@ -4,12 +4,11 @@
 """Publishers of the node: status, diagnostics, paths, result parameters."""
 
 from functools import partial
+import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Path as PathMessage
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -17,7 +16,8 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import Float64, String
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.live import jobs, params, result_files as outputs
+from odocal_ros.live import jobs, params
+from odocal_ros.live.filing import iso
 from odocal_ros.live.guidance import action_first
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session_view import SessionView
@@ -45,7 +45,6 @@ class Publishing:
         self._shown: dict[Publisher, str] = {}        # what these publishers said last
         self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._setting = False
         self._before = self.results()    # what holds while no leg is kept: restored, or nothing
 
@@ -64,7 +63,7 @@ class Publishing:
 
     def set_results(self, calibration: Calibration | None) -> None:
         """Set all ``result.*`` at once: one event, never half a result; None: as it began."""
-        stamp = no_date(outputs.iso(self._node.get_clock().now().nanoseconds))
+        stamp = no_date(iso(self._node.get_clock().now().nanoseconds))
         results = self._before
         if calibration:
             vehicle = self._node.get_parameter('vehicle').value
@@ -90,18 +89,6 @@ class Publishing:
         """Return the resolved name of ``~/status``."""
         return self._status.topic_name
 
-    def view(self, recording: Recording, **known: Any) -> SessionView:
-        """Return the current status; ``known`` are the fields that are computed elsewhere."""
-        config, progress = known['config'], recording.progress
-        return SessionView(
-            missing=recording.inputs.missing(config), doubled=recording.inputs.doubled(),
-            lost_messages=recording.inputs.lost(), clocks=progress.clocks.differing(config),
-            rates_hz=recording.rates_hz(), results=self.results(),
-            max_speed=progress.max_speed(), still_s=progress.still_s(),
-            two_wheels=recording.two_wheels(), received=recording.received(),
-            local=recording.local,
-            restored=known['session'].restored_since(), **known)
-
     def show_status(self, now: SessionView) -> DiagnosticArray:
         """Publish ``~/status`` and return it."""
         array = self._array([calibration_status(now)])
@@ -123,11 +110,10 @@ class Publishing:
         node = self._node.get_fully_qualified_name()
         if not config.diagnostic_updater.use_fqn:
             node = node.lstrip('/')      # with its namespace: two vehicles are not one
-        now_ns = self._steady.now().nanoseconds
         needed = recording.inputs.required(config)
         self._diagnostics.publish(self._array([
             input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.why(),
-                         one in needed, now_ns)
+                         one in needed, time.monotonic_ns())
             for slot, one in recording.inputs.by_slot.items()
             if one in needed or one.reader is not None]))
 

@@ -5,19 +5,19 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+import time
 
-from rclpy.clock import Clock, JumpThreshold
-from rclpy.clock_type import ClockType
+from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from odocal_ros.data.leg import LegRecorder, WHEELS
+from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import FixSamples, LOCAL, Samples, take
 from odocal_ros.forecast.ability import Received
 from odocal_ros.forecast.progress import Progress
 from odocal_ros.live.inputs import Inputs
-from odocal_ros.live.static_transforms import StaticTransforms
-from odocal_ros.live.topic_input import Input
+from odocal_ros.live.topic_input import Input, StaticTransforms
 from odocal_ros.settings.config import Config
 
 CLOCK_BACK_S = 0.1         # judgement: a clock that steps back by more has jumped
@@ -41,7 +41,6 @@ class Recording:
         self.tap: Callable[[str, Samples], None] | None = None  # also receives every block
         self._clock = node.get_clock()
         self.progress = self._no_progress()
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._clock_jumped = False
         self._jumps = self._clock.create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(seconds=-CLOCK_BACK_S)),
@@ -154,7 +153,7 @@ class Recording:
 
     def rates_hz(self) -> dict[str, float]:
         """Return the rate of each topic by its stamps."""
-        now_ns = self._steady.now().nanoseconds
+        now_ns = time.monotonic_ns()
         return {slot: one.health.rate_hz(now_ns) for slot, one in self.inputs.by_slot.items()}
 
     def received(self) -> bool:

@@ -16,9 +16,9 @@ from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps, screened_in
 from odocal_ros.forecast.smoother_so_far import SmootherSoFar
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.live.answers import one_line
-from odocal_ros.live.plain_log import PlainLog
+from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import Worker
-from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.reasons import Code, gravest_first, Reason
 from odocal_ros.settings.config import Config
 
 # judgement: of the IMU's time, so that a fast replay is looked at as often
@@ -115,8 +115,7 @@ class RunningEstimate:
                       'better section') for r in self._gaps.reasons(silent_s)]
         seen = (*cut, *self._faults, *(self._newest.faults if self._newest else ()))
         first = {r.code: r for r in reversed(seen)}
-        order = list(Verdict)
-        return tuple(sorted(first.values(), key=lambda r: -order.index(r.code.gravity)))
+        return tuple(gravest_first(first.values()))
 
     def look(self, newest_ns: int) -> None:
         """Have the worker look if it is time to."""

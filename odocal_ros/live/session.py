@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from odocal_ros.calib.carried import Carried
-from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.errors import OdocalError
-from odocal_ros.live.restored import Restored
+from odocal_ros.output.summary import values_in_words
+from odocal_ros.outside.names import one_line
 from odocal_ros.pipeline.floor_marks import FloorMark, next_point
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
@@ -45,6 +46,26 @@ class KeptLeg:
     start_ns: int
     stop_ns: int
     results: tuple[LegResult, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Restored:
+    """What the parameters ``result.*`` held at the start; the unit of a scale is not among it."""
+
+    estimates: dict[str, Estimate]
+    legs: int
+    valid: bool
+    stamp: str
+    vehicle: str = ''
+
+    def words(self, unit: str) -> str:
+        """Return it as a sentence; ``unit`` is that of scales of the odometer, or empty."""
+        estimates = {name: replace(e, unit=unit) if unit and name.startswith('scale_factor') else e
+                     for name, e in self.estimates.items()}
+        use = '' if self.valid else ', which was rejected'
+        whose = f' of vehicle {one_line(self.vehicle)}' if self.vehicle else ''
+        return (f'restored result of {self.stamp}{whose}{use}: {values_in_words(estimates)}; from '
+                f'{self.legs} leg{"s" * (self.legs != 1)}')
 
 
 class Session:

@@ -13,7 +13,6 @@ from odocal_ros.live.session import Session, State
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config, LegConfig
-from odocal_ros.settings.frame import in_local_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ class SessionView:
     def leg(self) -> LegConfig:
         """Return the limits of the leg."""
         config = self.session.config
-        return (in_local_frame(config) if self.local else config).leg
+        return (config.in_local_frame() if self.local else config).leg
 
     @property
     def lost_cause(self) -> bool:

@@ -3,26 +3,13 @@
 
 """The commands calibrator, odometry, drive_pattern: start a node, or print what is missing."""
 
+from functools import partial
 from importlib import import_module
 import sys
 
 
-def calibrator() -> int:
-    """Run the node calibrator; 2 without ROS 2."""
-    return _run('calibrator', 'odocal_ros.live.node')
-
-
-def odometry() -> int:
-    """Run the node odometry; 2 without ROS 2."""
-    return _run('odometry', 'odocal_ros.live.odometry')
-
-
-def drive_pattern() -> int:
-    """Run the node drive_pattern; 2 without ROS 2."""
-    return _run('drive_pattern', 'odocal_ros.live.drive_pattern')
-
-
 def _run(command: str, module: str) -> int:
+    """Run a node; return its exit code, 2 without ROS 2."""
     try:
         main = import_module(module).main
     except ModuleNotFoundError as error:
@@ -34,3 +21,8 @@ def _run(command: str, module: str) -> int:
         return 2
     code: int = main()
     return code
+
+
+calibrator = partial(_run, 'calibrator', 'odocal_ros.live.node')
+odometry = partial(_run, 'odometry', 'odocal_ros.live.odometry')
+drive_pattern = partial(_run, 'drive_pattern', 'odocal_ros.live.drive_pattern')

@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from odocal_ros.calib.result import wheel_factors
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import as_keys
+from odocal_ros.live.console import losses_in_words
 from odocal_ros.live.guidance import (
     hint,
     manoeuvres,
@@ -21,7 +22,6 @@ from odocal_ros.live.guidance import (
 from odocal_ros.live.health import Health
 from odocal_ros.live.session import Session, State
 from odocal_ros.live.session_view import SessionView
-from odocal_ros.live.waiting_messages import losses_in_words
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Verdict
 

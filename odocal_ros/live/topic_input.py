@@ -6,40 +6,61 @@
 from collections.abc import Callable
 import difflib
 from functools import partial
+import time
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from odocal_ros.data.inputs import INPUTS
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.live.definitions import message_class
 from odocal_ros.live.health import Health
-from odocal_ros.live.static_transforms import StaticTransforms
+from odocal_ros.live.journal_writer import ALWAYS_NS
 from odocal_ros.live.waiting_messages import WaitingMessages
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES
-from odocal_ros.messages.sensor_types import TRANSFORMS
-from odocal_ros.messages.transforms import TransformReader
+from odocal_ros.messages.sensor_types import Pairs, TRANSFORMS
+from odocal_ros.messages.transforms import STATIC, StaticReader, TransformReader
 from odocal_ros.outside.names import one_line, said_by
 from odocal_ros.settings.config import Config
 
-TOPICS = {'imu': 'imu/data', 'odometer': 'odometer', 'odometer_right': 'odometer_right',
-          'fix': 'fix', 'fix_velocity': 'fix_velocity', 'heading': 'heading'}
-# physical: messages in five seconds of the highest expected rate, 4 kHz, 1 kHz and 100 Hz: a queue
-# that runs over is what loses them
-DEPTH = {'imu': 20_000, 'odometer': 5000, 'odometer_right': 5000, 'heading': 5000,
-         'fix': 500, 'fix_velocity': 500}
-LABELS = {'imu': 'IMU', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
-          'fix_velocity': 'GNSS velocity', 'heading': 'heading'}
 MOST_TOPICS_MEANT, NAME_SIMILARITY = 2, 0.4      # judgement: of difflib, 1 for the same name
+STATIC_DEPTH = 100     # judgement: publishers of static transforms
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
+
+
+class StaticTransforms:
+    """
+    The topic of static transforms beside a TF reference, which each publisher sends once.
+
+    They hold at all times: each journal has all of them.
+    """
+
+    slot, msgtype, newest_ns = 'fix_static', TRANSFORMS, ALWAYS_NS
+
+    def __init__(self, node: Node, moving_topic: str, kind: type, reader: StaticReader) -> None:
+        self.topic = moving_topic + STATIC
+        self._reader = reader
+        self._deserialize = partial(deserialize_message, message_type=kind)
+        self._waiting = WaitingMessages(node)
+        self._waiting.subscribe(kind, self.topic, QoSProfile(
+            history=HistoryPolicy.KEEP_LAST, depth=STATIC_DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+
+    def take(self) -> tuple[list[bytes], list[int]]:
+        """Return the messages that came since the last call, and when they were sent, ns."""
+        self._waiting.follow_clock()
+        return self._waiting.take()[:2]
+
+    def decode(self, raws: list[bytes], sent_ns: list[int]) -> Pairs:
+        """Return the positions that waited for these messages."""
+        return self._reader.rows(raws, sent_ns, self._deserialize)
 
 
 class Input:
@@ -51,7 +72,7 @@ class Input:
 
     def __init__(self, node: Node, slot: str, allowed: tuple[str, ...]) -> None:
         self.slot, self.allowed = slot, allowed
-        self.name = TOPICS[slot]
+        self.name = INPUTS[slot].topic
         self.topic = node.resolve_topic_name(self.name)
         self.msgtype = ''
         self.reader: Reader | None = None
@@ -65,7 +86,6 @@ class Input:
         self._frame_id = ''
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.waiting = WaitingMessages(node)
         self.static: StaticTransforms | None = None     # the topic beside a TF reference
 
@@ -137,7 +157,7 @@ class Input:
         offered = {p.qos_profile.reliability for p in self.publishers}
         reliable = self._counts_increments(reader) and offered == {ReliabilityPolicy.RELIABLE}
         qos = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST, depth=DEPTH[self.slot],
+            history=HistoryPolicy.KEEP_LAST, depth=INPUTS[self.slot].queue,
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
         self._deserialize = partial(deserialize_message, message_type=kind)
         self.waiting.subscribe(kind, self.name, qos)
@@ -155,12 +175,10 @@ class Input:
 
     def take(self) -> tuple[list[bytes], list[int]]:
         """Return the messages that came since the last call, and when they were sent, ns."""
-        pending = self.waiting.take()
-        if pending:
-            self.health.arrived([i['publication_sequence_number'] for _, i in pending],
-                                self._steady_ns())
-        return ([raw for raw, _ in pending],
-                [i['source_timestamp'] or i['received_timestamp'] for _, i in pending])
+        raws, sent_ns, numbers = self.waiting.take()
+        if raws:
+            self.health.arrived(numbers, time.monotonic_ns())
+        return raws, sent_ns
 
     def decode(self, raws: list[bytes], received_ns: list[int],
                max_gap_s: float | None) -> list[tuple[str, Any]]:
@@ -191,11 +209,11 @@ class Input:
 
     def flowing(self) -> bool:
         """Return True if usable messages arrive."""
-        return self.health.flowing(self._steady_ns())
+        return self.health.flowing(time.monotonic_ns())
 
     def why(self) -> str:
         """Return the explanation why no usable message arrives, for people; empty if one does."""
-        silent = self.health.silent_s(self._steady_ns())
+        silent = self.health.silent_s(time.monotonic_ns())
         if self.flowing():
             return ''
         if self.trouble:
@@ -203,7 +221,7 @@ class Input:
         if self.health.stampless:
             return f'{self.topic}: all header stamps are zero; check the driver'
         if not self.publishers:
-            return (f'no {LABELS[self.slot]} on {self.topic}: 0 publishers found'
+            return (f'no {INPUTS[self.slot].label} on {self.topic}: 0 publishers found'
                     + (f', silent for {silent:.0f} s' if self.health.received_ns else
                        '; start the driver or remap ' + self.name)
                     + (f' (did you mean {" or ".join(self.meant)}?)' if self.meant else ''))
@@ -216,7 +234,4 @@ class Input:
         many = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'
         if not self.health.received_ns:
             return f'{self.topic}: {many} found ({offers}) but no message yet'
-        return f'no {LABELS[self.slot]} on {self.topic} for {silent:.0f} s: {many} found'
-
-    def _steady_ns(self) -> int:
-        return self._steady.now().nanoseconds
+        return f'no {INPUTS[self.slot].label} on {self.topic} for {silent:.0f} s: {many} found'

@@ -20,7 +20,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 Message: TypeAlias = tuple[bytes, dict[str, Any]]     # serialised, and the info of the middleware
-AGAIN = 10     # judgement: times as many as were said, to say it again
 
 
 class Gate(MutuallyExclusiveCallbackGroup):
@@ -69,8 +68,8 @@ class WaitingMessages:
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
-    def take(self) -> list[Message]:
-        """Return the messages since the last call."""
+    def take(self) -> tuple[list[bytes], list[int], list[int | None]]:
+        """Return the messages since the last call: serialised, when sent (ns), and numbers."""
         if self._subscription is not None and not self._carried:
             try:
                 self._fetch(self._subscription)
@@ -80,7 +79,10 @@ class WaitingMessages:
                     f'this rclpy has no usable take_message ({error}): the executor takes the '
                     'messages, at several times the CPU load')
         pending, self._pending = self._pending, []
-        return pending
+        infos = [info for _, info in pending]
+        return ([raw for raw, _ in pending],
+                [info['source_timestamp'] or info['received_timestamp'] for info in infos],
+                [info['publication_sequence_number'] for info in infos])
 
     def _fetch(self, subscription: Subscription) -> None:
         """
@@ -102,33 +104,3 @@ class WaitingMessages:
         if self._simulated:
             info['source_timestamp'] = self._node.get_clock().now().nanoseconds
         self._pending.append((raw, info))
-
-
-class LossReport:
-    """Turns counts of lost messages into sentences, each topic again at ten times the number."""
-
-    def __init__(self) -> None:
-        self._said: dict[str, int] = {}
-
-    def news(self, lost: dict[str, int]) -> list[str]:
-        """
-        Return the new sentences.
-
-        lost : topic -> messages so far; fewer than before: a new count.
-        """
-        found = []
-        for topic, count in lost.items():
-            said = self._said.get(topic, 0)
-            if count < said:
-                said = self._said[topic] = 0
-            if count >= max(1, AGAIN * said):
-                self._said[topic] = count
-                found.append(f'{losses_in_words({topic: count})}. Likely cause: CPU load or '
-                             'network. Reduce the load, or set the QoS of the topic to reliable')
-        return found
-
-
-def losses_in_words(lost: dict[str, int]) -> str:
-    """Return the counts as text, empty if nothing was lost in a queue or on the network."""
-    return ', '.join(f'{count} message{"s" * (count != 1)} of {topic} lost'
-                     for topic, count in lost.items() if count)

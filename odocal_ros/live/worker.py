@@ -53,7 +53,7 @@ class Worker:
             then(result, error)
 
     def close(self, grace_s: float = JOB_GRACE_S) -> bool:
-        """Let the thread end after the jobs it was given; return whether it has, in that time."""
+        """Let the thread end after its queue; return True if it ended within ``grace_s``."""
         self._jobs.put(None)
         self._thread.join(grace_s)
         return not self._thread.is_alive()

@@ -15,6 +15,7 @@ import struct
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32': '<i4',
          'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8', 'float32': '<f4', 'float64': '<f8'}
@@ -78,7 +79,7 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 
 
 class Run(NamedTuple):
-    """Values of one kind side by side: where, of what kind, and all of them as one thing."""
+    """Values of one kind side by side: bytes, kind, kind of all of them as one item, number."""
 
     place: slice
     dtype: np.dtype[Any]
@@ -117,11 +118,28 @@ class Layout:
             return offset + int(match[2]) * np.dtype(dtype).itemsize, dtype
         return None
 
-    def runs(self, paths: tuple[str, ...]) -> list[Run] | None:
-        """Return the offsets of values, adjacent ones merged; None if one is missing."""
+    def _places(self, paths: tuple[str, ...]) -> list[Run] | None:
+        """Return the places of values, adjacent ones merged; None if one is missing."""
         if paths not in self._runs:
             self._runs[paths] = _side_by_side([self.find(path) for path in paths])
         return self._runs[paths]
+
+    def columns(self, table: NDArray[np.uint8], paths: Sequence[str]) -> NDArray[Any] | None:
+        """
+        Return the values at some paths of messages of this layout, (n, size) bytes.
+
+        Returns
+        -------
+        (n, len(paths)) array of the first path's dtype; None where a path is not in the layout.
+
+        """
+        runs = self._places(tuple(paths))
+        if runs is None:
+            return None
+        # all of a run at a time, not value by value
+        values = [table[:, run.place].view(run.together).copy().view(run.dtype).reshape(
+            -1, run.width) for run in runs]
+        return values[0] if len(values) == 1 else np.concatenate(values, axis=1)
 
     def fits(self, raw: bytes) -> bool:
         """Return True if a message has this layout."""
@@ -133,7 +151,7 @@ _before: dict[str, Layout] = {}      # by type, the last one found: most topics 
 
 
 def _side_by_side(places: Sequence[tuple[int, str] | None]) -> list[Run] | None:
-    """Return places of values as runs; None where one of them is none."""
+    """Return places of values as runs; None if one of them is missing."""
     found: list[tuple[int, str, int]] = []
     for place in places:
         if place is None:

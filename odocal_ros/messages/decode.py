@@ -5,7 +5,7 @@
 Messages to samples: one set of readers for the wire and for bags.
 
 A reader takes messages as they were serialised. Those of one layout are read as columns by
-``messages.tables``; any other goes through ``deserialize`` and gives the same row to the last bit.
+``messages.raws``; any other goes through ``deserialize`` and gives the same row to the last bit.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,16 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.data.leg import WHEELS
+from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
 from odocal_ros.messages.fields import MessageView, View
 from odocal_ros.messages.frames import FrameFilter
 from odocal_ros.messages.odometer_types import OdometerPlan
-from odocal_ros.messages.raws import Raws, Table
+from odocal_ros.messages.raws import Raws, Table, tables
 from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan, TRANSFORMS
-from odocal_ros.messages.tables import tables
 from odocal_ros.settings.config import Config
 
 # judgement: messages that gave nothing, after which odd ones are not looked at

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Ints
 from odocal_ros.messages import cdr
 from odocal_ros.messages.raws import Table
-from odocal_ros.messages.tables import columns
 
 PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
 
@@ -96,9 +95,9 @@ def parts(path: str) -> tuple[tuple[str, str], ...]:
 @dataclass(frozen=True)
 class Column:
     """
-    Values wanted of every message.
+    Values to read from every message.
 
-    ``pick`` says at which paths they lie in a message, None if they are not there.
+    ``pick`` returns their paths in a message, None if they are missing.
     """
 
     dtype: type
@@ -108,7 +107,7 @@ class Column:
     def of_table(self, layout: cdr.Layout, table: Table) -> NDArray[Any] | None:
         """Return (n, width) values of messages of one layout, None if they are not there."""
         paths = self.pick(layout)
-        return columns(layout, table, paths) if paths else None
+        return layout.columns(table, paths) if paths else None
 
     def of_message(self, view: MessageView) -> list[Any] | None:
         """Return the same values of one message."""

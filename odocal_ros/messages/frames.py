@@ -57,7 +57,7 @@ class FrameFilter:
                                      np.full(len(other), self.frame.encode()[:FRAME_BYTES]))
 
     def _count(self, frame: str | None) -> None:
-        """Take the frame of one message of the begin."""
+        """Count the frame of one of the first messages."""
         if frame is None:
             return
         self._seen[frame] = self._seen.get(frame, 0) + 1

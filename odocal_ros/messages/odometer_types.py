@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Odometer messages: where the value lies in each type, and what it means."""
+"""Odometer messages: field of the value in each type, and its meaning."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.data.leg import WHEELS
+from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, of_columns, Samples
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
@@ -38,7 +38,7 @@ TYPES = tuple(DEFAULT_FIELD)
 
 class OdometerPlan:
     """
-    What to take from the messages of an odometer topic, and what it means.
+    Fields to read from the messages of an odometer topic, and their meaning.
 
     The first message decides some of it (does a JointState hold positions? which of its joints
     are wheels? is a foreign field a whole number?); ``ready`` is called with messages in order
@@ -68,7 +68,7 @@ class OdometerPlan:
                 self._settle(self.field or self.fields[0])
 
     def _check(self) -> None:
-        """Refuse what can be seen to fail before any message came."""
+        """Refuse settings that must fail, before the first message."""
         if not self.known and not self.field and len(self.keys) < 2:
             raise BadData(
                 f'{self.slot}: {self.msgtype} is not a known odometer type: set '
@@ -99,7 +99,7 @@ class OdometerPlan:
         return self.known and (not base or '[' in _kinds(self.msgtype)[base])
 
     def ready(self, view: View) -> bool:
-        """Learn from a message what is still open; False: ask again with the next one."""
+        """Determine what is still open from a message; False: repeat with the next one."""
         if self.columns:
             return True
         if not self.known:
@@ -184,7 +184,7 @@ class OdometerPlan:
         return f'{_base(field)[0]}[{key}]' if field else key
 
     def _pick(self, field: str, key: str) -> Callable[[View], Sequence[str] | None]:
-        """Return the function that says where in a message a wheel's values lie."""
+        """Return the function that gives the paths of a wheel's values in a message."""
         path = self._path(field, key)
         base, own = _base(field)
         if not self.known or '[' not in _kinds(self.msgtype)[base]:

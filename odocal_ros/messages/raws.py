@@ -1,19 +1,22 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Serialised messages side by side in one buffer."""
+"""Serialised messages side by side in one buffer, and those of one layout as a table."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Ints
+from odocal_ros.messages import cdr
 
 Bytes = bytes | bytearray | memoryview
 Rows = Ints | Bools | slice
 Table = NDArray[np.uint8]
+# judgement: per call; a stream with more is odd enough to be read message by message
+MAX_LAYOUTS = 16
 
 
 class Raws(Sequence[bytes]):
@@ -78,3 +81,49 @@ class Raws(Sequence[bytes]):
             return [np.arange(len(self))]
         order = np.argsort(self.size, kind='stable')
         return np.split(order, np.flatnonzero(np.diff(self.size[order])) + 1)
+
+
+def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[cdr.Layout | None, Rows, Table]]:
+    """
+    Sort messages by layout.
+
+    Yields
+    ------
+    Layout, where its rows stand (numbers, or a slice: all of them) and the messages, (n, size)
+    bytes. Rows that have no layout come last, with None and no messages.
+
+    """
+    raws = Raws.of(raws)
+    odd: list[Ints] = []
+    for rows in raws.by_size():
+        table = raws.table(rows)
+        for _ in range(MAX_LAYOUTS):
+            layout = cdr.layout_of(msgtype, table[0].tobytes())
+            alike = _same(table, layout.fixed if layout else [(0, table.shape[1])])
+            whole = bool(alike.all())
+            if layout is None:
+                odd.append(rows[alike])
+            elif whole:
+                yield layout, slice(None) if len(rows) == len(raws) else rows, table
+            else:
+                yield layout, rows[alike], table[alike]
+            if whole:
+                break
+            rows, table = rows[~alike], table[~alike]
+        else:
+            odd.append(rows)
+    if odd:
+        yield None, np.sort(np.concatenate(odd)), np.empty((0, 0), np.uint8)
+
+
+def _same(table: Table, fixed: Sequence[tuple[int, int]]) -> Bools:
+    """Return a mask of messages of one length whose layout bytes equal those of the first."""
+    alike = np.ones(len(table), bool)
+    for start, stop in fixed:
+        part = table[:, start:stop]
+        if stop - start in (2, 4, 8):
+            number = part.view(f'u{stop - start}')[:, 0]
+            alike &= number == number[0]
+        else:
+            alike &= (part == part[0]).all(axis=1)
+    return alike

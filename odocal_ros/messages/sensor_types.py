@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Messages of the IMU, positions and heading: where the values lie, and what they mean."""
+"""Messages of the IMU, positions and heading: fields and their meaning."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
@@ -22,12 +23,11 @@ from odocal_ros.data.samples import (
 from odocal_ros.errors import BadData
 from odocal_ros.messages.fields import array, Column, fixed, STAMP, stamp_ns, View, xyz
 from odocal_ros.nav.local_frame import local_fixes
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, OdometerConfig
 from odocal_ros.settings.levels import RAD_PER_DEG
 
 IMU = 'sensor_msgs/msg/Imu'
 FIX = 'sensor_msgs/msg/NavSatFix'
-VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, Samples]]
 Build = Callable[..., Samples]        # of stamps, arrivals and a slot's columns
@@ -44,7 +44,7 @@ LOCAL_TYPES: dict[str, Sequence[Column]] = {
 
 
 class SensorPlan:
-    """What to take from a stamped sensor message, and the samples it makes."""
+    """Fields to read from a stamped sensor message, and the samples of them."""
 
     form: OdometerForm | None = None
     known = True         # its layout is all there is to learn of its type
@@ -116,10 +116,18 @@ SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
                     array('position_covariance', *range(9)),
                     fixed(np.int64, 'position_covariance_type'),
                     fixed(np.int64, 'status.status')), _fix),
-    ('fix_velocity', VELOCITY[0]): ((xyz('twist.linear'),), _velocity),
-    ('fix_velocity', VELOCITY[1]): (
+    ('fix_velocity', 'geometry_msgs/msg/TwistStamped'): ((xyz('twist.linear'),), _velocity),
+    ('fix_velocity', 'geometry_msgs/msg/TwistWithCovarianceStamped'): (
         (xyz('twist.twist.linear'), array('twist.covariance', 0, 7, 14)), _velocity),
 }
+
+
+def types_of(slot: str, odometer: OdometerConfig) -> tuple[str, ...]:
+    """Return the message types that an input can have; empty: any type, of an odometer."""
+    if slot in WHEELS:
+        return () if odometer.type == 'auto' else (odometer.type,)
+    types = tuple(kind for own, kind in SENSORS if own == slot)
+    return (*types, *LOCAL_TYPES, TRANSFORMS) if slot == 'fix' else types
 
 
 def sensor_plan(slot: str, msgtype: str, config: Config) -> SensorPlan:
@@ -127,8 +135,6 @@ def sensor_plan(slot: str, msgtype: str, config: Config) -> SensorPlan:
     if slot == 'fix' and msgtype in LOCAL_TYPES:
         return SensorPlan(slot, LOCAL_TYPES[msgtype], local_fixes(config.reference.latitude_deg))
     if (slot, msgtype) not in SENSORS:
-        types = [other for own, other in SENSORS if own == slot]
-        types += (*LOCAL_TYPES, TRANSFORMS) if slot == 'fix' else ()
         raise BadData(f'{slot}: messages of type {msgtype} cannot be used; give a topic of type '
-                      f'{" or ".join(types)}')
+                      f'{" or ".join(types_of(slot, config.odometer))}')
     return SensorPlan(slot, *SENSORS[slot, msgtype])

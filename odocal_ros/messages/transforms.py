@@ -89,7 +89,7 @@ class TransformReader(Reader):
         return self.known()
 
     def add_static(self, raws: Sequence[bytes], deserialize: Deserialize) -> None:
-        """Take messages of the static topic."""
+        """Process messages of the static topic."""
         for raw in raws:
             for child, parent, _, values in self._read(raw, deserialize):
                 self._chain.add_static(child, parent, values)

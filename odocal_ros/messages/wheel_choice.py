@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Which values of a message are the wheels, where no setting names them.
+Selection of the wheels among the values of a message, if no setting names them.
 
 Joints are selected by name: wheels, steering and arm joints have typical names. A left and a right
 one make a pair; of several axles the one that does not steer, else the rear one. Without

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.leg import WHEELS
-from odocal_ros.data.samples import NO_STAMPS, OdometerForm
+from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.samples import OdometerForm
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.messages.decode import Deserialize
 from odocal_ros.messages.fields import MessageView
@@ -44,7 +44,7 @@ class Fields:
         self.paths: list[str] = []
         self.whole: list[bool] = []
         self._every, self._seen, self._times, self._values = 1, 0, array('q'), array('d')
-        self._t_ns, self._travel = NO_STAMPS, dict[str, Floats]()
+        self._t_ns, self._travel = np.empty(0, np.int64), dict[str, Floats]()
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:

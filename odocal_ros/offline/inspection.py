@@ -12,7 +12,8 @@ import numpy as np
 
 from odocal_ros.bagio.read import Bag, TopicInfo
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.leg import LegRecorder, WHEELS
+from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.pieces import medians
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError

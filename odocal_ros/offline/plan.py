@@ -10,6 +10,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import say
 
@@ -51,7 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
     for slot in SLOTS:
-        add(f'--{slot}-topic', metavar='TOPIC', help=f'with --bag: topic of the {slot}')
+        add(topic_option(slot), metavar='TOPIC',
+            help=f'with --bag: topic of the {INPUTS[slot].label}')
     add('--json', action='store_true', help='print JSON, nothing else')
 
 

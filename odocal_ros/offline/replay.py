@@ -12,6 +12,7 @@ import sys
 from textwrap import fill
 from typing import Any, TYPE_CHECKING
 
+from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.listener import Listener
 from odocal_ros.offline.say import Phase, say, warn
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from odocal_ros.calib.result import Calibration as Combined
     from odocal_ros.library.calibration import Calibration
     from odocal_ros.settings.config import Config
-
-SLOTS = ('imu', 'odometer', 'fix', 'heading', 'odometer_right', 'fix_velocity')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,10 +49,9 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     add('--config', metavar='FILE', help='ROS parameter file, the same YAML as for the node')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
-    for slot in SLOTS:
-        add(f'--{slot.replace("_", "-")}-topic', metavar='TOPIC', dest=f'{slot}_topic',
-            help=f'topic of the {slot.replace("_", " ")}; default: the only topic of a fitting '
-            'type')
+    for slot in TOPICS:
+        add(topic_option(slot), metavar='TOPIC', dest=f'{slot}_topic',
+            help=f'topic of the {INPUTS[slot].label}; default: the only topic of a fitting type')
 
 
 def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
@@ -147,7 +145,7 @@ def asked_settings(args: argparse.Namespace) -> dict[str, Any]:
 
 def asked_topics(args: argparse.Namespace) -> dict[str, str]:
     """Return slot -> topic of those asked for."""
-    return {slot: topic for slot in SLOTS if (topic := getattr(args, f'{slot}_topic'))}
+    return {slot: topic for slot in TOPICS if (topic := getattr(args, f'{slot}_topic'))}
 
 
 def _styled(stream: Any) -> bool:

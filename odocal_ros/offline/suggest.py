@@ -6,15 +6,9 @@
 from collections.abc import Collection
 
 from odocal_ros.bagio.read import TopicInfo
+from odocal_ros.data.inputs import topic_option
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.topics import (
-    candidates,
-    choose_topics,
-    imu_needed,
-    named,
-    OPTION,
-    wanted,
-)
+from odocal_ros.library.topics import candidates, choose_topics, imu_needed, named, wanted
 from odocal_ros.messages.sensor_types import FIX
 from odocal_ros.outside.names import for_shell
 from odocal_ros.settings.config import Config, with_settings
@@ -93,7 +87,7 @@ def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: 
         found = candidates(topics, slot, config, others)
         local = slot == 'fix' and topics[topic].msgtype != FIX      # said, as it is unusual
         if slot in overrides or len(found) > 1 or topic not in found or local:
-            words += [OPTION[slot], topic]
+            words += [topic_option(slot), topic]
     if 'odometer_right' in mapping and 'odometer_right' not in overrides:
         extra = ['odometer.left=topic', 'odometer.right=topic', *extra]
     for option in extra:

@@ -12,6 +12,7 @@ import shlex
 import sys
 from typing import Any, TYPE_CHECKING
 
+from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadData
 from odocal_ros.offline import replay
 from odocal_ros.offline.say import say
@@ -19,9 +20,6 @@ from odocal_ros.offline.say import say
 if TYPE_CHECKING:
     from odocal_ros.bagio.read import Bag
     from odocal_ros.settings.config import Config
-
-LABELS = {'imu': 'IMU', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
-          'heading': 'heading', 'fix_velocity': 'GNSS velocity'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,9 +63,8 @@ class _Choice:
 
     def words(self) -> str:
         """Return the choice as a printed line."""
-        from odocal_ros.library.topics import OPTION
-        return (f'{LABELS[self.slot]}: {self.topic}, because {self.why}; other candidates: '
-                f'{", ".join(self.others)} ({OPTION[self.slot]})')
+        return (f'{INPUTS[self.slot].label}: {self.topic}, because {self.why}; other candidates: '
+                f'{", ".join(self.others)} ({topic_option(self.slot)})')
 
 
 def _look(args: argparse.Namespace) -> tuple[dict[str, Any], list[_Choice]]:
@@ -100,13 +97,13 @@ def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str],
         if rest and mapping[slot] in candidates(bag.topics, slot, config, {}):
             why = why_before(bag.topics, slot, mapping[slot], rest[0], still)
             found.append(_Choice(slot, mapping[slot], rest, why))
-    return sorted(found, key=lambda choice: list(LABELS).index(choice.slot))
+    return sorted(found, key=lambda choice: list(INPUTS).index(choice.slot))
 
 
 def _asked(bag: 'Bag', choice: _Choice) -> _Choice:
     """Return the choice of the user at the terminal; an empty line selects the first."""
     names = [choice.topic, *choice.others]
-    say(f'{len(names)} candidate topics for the {LABELS[choice.slot]}:')
+    say(f'{len(names)} candidate topics for the {INPUTS[choice.slot].label}:')
     for number, name in enumerate(names, 1):
         info = bag.topics[name]
         say(f'  {number}  {name}  {info.msgtype}, {info.count} messages')
@@ -126,7 +123,8 @@ def _asked(bag: 'Bag', choice: _Choice) -> _Choice:
 
 
 def _missing(found: dict[str, Any]) -> str:
-    missing = [LABELS[slot] for slot in ('imu', 'odometer', 'fix') if slot not in found['mapping']]
+    missing = [INPUTS[slot].label for slot in ('imu', 'odometer', 'fix')
+               if slot not in found['mapping']]
     return f'no topic was found for: {", ".join(missing)}'
 
 
@@ -155,7 +153,7 @@ def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str])
     chosen = {choice.slot: choice.words() for choice in choices}
     lines = ['topics']
     for slot, topic in found['mapping'].items():
-        lines += wrapped(chosen.get(slot, f'{LABELS[slot]}: {topic}'))
+        lines += wrapped(chosen.get(slot, f'{INPUTS[slot].label}: {topic}'))
     pairs = list(zip(options, options[1:], strict=False))
     settings = [value for option, value in pairs if option == '--set']
     lines += ['settings'] * bool(settings)

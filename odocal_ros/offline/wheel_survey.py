@@ -12,7 +12,7 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import MOST_DAYS
 from odocal_ros.messages.odometer_types import JOINTS
-from odocal_ros.messages.tables import columns, tables
+from odocal_ros.messages.raws import tables
 from odocal_ros.offline.fix_path import FixPath
 from odocal_ros.screening.glitches import beyond
 from odocal_ros.settings.config import SIDES
@@ -39,8 +39,8 @@ class Values:
                 continue
             n = layout.count(field)
             keys = tuple(layout.names[:n]) or tuple(str(k) for k in range(n))
-            values = columns(layout, table, [f'{field}[{k}]' for k in range(len(keys))])
-            stamp = columns(layout, table, ['header.stamp.sec', 'header.stamp.nanosec'])
+            values = layout.columns(table, [f'{field}[{k}]' for k in range(len(keys))])
+            stamp = layout.columns(table, ['header.stamp.sec', 'header.stamp.nanosec'])
             stamps = received[rows] if stamp is None else (
                 stamp[:, 0].astype(np.int64) * 10**9 + stamp[:, 1])
             self._blocks.setdefault((field, keys), []).append(

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What reading may take, whatever a file claims: every bound, and how a user raises them."""
+"""Limits of reading untrusted files, and how a user raises them."""
 
 from functools import cache
 import os
@@ -28,7 +28,7 @@ class LimitReached(BadBag):
 
 
 class Damaged(Exception):
-    """A part of a file is not what it was when it was written; what it says goes into notes."""
+    """A part of a file is damaged; the text goes into the notes."""
 
 
 def factor() -> float:
@@ -63,7 +63,7 @@ class Allowance:
         self._used = 0
 
     def again(self) -> None:
-        """Begin another pass."""
+        """Restart the count for another pass."""
         self._used = 0
 
     def take(self, count: int) -> None:
@@ -72,7 +72,7 @@ class Allowance:
         check(self._used, self.most, self._what)
 
     def check_frames(self, frames: int, packed: int) -> None:
-        """Raise LimitReached where so many bytes hold more frames than anybody packs."""
+        """Raise LimitReached for implausibly many frames in so many bytes."""
         few, bytes_a_frame = 1000, 1024
         check(frames, few + packed / bytes_a_frame, self._what, 'frames')
 

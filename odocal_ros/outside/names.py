@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Names from outside (frames, topics, types, joints, files): the one door for what others chose.
+Names from outside (frames, topics, types, joints, files), made safe for each format.
 
 Writers of such a name use the function of their format; a frame is taken only where
 ROS takes it, since files that are acted on name it.

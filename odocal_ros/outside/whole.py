@@ -22,7 +22,7 @@ PART = '.part'                # of files being written: no ending that a result'
 
 
 class Disk:
-    """What may fail, one call a step."""
+    """The operations that a disk can refuse, one call each."""
 
     def __call__(self, step: Callable[..., Any], *values: Any) -> Any:
         """Do a step of the operating system."""
@@ -45,7 +45,7 @@ class WholeFile:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[WholeFile]:
-    """Open a file that is there, whole and safe on the disk, after the block, or not at all."""
+    """Open a file that after the block is complete and synced to the disk, or does not exist."""
     part = path.with_name(f'.{path.name}{PART}')
     try:
         with disk(open, part, 'wb') as file:
@@ -61,7 +61,7 @@ def whole_file(path: Path) -> Iterator[WholeFile]:
 
 
 def new_folder(root: Path, name: str) -> Path:
-    """Create a folder that nobody else has: of that name, or with a number after it."""
+    """Create a new folder: of that name, or with a number after it."""
     root.mkdir(parents=True, exist_ok=True)
     for count in range(1, MOST_SAME_NAME + 1):
         folder = root / (name if count == 1 else f'{name}-{count}')
@@ -80,7 +80,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk."""
+    """Sync the names in a folder to the disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         disk(os.fsync, handle)
@@ -91,10 +91,10 @@ def sync_folder(folder: Path) -> None:
 @contextmanager
 def locked(folder: Path, wait: bool = True) -> Iterator[bool]:
     """
-    Hold a folder against others who ask for it this way; gives whether it is held.
+    Lock a folder against other callers; yields True if it is locked.
 
-    No file is left of it, and it ends with the process. Where there are no locks, as on some
-    network disks, it counts as held.
+    No file remains, and the lock ends with the process. Without support for locks, as on some
+    network disks, it counts as locked.
     """
     try:
         handle = os.open(folder, os.O_RDONLY)
@@ -116,7 +116,7 @@ def locked(folder: Path, wait: bool = True) -> Iterator[bool]:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let Ctrl-C wait until the block is over."""
+    """Delay Ctrl-C until the end of the block."""
     if threading.current_thread() is not threading.main_thread():
         yield       # only the main thread receives it
         return

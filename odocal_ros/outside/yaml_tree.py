@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""YAML from outside as a tree: nested and linked no deeper than a person would write it."""
+"""YAML from outside as a tree, with limits of depth and size, without links."""
 
 from functools import cache
 from typing import Any
@@ -18,7 +18,7 @@ def loader(aliases: bool = False) -> Any:
     import yaml
 
     class Plain(yaml.SafeLoader):       # type: ignore[misc]  # PyYAML has no types here
-        """Composes with a bound."""
+        """Composes nodes within limits."""
 
         depth = nodes = 0
 
@@ -45,7 +45,7 @@ def loader(aliases: bool = False) -> Any:
             return node
 
         def flatten_mapping(self, node: Any) -> None:
-            """Take no merges (<<): a few of them in each other are millions of keys."""
+            """Ignore merges (<<): a few nested ones make millions of keys."""
     return Plain
 
 

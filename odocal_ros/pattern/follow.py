@@ -22,7 +22,7 @@ Pose = tuple[float, float, float]   # x, y, m, and heading, rad
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a route is driven: piece, turning on the spot, end of the rest, last command."""
+    """Progress on a route: piece, turning on the spot, end of the rest, last command."""
 
     piece: int = 0
     turning: bool = True

@@ -8,32 +8,38 @@ from collections.abc import Mapping
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_step, median, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
 from odocal_ros.nav.statistics import GAP_INTERVALS
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_APART
 
 OFFSET_REACH = 1.0     # s, format: what a time_offset setting holds
 CLOCK_SET = 0.02       # s, judgement: a clock set by more than this is named
-GROUP = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
 TOO_FAR = ('Stamp all sensors with one clock: the difference exceeds the range of time_offset. '
            'If a bag is played, use ros2 bag play --clock at normal speed and start the node '
            'with use_sim_time:=true.')
 
 
-def judge_clocks(leg: Leg, offsets: Mapping[str, float],
-                 labels: Mapping[str, str]) -> list[Reason]:
+def offsets(config: Config) -> dict[str, float]:
+    """Return the s to add to the stamps of each input; 0 for the IMU, which stamps the marks."""
+    def of(group: str) -> float:
+        return float(getattr(config, group).time_offset) if group else 0.0
+    return {slot: of(one.clock) - of('imu') for slot, one in INPUTS.items()}
+
+
+def judge_clocks(leg: Leg, offset: Mapping[str, float]) -> list[Reason]:
     """
     Compare each topic's clock with the IMU's, at equal times of arrival.
 
-    leg : as it came.   offsets, labels : of each slot: s to be added to its stamps, and what
-    people call it.
+    leg : as it came.   offset : s to add to the stamps of each input.
     """
-    found = [r for slot in ('imu', *TOPICS) for r in _was_set(getattr(leg, slot), labels[slot],
-                                                              leg.start_ns)]
+    found = [r for slot in ('imu', *TOPICS) for r in _was_set(
+        getattr(leg, slot), INPUTS[slot].label, leg.start_ns)]
     imu = _stamped(leg.imu)
     if len(imu.stamp_ns) < 2:
         return found
@@ -42,11 +48,11 @@ def judge_clocks(leg: Leg, offsets: Mapping[str, float],
         if not len(samples.stamp_ns):
             continue
         ahead = median(_lag_at(samples.received_ns, imu) - _lag(samples))
-        ahead += offsets[slot]
+        ahead += offset[slot]
         if abs(ahead) > CLOCK_APART:
-            found.append(Reason(Code.CLOCKS_DIFFER, f'{labels[slot]} stamps are {ahead:+.3f} s '
-                                'relative to IMU stamps of the same '
-                                f'time{_cure(slot, ahead)}', remedy(ahead)))
+            found.append(Reason(
+                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps are {ahead:+.3f} s relative to '
+                f'IMU stamps of the same time{_cure(slot, ahead)}', remedy(ahead)))
     return found
 
 
@@ -90,9 +96,10 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
 
 def _cure(slot: str, ahead: float) -> str:
     """Return the offset that aligns a topic's stamps with the IMU, if a setting allows it."""
-    if slot not in GROUP or abs(ahead) > OFFSET_REACH:
+    group = INPUTS[slot].clock
+    if not group or abs(ahead) > OFFSET_REACH:
         return ''
-    return f'; if this is not transport delay, add {-ahead:+.3f} to {GROUP[slot]}.time_offset'
+    return f'; if this is not transport delay, add {-ahead:+.3f} to {group}.time_offset'
 
 
 def _may_be_odd(stamp_ns: Ints) -> Bools:

@@ -20,13 +20,12 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import chunks
-from odocal_ros.data.samples import FixSamples, LOCAL, no_heading, no_velocity
+from odocal_ros.data.samples import FixSamples, HeadingSamples, LOCAL, VelocitySamples
 from odocal_ros.nav.earth import OMEGA
 from odocal_ros.nav.local_frame import LARGEST_FRAME
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.frame import in_local_frame
 from odocal_ros.settings.grades import G
 
 TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
@@ -60,7 +59,7 @@ def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
 
 def settings_by_frame(fix: FixSamples, config: Config) -> Config:
     """Return the settings that apply to positions, by their frame."""
-    return in_local_frame(config) if is_local(fix) else config
+    return config.in_local_frame() if is_local(fix) else config
 
 
 def is_local(fix: FixSamples) -> bool:
@@ -78,10 +77,10 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     if not is_local(leg.fix):
         return leg, ()
     left_out = ['GNSS velocities'] * bool(len(leg.fix_velocity.stamp_ns))
-    leg = replace(leg, fix_velocity=no_velocity())
+    leg = replace(leg, fix_velocity=VelocitySamples.none())
     if config.alignment.heading_source == 'auto' and len(leg.heading.stamp_ns):
         left_out += ['external headings']
-        leg = replace(leg, heading=no_heading())
+        leg = replace(leg, heading=HeadingSamples.none())
     latitude = math.radians(config.reference.latitude_deg)
     unknown = OMEGA if math.isnan(latitude) else OMEGA * math.cos(latitude)
     text = ('positions are in a local frame, so north is unknown: up to '

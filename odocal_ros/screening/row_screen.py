@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.leg import Leg, SLOTS, WHEELS
+from odocal_ros.data.inputs import INPUTS, WHEELS
+from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks
 from odocal_ros.data.samples import OdometerForm, Samples, take
@@ -25,8 +26,7 @@ from odocal_ros.screening.glitches import (
 )
 from odocal_ros.settings.config import Config
 
-LABEL = {slot: slot.replace('_', ' ') for slot in SLOTS} | {
-    'imu': 'IMU', 'odometer_right': 'right odometer'}
+LABEL = {slot: one.label for slot, one in INPUTS.items()} | {'fix_velocity': 'fix velocity'}
 NOTHING = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
            **dict.fromkeys(WHEELS, Code.NO_ODOMETER)}
 
@@ -81,12 +81,9 @@ def _where(samples: Samples, index: int, leg: Leg) -> str:
 
 def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Bools, Bools]:
     """Return masks of rows with a stamp and all required values, and of impossible rows."""
-    needed = {'imu': ('w_i', 'f_i'), 'fix': ('latitude', 'longitude')}.get(slot, ('value',))
-    if slot in ('fix_velocity', 'heading'):
-        needed = ('velocity_n',) if slot == 'fix_velocity' else ('q_ni',)
     stamped = samples.stamp_ns > 0
     finite, wild = np.ones(len(stamped), bool), np.zeros(len(stamped), bool)
-    for name in needed:
+    for name in INPUTS[slot].needed:
         column = getattr(samples, name)
         odd = beyond(name, column)
         finite &= ~odd

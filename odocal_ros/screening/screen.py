@@ -15,21 +15,22 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.leg import Leg, WHEELS
+from odocal_ros.data.inputs import INPUTS
+from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_step
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.statistics import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
-from odocal_ros.screening.clocks import judge_clocks
+from odocal_ros.screening.clocks import judge_clocks, offsets
 from odocal_ros.screening.fix_screen import contradicted, reckoned, usable_fixes
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import with_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
-from odocal_ros.screening.row_screen import LABEL, usable_rows
+from odocal_ros.screening.row_screen import usable_rows
 from odocal_ros.screening.wheel_travel import wheels
 from odocal_ros.settings.config import Config, ImuConfig, SIDES
 
@@ -51,10 +52,10 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
             code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
             if any(r.code is code for r in found):      # a frame_id that nobody sends
                 continue
-            found.append(Reason(code, f'no {LABEL[slot]} message between the marks'))
-    offset = _offsets(config)
+            found.append(Reason(code, f'no {INPUTS[slot].label} message between the marks'))
+    offset = offsets(config)
     if judged:
-        found += judge_clocks(leg, offset, LABEL)
+        found += judge_clocks(leg, offset)
 
     def rows(slot: str) -> tuple[Any, Floats]:
         return usable_rows(slot, leg, config, offset[slot], found)
@@ -138,20 +139,12 @@ def _turned(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:
     return np.stack([x * a + y * b + z * c for a, b, c in scale * C_bi], -1)
 
 
-def _offsets(config: Config) -> dict[str, float]:
-    """Return the time offset of each topic; marks are IMU stamps, so that of the IMU is 0."""
-    imu = config.imu.time_offset
-    wheel, gnss = config.odometer.time_offset - imu, config.gnss.time_offset - imu
-    return {'imu': 0.0, **dict.fromkeys(WHEELS, wheel), 'fix': gnss, 'fix_velocity': gnss,
-            'heading': -imu}
-
-
 def _gaps(slot: str, t: Floats, found: list[Reason]) -> None:
     """Name the longest gap of odometer or fixes where it is far beyond their own rhythm."""
     gaps = gaps_in_rhythm(t)
     if len(gaps):
         begin, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]
-        found.append(Reason(Code.TOPIC_GAP, f'{LABEL[slot]} gap of {end - begin:.2f} s at '
+        found.append(Reason(Code.TOPIC_GAP, f'{INPUTS[slot].label} gap of {end - begin:.2f} s at '
                             f't = {begin:.2f} s (median interval {np.median(np.diff(t)):.3f} s)'))
 
 

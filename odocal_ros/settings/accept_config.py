@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Limits of a production line, which result passes; --accept NAME=LOW:HIGH, their short form."""
+"""Acceptance limits of a production line, and their short form --accept NAME=LOW:HIGH."""
 
 from dataclasses import dataclass
 import math

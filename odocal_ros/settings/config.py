@@ -8,7 +8,7 @@ ROS parameters, ``config/calibrator.yaml``, ``--config``, ``--set`` and docs/set
 made from these dataclasses. A setting's name is ``group.field``, as its ROS parameter's.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
@@ -33,6 +33,18 @@ NAN = math.nan
 SIDES = ('left', 'right')     # names of two wheels
 DRIVES = DIFFERENTIAL, SKID, MECANUM = 'differential', 'skid', 'mecanum'
 
+TYPICAL = 'typical value of IMUs sold in this grade'
+
+
+def _place(about: str) -> Any:
+    """Declare a position in base_link."""
+    return setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=about)
+
+
+def _figure(unit: str, high: float, about: str, nan: str = 'value of the grade') -> Any:
+    """Declare a quality figure of an IMU; ``nan`` : meaning of NaN, its default."""
+    return setting(NAN, unit, 0.0, high, about=f'{about}; NaN: {nan}.')
+
 
 @dataclass(frozen=True, kw_only=True)
 class OdometerConfig:
@@ -52,8 +64,7 @@ class OdometerConfig:
                                    'configured, K0; 0: unknown for counts, 1 for speeds.')
     max_scale_deviation: float = setting(0.35, '1', 0.0, 1.0, about='Limit of the deviation from '
                                          'the nominal scale; beyond it the verdict is caution.')
-    lever_arm: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=(
-        'Wheel contact point in base_link (forward, left, up).'))
+    lever_arm: tuple[float, ...] = _place('Wheel contact point in base_link (forward, left, up).')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to odometer stamps.')
     # a bus and a middleware seldom deliver within less; u-blox asks for 10 ms or better
     time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown latency of the odometer, 1 '
@@ -94,27 +105,20 @@ class ImuConfig:
                          'settings below override single values.')
     frame_id: str = setting('', ro=True, about='Use only messages of the IMU topic with this '
                             "frame_id; '': the topic must carry one IMU.")
-    gyro_noise: float = setting(NAN, 'rad/s/sqrt(Hz)', 0.0, 1.0, about='White gyro noise; NaN: '
-                                'value of the grade.')
-    gyro_bias: float = setting(NAN, 'rad/s', 0.0, 1.0, about='Turn-on gyro bias, 1 sigma; NaN: '
-                               'typical value of IMUs sold in this grade.')
-    gyro_bias_walk: float = setting(NAN, 'rad/s/sqrt(s)', 0.0, 1.0, about='Random walk of the '
-                                    'gyro bias; NaN: value of the grade.')
-    accel_noise: float = setting(NAN, 'm/s^2/sqrt(Hz)', 0.0, 10.0, about='White accelerometer '
-                                 'noise; NaN: value of the grade.')
-    accel_bias: float = setting(NAN, 'm/s^2', 0.0, 10.0, about='Turn-on accelerometer bias, 1 '
-                                'sigma; NaN: typical value of IMUs sold in this grade.')
-    accel_bias_walk: float = setting(NAN, 'm/s^2/sqrt(s)', 0.0, 10.0, about='Random walk of the '
-                                     'accelerometer bias; NaN: value of the grade.')
-    gyro_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the gyro scale, '
-                                      'relative, 1 sigma; NaN: value of the grade.')
-    accel_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the accelerometer '
-                                       'scale, relative, 1 sigma; NaN: value of the grade.')
-    misalignment_sigma: float = setting(NAN, 'rad', 0.0, 0.1, about='Axis misalignment of gyro '
-                                        'and accelerometer (non-orthogonality), 1 sigma; NaN: '
-                                        'value of the grade.')
-    gyro_by_force_sigma: float = setting(NAN, 'rad/s/(m/s^2)', 0.0, 0.01, about='g-sensitivity '
-                                         'of the gyro, 1 sigma; NaN: value of the grade.')
+    gyro_noise: float = _figure('rad/s/sqrt(Hz)', 1.0, 'White gyro noise')
+    gyro_bias: float = _figure('rad/s', 1.0, 'Turn-on gyro bias, 1 sigma', TYPICAL)
+    gyro_bias_walk: float = _figure('rad/s/sqrt(s)', 1.0, 'Random walk of the gyro bias')
+    accel_noise: float = _figure('m/s^2/sqrt(Hz)', 10.0, 'White accelerometer noise')
+    accel_bias: float = _figure('m/s^2', 10.0, 'Turn-on accelerometer bias, 1 sigma', TYPICAL)
+    accel_bias_walk: float = _figure('m/s^2/sqrt(s)', 10.0, 'Random walk of the accelerometer '
+                                     'bias')
+    gyro_scale_sigma: float = _figure('1', 1.0, 'Error of the gyro scale, relative, 1 sigma')
+    accel_scale_sigma: float = _figure('1', 1.0, 'Error of the accelerometer scale, relative, 1 '
+                                       'sigma')
+    misalignment_sigma: float = _figure('rad', 0.1, 'Axis misalignment of gyro and accelerometer '
+                                        '(non-orthogonality), 1 sigma')
+    gyro_by_force_sigma: float = _figure('rad/s/(m/s^2)', 0.01, 'g-sensitivity of the gyro, 1 '
+                                         'sigma')
     gyro_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on the published turn rates; '
                                 '0.017453292519943295 for an IMU in deg/s.')
     accel_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on the published specific '
@@ -125,8 +129,7 @@ class ImuConfig:
     constants: str = setting('', ro=True, about='calibration.json of an earlier result of this '
                              'vehicle, or its folder: its IMU scales and axes (not the mounting) '
                              'are used like one more leg of the smoother.')
-    lever_arm: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=(
-        'IMU position in base_link.'))
+    lever_arm: tuple[float, ...] = _place('IMU position in base_link.')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to IMU stamps.')
     nominal_yaw: float = setting(NAN, 'rad', about='Expected yaw mounting angle; a result far '
                                  'from it is a caution. NaN: not checked.')
@@ -134,8 +137,7 @@ class ImuConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class GnssConfig:
-    lever_arm: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=(
-        'Antenna in base_link (10 cm is enough).'))
+    lever_arm: tuple[float, ...] = _place('Antenna in base_link (10 cm is enough).')
     lever_arm_sigma: float = setting(0.1, 'm', 0.0, 10.0, about='Uncertainty of the antenna '
                                      'position, each axis.')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to fix stamps.')
@@ -257,6 +259,21 @@ class Config:
     publish: PublishConfig = PublishConfig()
     frames: FramesConfig = FramesConfig()
     diagnostic_updater: UpdaterConfig = UpdaterConfig()
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Return the inputs that these settings use, with optional ones; see data/inputs.py."""
+        optional = {'odometer_right': self.odometer.own_topics,
+                    'fix_velocity': self.gnss.use_velocity,
+                    'heading': self.alignment.heading_source in ('auto', 'heading_topic')}
+        return 'imu', 'odometer', 'fix', *(slot for slot, used in optional.items() if used)
+
+    def in_local_frame(self) -> 'Config':
+        """Return the settings of a leg whose positions are in a local frame."""
+        ours = self.reference
+        leg = replace(self.leg, min_distance=min(self.leg.min_distance, ours.min_distance),
+                      min_speed=min(self.leg.min_speed, ours.min_speed))
+        return replace(self, leg=leg, gnss=replace(self.gnss, default_sigma=ours.default_sigma))
 
 
 SETTINGS = settings_of(Config)

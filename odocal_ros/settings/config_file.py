@@ -75,7 +75,7 @@ def _settings(path: Path, root: Node) -> dict[str, object]:
 
 
 def read_journal_file(path: Path, block: str) -> tuple[dict[str, object], dict[str, str]]:
-    """Return the settings of a journal's file, and what a block of its own says, as text."""
+    """Return the settings of a journal's file, and the values of its own block as text."""
     root = _root(path)
     about = list(_blocks(root, '').get(block, ()))
     return _settings(path, root), {

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""IMU grades: what the sensors' errors are taken to be, 1 sigma, in SI."""
+"""IMU grades: assumed errors of the sensors, 1 sigma, SI units."""
 
 from collections.abc import Mapping
 import dataclasses
@@ -39,7 +39,7 @@ def _from_data_sheet(gyro_noise: float, gyro_bias: float, gyro_bias_walk: float,
                      gyro_scale_error: float, accel_scale_error: float, misalignment: float,
                      gyro_by_force: float) -> Grade:
     """
-    Take the units of data sheets.
+    Return the figures of a data sheet in SI units.
 
     deg/sqrt(h), deg/h, deg/h/sqrt(h); m/s/sqrt(h), m/s^2, m/s^2/sqrt(h); 1 twice; deg; deg/s/g.
     """

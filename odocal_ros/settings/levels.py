@@ -4,7 +4,7 @@
 """
 Limits of several packages: sigmas for a remark, and motions of land vehicles.
 
-A level is one of two sides of the normal law; beside each, how often chance alone reaches it.
+The comment beside a level is the probability that chance exceeds it, on two sides.
 
 Beside a number stands where it is from: physical, with its source; statistical, with how often
 chance does so; tuned, with the benchmark that shows it; judgement, where nothing was measured;

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The scale that the settings give, before anything is driven."""
+"""The nominal scale, from the settings."""
 
 from math import tau
 

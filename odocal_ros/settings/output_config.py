@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Settings of what goes out: files, journal, topics, frames; the groups of ``Config`` of that."""
+"""Settings of the output: files, journal, topics and frames."""
 
 from dataclasses import dataclass
 

@@ -25,35 +25,26 @@ class Settings(Protocol):
 AnyConfig = TypeVar('AnyConfig', bound=Settings)
 
 
-def setting(default: object, unit: str = '', low: float | None = None, high: float | None = None,
-            about: str = '', choices: Sequence[str] = (), ro: bool = False,
-            frame: bool = False, item: type = float, many: bool = False) -> Any:
-    """
-    Declare a setting; NaN passes where the default is NaN.
-
-    ro : fixed at start-up.   frame : the name of a coordinate frame.   item : type of the values
-    of a list.   many : a list of any length.
-    """
-    return field(default=default, metadata={
-        'unit': unit, 'low': low, 'high': high, 'about': about, 'choices': choices, 'ro': ro,
-        'frame': frame, 'item': item, 'many': many})
-
-
 @dataclass(frozen=True)
 class Setting:
-    """One setting: what a parameter descriptor, a YAML line and a table row are made from."""
+    """
+    One setting: source of a parameter descriptor, a YAML line and a table row.
+
+    default : NaN is accepted where it is NaN.   ro : fixed at start-up.   frame : the name of a
+    coordinate frame.   item : type of the values of a list.   many : a list of any length.
+    """
 
     name: str
     default: Any
-    unit: str
-    low: float | None
-    high: float | None
-    choices: Sequence[str]
-    about: str
-    read_only: bool
-    frame: bool
-    item: type
-    many: bool
+    unit: str = ''
+    low: float | None = None
+    high: float | None = None
+    about: str = ''
+    choices: Sequence[str] = ()
+    ro: bool = False
+    frame: bool = False
+    item: type = float
+    many: bool = False
 
     @property
     def kind(self) -> str:
@@ -103,7 +94,7 @@ class Setting:
         return value
 
     def _check_text(self, value: str) -> None:
-        """Refuse what no name is: it would stand in files and on terminals."""
+        """Refuse text with invisible characters, and names of frames that ROS does not allow."""
         if one_line(value) != value:
             raise BadConfig(f"{self.name}: '{one_line(value)}' has invisible characters")
         # empty is one where that means something: as the default
@@ -112,14 +103,17 @@ class Setting:
                             'digits and _ . / -, without a leading /')
 
 
+def setting(default: object, *about: Any, **more: Any) -> Any:
+    """Declare a setting, with the fields of ``Setting`` after its default."""
+    return field(default=default, metadata={'setting': Setting('', default, *about, **more)})
+
+
 def _settings(owner: Settings, prefix: str = '') -> Iterator[Setting]:
     for f in fields(owner):
         if is_dataclass(f.default) and not isinstance(f.default, type):
             yield from _settings(f.default, f'{prefix}{f.name}.')
         else:
-            m = f.metadata
-            yield Setting(prefix + f.name, f.default, m['unit'], m['low'], m['high'],
-                          m['choices'], m['about'], m['ro'], m['frame'], m['item'], m['many'])
+            yield replace(f.metadata['setting'], name=prefix + f.name)
 
 
 @cache

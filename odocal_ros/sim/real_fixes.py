@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.samples import no_velocity, VelocitySamples
+from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.nav.earth import radii
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point
@@ -126,7 +126,7 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     """Return the published velocity of the antenna; none without a sigma."""
     sigma = options.velocity_sigma
     if sigma is None:
-        return no_velocity()
+        return VelocitySamples.none()
     ns, t = stamps(motion.duration, options.velocity_rate, PHASE['fix'])
     smoothed = replace(options, real=replace(options.real, receiver_lag=options.velocity_lag))
     before, after = (np.stack(places(motion, np.maximum(t + by, 0.0), smoothed), -1)

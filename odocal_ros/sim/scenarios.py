@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.leg import Leg, WHEELS
+from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
     ImuSamples,
-    no_heading,
-    no_imu,
-    no_odometer,
     OdometerForm,
     OdometerSamples,
     VelocitySamples,
@@ -99,7 +97,7 @@ class Drive:
     @property
     def odometer_right(self) -> OdometerSamples:
         """Return the samples of the right wheel, no rows without one."""
-        return self.wheels[1] if len(self.wheels) > 1 else no_odometer()
+        return self.wheels[1] if len(self.wheels) > 1 else OdometerSamples.none()
 
     @property
     def reference(self) -> Reference:
@@ -204,10 +202,10 @@ def simulate(options: SimOptions | None = None) -> Drive:
     imu = sensors.imu(motion, options)
     return Drive(
         options=options, motion=motion, truth=_truth(motion, options, imu),
-        form=FORMS[options.odometer], imu=imu if options.imu else no_imu(),
+        form=FORMS[options.odometer], imu=imu if options.imu else ImuSamples.none(),
         wheels=tuple(sensors.odometers(motion, options)),
         fix=sensors.fixes(motion, options),
-        heading=(no_heading() if options.heading_sigma is None
+        heading=(HeadingSamples.none() if options.heading_sigma is None
                  else sensors.heading(motion, options, options.heading_sigma)),
         velocity=velocity(motion, options))
 

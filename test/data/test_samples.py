@@ -56,8 +56,7 @@ def test_what_is_cut_and_joined_is_the_whole():
     assert s.join([whole]) is whole
 
 
-@pytest.mark.parametrize('empty', [s.no_imu, s.no_odometer, s.no_fix, s.no_velocity,
-                                   s.no_heading])
+@pytest.mark.parametrize('empty', [kind.none for kind in s.Samples.__subclasses__()])
 def test_an_empty_block_has_no_rows_and_joins_with_others(empty):
     assert len(empty().stamp_ns) == 0
     assert len(s.join([empty(), empty()]).stamp_ns) == 0

@@ -141,6 +141,17 @@ def same_result(live: dict, offline: dict, *more: str) -> None:
         assert live[key] == offline[key], key
 
 
+def check_replay(live: dict, journal: Path) -> str:
+    """Assert that a journal replays to the result of the node, to the last bit; return its log."""
+    code, offline, said = replayed(journal)
+    assert code == 0, said
+    same_result(live, offline, 'config')
+    for here, there in zip(live['legs'], offline['legs'], strict=True):
+        assert here | {'bag': journal.name} == there
+    assert live['inputs'][0]['topics'] == offline['inputs'][0]['topics']
+    return said
+
+
 def wrong(left: Files | Remains) -> list[float]:
     """Return by how many sigmas values that were not rejected miss the truth, where too many."""
     found = [*left.whole, left.journal[1]] if isinstance(left, Files) else [left.result]

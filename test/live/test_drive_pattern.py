@@ -112,46 +112,51 @@ def test_a_pattern_is_driven_to_its_end_inside_the_rectangle():
         assert max(abs(rate) for _, rate in robot.commands) <= 3.0
 
 
-def test_the_service_stops():
-    with driven(kind=TwistStamped, stamped='true') as (node, client, robot):
+@contextlib.contextmanager
+def changed(owner, name, value):
+    """Change an attribute as long as the block lasts."""
+    before = getattr(owner, name)
+    setattr(owner, name, value)
+    yield
+    setattr(owner, name, before)
+
+
+@contextlib.contextmanager
+def bumped(robot):
+    """Press the bumper as long as the block lasts."""
+    robot.bump(True)
+    yield
+    robot.bump(False)
+
+
+# the cause, how it is made, and whether a start is refused for it
+CAUSES = {
+    'no pose for 0.5 s': (lambda robot: changed(robot, 'blind', True), True),
+    'the bumper is pressed': (bumped, True),
+    'the robot is outside the rectangle, at x': (
+        lambda robot: changed(robot, 'pose', [0.0, 1.2, 0.0]), True),
+    'the pose has not changed for 2 s': (lambda robot: changed(robot, 'frozen', True), False)}
+
+
+def test_each_cause_stops_and_a_start_goes_on():
+    with driven() as (node, client, robot):
+        for why, (cause, refused) in CAUSES.items():
+            with cause(robot):
+                stopped(node, robot, why, 10)
+                if refused:
+                    answer = client.call('start')
+                    assert not answer.success
+                    assert why in answer.message
+            wait_for(lambda: client.call('start').success, f'a start after {why}')
+
+
+def test_the_service_and_a_timeout_stop():
+    with driven(kind=TwistStamped, stamped='true', timeout=5.0) as (node, client, robot):
         assert client.call('stop').message == 'stopped'
         stopped(node, robot, '~/stop', 5)
         assert 'was not driven' in client.call('stop').message
-
-
-def test_a_lost_pose_stops():
-    with driven() as (node, client, robot):
-        robot.blind = True
-        stopped(node, robot, 'no pose for 0.5 s', 5)
-        answer = client.call('start')
-        assert (answer.success, answer.message) == (False, 'no pose for 0.5 s')
-
-
-def test_the_bumper_stops():
-    with driven() as (node, client, robot):
-        robot.bump(True)
-        stopped(node, robot, 'the bumper is pressed', 5)
-        assert client.call('start').message == 'the bumper is pressed'
-        robot.bump(False)
-        wait_for(lambda: client.call('start').success, 'a start after the bumper')
-
-
-def test_outside_the_rectangle_the_robot_stops():
-    with driven() as (node, client, robot):
-        robot.pose[1] = 1.2
-        stopped(node, robot, 'the robot is outside the rectangle, at x', 5)
-        assert 'outside the rectangle' in client.call('start').message
-
-
-def test_a_pose_that_does_not_change_stops():
-    with driven() as (node, _, robot):
-        robot.frozen = True
-        stopped(node, robot, 'the pose has not changed for 2 s', 10)
-
-
-def test_a_timeout_stops():
-    with driven(timeout=1.0) as (node, _, robot):
-        stopped(node, robot, 'timeout of 1 s', 5)
+        assert client.call('start').success
+        stopped(node, robot, 'timeout of 5 s', 10)
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

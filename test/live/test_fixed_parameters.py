@@ -7,7 +7,8 @@ import math
 
 from rclpy.parameter import Parameter
 
-from odocal_ros.live.params import refused, RESULTS
+from odocal_ros.live.params import fixed, refused, RESULTS
+from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import Config
 
 
@@ -33,3 +34,12 @@ def test_a_result_is_refused_unless_it_is_the_one_in_force():
     text = refused(Config(), here, of(result__scale_factor=0.06))
     assert 'result.scale_factor is set by the node' in text
     assert '--params-file calibration.yaml' in text
+
+
+def test_a_node_that_reads_its_settings_at_start_up_refuses_all_of_them():
+    refuse = fixed(ApplyConfig)
+    for values in ({'levelling': False}, {'publish__rate': 5.0}, {'result__valid': True}):
+        answer = refuse(of(**values))
+        assert not answer.successful, values
+        assert 'is only read at start-up: restart the node with it' in answer.reason
+    assert refuse(of(use_sim_time=True, leg__min_distance=5.0)).successful

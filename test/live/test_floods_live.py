@@ -4,12 +4,10 @@
 """A flood of parameters in a leg, and a sender that restarts in it: the node goes on."""
 
 from bench import wait_for
-from player import messages_of, part, Player
+from player import ended, messages_of, part, Player, recording, straight
 import pytest
 from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
-
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 SPEED = 15.0
@@ -32,13 +30,9 @@ def flood(client):
 
 
 def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(start, connect):
-    types, sent = messages_of(simulate(SimOptions(
-        scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
-        fix_noise='rtk', imu_grade='tactical')))
+    types, sent = messages_of(straight())
     node, client = start(), connect()
-    player = Player.connected(client, types)
-    player.play(part(sent, 45, 60), SPEED)
-    client.start()
+    player = recording(client, (types, sent), 45, 60, SPEED)
     with player.playing(part(sent, 60, 95), SPEED):
         futures = flood(client)
         wait_for(lambda: all(one.done() for one in futures), 'the answers')
@@ -53,8 +47,6 @@ def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(start,
         client.node.destroy_publisher(publisher)
     player = Player.connected(client, types)
     player.play(part(sent, 95, 115), SPEED)
-    stopping = client.ask('stop_leg')
-    player.play(part(sent, 115, 117), SPEED)
-    answer = client.result(stopping)
+    answer = ended(client, player, part(sent, 115, 117), SPEED)
     assert 'scale factor 1.0' in answer.message
     assert node.process.poll() is None

@@ -3,13 +3,11 @@
 
 """The IMU falls silent in a leg: said at once, the leg is cut there, its parts make the result."""
 
-import json
-from pathlib import Path
 from types import SimpleNamespace
 
 from bench import given, wait_for
 from kills import NUMBERS, replayed, same_result
-from player import messages_of, part, playing_to
+from player import messages_of, part, playing_to, stopped
 import pytest
 
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -42,16 +40,9 @@ def seen(tmp_path_factory):
         found.told = wait_for(lambda: '3.02 s' in client.status['hint'] and client.status,
                               'the whole gap')
         player.play(part(sent, 130, 190), SPEED)
-        stopping = client.ask('stop_leg')
-        player.play(part(sent, 190, 192), SPEED)
-        found.answer = client.result(stopping)
-        found.status = client.until(state='calibrated')
-        saved = wait_for(lambda: client.status['saved'], 'the saved folder')
-        found.written = json.loads((Path(saved) / 'calibration.json').read_text())
+        seen = stopped(client, player, part(sent, 190, 192), SPEED)
         found.undone = client.call('undo_leg')
-        found.journal = Path(found.status['journal'])
-        wait_for((found.journal / 'metadata.yaml').exists, 'the joined journal')
-        yield found
+        yield SimpleNamespace(**vars(found), **vars(seen))
 
 
 def test_it_is_said_while_the_leg_is_driven(seen):
@@ -71,14 +62,14 @@ def test_it_is_said_at_once_and_what_was_good_enough_stays_so(seen):
 
 
 def test_its_parts_make_the_result(seen):
-    assert seen.answer.success
-    assert seen.answer.message.startswith('leg 1 in 2 parts, ')
+    assert seen.stop.success
+    assert seen.stop.message.startswith('leg 1 in 2 parts, ')
     assert seen.status['legs'] == '1'
-    one, other = seen.written['legs']
+    one, other = seen.live['legs']
     assert other['start_ns'] - one['stop_ns'] == pytest.approx(3.02e9, abs=1e6)
-    scale = seen.written['result']['scale_factor']
+    scale = seen.live['result']['scale_factor']
     assert abs(scale['value'] - seen.truth.scale) < 4 * scale['sigma']
-    assert 'LEG_CUT' in {r['code'] for r in seen.written['reasons']}
+    assert 'LEG_CUT' in {r['code'] for r in seen.live['reasons']}
     assert seen.undone.message == 'leg 1 is undone; no leg is left'
 
 
@@ -87,4 +78,4 @@ def test_a_replay_of_the_journal_gives_the_same(seen):
     marks = [f'{ns // 10**9}.{ns % 10**9:09}' for ns in ends_ns]
     # undone since: it must be asked for by its marks
     _, offline, _ = replayed(seen.journal, '--leg', ':'.join(marks), *NUMBERS)
-    same_result(seen.written, offline)
+    same_result(seen.live, offline)

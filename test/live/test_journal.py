@@ -8,11 +8,20 @@ import json
 from pathlib import Path
 import resource
 import time
-from types import SimpleNamespace
 
 from bench import given, wait_for
-from kills import drive, killed, remains, replayed, same_result, wrong
-from player import by_now, messages_of, part, Player, playing_to, sent_of
+from kills import check_replay, drive, killed, remains, replayed, same_result, wrong
+from player import (
+    by_now,
+    messages_of,
+    part,
+    Player,
+    playing_to,
+    recording,
+    sent_of,
+    stopped,
+    straight,
+)
 import pytest
 
 from odocal_ros.bagio import encode
@@ -24,38 +33,21 @@ SPEED = 30.0
 NAMES = {'imu': '/front/imu', 'fix': '/gps/fix'}
 
 
-def same(live, offline, journal):
-    """Assert that a result written live is the one of its journal, in every digit."""
-    same_result(live, offline, 'config')
-    for here, there in zip(live['legs'], offline['legs'], strict=True):
-        assert here | {'bag': Path(journal).name} == there
-
-
 @pytest.fixture(scope='module')
 def session(tmp_path_factory):
     """Drive three legs through one node: kept, cancelled, undone."""
-    simulated = simulate(SimOptions(
-        scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
-        fix_noise='rtk', imu_grade='tactical', heading=0.7))
+    simulated = straight(heading=0.7)
     types, sent = messages_of(simulated)
     folder = tmp_path_factory.mktemp('journal')
-    remaps = [x for slot, name in NAMES.items() for x in ('-r', f'{slot_name(slot)}:={name}')]
     settings = {'output.directory': folder, 'alignment.heading_source': 'fixed',
                 'alignment.heading': simulated.truth.heading, 'leg.preroll': 20.0}
-    seen = SimpleNamespace(folder=folder)
-    with playing_to(types, *given(settings), *remaps, names=NAMES) as (_, client, player):
+    with playing_to(types, *given(settings), names=NAMES) as (_, client, player):
         player.play(part(sent, 30, 60), SPEED)
         client.until(state='idle')
         client.call('start_leg')
         player.play(part(sent, 60, 115), SPEED)
-        stopping = client.ask('stop_leg')
-        client.until(state='computing')
-        player.play(part(sent, 115, 117), SPEED)
-        seen.stop = client.result(stopping)
-        seen.status = wait_for(lambda: client.status['saved'] and client.status, 'saved files')
-        seen.kept = Path(seen.status['journal'])
-        seen.joined = wait_for((seen.kept / 'metadata.yaml').exists, 'the joined journal')
-        seen.live = json.loads((Path(seen.status['saved']) / 'calibration.json').read_text())
+        seen = stopped(client, player, part(sent, 115, 117), SPEED)
+        seen.kept = seen.journal
         # a leg that is cancelled, and one that is undone after it was joined
         player.play(part(sent, 117, 118), SPEED)
         client.start()
@@ -77,15 +69,9 @@ def session(tmp_path_factory):
     return seen
 
 
-def slot_name(slot):
-    return {'imu': 'imu/data'}.get(slot, slot)
-
-
 def test_a_journal_replays_to_the_last_bit_without_options(session):
-    code, result, said = replayed(session.kept)
-    assert code == 0, said
-    same(session.live, result, session.kept)
-    assert result['inputs'][0]['topics'] == {
+    said = check_replay(session.live, session.kept)
+    assert session.live['inputs'][0]['topics'] == {
         'imu': '/front/imu', 'odometer': '/odometer', 'fix': '/gps/fix'}
     assert 'is a journal: settings and topics come from' in said
 
@@ -118,7 +104,7 @@ def test_dropped_legs_are_not_replayed(session):
     code, result, said = replayed(session.undone, str(session.kept))
     assert code == 0, said
     assert 'cancelled or undone' in said
-    same(session.live, result, session.kept)
+    same_result(session.live, result, 'config')
 
 
 @pytest.mark.parametrize('moment_s', [0.3, 1.3, 2.6])
@@ -138,8 +124,7 @@ def test_a_killed_leg_is_replayed_from_its_mark(tmp_path, moment_s):
 
 
 def test_pulses_without_stamps_keep_the_times_they_were_sent_at(start, connect, tmp_path):
-    made = simulate(SimOptions(scenario='straight', duration=180.0, imu_rate=50.0,
-                               odometer_rate=25.0, fix_noise='rtk'))
+    made = straight(odometer='counts', imu_grade='industrial')
     start('-p', 'leg.min_distance:=3.0', '-p', 'output.autosave:=false')
     client = connect()
     player = Player(client.node, {'imu': 'sensor_msgs/msg/Imu',
@@ -174,7 +159,7 @@ def test_pulses_without_stamps_keep_the_times_they_were_sent_at(start, connect, 
     folder, = (p for p in tmp_path.iterdir() if p.name[0] == '2' and not p.is_symlink())
     live = json.loads((folder / 'calibration.json').read_text())
     assert live['result']['scale_factor']['value'] > 0
-    same(live, replayed(journal)[1], journal)
+    check_replay(live, journal)
 
 
 @pytest.fixture(scope='module')
@@ -185,20 +170,11 @@ def slow():
     return types, part(sent, 45, 105)
 
 
-def recording(client, slow):
-    """Start a leg and return the player."""
-    player = Player.connected(client, slow[0])
-    player.play(part(slow[1], 0, 10), SPEED)
-    client.until(state='idle')
-    assert client.call('start_leg').success
-    return player
-
-
 def test_a_folder_that_cannot_be_written_is_a_warning_and_no_more(start, connect, slow, tmp_path):
     (tmp_path / 'file').touch()
     node = start('-p', f'output.directory:={tmp_path}/file', '-p', 'output.autosave:=false')
     client = connect()
-    player = recording(client, slow)
+    player = recording(client, slow, 0, 10, SPEED)
     player.play(part(slow[1], 10, 55), SPEED)
     status = wait_for(lambda: client.status['journal_trouble'] and client.status, 'the warning')
     assert (status['state'], status['level']) == ('recording', b'\x01')
@@ -227,7 +203,7 @@ def test_a_folder_that_cannot_be_written_is_a_warning_and_no_more(start, connect
 def test_a_disk_full_for_a_while_costs_nothing_nor_does_the_end_of_the_node(start, connect, slow):
     node = start()
     client = connect()
-    player = recording(client, slow)
+    player = recording(client, slow, 0, 10, SPEED)
     journal = Path(wait_for(lambda: client.status['journal'], 'the journal'))
     # what a full disk does, without one: no file may grow beyond some bytes
     resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))

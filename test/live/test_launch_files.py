@@ -10,7 +10,8 @@ from launch_stand_in import of_python, of_xml
 import pytest
 import yaml
 
-from odocal_ros.live.topic_input import TOPICS
+from odocal_ros.data.inputs import TOPICS
+from odocal_ros.messages.sensor_types import FIX, IMU
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON, XML = (ROOT / 'launch' / f'calibrator.launch.{kind}' for kind in ('py', 'xml'))
@@ -62,7 +63,6 @@ def test_an_empty_method_leaves_the_one_of_the_file():
                          ids=['python', 'xml'])
 def test_the_node_started_so_listens_where_it_is_told(start, connect, tmp_path, read, path):
     from odocal_ros.live.definitions import message_class
-    import odocal_ros.live.inputs as inputs
     mine = tmp_path / 'mine.yaml'
     mine.write_text(yaml.safe_dump({'/**/calibrator': {'ros__parameters': {
         'odometer': {'type': 'std_msgs/msg/Int64', 'right': 'topic'},
@@ -73,9 +73,9 @@ def test_the_node_started_so_listens_where_it_is_told(start, connect, tmp_path, 
     _, (node,) = read(path, given)
     start(*node.command_line())
     client = connect('/truck/calibrator')
-    names = {'/a/imu': inputs.IMU, '/a/left': 'std_msgs/msg/Int64',
-             '/truck/right': 'std_msgs/msg/Int64', '/truck/gps/fix': inputs.FIX,
-             '/a/speed': inputs.VELOCITY[0], '/truck/compass': inputs.IMU}
+    names = {'/a/imu': IMU, '/a/left': 'std_msgs/msg/Int64',
+             '/truck/right': 'std_msgs/msg/Int64', '/truck/gps/fix': FIX,
+             '/a/speed': 'geometry_msgs/msg/TwistStamped', '/truck/compass': IMU}
     for name, kind in names.items():
         client.node.create_publisher(message_class(kind), name, 10)
     for name in names:

@@ -8,10 +8,9 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 from bench import answer_of, NODE, NodeProcess, PATIENCE, ROOT, wait_for
-from player import messages_of, part, Player, Sent
+from player import ended, messages_of, part, Player, recording, Sent, with_clock
 import pytest
 from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import SetParameters
@@ -37,10 +36,7 @@ def sent():
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_the_node_cleanly_even_in_a_leg(start, connect, sent, how):
     node, client = start(), connect()
-    player = Player.connected(client, sent[0])
-    player.play(part(sent[1], 0, 5), 20)
-    client.until(state='idle')
-    assert client.call('start_leg').success
+    recording(client, sent, 0, 5, 20)
     assert node.end(how) == 0
     assert 'Traceback' not in node.text
     assert 'rror' not in node.text
@@ -217,10 +213,7 @@ def test_a_restored_result_gives_way_to_a_leg_and_comes_back_when_it_is_undone(
             'date') in client.until(state='idle')['message']
     assert client.call('start_leg').success
     player.play(part(sent[1], 5, 20), 20)
-    stopping = client.ask('stop_leg')
-    client.until(state='computing')
-    player.play(part(sent[1], 20, 23), 20)
-    assert 'restored' not in client.result(stopping).message
+    assert 'restored' not in ended(client, player, part(sent[1], 20, 23), 20).message
     assert client.until(restored='', legs='1')['scale_factor'] != '0.0213'
     assert client.call('undo_leg').success
     client.until(restored='an unknown date', legs='2', scale_factor='0.0213', scale_ok='yes')
@@ -253,43 +246,57 @@ def test_namespace_and_remaps(start, connect, sent):
 
 
 def test_sim_time_and_its_jump_back(start, connect, sent):
-    from rosgraph_msgs.msg import Clock
     node = start('-p', 'use_sim_time:=true')
     client = connect()
-    clock = client.node.create_publisher(Clock, '/clock', 1)
-    player = Player(client.node, sent[0])
-    wait_for(lambda: player.matched() and clock.get_subscription_count(), 'subscriptions')
-
-    def play(first_s, last_s):
-        for one in part(sent[1], first_s, last_s):
-            message = Clock()
-            message.clock.sec, message.clock.nanosec = divmod(one.stamp_ns, 10**9)
-            clock.publish(message)
-            player.publishers[one.slot].publish(one.raw)
-            time.sleep(0.002)
-
-    play(0, 10)
+    play = with_clock(client, Player(client.node, sent[0]))
+    play(part(sent[1], 0, 10))
     client.until(state='idle')
     arrival = wait_for(lambda: client.health.get('calibrator: imu', {}).get('stamp_delay_s'),
                        'diagnostics')
     assert abs(float(arrival)) < 1.0   # on the sim clock; against the wall clock it is a year
     assert client.call('start_leg').success
-    play(10, 14)
-    play(2, 4)
+    play(part(sent[1], 10, 14))
+    play(part(sent[1], 2, 4))
     status = client.until(leg_event='cancelled')
     assert status['leg_id'] == '1'
     wait_for(lambda: 'time jumped: leg 1 is cancelled' in node.text, 'the warning')
-    play(4, 6)
+    play(part(sent[1], 4, 6))
     client.until(state='idle')         # and it goes on with what comes after the jump
     assert client.call('start_leg').success
 
 
+def test_messages_that_queue_in_simulated_time_are_no_clocks_that_differ(start, connect):
+    """The node stands still for a moment, as on a busy machine; simulation does not wait."""
+    types, messages = messages_of(simulate(SimOptions(
+        duration=180.0, imu_rate=100.0, odometer_rate=10.0, odometer='speed')))
+    messages = part(messages, 40, 90)
+    node = start('-p', 'use_sim_time:=true', '-p', 'publish.rate:=20.0')
+    client = connect()
+    play = with_clock(client, Player(client.node, types))
+    play(part(messages, 0, 10), 0.001)
+    client.until(state='idle')
+    for first_s in (10, 20, 30):
+        node.process.send_signal(signal.SIGSTOP)
+        play(part(messages, first_s, first_s + 8), 0.0)
+        node.process.send_signal(signal.SIGCONT)
+        play(part(messages, first_s + 8, first_s + 10), 0.001)
+    client.until(state='idle')
+    assert not [s['hint'] for s in client.statuses if 'CLOCKS_DIFFER' in s['hint']]
+    assert client.call('start_leg').success
+
+
+def test_two_nodes_of_one_name_say_so(start):
+    nodes = [start(), start()]
+    for node in nodes:
+        wait_for(lambda node=node: 'another node is called /calibrator' in node.text,
+                 'a warning about the other node')
+        assert node.text.count('another node is called') == 1
+    assert [node.end() for node in nodes] == [0, 0]
+
+
 def test_imu_stamps_that_start_anew_cancel_the_leg(start, connect, sent):
     node, client = start(), connect()
-    player = Player.connected(client, sent[0])
-    player.play(part(sent[1], 10, 20), 20)
-    client.until(state='idle')
-    assert client.call('start_leg').success
+    player = recording(client, sent, 10, 20, 20)
     waiting = client.ask('stop_leg')
     client.until(state='computing')    # waits for samples beyond the mark, which never come
     player.play(part(sent[1], 0, 5), 20)
@@ -302,10 +309,7 @@ def test_imu_stamps_that_start_anew_cancel_the_leg(start, connect, sent):
 
 def test_a_forgotten_leg_is_stopped(start, connect, sent):
     node, client = start('-p', 'leg.max_duration:=10.0'), connect()
-    player = Player.connected(client, sent[0])
-    player.play(part(sent[1], 0, 5), 20)
-    client.until(state='idle')
-    assert client.call('start_leg').success
+    player = recording(client, sent, 0, 5, 20)
     player.play(part(sent[1], 5, 20), 20)
     client.until(state='rejected', leg_event='stopped')   # 10 s are too short a leg
     assert 'longer than leg.max_duration' in node.text
@@ -398,7 +402,7 @@ def test_1_khz_arrives_whole_and_services_answer_meanwhile(start, connect):
 
 
 def test_each_node_has_a_folder_of_its_own_in_the_ros_home(tmp_path, monkeypatch):
-    from odocal_ros.live.result_files import output_root
+    from odocal_ros.live.filing import output_root
     from odocal_ros.settings.config import Config, with_settings
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     assert output_root(Config(), '/calibrator') == tmp_path / 'odocal/calibrator'

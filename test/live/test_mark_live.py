@@ -4,8 +4,8 @@
 """~/mark over DDS: a square from point to point; its journal replays to the same bits."""
 
 from bench import given, wait_for
-from kills import replayed, same_result
-from player import part, playing_to, sent_of, stopped
+from kills import check_replay
+from player import messages_of, part, playing_to, stopped
 import pytest
 
 from odocal_ros.bagio import encode
@@ -30,15 +30,11 @@ def drive():
 def session(drive, tmp_path_factory):
     """Drive the square, with a mark at each point; keep what the node said."""
     wheels = dict(zip(('left', 'right'), drive.wheels, strict=True))
-    topics = {'imu': encode.imu('imu/data', drive.imu),
-              'odometer': encode.joints('odometer', wheels)}
-    sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)),
-                  key=lambda one: one.stamp_ns)
+    types, sent = messages_of(drive, odometer=encode.joints('odometer', wheels), fix=None)
     settings = SETTINGS | {
         'output.directory': tmp_path_factory.mktemp('marked'),
         'odometer.nominal_scale': drive.options.nominal_scale,
         'reference.points': f'[{", ".join(f"{x}.0" for x in POINTS)}]'}
-    types = {slot: topic.msgtype for slot, topic in topics.items()}
     with playing_to(types, *given(settings)) as (node, client, player):
         at, answers = 0.0, []
 
@@ -98,11 +94,7 @@ def test_the_leg_finds_both_wheels_and_the_track_width(session, drive):
 
 
 def test_its_journal_replays_to_the_last_bit(session):
-    code, offline, said = replayed(session.journal)
-    assert code == 0, said
-    same_result(session.live, offline, 'config')
-    for here, there in zip(session.live['legs'], offline['legs'], strict=True):
-        assert here | {'bag': session.journal.name} == there
+    check_replay(session.live, session.journal)
 
 
 def test_marks_as_options_precede_those_of_the_node(session):
@@ -113,3 +105,19 @@ def test_marks_as_options_precede_those_of_the_node(session):
 def test_the_points_of_a_replay_are_those_of_the_recording(session):
     with pytest.raises(BadUsage, match='a mark of point [2-9], reference.points has 1: use'):
         calibrate_bag(session.journal, config={'reference.points': [0.0, 0.0]})
+
+
+def test_without_points_a_mark_is_refused(start, connect):
+    start()
+    client = connect()
+    client.until(state='waiting')
+    answer = client.call('mark')
+    assert not answer.success
+    assert 'reference.points is empty' in answer.message
+
+
+def test_points_are_pairs(start):
+    node = start('-p', 'reference.points:=[1.0, 2.0, 3.0]')
+    assert node.wait() != 0
+    assert 'reference.points has 3 values; required with marks' in node.text
+    assert 'Traceback' not in node.text

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 from bench import Client, NodeProcess, PATIENCE, ROOT, wait_for
 from kills import same_result
-from player import messages_of, part, Player
+from player import ended, messages_of, part, Player, straight
 import pytest
 from rclpy.serialization import serialize_message
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -25,7 +25,6 @@ from odocal_ros.output.files import as_json
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 30.0            # times real time: 2400 messages a second
 HEADING = 0.7           # rad, a heading of its own makes the yaw separable
@@ -42,10 +41,8 @@ RESULTS = ([f'result.{name}{end}' for name in ESTIMATES + OF_TWO_WHEELS for end 
 
 @pytest.fixture(scope='module')
 def drive():
-    """Simulate a straight drive, all stamped: 60 s of rest, 60 s of driving, 60 s of rest."""
-    simulated = simulate(SimOptions(
-        scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
-        fix_noise='rtk', imu_grade='tactical', heading=HEADING))
+    """Simulate a straight drive."""
+    simulated = straight(heading=HEADING)
     types, sent = messages_of(simulated)
     heading = simulated.truth.heading
     return SimpleNamespace(simulated=simulated, types=types, sent=sent, heading=heading)
@@ -121,9 +118,7 @@ def _second_leg(seen, client, player, sent):
     player.play(part(sent, 118, 119), SPEED)
     client.start()
     player.play(part(sent, 119, 125), SPEED)
-    stopping = client.ask('stop_leg')
-    player.play(part(sent, 125, 127), SPEED)
-    seen.second = client.result(stopping)
+    seen.second = ended(client, player, part(sent, 125, 127), SPEED)
     seen.two_legs = client.until(leg_id='3', leg_event='stopped', legs='2')
 
 

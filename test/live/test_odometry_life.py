@@ -4,11 +4,10 @@
 """The node odometry goes on after an error of its own, in real and in simulated time."""
 
 import importlib.util
-import time
 
 from bench import Client, NodeProcess, wait_for
 import numpy as np
-from player import messages_of, part, Player
+from player import messages_of, part, Player, with_clock
 import pytest
 from rclpy.qos import QoSProfile
 
@@ -67,26 +66,16 @@ def sent():
 def test_it_goes_on_after_an_error_of_its_own(sent, simulated):
     from nav_msgs.msg import Odometry
     from rcl_interfaces.srv import GetParameters
-    from rosgraph_msgs.msg import Clock
     node = NodeProcess(*RESULT, '-p', f'use_sim_time:={str(simulated).lower()}', before=FAILS,
                        module='odometry')
     client, seen = Client('odometry'), []
     try:
         client.node.create_subscription(Odometry, 'odometry', seen.append, QoSProfile(depth=5000))
-        clock = client.node.create_publisher(Clock, '/clock', 10)
-        player = Player(client.node, sent[0])
-        wait_for(player.matched, 'subscriptions')
-        if simulated:
-            wait_for(clock.get_subscription_count, 'that of the clock')
+        player = Player.connected(client, sent[0])
+        play = with_clock(client, player) if simulated else player.play
         asked = client.node.create_client(GetParameters, 'odometry/get_parameters').call_async(
             GetParameters.Request(names=['publish.rate']))
-        for one in sent[1]:
-            message = Clock()
-            message.clock.sec, message.clock.nanosec = divmod(one.stamp_ns, 10**9)
-            if simulated:
-                clock.publish(message)
-            player.publishers[one.slot].publish(one.raw)
-            time.sleep(0.002)
+        play(sent[1], *(() if simulated else (7.0,)))
         wait_for(lambda: seen and seen[-1].header.stamp.sec > sent[1][-1].stamp_ns // 10**9 - 2,
                  f'the last pose; the node says {node.text}')
         assert asked.result().values[0].double_value == 20.0

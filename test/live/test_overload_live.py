@@ -13,11 +13,10 @@ from types import SimpleNamespace
 
 from bench import given, wait_for
 from kills import NUMBERS, replayed, same_result
-from player import messages_of, part, playing_to, stopped
+from player import messages_of, part, playing_to, stopped, straight
 import pytest
 
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 SPEED = 15.0
@@ -41,9 +40,7 @@ def busy():
 @pytest.fixture(scope='module')
 def leg(tmp_path_factory):
     """Drive a leg with a loop on each core; in its midst the node is stopped for 0.7 s."""
-    types, sent = messages_of(simulate(SimOptions(
-        scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
-        fix_noise='rtk', imu_grade='tactical')))
+    types, sent = messages_of(straight())
     settings = {'output.directory': tmp_path_factory.mktemp('out'),
                 'qos_overrides./odometer.subscription.depth': FEW}
     with playing_to(types, *given(settings)) as (node, client, player), busy() as loops:

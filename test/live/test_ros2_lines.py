@@ -11,14 +11,13 @@ from types import SimpleNamespace
 from bench import answer_of, Client, NodeProcess, PATIENCE, wait_for
 from launch_stand_in import of_python, ROOT
 from pages import all_commands
-from player import messages_of, part, Player
+from player import messages_of, part, Player, straight
 import pytest
 from test_shown_names import has_field, INPUT_TYPES
 import yaml
 
 from odocal_ros.live.definitions import message_class
 from odocal_ros.offline import cli
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 LINES = [(page, shlex.split(line)) for page, line in all_commands('ros2')]
 FOREIGN = {'foxglove_bridge': 'a package of Foxglove, installed apart'}
@@ -43,8 +42,7 @@ def driven(tmp_path_factory):
     client = Client()
     seen = SimpleNamespace(client=client, answers={})
     try:
-        made = simulate(SimOptions(scenario='straight', duration=180.0, imu_rate=50.0,
-                                   odometer_rate=25.0, odometer='speed', fix_noise='rtk'))
+        made = straight(imu_grade='industrial')
         types, sent = messages_of(made)
         seen.truth = made.truth.scale
         player = Player.connected(client, types, TOPICS)

@@ -6,11 +6,10 @@
 from types import SimpleNamespace
 
 from bench import Client, NodeProcess, wait_for
-from player import messages_of, part, Player, Sent
+from player import ended, messages_of, part, Player, Sent, straight
 import pytest
 
 from odocal_ros.messages.cdr import FRAME_AT
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 15.0
 FIRST_S, MARK_S, STOP_S, END_S = 45, 60, 115, 117     # of the drive: played, and the leg
@@ -28,8 +27,7 @@ def alternating(sent):
 @pytest.fixture(scope='module')
 def seen(tmp_path_factory):
     """Drive one leg; keep what the nodes said."""
-    drive = simulate(SimOptions(scenario='straight', duration=180.0, imu_rate=50.0,
-                                odometer_rate=25.0, odometer='speed', fix_noise='rtk'))
+    drive = straight(imu_grade='industrial')
     types, sent = messages_of(drive)
     sent = alternating(sent)
     file = tmp_path_factory.mktemp('given') / 'calibration.yaml'
@@ -46,9 +44,7 @@ def seen(tmp_path_factory):
         found.start = client.start()
         player.play(part(sent, MARK_S, STOP_S), SPEED)
         found.recording = client.status
-        stopping = client.ask('stop_leg')
-        player.play(part(sent, STOP_S, END_S), SPEED)
-        found.stop = client.result(stopping)
+        found.stop = ended(client, player, part(sent, STOP_S, END_S), SPEED)
         found.status = client.until(state='rejected')
         wait_for(lambda: 'several IMUs' in odometry.text, f'a word: {odometry.text}')
     finally:

@@ -8,7 +8,7 @@ import signal
 import time
 
 from bench import wait_for
-from player import messages_of, part, Player
+from player import ended, messages_of, part, recording
 import pytest
 
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -36,15 +36,9 @@ def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
     node = start('-p', 'alignment.heading_source:=fixed', '-p', 'alignment.heading:=0.7',
                  '-p', 'method:=two_point', before=before)
     client = connect()
-    player = Player.connected(client, sent[0])
-    player.play(part(sent[1], 40, 60), 30)
-    client.until(state='idle')
-    client.start()
+    player = recording(client, sent, 40, 60, 30)
     player.play(part(sent[1], 60, 115), 30)
-    stopping = client.ask('stop_leg')
-    client.until(state='computing')
-    player.play(part(sent[1], 115, 117), 30)
-    answer = client.result(stopping)
+    answer = ended(client, player, part(sent[1], 115, 117), 30)
     assert answer.success, answer.message
     if before:      # the numbers are there, the report is being drawn
         wait_for(lambda: list(tmp_path.glob('2*/calibration.json')), 'the numbers')

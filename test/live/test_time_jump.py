@@ -8,13 +8,12 @@ import shlex
 
 from bench import wait_for
 from kills import replayed
-from player import messages_of, part, Player
+from player import messages_of, part, Player, straight
 import pytest
 
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.library.asked import parse_leg
 from odocal_ros.live.journal import replay_command
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 30.0
 
@@ -22,9 +21,7 @@ SPEED = 30.0
 @pytest.mark.parametrize('journal', [True, False])
 def test_a_leg_lost_to_a_jump_of_time_is_said_and_computed_from_its_journal(
         start, connect, journal):
-    drive = simulate(SimOptions(
-        scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
-        fix_noise='rtk', imu_grade='tactical', heading=0.7))
+    drive = straight(heading=0.7)
     types, sent = messages_of(drive)
     node = start('-p', 'alignment.heading_source:=fixed', '-p',
                  f'alignment.heading:={drive.truth.heading!r}', '-p',

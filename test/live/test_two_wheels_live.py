@@ -7,7 +7,7 @@ import re
 from types import SimpleNamespace
 
 from bench import given, wait_for
-from player import part, playing_to, sent_of
+from player import messages_of, part, playing_to
 import pytest
 
 from odocal_ros.bagio import encode
@@ -33,15 +33,12 @@ def session(drive, tmp_path_factory):
     # no setting says which joints are the wheels: their names do
     wheels = {'left_steering': drive.odometer_right, 'right_steering': drive.odometer,
               'wheel_left': drive.odometer, 'wheel_right': drive.odometer_right}
-    topics = {'imu': encode.imu('imu/data', drive.imu), 'fix': encode.fix('fix', drive.fix),
-              'odometer': encode.joints('odometer', wheels)}
-    sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)),
-                  key=lambda one: one.stamp_ns)
+    types, sent = messages_of(drive, odometer=encode.joints('odometer', wheels))
     start_s = (drive.leg().start_ns - sent[0].stamp_ns) * 1e-9
     settings = {'output.directory': folder, 'method': 'wheels',
                 'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': 0.002,
                 'wheels.radius': 0.3, 'imu.grade': 'tactical'}
-    types, seen = {slot: topic.msgtype for slot, topic in topics.items()}, SimpleNamespace()
+    seen = SimpleNamespace()
     with playing_to(types, *given(settings)) as (_, client, player):
         player.play(part(sent, start_s - REST_S, start_s), SPEED)
         seen.idle = client.until(state='idle')

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import ros_messages as make
 
-from odocal_ros.data.leg import LegRecorder, WHEELS
+from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import make_reader

@@ -18,7 +18,6 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.settings.frame import in_local_frame
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
@@ -48,7 +47,7 @@ def test_two_minutes_give_radius_ratio_width_and_yaw(reference, limit):
 
 def test_limits_are_those_of_the_frame_the_smaller_of_both():
     config = with_settings(Config(), {'leg.min_distance': 50.0, 'reference.min_speed': 5.0})
-    local = in_local_frame(config)
+    local = config.in_local_frame()
     assert (local.leg.min_distance, local.leg.min_speed) == (2.0, 2.78)
     assert local.gnss.default_sigma == 0.05
     assert config.gnss.default_sigma == 2.5

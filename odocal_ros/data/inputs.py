@@ -1,0 +1,44 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The table of inputs: names, topics, queues, clocks and required columns, each defined once."""
+
+from typing import NamedTuple
+
+# slots of the wheels, in the order of odometer.wheels. Judgement: an 8x8 truck has most
+WHEELS = ('odometer', 'odometer_right', *(f'odometer_{k}' for k in range(3, 9)))
+
+
+class Input(NamedTuple):
+    """
+    One input; its slot is its name in code, bags, journals and options.
+
+    label : for people.   needed : columns without which a row is unusable.   clock : group of
+    settings that holds its ``time_offset``, or empty.   topic : the node subscribes to it; empty
+    for further wheels of one message.   queue : messages that the subscription keeps.
+    """
+
+    label: str
+    needed: tuple[str, ...]
+    clock: str = ''
+    topic: str = ''
+    queue: int = 0
+
+
+# queues, physical: five seconds of the highest expected rate, 4 kHz, 1 kHz and 100 Hz: messages
+# that overrun a queue are lost
+INPUTS = {
+    'imu': Input('IMU', ('w_i', 'f_i'), 'imu', 'imu/data', 20_000),
+    'odometer': Input('odometer', ('value',), 'odometer', 'odometer', 5000),
+    'odometer_right': Input('right odometer', ('value',), 'odometer', 'odometer_right', 5000),
+    **{slot: Input(slot.replace('_', ' '), ('value',), 'odometer') for slot in WHEELS[2:]},
+    'fix': Input('fix', ('latitude', 'longitude'), 'gnss', 'fix', 500),
+    'heading': Input('heading', ('q_ni',), '', 'heading', 5000),
+    'fix_velocity': Input('GNSS velocity', ('velocity_n',), 'gnss', 'fix_velocity', 500),
+}
+TOPICS = {slot: one.topic for slot, one in INPUTS.items() if one.topic}
+
+
+def topic_option(slot: str) -> str:
+    """Return the option of the commands that names the topic of an input."""
+    return f'--{slot.replace("_", "-")}-topic'

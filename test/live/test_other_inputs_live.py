@@ -1,0 +1,116 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Legs by poses, by a robot with skid steering and by four wheels; journals replay to the bit."""
+
+from types import SimpleNamespace
+
+from bench import wait_for
+from kills import check_replay
+from player import leg_of, messages_of
+import pytest
+
+from odocal_ros.bagio import encode
+from odocal_ros.sim.scenarios import SimOptions, simulate
+from odocal_ros.sim.wheels import effective_width
+
+SIGMAS = 4.0             # 1 in 16 000 of a normal error; the seeds are fixed
+
+
+def driven(folder, options, topics, settings=lambda drive: {}, **more):
+    """Simulate and drive one leg; return its results and the drive."""
+    drive = simulate(SimOptions(**options))
+    wanted = {'output.directory': folder, 'leg.preroll': 20.0} | settings(drive)
+    seen = leg_of(drive, messages_of(drive, **topics(drive)), wanted, **more)
+    assert seen.stop.success, seen.stop.message
+    return SimpleNamespace(drive=drive, **vars(seen))
+
+
+def joints(drive):
+    return dict(zip(drive.joints, drive.wheels, strict=True))
+
+
+@pytest.fixture(scope='module')
+def posed(tmp_path_factory):
+    """Drive two minutes of town with poses on the topic fix."""
+    return driven(tmp_path_factory.mktemp('posed'), {
+        'scenario': 'town', 'duration': 200.0, 'imu_rate': 50.0, 'odometer_rate': 25.0,
+        'odometer': 'speed', 'fix_noise': 'rtk', 'reference': 'pose', 'seed': 4},
+        lambda drive: {'fix': encode.pose('pose', drive.fix, drive.positions())},
+        names={'fix': '/slam/pose'})
+
+
+@pytest.fixture(scope='module')
+def skid(tmp_path_factory):
+    """Drive 90 s of a robot with two wheels that slide in turns."""
+    return driven(tmp_path_factory.mktemp('skid'), {
+        'scenario': 'indoor', 'duration': 90.0, 'imu_rate': 50.0, 'drive': 'skid',
+        'odometer': 'angle', 'odometer_rate': 25.0, 'reference': 'mocap', 'fix_rate': 10.0,
+        'slip_walk': 5e-4, 'seed': 3},
+        lambda drive: {'odometer': encode.joints('joint_states', joints(drive)),
+                       'fix': encode.pose('mocap', drive.fix, drive.positions())},
+        lambda drive: {'odometer.drive': 'skid', 'odometer.left': drive.joints[0],
+                       'odometer.right': drive.joints[1]},
+        rest_s=4.0, leg_s=80.0, speed=20.0, names={'fix': '/mocap', 'odometer': '/joint_states'})
+
+
+@pytest.fixture(scope='module')
+def four(tmp_path_factory):
+    """Drive some minutes of town with four wheels, the front ones of which steer."""
+    return driven(tmp_path_factory.mktemp('four'), {
+        'scenario': 'town', 'duration': 240.0, 'imu_rate': 50.0, 'odometer_rate': 25.0,
+        'fix_noise': 'rtk', 'imu_grade': 'tactical', 'wheels': 4, 'heading': 0.7, 'seed': 4},
+        lambda drive: {'odometer': encode.joints('odometer', {
+            'steering': drive.odometer, **joints(drive)})},
+        lambda drive: {'method': 'smoother', 'imu.grade': 'tactical',
+                       'odometer.wheels': f'[{", ".join(drive.joints)}]'},
+        rest_s=30.0, leg_s=160.0)
+
+
+@pytest.mark.parametrize('leg', ['posed', 'skid', 'four'])
+def test_a_journal_replays_to_the_last_bit(leg, request):
+    seen = request.getfixturevalue(leg)
+    assert 'no NavSatFix' not in check_replay(seen.live, seen.journal)    # it names its topics
+    assert 'Traceback' not in seen.node.text
+
+
+def test_a_leg_with_poses_finds_the_truth(posed):
+    assert 'fix: geometry_msgs/msg/PoseStamped on /slam/pose, best effort' in posed.node.text
+    scale = posed.live['result']['scale_factor']
+    assert abs(scale['value'] - posed.drive.truth.scale) < SIGMAS * scale['sigma'] < 0.004
+    assert 'LOCAL_FRAME' in {r['code'] for r in posed.live['legs'][0]['reasons']}
+    assert posed.live['inputs'][0]['topics']['fix'] == '/slam/pose'
+
+
+def test_skid_steering_gives_the_effective_width(skid):
+    width = skid.live['result']['track_width']
+    assert width['method'] == 'planar'
+    true = effective_width(skid.drive.options)
+    assert abs(width['value'] - true) < SIGMAS * width['sigma'] < 0.02 * true
+
+
+def test_status_and_answer_have_each_of_four_wheels_by_its_name(four):
+    for name, true in zip(four.drive.joints, four.drive.truth.wheel_scales, strict=True):
+        assert f', {name} 0.3' in four.stop.message
+        value, sigma = (float(four.status[f'scale_factor_{name}{end}'])
+                        for end in ('', '_sigma'))
+        assert abs(value - true) < SIGMAS * sigma
+        assert four.live['result'][f'scale_factor_{name}']['value'] == value
+    assert four.status['left_right_ok'] == 'unknown'
+    assert 'WHEELS_STEERED' in four.status['reasons']
+
+
+def test_one_topic_is_not_odometer_and_reference(start):
+    node = start('-r', 'fix:=/odom', '-r', 'odometer:=/odom')
+    assert node.wait() != 0
+    assert ('/odom is both odometer and fix: an odometer cannot be calibrated against itself; '
+            'remap one of them to another topic') in node.text
+    assert 'Traceback' not in node.text
+
+
+def test_an_odometry_is_the_reference_where_the_name_is_remapped(start, connect):
+    from nav_msgs.msg import Odometry
+    node = start('-r', 'fix:=/lidar/odometry')
+    connect().node.create_publisher(Odometry, '/lidar/odometry', 1)
+    wait_for(lambda: 'fix: nav_msgs/msg/Odometry on /lidar/odometry' in node.text,
+             'a subscription')

@@ -1,0 +1,105 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The converter of a CANedge session, on frames made back from the bag of a recorded drive."""
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from tools import canedge_bag
+from tools.canedge_bag import HEIGHT, IMU, POSITION, REPLY, SIGNALS, SPEED
+
+IMU_ROWS = 20_000          # of 286 219, for time
+START = 1_627_305_219_000_000_000
+
+
+def frame(number, **signals):
+    """Return the 8 bytes of each row of signals, by the layout of the data set."""
+    bits = 0
+    for name, value in signals.items():
+        first, width, factor, offset = SIGNALS[number][name]
+        raw = np.round((np.asarray(value) - offset) / factor).astype(np.uint64)
+        assert (raw < 2**width).all()
+        bits = bits | raw << np.uint64(first)
+    return np.atleast_1d(bits).astype('<u8').view(np.uint8).reshape(-1, 8)
+
+
+def together(parts):
+    """Return stamps, identifiers and bytes of frames in their order."""
+    stamp, ids, data = (np.concatenate(column) for column in zip(*(
+        (stamp, np.full(len(stamp), number), data) for number, stamp, data in parts), strict=True))
+    order = np.argsort(stamp, kind='stable')
+    return stamp[order], ids[order], data[order]
+
+
+def reply(km_per_hour):
+    """Return replies of the engine to a request of the speed."""
+    data = np.zeros((len(km_per_hour), 8), np.uint8)
+    data[:, :3], data[:, 3] = [3, 0x41, 0x0D], km_per_hour
+    return data
+
+
+@pytest.fixture
+def session():
+    """Return frames of four seconds, with a reply that is not a speed and an invalid fix."""
+    whole = START + np.arange(4) * 10**9
+    other = reply([1, 2])
+    other[:, 2] = 0x0C
+    return together([
+        (IMU, whole, frame(IMU, fx=[9.5, 9.625, 0, 0], fy=[-0.625, 0, 0, 0], fz=[1.0, 0, 0, 0],
+                           wx=[6.75, 0, 0, 0], wy=[0, -0.25, 0, 0], wz=[0.25, 0, 0, 0])),
+        (REPLY, whole + 5, reply([0, 36, 36, 72])), (REPLY, whole[:2] + 7, other),
+        (SPEED, whole, frame(SPEED, speed=[0.015, 10.0, 10.001, 20.0])),
+        (HEIGHT, whole[:2], frame(HEIGHT, height=[79.9, 80.0], accuracy=[2, 3])),
+        (POSITION, whole[1:], frame(POSITION, valid=[1, 0, 1], latitude=[55.87, 55.9, -33.0],
+                                    longitude=[9.86, 9.9, -71.0], accuracy=[1, 1, 7]))])
+
+
+def test_signals_are_those_of_the_layout(session):
+    imu, twist, pulses, speed, fix = (topic.pack(slice(None))
+                                      for topic in canedge_bag.topics(*session))
+    np.testing.assert_array_equal(imu['f'][:2], [[9.5, -0.625, 1.0], [9.625, 0.0, 0.0]])
+    np.testing.assert_allclose(np.rad2deg(imu['w'][:2]), [[6.75, 0, 0.25], [0, -0.25, 0]])
+    np.testing.assert_allclose(twist['linear'][:, 0], [0, 10, 10, 20])
+    np.testing.assert_array_equal(pulses['data'], [0, 50, 150, 300])     # 5, 10 and 15 m
+    np.testing.assert_allclose(speed['linear'][:, 0], [0.015, 10.0, 10.001, 20.0])
+    np.testing.assert_allclose(fix['place'], [(55.87, 9.86, 80.0), (-33.0, -71.0, 80.0)])
+    np.testing.assert_allclose(fix['cov'][:, [0, 4, 8]], [[0.5, 0.5, 9], [24.5, 24.5, 9]])
+
+
+def test_the_recorded_drive_comes_back(data_dir):
+    """The bag of the recording as frames, and these as a bag: the same messages."""
+    kept, parts, said = {}, [], {}
+    with AnyReader([data_dir / 'canedge_car_165' / 'bag']) as bag:
+        for link, stamp, raw in bag.messages():
+            if link.topic == '/imu/data' and len(kept.get(link.topic, ())) == IMU_ROWS:
+                continue
+            kept.setdefault(link.topic, []).append((stamp, bytes(raw)))
+            said.setdefault(link.topic, []).append(bag.deserialize(raw, link.msgtype))
+    stamp = {topic: np.array([s for s, _ in rows]) for topic, rows in kept.items()}
+    imu, fix, speed = (said[topic] for topic in ('/imu/data', '/fix', '/fix_speed'))
+    turn, force = (np.array([[getattr(getattr(m, field), axis) for axis in 'xyz'] for m in imu])
+                   for field in ('angular_velocity', 'linear_acceleration'))
+    parts.append((IMU, stamp['/imu/data'], frame(
+        IMU, **{f'w{a}': np.rad2deg(turn[:, n]) for n, a in enumerate('xyz')},
+        **{f'f{a}': force[:, n] for n, a in enumerate('xyz')})))
+    parts.append((REPLY, stamp['/vehicle/twist'], reply(
+        np.round([m.twist.linear.x * 3.6 for m in said['/vehicle/twist']]))))
+    parts.append((SPEED, stamp['/fix_speed'], frame(
+        SPEED, speed=[m.twist.linear.x for m in speed])))
+    variance = np.array([m.position_covariance[[0, 8]] for m in fix])
+    parts.append((HEIGHT, stamp['/fix'], frame(
+        HEIGHT, height=[m.altitude for m in fix], accuracy=np.sqrt(variance[:, 1]))))
+    parts.append((POSITION, stamp['/fix'], frame(
+        POSITION, valid=[1] * len(fix), latitude=[m.latitude for m in fix],
+        longitude=[m.longitude for m in fix], accuracy=np.sqrt(2 * variance[:, 0]))))
+    for topic in canedge_bag.topics(*together(parts)):
+        found = topic.pack(slice(None))
+        np.testing.assert_array_equal(topic.time_ns, stamp[topic.name])
+        wanted = np.frombuffer(b''.join(raw for _, raw in kept[topic.name]), found.dtype)
+        for field in found.dtype.names:
+            if field == 'place':     # degrees were radians between
+                np.testing.assert_allclose(found[field], wanted[field], rtol=0, atol=1e-12)
+            else:
+                np.testing.assert_array_equal(found[field], wanted[field], f'{topic.name} {field}')
