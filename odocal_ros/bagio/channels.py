@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all files of a bag have: topics, messages, and how many of each were found."""
+"""Base class of the files of a bag: topics, messages and their number."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -35,8 +35,7 @@ class Recording:
     """
     A file of a bag: its channels by number, their counts, first and last time.
 
-    ``damage`` says what is wrong with it, empty if nothing is; found while reading, it is reported
-    only after that.
+    ``damage`` describes the damage found so far, empty if none; complete only after reading.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,11 +48,11 @@ class Recording:
         raise NotImplementedError
 
     def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
-        """Return the same many at a time, each a column; None where only one by one is known."""
+        """Return the same in batches by topic; None if only single messages are available."""
         return None
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         raise NotImplementedError
 
     def _scan(self) -> Iterator[tuple[int, int]]:

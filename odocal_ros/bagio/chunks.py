@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Write mcap files chunk by chunk (mcap.dev/spec), without rosbags: quick, and sure of the disk.
+Write mcap files chunk by chunk (mcap.dev/spec), without rosbags: fast, and flushed to the disk.
 
 A chunk holds messages of one topic as they will stand in every file that it is part of, so
 joining files copies chunks and packs nothing again.
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 import zlib
 
 import numpy as np
@@ -23,6 +23,7 @@ from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.mcap_records import (
     CHANNEL,
     CHUNK,
+    CHUNK_HEAD,
     CHUNK_INDEX,
     FOOTER,
     MAGIC,
@@ -30,13 +31,13 @@ from odocal_ros.bagio.mcap_records import (
     MESSAGE_INDEX,
     SCHEMA,
     STATISTICS,
+    text_at,
 )
 from odocal_ros.outside.limits import zstd_module
 from odocal_ros.outside.whole import whole_file, WholeFile
 
 HEADER, DATA_END = 1, 15      # format: opcodes, beside those of mcap_records: mcap.dev/spec
 MESSAGE_HEAD = struct.Struct('<BQHIQQ')
-CHUNK_HEAD = struct.Struct('<QQQI')
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +97,18 @@ def _packed(records: bytes) -> tuple[str, bytes]:
     return ('zstd', zstd.compress(records, level)) if zstd else ('', records)
 
 
-def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> int:
+class Written(NamedTuple):
+    """A file that was written: bytes, first and last time, messages by channel."""
+
+    size: int
+    start_ns: int
+    end_ns: int
+    counts: Counter[int]
+
+
+def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> Written:
     """
-    Write an mcap file, whole or not at all, safe on the disk when this returns its size.
+    Write an mcap file, whole or not at all, safe on the disk when this returns.
 
     Raises
     ------
@@ -110,8 +120,8 @@ def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chu
         return _fill(file, channels, chunks)
 
 
-def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> int:
-    """Write all records of a file; return its size."""
+def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> Written:
+    """Write all records of a file."""
     described = b''.join(
         _record(SCHEMA, struct.pack('<H', key) + _text(c.msgtype)
                 + _text('ros2msg' if c.definition[0] else '') + _text(c.definition[1]))
@@ -131,11 +141,12 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chu
                              len(indexes), start_ns, end_ns, len(tallies)) + tallies
     summary = described + _record(STATISTICS, statistics) + b''.join(indexes)
     footer = struct.pack('<QQI', at + len(end), 0, 0)
-    return at + file.write(end + summary + _record(FOOTER, footer) + MAGIC)
+    at += file.write(end + summary + _record(FOOTER, footer) + MAGIC)
+    return Written(at, start_ns, end_ns, counts)
 
 
 def _chunk_index(chunk: Chunk, at: int) -> bytes:
-    """Return the record that says where in a file a chunk stands."""
+    """Return the index record of a chunk at an offset of the file."""
     _, _, size, _, form, packed = _chunk_body(chunk.record)
     return _record(CHUNK_INDEX, struct.pack(
         '<QQQQIHQQ', chunk.start_ns, chunk.end_ns, at, len(chunk.record), 10, chunk.channel,
@@ -145,10 +156,9 @@ def _chunk_index(chunk: Chunk, at: int) -> bytes:
 def _chunk_body(record: bytes) -> tuple[int, int, int, int, str, int]:
     """Return start, end, size unpacked, CRC, compression and size packed of a chunk record."""
     start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(record, 9)
-    (length,) = struct.unpack_from('<I', record, 9 + CHUNK_HEAD.size)
-    at = 13 + CHUNK_HEAD.size
-    (packed,) = struct.unpack_from('<Q', record, at + length)
-    return start_ns, end_ns, size, crc, record[at:at + length].decode(), packed
+    form, at = text_at(record, 9 + CHUNK_HEAD.size)
+    (packed,) = struct.unpack_from('<Q', record, at)
+    return start_ns, end_ns, size, crc, form, packed
 
 
 def read_chunks(path: Path) -> Iterator[Chunk]:

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A file as bytes: not mapped, since a page of a map that the disk cannot give kills a process."""
+"""A file as bytes, not mapped: a mapped page that the disk cannot read ends the process."""
 
 import os
 from pathlib import Path
@@ -12,7 +12,7 @@ LET_GO = 2**23      # judgement: bytes
 
 
 class FileBytes:
-    """The bytes of a file by place, as far as they are there when it is opened."""
+    """The bytes that a file has when it is opened, by offset."""
 
     def __init__(self, path: Path) -> None:
         # glibc gives a block of memory back to the system, and has all its pages made again for
@@ -39,5 +39,5 @@ class FileBytes:
         return parts[0] if len(parts) == 1 else b''.join(parts)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()

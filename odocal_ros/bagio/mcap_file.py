@@ -46,9 +46,9 @@ class McapFile(Recording):
     """
     A file of messages in chunks.
 
-    What a chunk says of itself is checked: its size, its checksum where it has one, its channels,
-    the times of its messages. A chunk of which anything is wrong is left out whole, since what
-    else of it is wrong would not show; of a chunk that is cut off, what is there is taken.
+    The size, the checksum (if any), the channels and the times of each chunk are checked. A chunk
+    with any error is left out completely, since other errors in it may not show; of a chunk
+    truncated by the end of the file, complete messages are used.
     """
 
     def __init__(self, path: Path, allowance: Allowance) -> None:
@@ -65,7 +65,7 @@ class McapFile(Recording):
             raise
 
     def _open(self) -> None:
-        """Learn what is in the file, by its index if that is sound."""
+        """Read the content of the file, by its index if that is valid."""
         try:
             if self._index():
                 return
@@ -119,7 +119,7 @@ class McapFile(Recording):
         self._recount()
 
     def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
-        """Yield the same many at a time; None where the index is gone, or not of these chunks."""
+        """Return the same in batches; None if the index is missing or of other chunks."""
         wanted = self._wanted(topics)
         places = [place for place in self._places
                   if not place.channels or place.channels & wanted.keys()]
@@ -134,7 +134,7 @@ class McapFile(Recording):
         self._recount()
 
     def _read(self, places: Sequence[Place]) -> list[Chunk | Damaged]:
-        """Return chunks of the index that stand side by side, and the message index of each."""
+        """Return adjacent chunks of the index, each with its message index."""
         begin, end = places[0].at, places[-1].at + places[-1].size + places[-1].index_size
         data = self._file[begin:end]
         found: list[Chunk | Damaged] = []
@@ -154,7 +154,7 @@ class McapFile(Recording):
         self.damage = self.damage or str(damage)
 
     def _recount(self) -> None:
-        """Count again what an index counted, once something of that is known to be lost."""
+        """Count the messages again if some that the index counted are lost."""
         if self.damage != self._counted:
             self._count()
             self._counted = self.damage
@@ -219,7 +219,7 @@ class McapFile(Recording):
         return time_ns, key, body[MESSAGE_HEAD.size:]
 
     def _walked(self, chunk: Chunk, cut: bool = False) -> list[Entry]:
-        """Return the messages of a chunk by time, as a walk over its records finds them."""
+        """Return the messages of a chunk by time, from a sequential scan."""
         found = self._entries(bytes(chunk.records), cut)
         found.sort(key=itemgetter(0))
         if found and not chunk.start_ns <= found[0][0] <= found[-1][0] <= max(
@@ -228,7 +228,7 @@ class McapFile(Recording):
         return found
 
     def _entries(self, records: bytes, cut: bool) -> list[Entry]:
-        """Return the messages among the records of a chunk; all of them are right, or Damaged."""
+        """Return the messages of a chunk; raise Damaged if any of its records is invalid."""
         found = []
         channels, head, at, end = self._channels, RECORD.unpack_from, 0, len(records)
         while at + 9 <= end:
@@ -256,7 +256,7 @@ class McapFile(Recording):
         return found
 
     def _learn(self, op: int, body: bytes) -> None:
-        """Note a schema or a channel."""
+        """Store a schema or a channel."""
         (key,) = struct.unpack_from('<H', body)
         if op == SCHEMA:
             name, at = text_at(body, 2)
@@ -271,7 +271,7 @@ class McapFile(Recording):
             self._channels[key] = Channel(topic, name, 0, form, definition)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()
 
 

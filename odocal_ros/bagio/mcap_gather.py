@@ -88,7 +88,7 @@ def _block(places: Sequence[Place], at: int, size: int, read: Read) -> tuple[Blo
 
 
 def _columns(block: Block, known: Bools, walk: Walk, note: Note) -> Columns:
-    """Return the messages of chunks; those of one that is odd by a walk."""
+    """Return the messages of chunks; of one with an unexpected layout by a sequential scan."""
     found = _gathered([chunk for chunk in block if isinstance(chunk, Chunk)], known)
     parts = []
     for chunk in block:
@@ -110,7 +110,7 @@ def _table(keys: Collection[int]) -> Bools:
 
 
 def _gathered(chunks: Sequence[Chunk], known: Bools) -> Columns | None:
-    """Return the messages of chunks; None where anything of them is odd."""
+    """Return the messages of chunks; None if any of them has an unexpected layout."""
     chunks = _in_one(chunks)
     starts = [_starts(chunk) for chunk in chunks]
     counts = np.array([len(s) for s in starts])
@@ -166,7 +166,7 @@ def _starts(chunk: Chunk) -> Ints:
 
 
 def _walked(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
-    """Return messages of a walk as columns."""
+    """Return messages of a sequential scan as columns."""
     return Columns(np.array([entry[0] for entry in entries], np.int64),
                    np.array([entry[1] for entry in entries], np.uint16),
                    Raws.of([entry[2] for entry in entries]))
@@ -187,7 +187,7 @@ def _joined(*parts: Columns) -> Columns:
 
 
 def _by_time(found: Columns) -> Columns:
-    """Return messages in order of time, those of one time as they stand."""
+    """Return messages in order of time, equal times in the order of the file."""
     if (found.time_ns[1:] >= found.time_ns[:-1]).all():
         return found
     return found.take(np.argsort(found.time_ns, kind='stable'))

@@ -28,7 +28,7 @@ END = 9 + 20 + len(MAGIC)      # format: of the footer
 
 class Place(NamedTuple):
     """
-    A chunk by the index: its times, where its record stands, whose messages it holds.
+    Index entry of a chunk: times, position of its record, channels.
 
     ``index_size`` is that of the message index behind it, as far as it is to be trusted;
     ``unpacked`` is how many bytes the chunk is said to hold.
@@ -97,7 +97,7 @@ def text_at(body: Bytes, at: int) -> tuple[str, int]:
 
 class Chunk(NamedTuple):
     """
-    Where its records lie, the times it states, and the message index behind it, to be proved.
+    Position of its records, stated times, and the message index behind it, unverified.
 
     ``data`` may hold more than ``data[at:stop]``: several chunks that were read in one go.
     """

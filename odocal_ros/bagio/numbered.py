@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How the files of a journal are called, so that a reader knows which of them count."""
+"""Names of the files of a journal, by which a reader knows which of them to read."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ def whole_name(folder: Path, number: int = 0) -> str:
 
 
 def without_joined(files: Sequence[Path]) -> list[Path]:
-    """Return files of a journal without those whose messages another one holds as well."""
+    """Return the files of a journal without those whose messages are in another file too."""
     numbers = {path: NUMBERED.fullmatch(path.name) for path in files}
     others = [path for path, match in numbers.items() if match is None]
     if any(path.name.endswith('_0.mcap') for path in others):

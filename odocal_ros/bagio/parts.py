@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One file of a bag, whatever its kind: its messages as CDR, many at a time."""
+"""One file of a bag, of any kind: its messages as CDR, in batches."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -87,7 +87,7 @@ class Part:
             yield channel, time_ns, raw
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         with suppress(Exception):
             self._file.close()
 
@@ -98,7 +98,7 @@ def _packed(raw: bytes) -> bool:
 
 
 def group(stream: Iterator[tuple[Any, ...]]) -> Batch:
-    """Take messages (rosbags' connection or our Channel, time, raw), by topic; {}: none left."""
+    """Return the next messages (connection or Channel, time, raw) by topic; {} at the end."""
     # lists of bytes and numbers only, which the garbage collector does not look at (a list of
     # tuples takes as long as the reading itself)
     found: dict[str, tuple[list[int], list[bytes]]] = {}

@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import hashlib
 import heapq
 from operator import itemgetter
@@ -75,17 +75,17 @@ class Bag:
     def _cut(self) -> list[Reason | str]:
         """Return the note on missing data, in seconds if metadata or the next file give them."""
         found: list[Reason | str] = []
-        whole = self._source.whole
+        known = self._source.known
         for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
             if not part.damage:
                 continue
-            span = dict(self._source.of_file).get(part.path.name) or (
-                whole if len(self._parts) == 1 else None)
+            span = dict(known.of_file).get(part.path.name) or (
+                known.whole if len(self._parts) == 1 else None)
             note = f'{part.path.name} is damaged ({part.damage})'
             if span and part.count >= span.count:
                 found.append(f'{note}, but all {span.count} messages were read')
                 continue
-            span = span or (whole if after is None else None)
+            span = span or (known.whole if after is None else None)
             end_ns = span.end_ns if span else after.start_ns if after else None
             seconds = (part.end_ns - part.start_ns) * 1e-9
             missing = (f'{max(end_ns - part.end_ns, 0) * 1e-9:.1f} s at the end are missing'
@@ -93,10 +93,10 @@ class Bag:
                        'how much is missing cannot be known without metadata.yaml')
             found.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
                                 f'{seconds:.1f} s were read; {missing}'))
-        if not found and whole and (whole.end_ns - self.end_ns) * 1e-9 > MISSING:
-            found.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: '
-                                f'{(whole.end_ns - self.end_ns) * 1e-9:.1f} s at the end, listed '
-                                'in metadata.yaml, are missing'))
+        lost = (known.whole.end_ns - self.end_ns) * 1e-9 if known.whole else 0.0
+        if not found and lost > MISSING:
+            found.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: {lost:.1f} s at the end, '
+                                'listed in metadata.yaml, are missing'))
         return found
 
     def read(self, readers: Mapping[str, RowReader], feed: Feed,
@@ -209,8 +209,8 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
 def _opened(path: Path, stack: ExitStack) -> Bag:
     """Return an open bag whose files are closed with the stack."""
     source, types = find(path), Types()
-    if source.foreign:
-        raise BadBag(f'{path}: its serialization format is {source.foreign!r}, only '
+    if source.known.foreign:
+        raise BadBag(f'{path}: its serialization format is {source.known.foreign!r}, only '
                      'cdr is supported; convert the bag with ros2 bag convert')
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
     parts, lost = [], []
@@ -235,9 +235,7 @@ def _opened(path: Path, stack: ExitStack) -> Bag:
         topics = sum(len(part.channels) for part in parts)
         raise BadBag(f'{path}: the bag is empty, 0 messages on {topics} topics in '
                      f'{names(source.files)}{f" ({damage})" if damage else ""}; record again')
-    source = Source(source.name, source.files, source.notes + bag_notes, source.whole,
-                    source.of_file)
-    return Bag(source, parts, types)
+    return Bag(replace(source, notes=source.notes + bag_notes), parts, types)
 
 
 def bag_sha256(bag: Bag) -> str:

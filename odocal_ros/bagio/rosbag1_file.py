@@ -81,7 +81,7 @@ class Rosbag1File(Recording):
             yield channel, time_ns, raw
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._reader.close()
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.bagio.channels import Channel
-from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file
+from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file, Written
 from odocal_ros.bagio.numbered import part_name, whole_name
 from odocal_ros.outside.whole import disk, write_text
 
@@ -26,15 +26,12 @@ TOGETHER = 60        # judgement: files joined while the bag grows: an hour is t
 
 @dataclass(frozen=True)
 class Segment:
-    """A file of the bag: the numbers it covers, its size and what it holds."""
+    """A file of the bag, and the numbers it covers."""
 
     path: Path
     first: int
     last: int
-    size: int
-    start_ns: int
-    end_ns: int
-    counts: Counter[int]      # messages by channel
+    written: Written
 
 
 class SegmentedBag:
@@ -53,12 +50,12 @@ class SegmentedBag:
     @property
     def size(self) -> int:
         """Return the bytes that its files take."""
-        return sum(segment.size for segment in (*self.segments, *self.extra))
+        return _size((*self.segments, *self.extra))
 
     @property
     def loose_size(self) -> int:
         """Return the bytes of the files that are joined next."""
-        return sum(segment.size for segment in self._loose())
+        return _size(self._loose())
 
     def _loose(self) -> list[Segment]:
         # the first is as large as the pre-roll: it is copied once only
@@ -106,7 +103,7 @@ class SegmentedBag:
         self.segments = [whole]
 
     def _join(self, segments: list[Segment]) -> None:
-        """Put one file in the place of several."""
+        """Replace several files by one."""
         first, last = segments[0].first, segments[-1].last
         joined = self._write(part_name(first, last), first, last, _chunks_of(segments))
         at = self.segments.index(segments[0])
@@ -115,29 +112,16 @@ class SegmentedBag:
             disk(os.unlink, segment.path)
 
     def _write(self, name: str, first: int, last: int, chunks: Iterable[Chunk]) -> Segment:
-        tally = _Tally()
         path = self.folder / name
-        size = write_file(path, self.channels, tally.over(chunks))
-        return Segment(path, first, last, size, tally.start_ns, tally.end_ns, tally.counts)
+        return Segment(path, first, last, write_file(path, self.channels, chunks))
 
     def _write_metadata(self) -> None:
         path = self.folder / 'metadata.yaml'
         write_text(path, _metadata([*self.segments, *self.extra], self.channels))
 
 
-class _Tally:
-    """Counts chunks as they pass."""
-
-    def __init__(self) -> None:
-        self.start_ns, self.end_ns = 2**63 - 1, 0
-        self.counts: Counter[int] = Counter()
-
-    def over(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-        for chunk in chunks:
-            self.start_ns = min(self.start_ns, chunk.start_ns)
-            self.end_ns = max(self.end_ns, chunk.end_ns)
-            self.counts[chunk.channel] += chunk.count
-            yield chunk
+def _size(segments: Iterable[Segment]) -> int:
+    return sum(segment.written.size for segment in segments)
 
 
 def _chunks_of(segments: Iterable[Segment]) -> Iterator[Chunk]:
@@ -148,23 +132,23 @@ def _chunks_of(segments: Iterable[Segment]) -> Iterator[Chunk]:
 def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
     """Return the text of metadata.yaml, version 9, as rosbag2 of Jazzy writes it."""
     import yaml
-    start_ns, end_ns = min(f.start_ns for f in files), max(f.end_ns for f in files)
-    counts: Counter[int] = sum((f.counts for f in files), Counter())
+    every = [f.written for f in files]
+    counts: Counter[int] = sum((one.counts for one in every), Counter())
     text: str = yaml.safe_dump({'rosbag2_bagfile_information': {
         'version': 9, 'storage_identifier': 'mcap',
-        **_span(start_ns, end_ns, counts.total()),
+        **_span(min(one.start_ns for one in every), max(one.end_ns for one in every), counts),
         'topics_with_message_count': [
             {'topic_metadata': {'name': c.topic, 'type': c.msgtype, 'serialization_format': 'cdr',
                                 'offered_qos_profiles': [], 'type_description_hash': ''},
              'message_count': counts[key]} for key, c in channels.items()],
         'compression_format': '', 'compression_mode': '',
         'relative_file_paths': [f.path.name for f in files],
-        'files': [{'path': f.path.name, **_span(f.start_ns, f.end_ns, f.counts.total())}
-                  for f in files],
+        'files': [{'path': f.path.name, **_span(*f.written[1:])} for f in files],
         'custom_data': None, 'ros_distro': 'jazzy'}}, sort_keys=False)
     return text
 
 
-def _span(start_ns: int, end_ns: int, count: int) -> dict[str, Any]:
+def _span(start_ns: int, end_ns: int, counts: Counter[int]) -> dict[str, Any]:
     return {'starting_time': {'nanoseconds_since_epoch': start_ns},
-            'duration': {'nanoseconds': end_ns - start_ns}, 'message_count': count}
+            'duration': {'nanoseconds': end_ns - start_ns},
+            'message_count': counts.total()}

@@ -1,10 +1,10 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From a path that a user gives to the files of a bag, unpacked where they are compressed."""
+"""The files of a bag from the path that a user gives, decompressed if necessary."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import re
 import shutil
@@ -40,15 +40,28 @@ class Span:
 
 
 @dataclass(frozen=True)
+class Known:
+    """
+    What metadata.yaml says of a bag.
+
+    foreign : a serialization format that is not cdr.   trouble : why it cannot be used.
+    """
+
+    names: tuple[str, ...] = ()
+    whole: Span | None = None
+    of_file: tuple[tuple[str, Span], ...] = ()
+    foreign: str = ''
+    trouble: str = ''
+
+
+@dataclass(frozen=True)
 class Source:
     """The files of a bag, in the order they were recorded, and what metadata.yaml says."""
 
     name: str
     files: tuple[Path, ...]
     notes: tuple[str, ...] = ()
-    whole: Span | None = None
-    of_file: tuple[tuple[str, Span], ...] = ()
-    foreign: str = ''                    # a serialization format that is not cdr
+    known: Known = Known()
 
 
 def find(path: Path) -> Source:
@@ -74,7 +87,7 @@ def find(path: Path) -> Source:
         return Source(_stem(path), (path,))
     whole = dict(known.of_file).get(path.name) or (
         known.whole if known.names == (path.name,) else None)
-    return Source(_stem(path), (path,), whole=whole, foreign=known.foreign)
+    return Source(_stem(path), (path,), known=replace(known, whole=whole, of_file=()))
 
 
 def _folder(path: Path) -> Source:
@@ -99,9 +112,7 @@ def _folder(path: Path) -> Source:
         if known is None or wanted:
             notes.append(f'{path}: metadata.yaml {what}; read {len(files)} file'
                          f'{"s" * (len(files) > 1)} in name order')
-    known = known or Known()
-    return Source(path.resolve().name, tuple(files), tuple(notes), known.whole, known.of_file,
-                  known.foreign)
+    return Source(path.resolve().name, tuple(files), tuple(notes), known or Known())
 
 
 def _distinct(files: list[Path]) -> list[Path]:
@@ -114,7 +125,7 @@ def _distinct(files: list[Path]) -> list[Path]:
 
 
 def _hint(path: Path) -> str:
-    """Name the bags one folder below, which is the usual slip."""
+    """Return a hint with the bags one folder below, or an empty text."""
     below = [sub for sub in sorted(path.iterdir()) if sub.is_dir()
              and any(file.name.endswith(ENDINGS) for file in sub.iterdir())]
     return f'; did you mean {" or ".join(map(str, below[:3]))}?' if below else ''
@@ -133,19 +144,8 @@ def _stem(path: Path) -> str:
     return name or path.name
 
 
-@dataclass(frozen=True)
-class Known:
-    """What metadata.yaml says; ``trouble`` is what is wrong with it where it cannot be used."""
-
-    names: tuple[str, ...] = ()
-    whole: Span | None = None
-    of_file: tuple[tuple[str, Span], ...] = ()
-    foreign: str = ''
-    trouble: str = ''
-
-
 def _read_metadata(path: Path) -> Known:
-    """Return the content of a metadata.yaml; raise an error for any invalid content."""
+    """Return the content of a metadata.yaml; with ``trouble`` if it is invalid."""
     import yaml
     if not is_file(path):
         return Known(trouble=f'{path}: is not a regular file and is ignored')
@@ -258,5 +258,5 @@ def _with_wal(path: Path, wal: Path, folder: Path) -> Path:
 
 
 def names(paths: Sequence[Path]) -> str:
-    """Name some files for people."""
+    """Return the names of files as one text."""
     return ', '.join(path.name for path in paths)

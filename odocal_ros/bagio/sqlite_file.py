@@ -142,7 +142,7 @@ class SqliteFile(Recording):
                 yield wanted[key], time_ns, raw
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._db.close()
         if self._leaves:
             self._leaves.close()

@@ -73,7 +73,7 @@ class Leaves:
                     yield key, time_ns, data
 
     def _rows_of(self, page: int) -> Iterator[tuple[int, int, int, Callable[..., Any]]]:
-        """Yield (row, topic_id, timestamp, what gives the data) of a page."""
+        """Yield (row, topic_id, timestamp, function that returns the data) of a page."""
         data = self._map[page * self._size:(page + 1) * self._size]
         count = struct.unpack_from('>H', data, 3)[0]
         for i in range(min(count, (self._size - 8) // 2)):
@@ -90,7 +90,7 @@ class Leaves:
         return self._payload(data, at, size)[skip:]
 
     def _payload(self, data: bytes, at: int, size: int) -> bytes:
-        """Return a row's bytes, those on overflow pages too."""
+        """Return the bytes of a row, including its overflow pages."""
         if size > min(len(self._map), MESSAGE * factor()):
             raise ValueError('larger than the file')
         largest = self._usable - 35
@@ -112,7 +112,7 @@ class Leaves:
         return b''.join(parts)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._map.close()
 
 

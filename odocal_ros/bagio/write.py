@@ -73,8 +73,7 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
                        '--out') from None
     try:
         part = work / path.name      # rosbag2 names its files after the folder
-        (_write_rosbag1 if storage == 'rosbag1' else _write_rosbag2)(
-            part, topics, storage, compression, progress)
+        _write(part, topics, storage, compression, progress)
         if force:
             _remove(path)
         part.rename(path)
@@ -116,20 +115,26 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _write_rosbag2(path: Path, topics: Sequence[Topic], storage: str, compression: str,
-                   progress: Callable[[float], None] | None) -> None:
+def _write(path: Path, topics: Sequence[Topic], storage: str, compression: str,
+           progress: Callable[[float], None] | None) -> None:
     with rosbags_for('writing a bag'):
+        from rosbags import rosbag1
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
         from rosbags.typesys import get_typestore, Stores
-    store = get_typestore(Stores.ROS2_JAZZY)
-    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
-    writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    ros2 = store = get_typestore(Stores.ROS2_JAZZY)
+    writer: Any
+    if storage == 'rosbag1':
+        store, writer = get_typestore(Stores.ROS1_NOETIC), rosbag1.Writer(path)
+    else:
+        writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+        writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
     with writer:
         if storage == 'mcap':
             _with_checksums(writer.storage)
         connections = [writer.add_connection(t.name, t.msgtype, typestore=store) for t in topics]
         for which, time_ns, raw in _merged(topics, progress):
-            writer.write(connections[which], time_ns, raw)
+            writer.write(connections[which], time_ns, ros2.cdr_to_ros1(
+                raw, topics[which].msgtype) if storage == 'rosbag1' else raw)
 
 
 def _with_checksums(storage: Any) -> None:
@@ -144,19 +149,6 @@ def _with_checksums(storage: Any) -> None:
         storage.bio.write(crc.to_bytes(4, 'little'))
         storage.bio.seek(end)
     storage.close_chunk = close_with_checksum
-
-
-def _write_rosbag1(path: Path, topics: Sequence[Topic], storage: str, compression: str,
-                   progress: Callable[[float], None] | None) -> None:
-    with rosbags_for('writing a bag'):
-        from rosbags.rosbag1 import Writer
-        from rosbags.typesys import get_typestore, Stores
-    store, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
-    with Writer(path) as writer:
-        connections = [writer.add_connection(t.name, t.msgtype, typestore=store) for t in topics]
-        for which, time_ns, raw in _merged(topics, progress):
-            writer.write(connections[which], time_ns,
-                         ros2.cdr_to_ros1(raw, topics[which].msgtype))
 
 
 def _merged(topics: Sequence[Topic],

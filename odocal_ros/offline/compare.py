@@ -43,12 +43,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _screen(found: 'Comparison') -> list[str]:
     from odocal_ros.library.compare import hints, label
-    from odocal_ros.output.figures import columns
+    from odocal_ros.output.figures import columns, counted
     from odocal_ros.output.worse import said as value_text
     stored = found.stored
     width = max(len(s.name) for s in stored)
-    lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, {len(s.legs)} leg'
-             f'{"s" * (len(s.legs) != 1)}' for i, s in enumerate(stored, 1)]
+    lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, '
+             f'{counted(len(s.legs), "leg")}' for i, s in enumerate(stored, 1)]
     for change in found.changes:
         rows = [(f'{e.index + 1:>2}', value_text(e.estimate), _cell(change, e.to_first, stored),
                  _cell(change, e.to_previous, stored)) for e in change.entries]

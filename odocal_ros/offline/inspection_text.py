@@ -5,11 +5,10 @@
 
 from collections.abc import Iterator
 import math
-import textwrap
 from typing import Any
 
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.output.summary import WIDTH
+from odocal_ros.output.figures import counted, wrapped
 from odocal_ros.outside.names import for_shell, one_line
 
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
@@ -27,10 +26,9 @@ def text(found: dict[str, Any]) -> str:
 
 
 def _head(found: dict[str, Any]) -> list[str]:
-    files = len(found['files'])
     lines = [found['path'], f'  {found["duration"]:.1f} s from {found["start_utc"]}, '
-             f'{found["messages"]} messages in {files} file{"s" * (files > 1)}']
-    return lines + [line for note in found['notes'] for line in _wrapped(f'note: {note}', 2)]
+             f'{found["messages"]} messages in {counted(len(found["files"]), "file")}']
+    return lines + [line for note in found['notes'] for line in wrapped(f'note: {note}')]
 
 
 def _topics(found: dict[str, Any], roles: dict[str, str]) -> list[str]:
@@ -60,7 +58,7 @@ def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:
         points.append(topic['trouble'])
     if topic['name'] not in roles and not any('warning:' in p for p in points):
         points = points[:2 + len(topic.get('moves', ()))]     # of topics not used, a look
-    return [one_line(topic['name']), *(line for point in points for line in _wrapped(point, 2))]
+    return [one_line(topic['name']), *(line for point in points for line in wrapped(point))]
 
 
 def _of_fields(topic: dict[str, Any]) -> Iterator[str]:
@@ -173,7 +171,7 @@ def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
         yield f'warning: {", ".join(odd)} of {topic["count"]} messages'
     if timing['gap_count']:
         longest = max(timing['gaps'], key=lambda gap: gap['length'])
-        yield (f'warning: {timing["gap_count"]} gap{"s" * (timing["gap_count"] > 1)}, the '
+        yield (f'warning: {counted(timing["gap_count"], "gap")}, the '
                f'longest {longest["length"]:.2f} s at {longest["at"]:.2f} s')
 
 
@@ -190,8 +188,7 @@ def _drive(found: dict[str, Any]) -> list[str]:
         lines.append(f'  about {drive["rough_scale"]:.4g} {drive["scale_unit"]}')
     stops = found['standstills']
     shown = ', '.join(f'{a:.1f} to {b:.1f}' for a, b in stops[:8]) + ', ...' * (len(stops) > 8)
-    lines += _wrapped(f'standstills: {shown} s' if stops else 'standstills: none',
-                      2)
+    lines += wrapped(f'standstills: {shown} s' if stops else 'standstills: none')
     lines += _legs(found['legs'])
     if len(found['each_stop']) > 1:
         lines.append(f'  --leg each-stop: {len(found["each_stop"])} legs, '
@@ -221,12 +218,12 @@ def _leg(leg: dict[str, Any]) -> str:
 
 def _mounting(mounting: dict[str, Any]) -> list[str]:
     if not mounting['accelerometer']:
-        return _wrapped('axes: an upright IMU is assumed, as there is no accelerometer; if it is '
-                        'not upright, set imu.mounting_rpy', 2)
+        return wrapped('axes: an upright IMU is assumed, as there is no accelerometer; if it is '
+                        'not upright, set imu.mounting_rpy')
     if mounting['rpy'] is None:
         text = ('the IMU orientation cannot be estimated from gravity and driving; set '
                 'imu.mounting_rpy manually')
-        return _wrapped(f'axes: {text}', 2)
+        return wrapped(f'axes: {text}')
     rpy = ', '.join(f'{math.degrees(x):.0f}' for x in mounting['rpy'])
     if mounting['assumed_forward']:
         how = 'level from gravity; the drive does not determine forward, x is assumed'
@@ -235,7 +232,7 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
         how = (f'forward direction from accelerations and turns, uncertainty {sure:.0f} deg (1 '
                f'sigma); remaining misalignment {math.degrees(mounting["off"]):.1f} deg')
     text = 'set imu.mounting_rpy to' if mounting['needed'] else 'imu.mounting_rpy is correct:'
-    return _wrapped(f'axes: {text} [{rpy}] deg ({how})', 2)
+    return wrapped(f'axes: {text} [{rpy}] deg ({how})')
 
 
 def _findings(found: dict[str, Any]) -> list[str]:
@@ -247,20 +244,14 @@ def _findings(found: dict[str, Any]) -> list[str]:
         some = [reason for reason in found['findings'] if reason['only'] == only]
         lines += [title] * bool(some)
         for reason in some:
-            lines += _wrapped(f'{reason["code"]}: {reason["text"]}. {reason["remedy"]}', 2)
+            lines += wrapped(f'{reason["code"]}: {reason["text"]}. {reason["remedy"]}')
     return lines
 
 
 def _length_text(found: dict[str, Any]) -> list[str]:
     lines = []
     if found['open']:
-        lines += _wrapped(f'replay needs options: {found["open"]}', 0)
+        lines += wrapped(f'replay needs options: {found["open"]}', '')
     if found['command']:
         lines += ['try', f'  {found["command"]}']
     return lines
-
-
-def _wrapped(line: str, indent: int) -> list[str]:
-    return textwrap.wrap(line, WIDTH, initial_indent=' ' * indent,
-                         subsequent_indent=' ' * (indent + 2), break_long_words=False,
-                         break_on_hyphens=False)

@@ -5,7 +5,6 @@
 
 import argparse
 import csv
-from datetime import datetime, UTC
 import io
 import math
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import Phase, say
+from odocal_ros.output.figures import iso
 from odocal_ros.outside.whole import write_text
 
 if TYPE_CHECKING:
@@ -80,10 +80,10 @@ def _truth(vehicle: 'FleetVehicle', drives: 'list[Drive]') -> dict[str, Any]:
         'scale_ratio': last.scale_ratio,
         'yaw_mounting_deg': [math.degrees(drive.truth.yaw) for drive in drives],
         'pitch_mounting_deg': math.degrees(last.pitch),
-        'start': [_iso(drive.truth.start_ns) for drive in drives],
+        'start': [iso(drive.truth.start_ns) for drive in drives],
         'changes': [{'value': change.what, 'bag': change.bag + 1,
-                     'size': change.size, 'after': _iso(drives[change.bag - 1].truth.start_ns),
-                     'by': _iso(drives[change.bag].truth.start_ns)}
+                     'size': change.size, 'after': iso(drives[change.bag - 1].truth.start_ns),
+                     'by': iso(drives[change.bag].truth.start_ns)}
                     for change in vehicle.changes]}
 
 
@@ -100,7 +100,3 @@ def _yaml(path: Path, content: dict[str, Any], title: str) -> None:
     import yaml
     write_text(path, f'# {title} Made by odocal simulate.\n' + yaml.safe_dump(
         content, sort_keys=False, default_flow_style=None))
-
-
-def _iso(stamp_ns: int) -> str:
-    return f'{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}'

@@ -10,7 +10,6 @@ import os
 from pathlib import Path
 import shlex
 import sys
-import textwrap
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.data.inputs import INPUTS, topic_option
@@ -149,22 +148,23 @@ def _own_options(args: argparse.Namespace) -> list[str]:
 
 def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str]) -> list[str]:
     """Return the selected topics, settings and legs with reasons, as printed lines."""
+    from odocal_ros.output.figures import wrapped
     from odocal_ros.settings.config import SETTINGS
     chosen = {choice.slot: choice.words() for choice in choices}
     lines = ['topics']
     for slot, topic in found['mapping'].items():
-        lines += _wrapped(chosen.get(slot, f'{INPUTS[slot].label}: {topic}'))
+        lines += wrapped(chosen.get(slot, f'{INPUTS[slot].label}: {topic}'))
     pairs = list(zip(options, options[1:], strict=False))
     settings = [value for option, value in pairs if option == '--set']
     lines += ['settings'] * bool(settings)
     for setting in settings:
         name = setting.partition('=')[0]
         why = _why_mounting(found['mounting']) if name == 'imu.mounting_rpy' else ''
-        lines += _wrapped(f'{setting}: {why or SETTINGS[name].about}')
+        lines += wrapped(f'{setting}: {why or SETTINGS[name].about}')
     legs = [value for option, value in pairs if option == '--leg'] or [
         f'{leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in found['legs']]
     lines += ['legs, seconds from the first message'] * bool(legs)
-    return [*lines, *_wrapped(', '.join(legs)), '']
+    return [*lines, *wrapped(', '.join(legs)), '']
 
 
 def _why_mounting(mounting: dict[str, Any] | None) -> str:
@@ -175,12 +175,6 @@ def _why_mounting(mounting: dict[str, Any] | None) -> str:
         return 'up is measured from gravity; x is assumed to be forward'
     return ('up is measured from gravity, forward from accelerations and turns '
             f'(1 sigma: {math.degrees(mounting["forward_sigma"]):.0f} deg)')
-
-
-def _wrapped(line: str) -> list[str]:
-    from odocal_ros.output.summary import WIDTH
-    return textwrap.wrap(line, WIDTH, initial_indent='  ', subsequent_indent='    ',
-                         break_long_words=False, break_on_hyphens=False)
 
 
 def _open(report: Path, never: bool) -> None:

@@ -5,10 +5,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import datetime, UTC
 import math
+import textwrap
 
 from odocal_ros.calib.result import Estimate
 
+WIDTH = 98    # judgement: columns
 NONE = Estimate(None, None, '')
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 
@@ -83,6 +86,22 @@ def time_span(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f'{hours} h {minutes:02d} min' if hours else f'{minutes} min {rest:02d} s'
+
+
+def iso(stamp_ns: int) -> str:
+    """Return a time as ISO 8601, UTC, whole seconds."""
+    return f'{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}'
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number of things, '1 leg' or '3 legs'."""
+    return f'{number} {noun}{"s" * (number != 1)}'
+
+
+def wrapped(text: str, indent: str = '  ', more: str = '  ', width: int = WIDTH) -> list[str]:
+    """Return a text in lines, all but the first indented by ``more``; words stay whole."""
+    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent + more,
+                         break_long_words=False, break_on_hyphens=False)
 
 
 def known(estimates: dict[str, Estimate], name: str) -> Estimate:

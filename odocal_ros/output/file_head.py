@@ -6,6 +6,7 @@
 from typing import Any
 
 from odocal_ros.calib.result import Calibration
+from odocal_ros.output.figures import counted
 from odocal_ros.output.summary import sentence
 from odocal_ros.outside.names import for_comment, one_line
 
@@ -21,6 +22,6 @@ def about(calibration: Calibration, content: dict[str, Any]) -> str:
     bags = ', '.join(str(i['bag']) for i in inputs if i.get('bag')) or 'live'
     bags += ''.join(f', node {i["node"]}' for i in inputs if i.get('node'))
     bags += f', vehicle {content["vehicle"]}' if content.get('vehicle') else ''
-    return (f'{content["software"]}, {content["created"]}, {len(calibration.legs)} leg'
-            f'{"s" * (len(calibration.legs) != 1)}, from: {one_line(bags)}\n'
+    return (f'{content["software"]}, {content["created"]}, '
+            f'{counted(len(calibration.legs), "leg")}, from: {one_line(bags)}\n'
             f'{sentence(calibration)}')

@@ -4,13 +4,12 @@
 """The legs as a table for a spreadsheet, their verdicts as shown, and their searches as lines."""
 
 import csv
-from datetime import datetime, UTC
 import io
 from typing import Any
 
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, wheel_factors
-from odocal_ros.output.figures import known
+from odocal_ros.output.figures import iso, known
 from odocal_ros.outside.names import for_table
 from odocal_ros.pipeline.combination import driven_twice
 from odocal_ros.reasons import Verdict, verdict_of
@@ -38,7 +37,7 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any
     giving = {e.method for e in calibration.estimates.values() if e.value is not None}
     reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
                                if m.name in giving or not giving)]
-    row = {'leg': number, 'bag': for_table(leg.bag), 'start [UTC]': _iso(leg.start_ns),
+    row = {'leg': number, 'bag': for_table(leg.bag), 'start [UTC]': iso(leg.start_ns),
            'start [ns]': leg.start_ns, 'stop [ns]': leg.stop_ns,
            'duration [s]': leg.duration, 'distance [m]': leg.distance,
            'imu_samples': leg.imu_samples, 'pulses': leg.pulses, 'fixes': leg.fixes,
@@ -62,10 +61,6 @@ def _estimate(leg: LegResult, calibration: Calibration, name: str) -> Estimate:
     """Return a leg's value by the method whose value the calibration gives, else by its own."""
     method = leg.methods.get(calibration.estimates[name].method)
     return known(leg_estimates(leg) if method is None else method.estimates, name)
-
-
-def _iso(stamp_ns: int) -> str:
-    return f'{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}'
 
 
 def search_lines(legs: tuple[LegResult, ...]) -> list[str]:

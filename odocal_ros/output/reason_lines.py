@@ -5,10 +5,10 @@
 
 from dataclasses import replace
 import re
-import textwrap
 from typing import Any
 
 from odocal_ros.calib.result import LegResult
+from odocal_ros.output.figures import wrapped
 from odocal_ros.reasons import Reason, Verdict
 
 OF_LEG = re.compile(r'leg (\d+): (.*)', re.DOTALL)
@@ -64,7 +64,7 @@ def bag_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
     if len(of_bag) < 2:
         return []
     listed = '; '.join(f'{_legs(numbers)}: {bag}' for bag, numbers in of_bag.items())
-    return _wrapped(listed, '  ', width)
+    return wrapped(listed, '  ', '   ', width)
 
 
 def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool = False) -> list[str]:
@@ -75,16 +75,11 @@ def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool = False) -
         found = [r for r in shared(reasons) if r.code.gravity is verdict]
         if brief and found and verdict is Verdict.ACCEPTED:
             codes = ', '.join(dict.fromkeys(r.code.name for r in found))
-            lines += _wrapped(f'notes, see the report: {codes}', '  ', width)
+            lines += wrapped(f'notes, see the report: {codes}', '  ', '   ', width)
             continue
         for reason in found:
             lines += [f'  {title}'] if title else []
             title = ''
-            lines += _wrapped(f'{reason.code.name}: {reason.text}', '    ', width)
-            lines += _wrapped(f'-> {reason.remedy}', '      ', width)
+            lines += wrapped(f'{reason.code.name}: {reason.text}', '    ', '   ', width)
+            lines += wrapped(f'-> {reason.remedy}', '      ', '   ', width)
     return lines
-
-
-def _wrapped(text: str, indent: str, width: int) -> list[str]:
-    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent + '   ',
-                         break_long_words=False, break_on_hyphens=False)

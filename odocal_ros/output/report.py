@@ -12,7 +12,7 @@ from typing import Any
 from odocal_ros.calib.choice import ABOUT, leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.output import report_tables as tables
-from odocal_ros.output.figures import known, length, time_span
+from odocal_ros.output.figures import counted, known, length, time_span
 from odocal_ros.output.plots_svg import Drawing
 from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.summary import DEG, MEANING, sentence
@@ -82,7 +82,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
         'created': _made(content['created']),
         'verdict': calibration.verdict.value, 'meaning': MEANING[calibration.verdict],
         'sentence': sentence(calibration).partition(': ')[2],
-        'way': f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
+        'way': f'{counted(len(legs), "leg")}, {length(distance)} in '
                f'{time_span(duration)}',
         'headline': tables.headline(calibration),
         'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),

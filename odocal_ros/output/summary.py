@@ -22,12 +22,14 @@ from odocal_ros.output.budget_table import budget_lines, largest_source, source_
 from odocal_ros.output.figures import (
     beyond_one,
     columns,
+    counted,
     COUNTS,
     inverse,
     known,
     length,
     share,
     time_span,
+    WIDTH,
     with_sigma,
     with_unit,
 )
@@ -36,7 +38,6 @@ from odocal_ros.output.reason_lines import bag_lines, reason_lines
 from odocal_ros.output.track_table import track_lines
 from odocal_ros.reasons import Verdict
 
-WIDTH = 98    # judgement: columns
 DEG = math.degrees(1.0)    # definition
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 PLACES = {'lateral': ('left', 'right'), 'forward': ('ahead', 'behind')}    # of a wheel: +, -
@@ -74,7 +75,7 @@ def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
 def sentence(calibration: Calibration) -> str:
     """Return the result as one line: verdict, values with sigma, legs."""
     used = sum(leg.verdict is not Verdict.REJECTED for leg in calibration.legs)
-    legs = f'{used} of {len(calibration.legs)} leg{"s" * (len(calibration.legs) != 1)} good'
+    legs = f'{used} of {counted(len(calibration.legs), "leg")} good'
     return f'{calibration.verdict.value}: {values_in_words(calibration.estimates)}; {legs}'
 
 
@@ -108,8 +109,7 @@ def _head(calibration: Calibration, styled: bool) -> list[str]:
         colours = {Verdict.ACCEPTED: 32, Verdict.CAUTION: 33, Verdict.REJECTED: 31}
         verdict = f'\x1b[1;{colours[calibration.verdict]}m{verdict}\x1b[0m'
     return [f'{verdict}: {MEANING[calibration.verdict]}',
-            f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
-            f'{time_span(duration)}']
+            f'{counted(len(legs), "leg")}, {length(distance)} in {time_span(duration)}']
 
 
 def _values(calibration: Calibration, width: int) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from odocal_ros.calib.result import Estimate, wheel_factors
 from odocal_ros.errors import BadUsage
-from odocal_ros.output.figures import with_sigma
+from odocal_ros.output.figures import with_sigma, with_unit
 from odocal_ros.output.stored import read_stored, Stored
 from odocal_ros.reasons import Code, Verdict
 
@@ -55,8 +55,7 @@ def said(estimate: Estimate) -> str:
     """Return a value with sigma and unit as people read them; angles in deg."""
     if estimate.unit == 'rad':
         return with_sigma(estimate.value, estimate.sigma, math.degrees(1.0), signed=True) + ' deg'
-    unit = '' if estimate.unit == '1' else f' {estimate.unit}'
-    return with_sigma(estimate.value, estimate.sigma) + unit
+    return with_unit(estimate)
 
 
 def stored_in(folder: Path) -> Stored | None:

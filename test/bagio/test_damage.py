@@ -64,6 +64,7 @@ def test_a_chunk_that_is_damaged_costs_itself(tmp_path, mcap, which, where):
     rows, notes = read(path)
     assert 0 < len(rows.stamp_ns) < len(whole.stamp_ns) or where == 'data'
     assert set(rows.stamp_ns.tolist()) <= set(whole.stamp_ns.tolist())
+    assert (np.diff(rows.stamp_ns) > 0).all()      # none twice
     assert [n.code for n in notes] == [Code.BAG_TRUNCATED] * len(notes)
     assert notes or where == 'data'       # eight bytes of one value show only by a checksum
 

@@ -68,8 +68,8 @@ def test_other_readers_read_a_segment(tmp_path, monkeypatch, zstd):
     if not zstd:
         monkeypatch.setattr(chunks, '_zstd', lambda: None)
     packed, messages = second(0)
-    size = write_file(tmp_path / 'part.mcap', CHANNELS, packed)
-    assert size == (tmp_path / 'part.mcap').stat().st_size
+    written = write_file(tmp_path / 'part.mcap', CHANNELS, packed)
+    assert written.size == (tmp_path / 'part.mcap').stat().st_size
     with rosbag2.Reader(tmp_path / 'part.mcap') as reader:
         assert {c.topic: (c.msgtype, c.msgcount) for c in reader.connections} == {
             '/imu/data': ('sensor_msgs/msg/Imu', 20), '/odometer': ('std_msgs/msg/Int64', 20)}

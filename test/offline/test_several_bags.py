@@ -81,13 +81,6 @@ def test_a_truncated_bag_goes_with_a_whole_one(bags, tmp_path, capsys):
     assert 'BAG_TRUNCATED' in {r['code'] for r in told['legs'][1]['reasons']}
 
 
-def test_a_bag_given_twice_is_read_once(bags, tmp_path, capsys):
-    assert replay(bags, ['one', f'../{bags.name}/one'], tmp_path / 'out', '--json') == 0
-    told = capsys.readouterr()
-    assert 'is given twice; it is read once' in told.err
-    assert len(json.loads(told.out)['legs']) == 1
-
-
 def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys, monkeypatch):
     """A leg that was dropped says nothing, its settings neither."""
     for name, limit in (('one', 3), ('other', 5), ('dropped', 7)):

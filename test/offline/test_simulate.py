@@ -150,8 +150,6 @@ def test_force_keeps_an_operators_own_settings(tmp_path, capsys):
     (['--pitch-deg', '90'], '--pitch-deg 90: the limit is 45'),
     (['--known-heading-sigma-deg', '-1'], '--known-heading-sigma-deg -1: required: 0 to 180'),
     (['--storage', 'tape'], '--storage tape: required: one of mcap'),
-    (['--storage', 'sqlite3', '--compression', 'storage'], 'is not available for --storage '
-     'sqlite3'),
     (['--frobnicate'], 'unrecognized arguments: --frobnicate')])
 def test_wrong_usage_is_one_line_and_exit_2(tmp_path, capsys, asked, told):
     assert odocal(*SHORT, '--out', tmp_path / 'drive', *asked) == 2

@@ -90,16 +90,6 @@ def test_write_returns_what_lies_there(good, tmp_path):
     assert json.loads(written[0].read_text()) == as_json(good, Config(), INPUTS, CREATED)
 
 
-def test_an_existing_result_is_kept_without_force(good, rejected, tmp_path):
-    write_results(good, Config(), tmp_path, INPUTS, CREATED)
-    before = (tmp_path / 'calibration.json').read_text()
-    with pytest.raises(BadUsage, match='calibration.json exists; give another folder'):
-        write_results(rejected, Config(), tmp_path, INPUTS, CREATED)
-    assert (tmp_path / 'calibration.json').read_text() == before
-    write_results(rejected, Config(), tmp_path, INPUTS, CREATED, force=True)
-    assert json.loads((tmp_path / 'calibration.json').read_text())['verdict'] == 'rejected'
-
-
 def test_a_folder_never_holds_parts_of_two_calibrations(good, nothing, tmp_path):
     (tmp_path / 'mine.txt').write_text('keep')
     write_results(good, Config(), tmp_path, INPUTS, CREATED)
