@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made
 
-from odocal_ros.estimator import remarks, smooth
+from odocal_ros.estimator import smooth
+from odocal_ros.estimator.result import remarks
 from odocal_ros.estimator.state import CONSTANTS, FAST_SPEED
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings

@@ -11,7 +11,7 @@ import pytest
 from smoother_legs import made, truth
 
 from odocal_ros.errors import BadConfig
-from odocal_ros.estimator import bound, problem, smooth
+from odocal_ros.estimator import bound, prepare, smooth
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.slow
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # what a drive is planned with
 WHITE = {'gnss.correlation_time': 0.0}
-USUAL = problem.imperfect_sigmas(GRADES['consumer'])
+USUAL = prepare.imperfect_sigmas(GRADES['consumer'])
 
 
 def sigmas_of(method):
@@ -115,7 +115,7 @@ def test_the_scale_bounds_of_method_md_come_out(monkeypatch, drive, grade, white
     config = with_settings(Config(), WHITE | {
         'imu.grade': grade, 'gnss.lever_arm_sigma': 1e-4, 'gnss.time_sigma': 0.0,
         'odometer.time_sigma': 0.0, 'imu.accel_scale_sigma': 0.0})
-    monkeypatch.setattr(problem, 'imperfect_sigmas', lambda *_: np.zeros(len(USUAL)))
+    monkeypatch.setattr(prepare, 'imperfect_sigmas', lambda *_: np.zeros(len(USUAL)))
     for slip, quantum, table in ((0.05 / math.sqrt(10), 0.0, white), (0.0, 0.02, pulses)):
         method = predict_smoother(drive(), Sigmas(config=config, slip=slip, quantum=quantum))
         assert 1e6 * method.estimates[NAMES[0]].sigma == pytest.approx(

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.estimator import problem
+from odocal_ros.estimator import prepare
 from odocal_ros.estimator.leg import smoother_leg
-from odocal_ros.estimator.problem import _priors
+from odocal_ros.estimator.prepare import _priors
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, OMEGA, PartlyKnownRate, rate_without_north
 from odocal_ros.nav.local_frame import local_fixes
@@ -79,7 +79,7 @@ def test_with_the_earth_rate_of_the_frame_they_are_those_of_fixes(monkeypatch):
     rate = earth_rate_n(latitude) @ matrix_from_rpy([0.0, 0.0, turned])
     monkeypatch.setattr(inputs_module, 'rate_without_north', lambda latitude: PartlyKnownRate(
         tuple(rate.tolist()), (0.0, 0.0, 0.0)))
-    monkeypatch.setattr(problem, 'drift_time', lambda leg, t: np.diff(t))
+    monkeypatch.setattr(prepare, 'drift_time', lambda leg, t: np.diff(t))
     config = settings(made, **SMOOTHER, reference__default_sigma=2.5)
     by_fix = estimates(without_covariance(made), config)
     by_pose = estimates(posed(made, math.degrees(latitude)), config)
