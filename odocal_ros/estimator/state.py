@@ -55,6 +55,7 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'fix_lag_square', 'fix_error_by_motion', 'odometer_lag_square',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking', 'squat',
              'sideslip', 'squat_by_jerk', 'sideslip_by_jerk', 'pitch_centre',
+             'pitch_centre_of_bumps',
              'fix_motion_time', 'speed_offset', 'velocity_delay', 'velocity_lag_square',
              'velocity_scale')
 
@@ -93,14 +94,14 @@ FAST_SPEED = 20.0           # m/s, definition: where the slope is said, of a roa
 # change, rad per m/s^3: a body answers late, tyres at once
 LEAN = constants_from('squat', 'sideslip_by_jerk')
 # what an ideal vehicle has not: all to here
-PITCH_CENTRE = CONSTANTS.index('pitch_centre')
-IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre')
+PITCH_CENTRE = constants_from('pitch_centre', 'pitch_centre_of_bumps')
+IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre_of_bumps')
 # kinds of these with one size each, and their numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
               'odometer_lag_square': 1,
               'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2, 'squat': 1,
-              'sideslip': 1, 'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 1}
+              'sideslip': 1, 'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 2}
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECT
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')

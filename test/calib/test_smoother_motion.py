@@ -11,7 +11,7 @@ from smoother_legs import made, truth
 
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.axle import Axle
-from odocal_ros.estimator.factors.motion import D
+from odocal_ros.estimator.factors.motion import D, HILL_INTERVALS, slowly
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import (
     ACCEL,
@@ -145,18 +145,32 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     part = Equations(problem, state).parts['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     off = (C_vn @ part.raw[:, 15:18, None])[:, 2, 0]
-    by = (C_vn @ part.jacobians(BARE)[2][:, 15:18, PITCH_CENTRE, None])[:, 2, 0]
+    by = (C_vn @ part.jacobians(BARE)[2][:, 15:18, PITCH_CENTRE])[:, 2, 0]
     centre = -(by @ off) / (by @ by)
     assert np.abs(off).max() > 1e-3       # m in a second
     assert centre == pytest.approx(1.5, rel=0.02)
     assert np.sqrt(((off + by * centre)**2).mean()) < 0.05 * np.sqrt((off**2).mean())
     # no count lifts the odometer: what does is no part of what the scale multiplies
     c = state.constants.copy()
-    c[PITCH_CENTRE] = centre
+    c[PITCH_CENTRE.start] = centre
     lifted = replace(state, constants=c)
     there = Equations(problem, lifted).parts['motion']
     np.testing.assert_allclose(there.jacobians(BARE)[2][:, D, LN_K],
                                part.jacobians(BARE)[2][:, D, LN_K], atol=1e-9)
+
+
+def test_bumps_may_have_another_centre_than_hills():
+    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.05)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    motion = Equations(problem, state).parts['motion'].motion
+    hill, bump = (np.sin(2 * np.pi * np.arange(len(motion.T)) / period) for period in (40.0, 2.5))
+    around = slice(HILL_INTERVALS, -HILL_INTERVALS)
+    # the mean of five over a period of 2.5 is 0; over one of 40 it is a sinc: 0.974
+    assert slowly(bump)[around] == pytest.approx(0.0, abs=1e-9)
+    assert slowly(hill)[around] == pytest.approx(np.sin(np.pi / 8) / (5 * np.sin(np.pi / 40))
+                                                 * hill[around])
+    both, fast = motion.nose_down.T
+    assert fast == pytest.approx(both - slowly(both))
 
 
 def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():

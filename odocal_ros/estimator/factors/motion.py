@@ -47,6 +47,8 @@ from odocal_ros.nav.rotations import exp_so3, skew, transpose
 
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
 ROWS = D.stop
+# judgement: intervals of a hill; what pitches the body faster is a bump of the road, or squat
+HILL_INTERVALS = 5
 # of Motion, what each interval has
 EACH = ('T', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed', 'nose_down',
         'from_mean', 'varied', 'travelled', 'residual')
@@ -68,6 +70,13 @@ def gravity_n(position_n: Floats, origin: Origin) -> Floats:
     down: Floats = -gravity(latitude, height)[:, None] * (
         up_e @ C_en(origin.latitude, origin.longitude))
     return down
+
+
+def slowly(x: Floats) -> Floats:
+    """Return moving means over HILL_INTERVALS: (K,)."""
+    around = np.ones(HILL_INTERVALS)
+    out: Floats = np.convolve(x, around, 'same') / np.convolve(np.ones(len(x)), around, 'same')
+    return out
 
 
 class Motion:
@@ -139,14 +148,14 @@ class Motion:
 
     @property
     def pitched(self) -> Floats:
-        """Return the derivative of the path by the centre of pitching: (K, 3)."""
-        out: Floats = (self.C @ self.up) * self.nose_down[:, None]
+        """Return the derivatives of the path by the centres of pitching: (K, 3, 2)."""
+        out: Floats = (self.C @ self.up)[:, :, None] * self.nose_down[:, None]
         return out
 
     @property
     def heaved(self) -> Floats:
         """Return the vertical displacement of the odometer by pitching: (K, 3) m."""
-        out: Floats = self.pitched * self.state.constants[PITCH_CENTRE]
+        out: Floats = self.pitched @ self.state.constants[PITCH_CENTRE]
         return out
 
     def _vary(self) -> Floats:
@@ -164,7 +173,8 @@ class Motion:
         self.varied = 1 + self.from_mean @ c[TYRES, None]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
         # nose down about a point ahead, the odometer goes up
-        self.nose_down = (self.sums.mean_rate - state.gyro_bias[:-1]) @ self.left * T[:, 0]
+        nose_down = (self.sums.mean_rate - state.gyro_bias[:-1]) @ self.left * T[:, 0]
+        self.nose_down = np.stack([nose_down, nose_down - slowly(nose_down)], -1)
         out: Floats = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
         return out
 
@@ -194,7 +204,8 @@ class Motion:
         a[:, P, P], a[:, P, V], a[:, P, PHI] = -one, -one * T, skew(self.dp)
         gyro = self._by_gyro()
         a[:, :, BG] = gyro[:, :, :3]
-        a[:, D, BG] += state.constants[PITCH_CENTRE] * T * np.outer(
+        # biases change little over HILL_INTERVALS: none of the faster part
+        a[:, D, BG] += state.constants[PITCH_CENTRE][0] * T * np.outer(
             C @ self.up, self.left).reshape(K, 3, 3)
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
