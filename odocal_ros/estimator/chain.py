@@ -123,7 +123,6 @@ class Solved:
         return square + rest.T @ moved, moved
 
 
-
 @dataclass(frozen=True, eq=False)
 class JointMarginals:
     """

@@ -38,8 +38,8 @@ def output_root(config: Config, node: str) -> Path:
 
 
 def _save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]], imu_frame: str,
-         now_ns: int, folders: ResultFolders, force: bool,
-         ) -> tuple[Path, str, Callable[[], str] | None]:
+          now_ns: int, folders: ResultFolders,
+          force: bool) -> tuple[Path, str, Callable[[], str] | None]:
     """
     Write the result files into a folder named by the time, and point ``latest`` at it.
 
