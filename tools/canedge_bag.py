@@ -9,7 +9,6 @@ Convert a session of a CANedge logger with a CANmod.gps and OBD-II to a bag.
 github.com/CSS-Electronics/api-examples (MIT), examples/other/matlab-basics/LOG_datastore.
 """
 
-import argparse
 import math
 from pathlib import Path
 import sys
@@ -19,8 +18,9 @@ import numpy as np
 from odocal_ros.bagio import encode
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
-from odocal_ros.errors import BadData, OdocalError
+from odocal_ros.errors import BadData, BadUsage
 from tools.comma2k19_bag import way_of
+from tools.converter import run
 
 # canmod-gps.dbc of the data set: frame -> signal -> first bit, bits, factor, offset
 POSITION, HEIGHT, SPEED, IMU = 3, 4, 7, 9
@@ -39,7 +39,10 @@ K0 = 0.1                 # m, of a pulse derived from the speed
 
 def frames(session: Path):
     """Return stamps in ns, identifiers and bytes (n, 8) of all frames of a session."""
-    from asammdf import MDF
+    try:
+        from asammdf import MDF
+    except ImportError:
+        raise BadUsage('needs asammdf: pip install asammdf') from None
     parts = []
     for file in sorted(session.rglob('*.[mM][fF]4')):
         with MDF(file) as mdf:
@@ -102,22 +105,15 @@ def _fixes(stamp, ids, data):
         status=np.zeros(len(t), np.int64)), 'gps')
 
 
+def convert(session: Path, out: Path, force: bool) -> Path:
+    """Write the bag of a session."""
+    return write_bag(out / 'bag', [*topics(*frames(session))], force=force)
+
+
 def main(argv=None) -> int:
     """Convert one session; return 0, 2 for unusable files."""
-    parser = argparse.ArgumentParser(description='make a bag of a session of a CANedge logger')
-    parser.add_argument('session', type=Path, help='folder with .MF4 files')
-    parser.add_argument('--out', type=Path, required=True, metavar='FOLDER')
-    parser.add_argument('--force', action='store_true', help='replace a bag that is there')
-    args = parser.parse_args(argv)
-    try:
-        print(write_bag(args.out / 'bag', [*topics(*frames(args.session))], force=args.force))
-    except ImportError:
-        print('canedge_bag: needs asammdf: pip install asammdf', file=sys.stderr)
-        return 2
-    except (OdocalError, OSError) as error:
-        print(f'canedge_bag: {error}', file=sys.stderr)
-        return 2
-    return 0
+    return run('canedge_bag', 'a session of a CANedge logger: a folder with .MF4 files', convert,
+               argv)
 
 
 if __name__ == '__main__':

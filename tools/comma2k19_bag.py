@@ -10,7 +10,6 @@ truth.yaml: the scale of the car's speed by the pose. FOLDER is what the tests a
 under $ODOCAL_DATA as comma2k19_rav4, made of Example_1 there.
 """
 
-import argparse
 from pathlib import Path
 import sys
 
@@ -19,8 +18,9 @@ import numpy as np
 from odocal_ros.bagio import encode
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
-from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.errors import BadUsage
 from odocal_ros.outside.whole import write_text
+from tools.converter import run
 
 GPS_EPOCH, WEEK, LEAP = 315_964_800.0, 604_800.0, 18.0    # s; GPS ahead of UTC since 2017
 MILLISECONDS = 1e11      # a time in UTC that is larger is none in seconds
@@ -201,17 +201,8 @@ def convert(segment: Path, out: Path, force: bool = False) -> Path:
 
 def main(argv=None) -> int:
     """Convert one segment; return 0, 2 on wrong use."""
-    parser = argparse.ArgumentParser(description='make a bag of a segment of comma2k19')
-    parser.add_argument('segment', type=Path, help='folder with processed_log and global_pose')
-    parser.add_argument('--out', type=Path, required=True, metavar='FOLDER')
-    parser.add_argument('--force', action='store_true', help='replace a bag that is there')
-    args = parser.parse_args(argv)
-    try:
-        print(convert(args.segment, args.out, args.force))
-    except (OdocalError, OSError) as error:
-        print(f'comma2k19_bag: {error}', file=sys.stderr)
-        return 2
-    return 0
+    return run('comma2k19_bag', 'a segment of comma2k19: a folder with processed_log and '
+               'global_pose', convert, argv)
 
 
 if __name__ == '__main__':

@@ -8,7 +8,6 @@ Convert the recording of a Husky in the tests of robot_localization to the bag o
 also reads the recording itself; the bag has renamed topics, pulses and an IMU in vehicle axes.
 """
 
-import argparse
 from pathlib import Path
 import sys
 
@@ -17,7 +16,8 @@ import numpy as np
 from odocal_ros.bagio import encode
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
-from odocal_ros.errors import BadData, OdocalError
+from odocal_ros.errors import BadData
+from tools.converter import run
 
 KINDS = ('sensor_msgs/msg/Imu', 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/NavSatFix')
 R_BI = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])    # Rz(-90) Rx(90) deg
@@ -85,19 +85,14 @@ def travel(rows):
     return np.append(0.0, np.cumsum(np.sign(ahead) * np.hypot(*steps.T)))
 
 
+def convert(recording: Path, out: Path, force: bool) -> Path:
+    """Write the bag of the recording."""
+    return write_bag(out / 'bag', [*topics(*messages(recording))], force=force)
+
+
 def main(argv=None) -> int:
     """Convert the recording; return 0, 2 for an unusable one."""
-    parser = argparse.ArgumentParser(description='make a bag of test1.bag of robot_localization')
-    parser.add_argument('recording', type=Path)
-    parser.add_argument('--out', type=Path, required=True, metavar='FOLDER')
-    parser.add_argument('--force', action='store_true', help='replace a bag that is there')
-    args = parser.parse_args(argv)
-    try:
-        print(write_bag(args.out / 'bag', [*topics(*messages(args.recording))], force=args.force))
-    except (OdocalError, OSError) as error:
-        print(f'husky_bag: {error}', file=sys.stderr)
-        return 2
-    return 0
+    return run('husky_bag', 'test1.bag of robot_localization', convert, argv)
 
 
 if __name__ == '__main__':

@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 from odocal_ros.bagio.channels import Channel, FORMATS, possible, Recording
 from odocal_ros.bagio.sqlite_leaves import Leaves
+from odocal_ros.errors import BadBag
 from odocal_ros.outside.limits import Damaged, factor, MESSAGE
 
 READS = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ}
@@ -33,7 +34,8 @@ class SqliteFile(Recording):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self._size = path.stat().st_size
+        self._opened = path.stat()
+        self._size = self._opened.st_size
         self._leaves: Leaves | None = None
         self._sorted = True
         self._db = sqlite3.connect(f'file:{quote(str(path.resolve()))}?mode=ro&immutable=1',
@@ -132,14 +134,23 @@ class SqliteFile(Recording):
                         # text and numbers are no messages: readers count what is none
                         yield wanted[key], time_ns, raw if isinstance(raw, bytes) else b''
                     last = row
+                self._refuse_if_changed()
                 return
             except Damaged as error:
+                self._refuse_if_changed()
                 self._to_leaves(error)
                 self._count()
         assert self._leaves
         for key, time_ns, raw in self._leaves.rows(wanted, last if self._sorted else -1):
             if possible(time_ns):
                 yield wanted[key], time_ns, raw
+
+    def _refuse_if_changed(self) -> None:
+        """Raise BadBag if the file was written since it was opened: SQL may see a mixture."""
+        now, then = self.path.stat(), self._opened
+        if (now.st_size, now.st_mtime_ns) != (then.st_size, then.st_mtime_ns):
+            raise BadBag(f'{self.path}: the file changes while it is read; stop the recorder '
+                         'first')
 
     def close(self) -> None:
         """Close the file."""

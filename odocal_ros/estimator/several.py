@@ -125,7 +125,7 @@ def _joint(borders: list[Border], steps: Floats, same: Bools) -> Joint:
 
 
 def _changed(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:
-    """Say by how much the scale changed between two legs, since when, and why that may be."""
+    """Return the reason for a scale that changed between two legs: size, time, likely cause."""
     relative = float(np.expm1(change.change))
     since = str(np.datetime64(int(times_ns[change.leg - 1]), 'ns').astype('datetime64[m]'))
     return Reason(Code.SCALE_CHANGED, f'the scale changed by {change_in_words(relative)} '
@@ -138,7 +138,7 @@ def _name(number: int) -> str:
 
 
 def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
-    """Say in which constants legs differ, and which leg differs most from the others."""
+    """Return the reasons for constants in which legs differ, with the leg that differs most."""
     J, said = len(found.deviation), list[Reason]()
     apart = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
     # what is determined with a parameter differs with it

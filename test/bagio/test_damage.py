@@ -14,6 +14,7 @@ import ros_bags
 from odocal_ros.bagio.mcap_file import McapFile
 from odocal_ros.bagio.mcap_records import CHUNK
 from odocal_ros.bagio.read import open_bag
+from odocal_ros.bagio.sqlite_file import SqliteFile
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadBag, BadData
 from odocal_ros.messages.decode import make_reader
@@ -106,6 +107,19 @@ def test_a_few_bytes_anywhere(tmp_path, storage):
             said.append(str(error))
     assert len(said) < 60
     assert not any('\n' in text for text in said)
+
+
+def test_a_database_that_is_being_written_is_refused(tmp_path):
+    path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(2.0), 'sqlite3') / 'bag.db3'
+    file = SqliteFile(path)
+    rows = file.messages({'/imu/data': 'sensor_msgs/msg/Imu'})
+    next(rows)
+    with sqlite3.connect(path) as db:
+        db.execute('INSERT INTO messages (topic_id, timestamp, data) '
+                   'SELECT topic_id, timestamp + 1, data FROM messages')
+    with pytest.raises(BadBag, match='changes while it is read; stop the recorder first'):
+        list(rows)
+    file.close()
 
 
 def test_a_database_whose_rows_are_no_messages(tmp_path):

@@ -166,9 +166,9 @@ def test_an_imu_that_is_silent_at_rest_is_not_taken_for_perfect():
 
 def test_the_gyro_scale_is_believed_as_it_is_set():
     _, config, leg = made(**SHORT)
-    for asked, believed in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
-        told = with_settings(config, {'imu.gyro_scale_sigma': asked})
-        assert problem_of(leg, told).priors.constants[GYRO_SCALE] == believed
+    for asked, prior in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
+        asking = with_settings(config, {'imu.gyro_scale_sigma': asked})
+        assert problem_of(leg, asking).priors.constants[GYRO_SCALE] == prior
 
 
 def test_too_little_is_refused():

@@ -184,11 +184,11 @@ def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
     cells = thinned(drive.leg(), 110.0, 98.0)
     config = with_settings(Config(), {'odometer.nominal_scale': drive.truth.scale})
     leg = cells.leg(start_ns)
-    told = forecast_of(leg, cells.fix_rate(), config, smoother=SmootherSoFar())
-    assert told.methods == {}
-    assert 'yaw is not determined yet' in told.words()
-    assert told.lacks == ['drive on with stops, starts and turns']
-    assert not told.complete
+    found = forecast_of(leg, cells.fix_rate(), config, smoother=SmootherSoFar())
+    assert found.methods == {}
+    assert 'yaw is not determined yet' in found.words()
+    assert found.lacks == ['drive on with stops, starts and turns']
+    assert not found.complete
     still = replace(leg, imu=replace(leg.imu, f_i=np.zeros_like(leg.imu.f_i)))    # none to come
     never = forecast_of(still, cells.fix_rate(), config, smoother=SmootherSoFar())
     assert 'yaw: not separable from the course over ground' in never.words()
@@ -200,9 +200,9 @@ def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
     cells, start_ns = sketched(drive, 150.0)
     leg = cells.leg(start_ns)
     n = len(leg.imu.stamp_ns)
-    told = replace(leg, imu=replace(leg.imu, yaw_variance=np.full(n, 0.004**2),
-                                    q_ni=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))))
-    forecast = forecast_of(told, cells.fix_rate(), auto)
+    oriented = replace(leg, imu=replace(leg.imu, yaw_variance=np.full(n, 0.004**2),
+                                        q_ni=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))))
+    forecast = forecast_of(oriented, cells.fix_rate(), auto)
     assert forecast.yaw.sources[0] == ('initial_heading', pytest.approx(0.004))
 
 

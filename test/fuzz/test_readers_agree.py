@@ -27,7 +27,7 @@ MUTATED = 40       # bags in each run
 MCAPS = ['mcap', 'zstd', 'messages', 'journal']
 
 
-def told(path):
+def read(path):
     """Return what a bag gives: each topic's times and messages, notes, or what is wrong."""
     found = {}
     try:
@@ -42,10 +42,10 @@ def told(path):
 
 def both(path, monkeypatch):
     """Return what it gives by columns, and one by one."""
-    by_columns = told(path)
+    by_columns = read(path)
     with monkeypatch.context() as patch:
         patch.setattr(McapFile, 'batches', lambda *_: None)
-        return by_columns, told(path)
+        return by_columns, read(path)
 
 
 @pytest.fixture(scope='module')
@@ -129,7 +129,7 @@ def test_rows_of_a_database_of_any_size_and_order(tmp_path, large, indexed):
     db.commit()
     wanted = db.execute('SELECT timestamp, data FROM messages ORDER BY timestamp, id').fetchall()
     db.close()
-    assert told(path)[1]['/t'] == wanted
+    assert read(path)[1]['/t'] == wanted
 
 
 @pytest.mark.parametrize('another', [True, False], ids=['of another', 'of none'])
