@@ -6,6 +6,8 @@
 from dataclasses import replace
 import math
 import re
+import sys
+from types import SimpleNamespace
 
 from pages import fenced, ROOT
 import pytest
@@ -94,13 +96,20 @@ def device_lines(calibration):
     return [line for line in text.splitlines() if line and not line.startswith('#')]
 
 
-def test_pyubx2_sends_the_factor_of_the_file(good):
+def test_pyubx2_sends_the_factor_of_the_file(good, tmp_path, monkeypatch):
     ubx = pytest.importorskip('pyubx2', reason='no pyubx2 here: pip install odocal_ros[dev]')
     name, value = device_lines(good)[0].split(' = ')
-    sent = ubx.UBXMessage.config_set(1, 0, [(name.replace('-', '_'), int(value))])
-    got = ubx.UBXReader.parse(sent.serialize(), msgmode=ubx.SET)
+    sent = ubx.UBXMessage.config_set(1, 0, [(name.replace('-', '_'), int(value))]).serialize()
+    got = ubx.UBXReader.parse(sent, msgmode=ubx.SET)
     assert (got.identity, got.CFG_SFODO_FACTOR) == ('CFG-VALSET', 50_000)     # um of 0.05 m
-    assert sent.payload[4:8] == (0x40070007).to_bytes(4, 'little')
+    assert got.payload[4:8] == (0x40070007).to_bytes(4, 'little')
+    # and so does the program of the page, here into a file in place of the port
+    program, = ('\n'.join(lines) for language, lines in fenced(PAGE) if language == 'python')
+    monkeypatch.setitem(sys.modules, 'serial', SimpleNamespace(
+        Serial=lambda port, baud: (tmp_path / 'port').open('wb')))
+    exec(program, {})
+    got = ubx.UBXReader.parse((tmp_path / 'port').read_bytes(), msgmode=ubx.SET)
+    assert (got.payload[1], got.CFG_SFODO_FACTOR) == (0b111, 21_299)     # layers, um
     keys = set(re.findall(r'\bCFG-SF[A-Z]+-[A-Z_0-9]+', PAGE))
     assert keys
     assert {key.replace('-', '_') for key in keys} <= set(ubx.UBX_CONFIG_DATABASE)
