@@ -3,6 +3,8 @@
 
 """The travel of a vehicle by one counter or by those of its two wheels."""
 
+import math
+
 import numpy as np
 
 from odocal_ros.apply.vehicle import Vehicle
@@ -91,8 +93,7 @@ class Wheels:
     @property
     def quantum(self) -> float:
         """Return the size of a count of the travel, m."""
-        return float(np.linalg.norm([w.quantum for w in self._wheels.values()])
-                     / len(self._wheels))
+        return math.hypot(*(w.quantum for w in self._wheels.values())) / len(self._wheels)
 
     def still(self, t_from: float, t_to: float) -> bool:
         """Return True if no wheel turned between two times, and none hangs."""
