@@ -4,51 +4,98 @@
 """
 Attitude of one sample after another, in plain numbers: arrays of one row cost ten times as much.
 
-The conventions are those of ``nav/rotations.py``, which does the same for arrays.
+The conventions are those of ``nav/rotations.py`` and ``nav/strapdown.py``, which do the same for
+arrays. A vector is three numbers, a quaternion four, x y z w, a matrix three rows.
 """
 
+from collections.abc import Sequence
 import math
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.strapdown import EVEN_RATIO, LEAST_INTERVAL
 
 SMALL = 1e-8      # rad; definition: a half angle whose sine is the angle to the last digit
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+ZERO = (0.0, 0.0, 0.0)      # definition
 
 
-def turned(q: Floats, phi: Floats) -> Floats:
-    """Return a quaternion, x y z w, turned by a rotation vector of its own axes, rad; unit."""
-    a, b, c = phi.tolist()
+def rotation(phi: Sequence[float]) -> Quaternion:
+    """Return the quaternion of a rotation vector, rad; unit."""
+    a, b, c = phi
     half = math.sqrt(a * a + b * b + c * c) / 2
     s = math.sin(half) / half / 2 if half > SMALL else 0.5
-    return product(q, (s * a, s * b, s * c, math.cos(half)))
+    return s * a, s * b, s * c, math.cos(half)
 
 
-def product(q: Floats, r: Floats | tuple[float, ...]) -> Floats:
+def product(q: Sequence[float], r: Sequence[float]) -> Quaternion:
     """Return the product of two quaternions, of length 1."""
-    (x, y, z, w), (a, b, c, d) = q.tolist(), r
-    out = (w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a,
-           w * c + x * b - y * a + z * d, w * d - x * a - y * b - z * c)
-    size = math.sqrt(sum(value * value for value in out))
-    return np.array([value / size for value in out])
+    (x, y, z, w), (a, b, c, d) = q, r
+    i, j, k, re = (w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a,
+                   w * c + x * b - y * a + z * d, w * d - x * a - y * b - z * c)
+    size = math.sqrt(i * i + j * j + k * k + re * re)
+    return i / size, j / size, k / size, re / size
 
 
-def matrix_of(q: Floats) -> Floats:
-    """Return the rotation matrix of a quaternion of any length but zero, (3, 3)."""
-    x, y, z, w = q.tolist()
+def matrix_of(q: Sequence[float]) -> Matrix:
+    """Return the rotation matrix of a quaternion of any length but zero."""
+    x, y, z, w = q
     s = 2 / (x * x + y * y + z * z + w * w)
-    return np.array([[1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
-                     [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
-                     [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)]])
+    return ((1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)),
+            (s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)),
+            (s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)))
 
 
-def cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross product of two vectors, (3,)."""
-    (x, y, z), (u, v, w) = a.tolist(), b.tolist()
-    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+def rotated(C: Sequence[Sequence[float]], v: Sequence[float]) -> Vector:
+    """Return the product of a matrix and a vector."""
+    (a, b, c), (d, e, f), (g, h, i) = C
+    x, y, z = v
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
-def skewed(a: Floats) -> Floats:
+def cross(a: Sequence[float], b: Sequence[float]) -> Vector:
+    """Return the cross product of two vectors."""
+    (x, y, z), (u, v, w) = a, b
+    return y * w - z * v, z * u - x * w, x * v - y * u
+
+
+def plus(a: Vector, b: Vector, times: float = 1.0) -> Vector:
+    """Return the sum of a vector and a multiple of another."""
+    return a[0] + b[0] * times, a[1] + b[1] * times, a[2] + b[2] * times
+
+
+def skewed(a: Sequence[float]) -> Floats:
     """Return the matrix of the cross product with a vector, (3, 3)."""
-    x, y, z = a.tolist()
+    x, y, z = a
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_increment(t: Sequence[float], w: Sequence[Sequence[float]], k: int) -> Vector:
+    """
+    Return the rotation vector of b from sample k to the next, rad.
+
+    t : s.   w : rad/s.   To the last digit ``nav.strapdown.rotation_increments``.
+    """
+    h = t[k + 1] - t[k]
+    rise = [b - a for a, b in zip(w[k], w[k + 1], strict=True)]
+    mid = [(a + b) * 0.5 for a, b in zip(w[k], w[k + 1], strict=True)]
+    mean = [m * h for m in mid]
+    if 0 < k < len(t) - 2:
+        before, own, after = (max(b - a, LEAST_INTERVAL) for a, b in (
+            (t[k - 1], t[k]), (t[k], t[k + 1]), (t[k + 1], t[k + 2])))
+        if max(before, after) < EVEN_RATIO * own and own < EVEN_RATIO * min(before, after):
+            weight = own * own / 4 / (before + own + after)
+            of_left, of_right = weight * (own / 2 + after), weight * (own / 2 + before)
+            for i in range(3):
+                slope = rise[i] / own
+                left = (slope - (w[k][i] - w[k - 1][i]) / before) / (before + own)
+                right = ((w[k + 2][i] - w[k + 1][i]) / after - slope) / (own + after)
+                bow = left * of_left + right * of_right
+                mid[i] -= bow
+                rise[i] -= (right - left) * (weight * own)
+                mean[i] -= bow * (h * (2 / 3))
+    coning, h2 = cross(mid, rise), h * h / 12
+    return mean[0] + coning[0] * h2, mean[1] + coning[1] * h2, mean[2] + coning[2] * h2

@@ -9,6 +9,9 @@ g times itself; true path (1 + k) on an axis turned by m in b. Position, scale, 
 scale are considered, never corrected: the pose does not jump, the calibration stands.
 """
 
+from collections.abc import Sequence
+import math
+
 import numpy as np
 
 from odocal_ros.apply.attitude import skewed
@@ -22,6 +25,9 @@ P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 K, M, G, N = 12, slice(13, 15), 15, 16    # m: about the y and z axis of b
 BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # observable by it, of a body nearly level: no heading
 BY_REST = np.r_[3:9]
+POSITIONS, ROTATIONS, BIASES, ALL = np.r_[P], np.r_[PHI], np.r_[BG], np.arange(N)
+EYE = np.eye(N)
+POSE = np.eye(6, N)       # definition: position and attitude of the IMU in the error state
 # judgement: m/sqrt(m) along, left, up, slip and slide of any road
 ROAD_PER_METRE = np.array([0.005, 0.01, 0.01])
 # rad/s, s; judgement: of a turn that may hide in a gap of the IMU; a shorter gap hides its cube
@@ -41,51 +47,54 @@ class Errors:
     """
     The covariance of the errors, (16, 16), and its updates by stops and gravity.
 
+    bent : (3,) m in n, what attitude errors do to travel in second order.
     grade : of the IMU.   tilt, bias_sigma : rad, rad/s, sigmas at the start.   earth_left : the
     Earth's turn is in the gyro's bias.
     """
 
     def __init__(self, grade: Grade, vehicle: Vehicle, tilt: float, bias_sigma: float | Floats,
                  earth_left: bool = True) -> None:
-        self.grade, self._earth_left = grade, EARTH_LEFT * earth_left
+        self.grade = grade
+        self._walks = np.zeros(N)      # variance per s
+        self._walks[PHI] = grade.gyro_noise**2
+        self._walks[3:5] += (EARTH_LEFT * earth_left)**2
+        self._walks[BG], self._walks[BA] = grade.gyro_bias_walk**2, grade.accel_bias_walk**2
         self.cov = np.zeros((N, N))
         sigma = np.concatenate([
             np.zeros(3), [tilt, tilt, 0.0], np.broadcast_to(bias_sigma, 3),
             np.full(3, grade.accel_bias), [vehicle.scale_sigma, vehicle.pitch_sigma,
                                            vehicle.yaw_sigma, grade.gyro_scale_error]])
-        self.cov[range(N), range(N)] = sigma**2
-        self._bent = np.zeros(3)      # m in n, what attitude errors do to travel in second order
+        self.cov[ALL, ALL] = sigma**2
+        self.bent = np.zeros(3)
         # x of odom is where the vehicle heads: what the yaw errs by is in the attitude, reversed
         self.cov[5, 5] = vehicle.yaw_sigma**2
         self.cov[5, 14] = self.cov[14, 5] = -vehicle.yaw_sigma**2
 
     def grow(self, T: float, C_nb: Floats, way_n: Floats, turn_n: Floats, axes_n: Floats,
-             doubt: float = 0.0, gaps: Floats | None = None) -> None:
+             doubt: float = 0.0, gaps: Sequence[float] = ()) -> None:
         """
         Carry the errors over an interval.
 
         T : s.   C_nb : (3, 3) in its middle.   way_n, turn_n : (3,) m, rad.
         axes_n : (3, 3) columns forward, left, up.   doubt : m^2, variance of uncertain travel.
-        gaps : (k,) s, parts of the interval without IMU data.
+        gaps : s, parts of the interval without IMU data.
         """
-        F = np.eye(N)
-        cross = skewed(way_n)
+        F = EYE.copy()
+        cross = skewed(way_n.tolist())
         F[P, PHI], F[P, K], F[P, M] = -cross, way_n, -cross @ C_nb[:, 1:]
-        F[PHI, BG], F[PHI, G] = -C_nb * T, -turn_n
+        F[PHI, BG], F[PHI, G] = C_nb * -T, -turn_n
         F[P, BG], F[P, G] = cross @ C_nb * (T / 2), cross @ turn_n / 2
-        self._bent = self._bent + way_n * min(
-            BEND * float(np.trace(self.cov[PHI, PHI])), MOST_BENT)
+        tilts = self.cov[ROTATIONS, ROTATIONS].tolist()
+        self.bent = self.bent + way_n * min(BEND * sum(tilts), MOST_BENT)
         cov = F @ self.cov @ F.T
-        road = self.road(float(np.linalg.norm(way_n))) + [doubt, 0.0, 0.0]
-        hidden = 0.0 if gaps is None else float(np.sum(
-            HIDDEN_IN_GAP * gaps * np.minimum(1.0, gaps / HIDING_GAP)**2))
-        cov[P, P] += axes_n * road @ axes_n.T + cross @ cross.T * hidden**2
-        diagonal = np.zeros(N)
-        diagonal[PHI] = self.grade.gyro_noise**2 * T + hidden**2
-        diagonal[3:5] += self._earth_left**2 * T
-        diagonal[BG] = self.grade.gyro_bias_walk**2 * T
-        diagonal[BA] = self.grade.accel_bias_walk**2 * T
-        cov[range(N), range(N)] += diagonal
+        road = self.road(math.hypot(*way_n.tolist()))
+        road[0] += doubt
+        hidden = sum(HIDDEN_IN_GAP * gap * min(1.0, gap / HIDING_GAP)**2 for gap in gaps)
+        cov[P, P] += axes_n * road @ axes_n.T
+        if hidden:
+            cov[P, P] += cross @ cross.T * hidden**2
+        cov[ALL, ALL] += self._walks * T
+        cov[ROTATIONS, ROTATIONS] += hidden**2
         self.cov = cov
 
     @staticmethod
@@ -96,7 +105,7 @@ class Errors:
 
     def lost(self, path_length: float) -> None:
         """Add travel, m, of unknown direction."""
-        self.cov[range(3), range(3)] += path_length**2
+        self.cov[POSITIONS, POSITIONS] += path_length**2
 
     def turned(self, variance: Floats) -> None:
         """Add the variance of an unknown turn, (3, 3) rad^2 in n."""
@@ -130,7 +139,7 @@ class Errors:
         H = np.zeros((3, N))
         H[:, BG] = np.eye(3)
         off = rate_b**2 > FAULT_SIGMAS**2 * (np.diag(self.cov)[BG] + variance)
-        self.cov[range(6, 9), range(6, 9)] += np.where(off, rate_b**2, 0.0)
+        self.cov[BIASES, BIASES] += np.where(off, rate_b**2, 0.0)
         return self._correction(H, rate_b, np.diag(variance), BY_REST)
 
     def _correction(self, H: Floats, z: Floats, R: Floats, observed: list[int] | Ints) -> Floats:
@@ -149,12 +158,11 @@ class Errors:
 
         arm_n : (3,) m, from the odometer's point to what the position is of.
         """
-        J = np.zeros((6, N))
-        J[:3, P], J[3:, PHI], J[3:, M] = np.eye(3), np.eye(3), C_nb[:, 1:]
-        J[:3] -= skewed(arm_n) @ J[3:]
+        J = POSE.copy()
+        J[3:, M] = C_nb[:, 1:]
+        J[:3, 3:] = -skewed(arm_n.tolist()) @ J[3:, 3:]
         cov: Floats = J @ self.cov @ J.T
-        cov[:3, :3] += np.outer(self._bent, self._bent)
         # two rotations leave half their product about the third axis
-        a, b, c = np.diag(self.cov)[PHI].tolist()
-        cov[range(3, 6), range(3, 6)] += [b * c / 4, a * c / 4, a * b / 4]
+        a, b, c = self.cov[ROTATIONS, ROTATIONS].tolist()
+        cov[ROTATIONS, ROTATIONS] += [b * c / 4, a * c / 4, a * b / 4]
         return cov

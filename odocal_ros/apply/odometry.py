@@ -86,7 +86,8 @@ class Odometry:
         if arrivals.dropped:
             self._notes.append(f'{slot}: {arrivals.dropped} messages dropped: their stamps differ '
                               f'from their arrival times by {arrivals.off_s:+.3g} s')
-        block = take(block, usable)
+        if not usable.all():
+            block = take(block, usable)
         if isinstance(block, OdometerSamples):
             self.wheels.feed(slot, block, form or COUNTER)
         else:

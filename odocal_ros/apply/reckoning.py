@@ -5,25 +5,37 @@
 Dead reckoning with the strapdown of the calibration, corrected at stops.
 
 From one IMU sample to the next attitude is turned by the calibration's rotation increments
-(``nav/strapdown.py``) and travel summed by the trapezoid rule along the calibrated forward axis,
+(``apply/attitude.py``) and travel summed by the trapezoid rule along the calibrated forward axis,
 as ``nav/dead_reckoning.py`` has it: with ``levelling`` off the path of equal samples, start
 attitude and bias is that of a replay. With it, the accelerometer holds the tilt, and stops the
 gyro bias; the position never jumps.
 """
 
+import math
+
 import numpy as np
 
-from odocal_ros.apply.attitude import cross, matrix_of, product, turned
+from odocal_ros.apply.attitude import (
+    cross,
+    Matrix,
+    matrix_of,
+    plus,
+    product,
+    Quaternion,
+    rotated,
+    rotation,
+    rotation_increment,
+    Vector,
+    ZERO,
+)
 from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
 from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
 from odocal_ros.apply.start import Start
-from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream
+from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply
 from odocal_ros.nav.standstill import REST_TURN
-from odocal_ros.nav.strapdown import rotation_increments
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.levels import FASTEST
 
@@ -33,7 +45,9 @@ CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
 # judgement: corrections in turn that force and motion disagree at, after which the attitude is
 # false; m/s^2 that the force is then as long as gravity to
 MOST_APART, AS_GRAVITY = 10, 1.0
+ROWS_BEHIND = 200         # judgement: of the IMU, before they are dropped; each block copies them
 GROW_PERIOD = 0.05        # s; judgement: in which a covariance hardly grows
+PLAUSIBLE = np.zeros(3)   # rad: no turn is implausible
 TILT_LOST = 0.5           # rad; judgement: sigma beyond which a straight line levels nothing
 
 
@@ -48,22 +62,24 @@ class Reckoning:
                  config: ApplyConfig, notes: list[str], delay_sigma: float) -> None:
         self.imu, self.wheels, self.vehicle, self.config = imu, wheels, vehicle, config
         self._notes, self._delay_sigma, self.failed = notes, delay_sigma, ''
-        self.q, self.bias, self.errors = start.q_nb, start.gyro_bias, start.errors
+        self.q: Quaternion = tuple(start.q_nb.tolist())
+        self.bias, self.errors = start.gyro_bias, start.errors
         self.accel_bias = np.zeros(3)
-        self.position = np.zeros(3)      # of the odometer's point, from where it began
+        self.position = ZERO      # of the odometer's point, from where it began
         self.imu.drop(start.row)
-        self._earth_n = start.earth_n
+        self._earth_n, self._forward_b = start.earth_n, vehicle.forward_b.tolist()
         self._t = self._t_pose = self._t_look = float(self.imu.t[self.imu.at])
-        self._s = self._s_pose = float(self.wheels.at(self._t))
-        self._C_nb = matrix_of(self.q)
-        self._turn_b, self._felt_n, self._felt = np.zeros(3), np.zeros(3), True
-        self._T_grow, self._way_grow, self._turn_grow = 0.0, np.zeros(3), np.zeros(3)
+        self._s = self._s_pose = self.wheels.at(self._t)
+        self._C_nb = np.array(matrix_of(self.q))
+        self._turn_b, self._felt_n, self._felt = ZERO, ZERO, True
+        self._T_grow, self._way_grow, self._turn_grow = 0.0, ZERO, ZERO
         self._w_look: list[Floats] = []
-        self._rested, self._apart, self._strange_turn = False, 0, np.zeros(3)
+        self._rested, self._apart, self._strange_turn = False, 0, PLAUSIBLE
         self._v_look = self._velocity_n(self._t)
-        self._swung = self._v_look           # m/s in n, at the start, and what turns added
+        # m/s in n, at the start, and what turns added
+        self._swung: Vector = tuple(self._v_look.tolist())
         self._moved = self._stays = 0.0      # s, by which a clock moved, and for good
-        self._arm0_n = matrix_from_quat(self.q) @ self.vehicle.C_vb.T @ self.vehicle.lever_arm
+        self._arm0_n = self._C_nb @ -vehicle.arm_b
 
     def poses(self, moved: float = 0.0, stays: float = 0.0) -> list[Pose]:
         """
@@ -83,11 +99,11 @@ class Reckoning:
             if self.failed:
                 break
             if received:
-                out.append(self._pose())
-                if not out[-1].sound():
-                    del out[-1]
+                pose = self._pose()
+                if not pose.sound():
                     self.failed = 'the pose was not finite'
                     break
+                out.append(pose)
             self._look()
             self._leave_behind(last)
         return out
@@ -111,60 +127,63 @@ class Reckoning:
     def _advance(self, last: int) -> None:
         """Go to a row of the IMU."""
         imu, at = self.imu, self.imu.at
-        low = max(at - 1, 0)
-        t = imu.t[low:last + 2]
-        phi = rotation_increments(t, imu.w_b[low:last + 2] - self.bias)
-        phi = phi[:, at - low:last - low]
-        t = imu.t[at:last + 1]
-        s, gaps = self.wheels.at(t), np.diff(t)
-        lost, self._s = abs(float(s[0]) - self._s), float(s[-1])
-        f_b = imu.f_b[at:last + 1] - self.accel_bias
-        way_n = np.zeros(3)
-        f_n = self._C_nb @ f_b[0]
-        for k, (T, step) in enumerate(zip(gaps.tolist(), np.diff(s).tolist(), strict=True)):
-            C_before, f_before = self._C_nb, f_n
-            self._turn(phi[:, k], T)
-            way_n += (C_before + self._C_nb) @ self.vehicle.forward_b * (step / 2)
-            f_n = self._C_nb @ f_b[k + 1]
-            self._felt_n += (f_before + f_n) * (T / 2)
-        self.position = self.position + way_n
-        turn_b, strange = phi.sum(axis=1), imu.strange[at + 1:last + 1]
-        self._grow(float(t[-1] - t[0]), way_n, turn_b, gaps[gaps > HOLE_INTERVALS * imu.usual],
-                   self.wheels.doubt(t[0], t[-1]))
-        self._swung = self._swung + cross(self._C_nb @ turn_b, way_n) / float(t[-1] - t[0])
-        self._doubt_turn(strange, gaps, self._C_nb)
+        low = max(at - 1, 0)      # a cubic needs the sample before and the one beyond
+        t = imu.t[low:last + 2].tolist()
+        w = (imu.w_b[low:last + 2] - self.bias).tolist()
+        f = (imu.f_b[at:last + 1] - self.accel_bias).tolist()
+        s = [self.wheels.at(one) for one in t[at - low:-1]]
+        gaps = [b - a for a, b in zip(t[at - low:-2], t[at - low + 1:-1], strict=True)]
+        lost, self._s = abs(s[0] - self._s), s[-1]
+        C_nb, turn_b, way_n, felt_n = self._C_nb.tolist(), ZERO, ZERO, ZERO
+        forward_n, f_n = rotated(C_nb, self._forward_b), rotated(C_nb, f[0])
+        for k, T in enumerate(gaps):
+            phi = rotation_increment(t, w, at - low + k)
+            C_nb = self._turn(phi, T)
+            forward_before, forward_n = forward_n, rotated(C_nb, self._forward_b)
+            f_before, f_n = f_n, rotated(C_nb, f[k + 1])
+            turn_b = plus(turn_b, phi)
+            way_n = plus(way_n, plus(forward_before, forward_n), (s[k + 1] - s[k]) / 2)
+            felt_n = plus(felt_n, plus(f_before, f_n), T / 2)
+        self._C_nb = np.array(C_nb)
+        self.position, self._felt_n = plus(self.position, way_n), plus(self._felt_n, felt_n)
+        T, turn_n = t[-2] - self._t, rotated(C_nb, turn_b)
+        self._grow(T, way_n, turn_n, [gap for gap in gaps if gap > HOLE_INTERVALS * imu.usual],
+                   self.wheels.doubt(self._t, t[-2]))
+        self._swung = plus(self._swung, cross(turn_n, way_n), 1 / T)
+        self._doubt_turn(imu.strange[at + 1:last + 1], np.array(gaps), self._C_nb)
         if lost > self.wheels.quantum:
             self.errors.lost(lost)
-        self._felt &= bool(np.isfinite(f_b).all()) and gaps.max() <= IMU_HOLE and not (
-            self._strange_turn.any())
-        self._turn_b = self._turn_b + turn_b
+        calm = self._strange_turn is PLAUSIBLE and max(gaps) <= IMU_HOLE
+        self._felt &= calm and math.isfinite(sum(felt_n))
+        self._turn_b = plus(self._turn_b, turn_b)
         self._w_look.append(imu.w_b[at + 1:last + 1])
-        self._t, imu.at = float(t[-1]), last
+        self._t, imu.at = t[-2], last
 
-    def _turn(self, phi: Floats, T: float) -> None:
-        """Turn the attitude by a rotation vector of b, rad, over T s."""
-        q = turned(self.q, phi)
+    def _turn(self, phi: Vector, T: float) -> Matrix:
+        """Turn the attitude by a rotation vector of b, rad, over T s; return its matrix."""
+        self.q = product(self.q, rotation(phi))
         if self._earth_n.any():
-            q = quat_multiply(quat_from_rotvec(-T * self._earth_n), q)
-        self.q, self._C_nb = q, matrix_of(q)
+            self.q = product(rotation((-T * self._earth_n).tolist()), self.q)
+        return matrix_of(self.q)
 
-    def _grow(self, T: float, way_n: Floats, turn_b: Floats, gaps: Floats, doubt: float) -> None:
+    def _grow(self, T: float, way_n: Vector, turn_n: Vector, gaps: list[float],
+              doubt: float) -> None:
         """Carry the errors over T s, at once where data are uncertain, else every GROW_PERIOD."""
         self._T_grow += T
-        self._way_grow = self._way_grow + way_n
-        self._turn_grow = self._turn_grow + self._C_nb @ turn_b
-        if self._T_grow > GROW_PERIOD - 1e-6 or doubt or len(gaps):
-            C_nb = self._C_nb
-            self.errors.grow(self._T_grow, C_nb, self._way_grow, self._turn_grow,
-                             C_nb @ self.vehicle.C_vb.T, doubt, gaps)
-            self._T_grow, self._way_grow, self._turn_grow = 0.0, np.zeros(3), np.zeros(3)
+        self._way_grow = plus(self._way_grow, way_n)
+        self._turn_grow = plus(self._turn_grow, turn_n)
+        if self._T_grow > GROW_PERIOD - 1e-6 or doubt or gaps:
+            way, turn, axes_n = self._way_grow, self._turn_grow, self._C_nb @ self.vehicle.C_vb.T
+            self.errors.grow(self._T_grow, self._C_nb, np.array(way), np.array(turn), axes_n,
+                             doubt, gaps)
+            self._T_grow, self._way_grow, self._turn_grow = 0.0, ZERO, ZERO
 
     def _doubt_turn(self, strange: Floats, gaps: Floats, C_nb: Floats) -> None:
         """Add variance for implausible turn rates: (n, 3) rad/s over n gaps of s, in b."""
         if not strange.any():
-            self._strange_turn = np.zeros(3)
+            self._strange_turn = PLAUSIBLE
             return
-        if not self._strange_turn.any():
+        if self._strange_turn is PLAUSIBLE:
             self._notes.append(f'the gyro jumps in one sample by {strange.max():.2g} rad/s, more '
                               'than a vehicle can turn: the gyro is down-weighted')
         turn = self._strange_turn + gaps @ strange
@@ -176,11 +195,11 @@ class Reckoning:
     def _velocity_n(self, t: float) -> Floats:
         """Return the velocity of the IMU in n, by the odometer's last rows."""
         v, C_nb = self.vehicle, self._C_nb
-        now, before = self.wheels.at(np.array([t, t - SPEED_SPAN]))
-        arm_b = v.C_vb.T @ (np.asarray(self.config.imu.lever_arm) - v.lever_arm)
+        moved = self.wheels.at(t) - self.wheels.at(t - SPEED_SPAN)
+        arm_b = v.C_vb.T @ self.config.imu.lever_arm + v.arm_b
         rate = self.imu.w_b[self.imu.at] - self.bias
         velocity: Floats = C_nb @ (
-            v.forward_b * (now - before) / SPEED_SPAN + cross(rate, arm_b))
+            v.forward_b * moved / SPEED_SPAN + cross(rate.tolist(), arm_b.tolist()))
         return velocity
 
     def _look(self) -> None:
@@ -196,7 +215,7 @@ class Reckoning:
         # a rest that begins with this look may begin with the last of the braking
         standing = resting and self._rested
         if self.config.levelling and received and self._felt:
-            off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
+            off_n = (np.array(self._felt_n) - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
             doubt = self.wheels.doubt(self._t_look, self._t)      # changes the speed in T
             noise = 2 * np.hypot(self.wheels.quantum / SPEED_SPAN / T, np.sqrt(doubt) / T**2)
             by = self.errors.by_gravity(
@@ -215,7 +234,7 @@ class Reckoning:
             self._correct(self.errors.by_rest(w.mean(axis=0) - self.bias - earth_b, variance))
         self._rested = resting
         self._t_look, self._v_look = self._t, self._velocity_n(self._t)
-        self._felt_n, self._felt, self._w_look = np.zeros(3), True, []
+        self._felt_n, self._felt, self._w_look = ZERO, True, []
 
     def _take_apart(self, off_n: Floats, velocity: Floats, T: float, w: Floats) -> None:
         """
@@ -235,20 +254,19 @@ class Reckoning:
             self.failed = f'specific force and attitude have disagreed for {self._apart} s'
 
     def _correct(self, by: Floats) -> None:
-        self.q = quat_multiply(quat_from_rotvec(by[PHI]), self.q)
-        self._C_nb = matrix_of(self.q)
+        self.q = product(rotation(by[PHI].tolist()), self.q)
+        self._C_nb = np.array(matrix_of(self.q))
         self.bias = self.bias + by[BG]
         self.accel_bias = self.accel_bias + by[BA]
 
     def _pose(self) -> Pose:
         """Return the pose at the row reached."""
-        v, T = self.vehicle, self._t - self._t_pose
-        C_nb, C_vb = self._C_nb, v.C_vb
-        arm_n = -C_nb @ C_vb.T @ v.lever_arm
-        earth_b = C_nb.T @ self._earth_n
-        rate = C_vb @ (self._turn_b / T - earth_b)
+        v, T, C_nb = self.vehicle, self._t - self._t_pose, self._C_nb
+        arm_n = C_nb @ v.arm_b
+        rate_b = np.array(self._turn_b) / T - C_nb.T @ self._earth_n
+        rate = v.C_vb @ rate_b
         speed = (self._s - self._s_pose) / T
-        velocity = cross(v.lever_arm, rate)
+        velocity = np.array(cross(v.lever_arm.tolist(), rate.tolist()))
         velocity[0] += speed
         if abs(speed) > FASTEST:
             self._notes.append(f'{speed:.0f} m/s is implausible: the calibration belongs to '
@@ -256,29 +274,27 @@ class Reckoning:
         quantum, jitter = self.wheels.quantum, self.wheels.jitter(self._t, T)
         doubt = self.wheels.doubt(self._t - T, self._t)
         pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
-                    product(self.q, v.q_bv), velocity, rate,
-                    self._late(speed, C_nb @ (self._turn_b / T - earth_b)) + pose_covariance(
-                        v, self.errors, C_nb, arm_n,
-                        quantum**2 / 6 + self.wheels.between(self._t) + jitter / 2),
+                    np.array(product(self.q, v.q_bv.tolist())), velocity, rate,
+                    pose_covariance(v, self.errors, C_nb, arm_n, self._late(speed, rate_b),
+                                    quantum**2 / 6 + self.wheels.between(self._t) + jitter / 2),
                     twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt
                                      + jitter))
-        self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
+        self._t_pose, self._s_pose, self._turn_b = self._t, self._s, ZERO
         return pose
 
-    def _late(self, speed: float, rate_n: Floats) -> Floats:
+    def _late(self, speed: float, rate_b: Floats) -> Floats:
         """
-        Return the covariance of a pose, (6, 6), by the times of odometer and IMU.
+        Return by how much a pose is off, (6,) m, rad in n, by the times of odometer and IMU.
 
-        speed : m/s.   rate_n : (3,) rad/s.   A delay shifts travel by what accelerations along
+        speed : m/s.   rate_b : (3,) rad/s.   A delay shifts travel by what accelerations along
         the path changed of the velocity; a clock that moved shifts the time of the pose too.
         """
         way_n = self._C_nb @ self.vehicle.forward_b * speed - self._swung
-        off = np.concatenate([way_n * np.hypot(self._delay_sigma, self._moved),
-                              rate_n * self._moved])
-        return np.outer(off, off)
+        return np.concatenate([way_n * math.hypot(self._delay_sigma, self._moved),
+                               self._C_nb @ rate_b * self._moved])
 
     def _leave_behind(self, last: int) -> None:
-        """Forget what lies behind."""
-        if last > 2000:
-            self.imu.drop(last - 2)
+        """Forget what lies behind, but for the rows that determine the usual interval."""
+        if last > ROWS_BEHIND:
+            self.imu.drop(last - INTERVAL_ROWS)
             self.wheels.forget(self._t - 2 * CORRECTION_PERIOD)

@@ -11,7 +11,6 @@ within the time that a spike may take. The limits are those of the leg.
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import across
 from odocal_ros.screening.glitches import (
     BACK_SHARE,
     EQUAL_NEIGHBOURS,
@@ -32,15 +31,16 @@ STUCK_TIME = 0.1          # s; judgement: of rows equal in every bit, after whic
 TURN_CHANGE = 10.0        # rad/s^2; physical: no vehicle starts to turn faster, but over a stone
 STRANGE_TURN_TIME = 1.0        # s; judgement: after which a turn that began so is one
 ALONE_CHANGE = 2.5        # rad/s^2; judgement: of a step that stands alone: turns begin slower
-STEPS = np.repeat([TURN_STEP, FORCE_STEP], 3)
+LARGEST = np.repeat([MOST_TURN, MOST_FORCE], 3)
+IS_FORCE = np.repeat([False, True], 3)
+LEAST_STEPS = np.array([TURN_STEP, FORCE_STEP])
 SINGLES = np.repeat([SINGLE_TURN, SINGLE_FORCE], 3)
 
 
-def beyond_sensor(w_b: Floats, f_b: Floats) -> Bools:
-    """Return a mask of impossible rows: (n, 3) rad/s, (n, 3) m/s^2; a force of NaN is missing."""
-    with np.errstate(invalid='ignore'):
-        turn = across(np.logical_and, np.abs(w_b) <= MOST_TURN)
-        return ~turn | across(np.logical_or, np.abs(f_b) > MOST_FORCE)
+def beyond_sensor(x_b: Floats) -> Bools:
+    """Return a mask of impossible rows: (n, 6) rad/s and m/s^2; a force of NaN is missing."""
+    odd: Bools = (~(np.abs(x_b) <= LARGEST) & ~(np.isnan(x_b) & IS_FORCE)).any(axis=1)
+    return odd
 
 
 class SpikeScreen:
@@ -52,7 +52,7 @@ class SpikeScreen:
     """
 
     def __init__(self) -> None:
-        self._usual = np.zeros(2)           # of steps from row to row, in STEPS: gyro, force
+        self._usual = np.zeros(2)           # of steps from row to row, in LEAST_STEPS: gyro, force
         self._since = 0.0                   # s, since when the rows are equal
         self._w: Floats = np.empty((0, 3))       # rad/s, of the rows before the last one
         self._strange = np.zeros(3)         # rad/s, step of the gyro that no vehicle makes
@@ -149,9 +149,11 @@ class SpikeScreen:
         """Return True if no row of a block needs a closer check."""
         if len(x) < 2:
             return True
-        sizes = _size(np.diff(x, axis=0))
-        most = np.minimum(self._allowed(), [TURN_CHANGE / TURN_STEP * np.diff(t).min(), np.inf])
-        calm = not self._strange.any() and not (sizes > most).any() and bool(
+        sizes = _size(x[1:] - x[:-1])
+        turn, force = self._allowed().tolist()
+        turn = min(turn, TURN_CHANGE / TURN_STEP * float((t[1:] - t[:-1]).min()))
+        largest, force_largest = sizes.max(axis=0).tolist()
+        calm = not (largest > turn or force_largest > force or self._strange.any()) and bool(
             sizes.any(axis=1).all())
         if calm:
             self._learn(sizes)
@@ -165,7 +167,8 @@ class SpikeScreen:
     def _learn(self, steps: Floats) -> None:
         most = 4 * self._usual + 1 / USUAL_STEPS       # one spike hardly changes the usual size
         share = 1 - (1 - 1 / USUAL_ROWS)**len(steps)
-        self._usual = self._usual + (np.minimum(steps, most).mean(axis=0) - self._usual) * share
+        mean = np.minimum(steps, most).sum(axis=0) / len(steps)
+        self._usual = self._usual + (mean - self._usual) * share
 
     def _back(self, away: Floats, step: Floats) -> int | None:
         """Return at which of the rows after a step the values are back, None if at none."""
@@ -177,9 +180,9 @@ class SpikeScreen:
 
 
 def _size(step: Floats) -> Floats:
-    """Return the size of steps, (..., 6), of gyro and force, in STEPS: (..., 2); no force is 0."""
-    size = np.abs(step) / STEPS
-    return np.stack([size[..., :3].max(axis=-1), np.nan_to_num(size[..., 3:].max(axis=-1))], -1)
+    """Return sizes of steps, (..., 6), of gyro and force in LEAST_STEPS, (..., 2); NaN is 0."""
+    size: Floats = np.abs(step).reshape(*step.shape[:-1], 2, 3).max(axis=-1) / LEAST_STEPS
+    return np.fmax(size, 0.0)
 
 
 def single(x: Floats) -> Bools:
@@ -192,6 +195,8 @@ def single(x: Floats) -> Bools:
     if len(x) < ROWS_BESIDE + 3:
         return off
     far = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)       # of row k + 1
+    if not (far[ROWS_BESIDE + 1:] > SINGLES).any():
+        return off
     for k in range(ROWS_BESIDE + 1, len(far)):
         at = far[k]
         beside = far[k - ROWS_BESIDE - 1:k - 1].max(axis=0)

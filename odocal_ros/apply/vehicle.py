@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from odocal_ros.apply.attitude import skewed
 from odocal_ros.calib.result import Estimate
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
@@ -54,6 +55,16 @@ class Vehicle:
     def C_vb(self) -> Floats:
         """Return the rotation that takes b to the vehicle's axes."""
         return matrix_from_rpy([0.0, self.pitch, self.yaw])
+
+    @cached_property
+    def arm_b(self) -> Floats:
+        """Return the vector from the odometer's point to base_link, in b: (3,) m."""
+        return -self.C_vb.T @ self.lever_arm
+
+    @cached_property
+    def twist_b(self) -> Floats:
+        """Return the matrix from a turn rate in b to the twist of base_link: (6, 3)."""
+        return np.concatenate([skewed(self.lever_arm.tolist()), np.eye(3)]) @ self.C_vb
 
     @cached_property
     def q_bv(self) -> Floats:

@@ -12,10 +12,8 @@ from bisect import bisect_left
 from collections import deque
 import math
 
-import numpy as np
-
 from odocal_ros.apply.rhythm import Rhythm
-from odocal_ros.data.arrays import FloatOrFloats, Floats, Values
+from odocal_ros.data.arrays import Floats, Values
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.levels import FASTEST
 
@@ -84,10 +82,8 @@ class Wheel:
         self.speed *= factor
         self.s = deque(s * factor for s in self.s)
 
-    def at(self, t: FloatOrFloats) -> FloatOrFloats:
-        """Return the travel at times, linear between rows, constant outside."""
-        if isinstance(t, np.ndarray):
-            return np.array([self.at(one) for one in t.tolist()])
+    def at(self, t: float) -> float:
+        """Return the travel at a time, linear between rows, constant outside."""
         after = bisect_left(self.t, t)
         if not 0 < after < len(self.t):
             return self.s[0] if after == 0 else self.s[-1]

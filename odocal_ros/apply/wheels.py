@@ -3,11 +3,12 @@
 
 """The travel of a vehicle by one counter or by those of its two wheels."""
 
+import math
+
 import numpy as np
 
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheel import Wheel
-from odocal_ros.data.arrays import FloatOrFloats
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.standstill import REST_TRAVEL
 from odocal_ros.settings.apply_config import ApplyConfig
@@ -73,12 +74,9 @@ class Wheels:
         """Return the first time that every wheel has, s."""
         return max(w.t[0] for w in self._wheels.values())
 
-    def at(self, t: FloatOrFloats) -> FloatOrFloats:
-        """Return the travel at times, m."""
-        total = t * 0.0
-        for wheel in self._wheels.values():
-            total = total + wheel.at(t)
-        return total / len(self._wheels)
+    def at(self, t: float) -> float:
+        """Return the travel at a time, m."""
+        return sum(wheel.at(t) for wheel in self._wheels.values()) / len(self._wheels)
 
     def doubt(self, t_from: float, t_to: float) -> float:
         """Return the variance of the travel between two times, m^2, beside that of the scale."""
@@ -95,8 +93,7 @@ class Wheels:
     @property
     def quantum(self) -> float:
         """Return the size of a count of the travel, m."""
-        return float(np.linalg.norm([w.quantum for w in self._wheels.values()])
-                     / len(self._wheels))
+        return math.hypot(*(w.quantum for w in self._wheels.values())) / len(self._wheels)
 
     def still(self, t_from: float, t_to: float) -> bool:
         """Return True if no wheel turned between two times, and none hangs."""

@@ -5,10 +5,11 @@
 
 from collections import deque
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Ints
+from odocal_ros.data.arrays import Bools
 from odocal_ros.data.samples import FixSamples, Samples
 from odocal_ros.settings.levels import TIME_ANEW_NS, TIME_ANEW_ROWS
 
@@ -50,11 +51,10 @@ class Health:
         """Count messages as they came; sequences are the publisher's numbers, or None."""
         self.received_ns = now_ns
         numbers = [s for s in [self._last_sequence, *sequences] if s is not None]
-        if len(numbers) > 1:
-            steps = np.diff(np.asarray(numbers, dtype=np.int64))
-            # several publishers, or one that restarted: the numbers are useless
-            if (steps > 0).all():
-                self.lost += int((steps - 1).sum())
+        steps = [after - before for before, after in pairwise(numbers)]
+        # several publishers, or one that restarted: the numbers are useless
+        if steps and min(steps) > 0:
+            self.lost += sum(steps) - len(steps)
         if numbers:
             self._last_sequence = numbers[-1]
 
@@ -64,52 +64,52 @@ class Health:
 
         Returns a mask of rows with a plausible stamp: not zero, not far ahead or behind.
         """
-        self.count += len(block.stamp_ns)
+        stamps = block.stamp_ns.tolist()
+        self.count += len(stamps)
         if isinstance(block, FixSamples) and len(block.status):
             self.fix_status = int(block.status[-1])
-        self.stampless = len(block.stamp_ns) > 0 and not (block.stamp_ns > 0).any()
-        sound = self._not_ahead(block.stamp_ns)
-        if not sound.any():
-            return sound
-        stamps, known = block.stamp_ns[sound], self.newest_ns
-        self._take(stamps, max_gap_s)
-        self.delay_s = (int(block.received_ns[sound][-1]) - int(stamps[-1])) * 1e-9
-        sound[sound] = stamps >= np.maximum.accumulate(np.maximum(stamps, known)) - TIME_ANEW_NS
-        return sound
+        self.stampless = bool(stamps) and max(stamps) <= 0
+        sound = self._not_ahead(stamps)
+        rows = [row for row, plausible in enumerate(sound) if plausible]
+        if rows:
+            newest = self.newest_ns
+            self._take([stamps[row] for row in rows], max_gap_s)
+            self.delay_s = (int(block.received_ns[rows[-1]]) - stamps[rows[-1]]) * 1e-9
+            for row in rows:
+                newest = max(newest, stamps[row])
+                sound[row] = stamps[row] >= newest - TIME_ANEW_NS
+        return np.array(sound, bool)
 
-    def _not_ahead(self, stamps: Ints) -> Bools:
-        """Return a mask of stamps that exist and are not far ahead of the last one."""
-        sound: Bools = stamps > 0
-        given = stamps[sound]
-        if not len(given) or not self._ahead and (
-                given.max() - (self.newest_ns or given[0]) < WILD_STAMP_NS):
+    def _not_ahead(self, stamps: list[int]) -> list[bool]:
+        """Return which stamps exist and are not far ahead of the last one."""
+        sound, last = [stamp > 0 for stamp in stamps], self.newest_ns
+        first = next((stamp for stamp in stamps if stamp > 0), 0)
+        if not self._ahead and max(stamps, default=0) - (last or first) < WILD_STAMP_NS:
             return sound
-        last = self.newest_ns
-        for i in np.flatnonzero(sound):
-            stamp = int(stamps[i])
-            if last and stamp - last >= WILD_STAMP_NS:
+        for row, stamp in enumerate(stamps):
+            if sound[row] and last and stamp - last >= WILD_STAMP_NS:
                 near = self._ahead and abs(stamp - self._ahead[-1]) < WILD_STAMP_NS
                 self._ahead = [*self._ahead, stamp] if near else [stamp]
-                sound[i] = len(self._ahead) >= TIME_ANEW_ROWS
-            if sound[i]:
+                sound[row] = len(self._ahead) >= TIME_ANEW_ROWS
+            if sound[row]:
                 last, self._ahead = stamp, []
         return sound
 
-    def _take(self, stamps: Ints, max_gap_s: float | None) -> None:
-        known = np.concatenate(([self.newest_ns], stamps)) if self.newest_ns else stamps
-        steps = known[1:] - known[:-1]
+    def _take(self, stamps: list[int], max_gap_s: float | None) -> None:
+        known = [self.newest_ns, *stamps] if self.newest_ns else stamps
+        steps = [after - before for before, after in pairwise(known)]
         newest = self._newest(known, steps)
-        rising = np.sort(steps[steps > 0]) * 1e-9
-        if len(rising):
+        rising = sorted(step * 1e-9 for step in steps if step > 0)
+        if rising:
             limit = max_gap_s or 5 * self._interval_s
-            self.gaps += int((rising > limit).sum()) if limit else 0
-            typical = float(rising[(len(rising) - 1) // 2])
+            self.gaps += sum(step > limit for step in rising) if limit else 0
+            typical = rising[(len(rising) - 1) // 2]
             self._interval_s = 0.9 * self._interval_s + 0.1 * typical if self._interval_s \
                 else typical
         self.newest_ns = newest
         self._ends.append((self.count, newest))
 
-    def _newest(self, known: Ints, steps: Ints) -> int:
+    def _newest(self, known: list[int], steps: list[int]) -> int:
         """
         Return the newest stamp with a block of them, and note whether time has restarted.
 
@@ -117,22 +117,22 @@ class Health:
         block ends with few of them, or has but one row, the next one decides.
         """
         behind, self._behind = self._behind, 0
-        at = int(steps.argmin()) if len(steps) else 0
-        if not len(steps) or steps[at] >= -TIME_ANEW_NS:
-            return int(known[-1])
-        after = known[at + 1:].max()
+        if not steps or min(steps) >= -TIME_ANEW_NS:
+            return known[-1]
+        at = steps.index(min(steps))
+        after = max(known[at + 1:])
         fell = after < known[at] - TIME_ANEW_NS
         # back to where the stamps were before one that was wild
         after_wild = at and steps[at - 1] > TIME_ANEW_NS and after >= known[at - 1] - TIME_ANEW_NS
         after_wild = after_wild or not (at or self.newest_ns)
         if not fell or after_wild:
-            return int(known[-1])
+            return known[-1]
         rows = len(known) - 1 - at
         if rows < TIME_ANEW_ROWS if at else rows + behind < 2:
             self._behind = rows
-            return int(known[at])
+            return known[at]
         self.jumped_back = True
-        return int(known[-1])
+        return known[-1]
 
     def silent_s(self, now_ns: int) -> float:
         """Return seconds since the last message, infinite before the first."""

@@ -12,7 +12,6 @@ from typing import Any
 
 from geometry_msgs.msg import TransformStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry as OdometryMessage
-import numpy as np
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import Executor
 from rclpy.node import Node
@@ -40,6 +39,7 @@ from odocal_ros.settings.apply_config import ApplyConfig, OdomFrames
 # executor, which cost most; before a pose is due, when messages are looked at; between turns
 # without a pose
 LOOK_S, SERVE_S, EARLY_S, SILENT_S = 0.02, 0.1, 0.01, 0.2
+TWIST_NUMBERS = 42              # format: floats of a twist with its covariance
 SAID_AGAIN_NS = 10 * 10**9      # judgement: between two sentences of one kind
 HELP = """\
 usage: odometry --ros-args --params-file CALIBRATION.yaml [-p NAME:=VALUE] [-r FROM:=TO] ...
@@ -220,10 +220,8 @@ class OdometryNode(SettledNode):
             self._silent_ns = now_ns + self._pause_ns
 
     def _publish(self, pose: Pose) -> None:
-        twist = np.concatenate([pose.velocity, pose.rate, pose.twist_cov.ravel()])
-        self._twist.send(pose.stamp_ns, twist)
-        self._pose.send(pose.stamp_ns, np.concatenate([
-            pose.position, pose.q, pose.pose_cov.ravel(), twist]))
+        self._twist.send(pose.stamp_ns, pose.numbers[-TWIST_NUMBERS:])
+        self._pose.send(pose.stamp_ns, pose.numbers)
         if self._tf is not None:
             self._tf(transform_of(pose, self.config.frames))
 

@@ -94,11 +94,11 @@ class Reader:
             The messages can never give what was asked: no such field, not a number.
 
         """
-        other = None
+        other, raws = None, Raws.of(raws)
         if self.frames is not None and len(raws):
             keep, other = self.frames.sort(raws, received_ns, deserialize)
             if other is not None:
-                raws = Raws.of(raws).take(keep)
+                raws = raws.take(keep)
                 received_ns = np.asarray(received_ns, np.int64)[keep]
         found = self._rows(raws, received_ns, deserialize)
         return found if other is None else [*found, ('imu_other', other)]

@@ -4,10 +4,12 @@
 """Messages of one topic by their frame_id: of several IMUs on one topic, only one is used."""
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 import struct
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.data.samples import FRAME_BYTES, OtherImuSamples
@@ -40,7 +42,9 @@ class FrameFilter:
         while not self._settled and first < len(raws):
             self._count(self._frame(raws[first], deserialize))
             first += 1
-        keep[first:] = self._alike(raws[first:])
+        keep[first:] = self._alike(Raws.of(raws)[first:])
+        if keep.all():
+            return keep, None
         other, stamps = [], []
         for i in np.flatnonzero(~keep).tolist():
             frame = self._frame(raws[i], deserialize)
@@ -64,15 +68,12 @@ class FrameFilter:
         if self._seen[frame] >= SETTLED:
             self.frame, self._settled = frame, True
 
-    def _alike(self, raws: Sequence[bytes]) -> Bools:
+    def _alike(self, raws: Raws) -> Bools:
         """Return a mask of messages with the frame at its place in CDR, vectorised."""
-        packed = Raws.of(raws)
-        text = self.frame.encode() + b'\0'
-        pattern = np.frombuffer(b'\0\1' + struct.pack('<I', len(text)) + text, np.uint8)
-        at = np.concatenate([[0, 1], np.arange(TEXT_AT, TEXT_AT + len(pattern) - 2)])
-        alike: Bools = packed.size > at[-1]
-        data = np.frombuffer(packed.data, np.uint8)
-        alike[alike] = (data[packed.start[alike][:, None] + at] == pattern).all(axis=1)
+        at, pattern = _pattern(self.frame)
+        alike: Bools = raws.size > at[-1]
+        data = np.frombuffer(raws.data, np.uint8)
+        alike[alike] = (data[raws.start[alike][:, None] + at] == pattern).all(axis=1)
         return alike
 
     def _frame(self, raw: bytes, deserialize: Callable[[bytes], Any]) -> str | None:
@@ -82,6 +83,14 @@ class FrameFilter:
             return str(deserialize(raw).header.frame_id) if frame is None else frame
         except Exception:       # rclpy and rosbags fail with exceptions of their own
             return None
+
+
+@lru_cache(maxsize=1)
+def _pattern(frame: str) -> tuple[Ints, NDArray[np.uint8]]:
+    """Return the places in CDR, little endian, that determine the frame_id, and their bytes."""
+    text = frame.encode() + b'\0'
+    pattern = np.frombuffer(b'\0\1' + struct.pack('<I', len(text)) + text, np.uint8)
+    return np.concatenate([[0, 1], np.arange(TEXT_AT, TEXT_AT + len(pattern) - 2)]), pattern
 
 
 def _stamp_ns(raw: bytes) -> int:

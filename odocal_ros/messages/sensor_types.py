@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.pieces import across
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
@@ -85,9 +86,8 @@ def _heading(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw
 
 def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
     """Return covariance[8], NaN where REP-145's -1 or an all-zero quaternion say 'none'."""
-    x, y, z, w = q_ni.T
-    zero = (x == 0) & (y == 0) & (z == 0) & (w == 0)
-    return np.where(zero | (of_roll[:, 0] == -1), np.nan, of_yaw[:, 0])
+    some = across(np.logical_or, q_ni != 0)
+    return np.where(~some | (of_roll[:, 0] == -1), np.nan, of_yaw[:, 0])
 
 
 def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,

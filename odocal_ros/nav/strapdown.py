@@ -19,6 +19,9 @@ Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
 # judgement: quaternions a scan multiplies up in step; 40 to 800 make no difference
 SCAN_BLOCK = 64
 SAMPLES_AT_A_TIME = 16384    # judgement: intervals at a time, whose arrays stay in the cache
+LEAST_INTERVAL = 1e-9    # s; judgement: of the stamps, keeps the slope of equal stamps finite
+# judgement: ratio of neighbouring intervals up to which a cubic is laid through them
+EVEN_RATIO = 2.0
 
 
 def rotation_increments(t: Floats, w_b: Floats, begin: int = 0, end: int | None = None) -> Floats:
@@ -72,13 +75,11 @@ def _bow(h: Floats, rise: Floats) -> tuple[Floats, Floats]:
     twist : how much less the middle slope, times the interval, rises than the chord.
     From divided differences of the rates over intervals h, (m,), with rises (3, m) over them.
     """
-    least_interval = 1e-9    # s, of the stamps: keeps the slope of equal stamps finite
-    safe = np.maximum(h, least_interval)
+    safe = np.maximum(h, LEAST_INTERVAL)
     curve = np.diff(rise / safe) / (safe[:-1] + safe[1:])       # half the second derivative
     before, own, after = safe[:-2], safe[1:-1], safe[2:]
-    even_ratio = 2.0    # ratio of neighbouring intervals up to which a cubic is laid through them
-    even = ((even_ratio * before > own) & (before < even_ratio * own)
-            & (even_ratio * after > own) & (after < even_ratio * own))
+    even = ((EVEN_RATIO * before > own) & (before < EVEN_RATIO * own)
+            & (EVEN_RATIO * after > own) & (after < EVEN_RATIO * own))
     weight = np.where(even, own**2 / 4 / (before + own + after), 0.0)
     left, right = curve[:, :-1], curve[:, 1:]
     bow = left * (weight * (own / 2 + after)) + right * (weight * (own / 2 + before))
