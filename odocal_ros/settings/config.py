@@ -92,6 +92,11 @@ class OdometerConfig:
         """Return True if the left and the right wheel have a topic each."""
         return 'topic' in (self.left, self.right)
 
+    @property
+    def needs_imu(self) -> bool:
+        """Return False for several wheels, which are sufficient on a level floor."""
+        return len(self.keys) < len(SIDES) and self.drive == DIFFERENTIAL
+
     def names(self, count: int) -> tuple[str, ...]:
         """Return the names of so many wheels, for people and results: '' of a single one."""
         if count <= len(SIDES):

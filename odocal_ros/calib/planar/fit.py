@@ -7,6 +7,7 @@ The planar estimate: poses, wheel constants and noise levels of a run, in one fi
 Gauss-Newton for poses and constants; levels by restricted likelihood, docs/decisions/0024.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -35,8 +36,12 @@ MOST_PASSES = 80
 CONVERGED = 0.02    # sigmas of a constant, and of the logarithm of a level
 
 
-def fit(run: Run, known: Known) -> Fit:
-    """Return the estimate of a run."""
+def fit(run: Run, known: Known, passed: Callable[[int, float], None] = lambda *_: None) -> Fit:
+    """
+    Return the estimate of a run.
+
+    passed : called with the passes made and the largest step of a constant, in sigmas.
+    """
     at_first = first_values(run, known.width)
     scale = (at_first.left + at_first.right) / 2
     state, c, prior = _begin(run, known, at_first)
@@ -59,8 +64,9 @@ def fit(run: Run, known: Known) -> Fit:
         for name, by in step.items():
             theta[name] *= float(np.exp(by))
         sigma = np.sqrt(np.diag(solved.covariance))
-        converged = bool((np.abs(solved.constants) < CONVERGED * sigma).all()
-                         and max(map(abs, step.values())) < CONVERGED)
+        change = float((np.abs(solved.constants) / sigma).max())
+        converged = change < CONVERGED and max(map(abs, step.values())) < CONVERGED
+        passed(passes, change)
     # weights of the information of Student's distribution, which has 3/4 of a normal one
     student = {name: weight * (FREEDOM + 2) / (FREEDOM + 4) / weight.mean()
                for name, weight in student.items()}
