@@ -32,6 +32,7 @@ HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'c
 NAN = math.nan
 SIDES = ('left', 'right')     # names of two wheels
 DRIVES = DIFFERENTIAL, SKID, MECANUM = 'differential', 'skid', 'mecanum'
+HOLONOMIC = (MECANUM,)        # drives that move sideways
 
 TYPICAL = 'typical value of IMUs sold in this grade'
 
