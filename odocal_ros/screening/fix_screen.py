@@ -203,15 +203,15 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
                    f'velocity, rotated by {np.degrees(np.angle(z)):+.0f} deg'),)
 
 
-def reckoned(t_fix: Floats, fixes_n: Floats, path: Floats, turned: Callable[[Floats], Floats],
-             ) -> tuple[Bools, tuple[Reason, ...]]:
+def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats, path: Floats,
+             turned: Callable[[Floats], Floats]) -> tuple[Bools, tuple[Reason, ...]]:
     """
     Return a mask of fixes that a receiver has reckoned, and FIXES_DEAD_RECKONED.
 
-    t_fix : (k,) s.   fixes_n : (k, 3) m.   path : (k,) path length by the odometer, m, its scale
+    t_fix : (k,) s.   fixes_n : (k, 3) m.   sigma : (k,) stated, of an axis, m.   path : (k,) path length by the odometer, m, its scale
     good to 30 %.   turned : angle turned about the vertical by (m,) times, rad: (m,).
     """
-    spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], path, turned)
+    spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, path, turned)
     found = np.zeros(len(t_fix), bool)
     for begin, end, _ in spans:
         found |= (t_fix >= begin) & (t_fix <= end)
@@ -224,13 +224,13 @@ def reckoned(t_fix: Floats, fixes_n: Floats, path: Floats, turned: Callable[[Flo
                           f'{int(found.sum())} of {len(t_fix)} fixes not used'),)
 
 
-def _spans(t: Floats, place: Complexes, path: Floats,
+def _spans(t: Floats, place: Complexes, sigma: Floats, path: Floats,
            turned: Callable[[Floats], Floats]) -> list[tuple[float, float, float]]:
     """Return begin and end of each span, s, and the jump after it, m."""
     if len(t) <= SMOOTH_ROWS:
         return []
     step = max(1, round(COMPARED_EVERY / float(np.median(np.diff(t)))))
-    t, place, path = t[::step], place[::step], path[::step]
+    t, place, sigma, path = t[::step], place[::step], sigma[::step], path[::step]
     dt, way, moved = np.diff(t), np.diff(path), np.diff(place)
     whole = (np.abs(way) > MOVED_LEAST) & (dt < MISSING_INTERVALS * np.median(dt))
     both = np.flatnonzero(whole[1:] & whole[:-1])
@@ -241,7 +241,9 @@ def _spans(t: Floats, place: Complexes, path: Floats,
     usual = float(np.median(off))
     smooth = off < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
     spans: list[tuple[float, float, float]] = []
-    for k in np.flatnonzero(off > max(JUMP_SIZE * usual, SHORTEST_JUMP)):
+    # smaller ones than the stated error are of satellites that come and go
+    least = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[both + 1])
+    for k in np.flatnonzero(off > least):
         begin = float(t[both[_begin(smooth[:k])]])
         # the row after a jump is as far off
         if begin < t[both[k]] and (not spans or begin > spans[-1][1]):

@@ -178,7 +178,8 @@ def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> In
     rate = inputs.w_b @ inputs.up_b
     # straights, and turns to both sides: the median is the bias
     angle = np.cumsum((rate[1:] - np.median(rate)) * np.diff(inputs.t_imu))
-    lost, why = reckoned(inputs.t_fix, placed.fixes_n, inputs.travel.at(inputs.t_fix)
+    sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
+    lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma, inputs.travel.at(inputs.t_fix)
                          * placed.rough, lambda t: np.interp(t, inputs.t_imu[1:], angle))
     found += why
     return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],

@@ -41,11 +41,17 @@ def received(sigma, tunnel, scale=0.02):
     return np.stack([place.real, place.imag, 0 * place.real], -1)
 
 
+def stated(sigma):
+    """Return the stated sigma of each fix, m."""
+    return np.full(len(at_s), sigma)
+
+
 @pytest.mark.parametrize('length', [20, 60, 120])
 @pytest.mark.parametrize('sigma', [0.05, 0.5])
 def test_a_tunnel_is_found_with_its_ends(sigma, length):
     begin = 150.0
-    found, why = reckoned(at_s, received(sigma, (begin, begin + length)), 15 * at_s, turned)
+    found, why = reckoned(at_s, received(sigma, (begin, begin + length)), stated(sigma),
+                          15 * at_s, turned)
     inside = (at_s >= begin) & (at_s < begin + length)
     assert [r.code for r in why] == [Code.FIXES_DEAD_RECKONED]
     assert f'to {begin + length - 1:.0f} s' in why[0].text
@@ -59,9 +65,20 @@ def test_a_tunnel_is_found_with_its_ends(sigma, length):
 def test_noise_and_a_wrong_fix_are_none(sigma):
     fixes = received(sigma, (0, 0))
     fixes[200:230, 0] += 20.0          # a false fix, and back
-    found, why = reckoned(at_s, fixes, 15 * at_s, turned)
+    found, why = reckoned(at_s, fixes, stated(sigma), 15 * at_s, turned)
     assert not found.any()
     assert not why
+
+
+@pytest.mark.parametrize('change', [0.7, 3.0])
+def test_satellites_that_change_are_no_tunnel(change):
+    """Carrier-smoothed fixes move by less than a metre of a stated error of 1.4 m."""
+    fixes = received(0.1, (0, 0))
+    fixes[150:200] = received(0.0, (0, 0))[150:200] + fixes[149] - received(0.0, (0, 0))[149]
+    fixes[200:, 0] += change
+    found, why = reckoned(at_s, fixes, stated(1.4), 15 * at_s, turned)
+    assert bool(why) == (change > 1.4)
+    assert found.any() == (change > 1.4)
 
 
 def test_fixes_of_a_tunnel_are_not_used_and_said():
