@@ -25,6 +25,7 @@ from odocal_ros.estimator.state import (
     GNSS_ARM,
     GNSS_DELAY,
     HEADING,
+    HEIGHT_DRIFT,
     IMPERFECT,
     KIND_SIZES,
     M,
@@ -43,6 +44,7 @@ from odocal_ros.settings.grades import G, Grade, grade_as_seen, turn_on_bias
 # s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a
 # consumer IMU 6 % larger (docs/decisions/0005)
 SPACING = 1.0
+HEIGHT_TIME = 900.0     # s, physical: in which ionosphere and orbits change by their size
 NO_ERROR = 1e-12        # prior sigma of what there is none of, in any unit
 
 
@@ -120,6 +122,7 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     up = np.hypot(accel, grade.accel_scale_error * G)
     accel_bias = np.maximum([accel, accel, up], 1e-6)
     centre = np.zeros(M)
+    sigma[HEIGHT_DRIFT] = max(height_sigma(leg) / HEIGHT_TIME, NO_ERROR)
     # physical: receivers with an odometer trust it for 5 to 60 s
     centre[FIX_TIME], sigma[FIX_TIME] = np.log(20.0), 0.7
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
@@ -129,6 +132,11 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
         if not len(leg.heading.t):
             centre[YAW], sigma[YAW] = nominal_yaw(config), NO_ERROR
     return Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, centre)
+
+
+def height_sigma(leg: SmootherLeg) -> float:
+    """Return the median stated sigma of the heights, m."""
+    return float(np.sqrt(np.median(leg.covariance_n[:, 2, 2]))) if len(leg.t_fix) else 0.0
 
 
 def nominal_yaw(config: Config) -> float:

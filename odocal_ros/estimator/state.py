@@ -57,8 +57,8 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking', 'squat',
              'sideslip', 'squat_by_jerk', 'sideslip_by_jerk', 'pitch_centre',
              'pitch_centre_of_bumps',
-             'fix_motion_time', 'speed_offset', 'velocity_delay', 'velocity_lag_square',
-             'velocity_scale')
+             'fix_motion_time', 'fix_height_drift', 'speed_offset', 'velocity_delay',
+             'velocity_lag_square', 'velocity_scale')
 
 
 def constants_from(first: str, last: str = '') -> slice:
@@ -80,6 +80,8 @@ ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_yz')
 # s^2, of a receiver's filter: square of the time constant of the mean of the past, or, below zero,
 # of a filter of position and velocity (nav/receiver_filter.py)
 FIX_LAG2 = CONSTANTS.index('fix_lag_square')
+# m/s: change of the height error, over more time than a leg has
+HEIGHT_DRIFT = CONSTANTS.index('fix_height_drift')
 # relative: by how much the clock of its stamps is faster than that of the IMU
 GNSS_CLOCK, ODO_CLOCK = map(CONSTANTS.index, ('gnss_clock_rate', 'odometer_clock_rate'))
 # s^2, of a low-pass filter on the odometer's speed: square of its time constant

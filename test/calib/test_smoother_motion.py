@@ -207,3 +207,19 @@ def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
     # force of each second would be off by 1 % of up to 0.2 m
     assert np.abs(r[:, :2] - kinks[:, :2]).max() < 2e-5
     assert np.abs(r[:, 3:5] - kinks[:, 3:5]).max() < 2e-5
+
+
+def test_the_scale_is_that_of_the_path_wherever_the_body_points():
+    """Squat by 0.1 rad per m/s^2 turns the path within the body, and makes it no longer."""
+    drive, config, leg = made(scenario='town', imu_grade='perfect', fix_sigma=0.0, duration=150.0)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    c = np.zeros(M)
+    c[LEAN.start] = 0.1
+    level, leaning = (Equations(problem, state.moved(np.zeros((len(state.t), BARE)), step))
+                      .parts['motion'].motion for step in (np.zeros(M), c))
+    straight = np.abs(level.sums.mean_rate[:, 2]) < 1e-3
+    hard = straight & (np.abs(level.pushed[:, 0]) > 0.5)
+    assert hard.sum() > 10
+    length, other = (np.linalg.norm(x.rolled, axis=1)[hard] for x in (level, leaning))
+    # with the square of the lean it would be (0.05)^2 / 2 = 1e-3 longer
+    np.testing.assert_allclose(other, length, rtol=1e-5)

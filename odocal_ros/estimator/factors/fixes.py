@@ -23,6 +23,7 @@ from odocal_ros.estimator.state import (
     GNSS_ARM,
     GNSS_CLOCK,
     GNSS_DELAY,
+    HEIGHT_DRIFT,
     M,
     P,
     PHI,
@@ -72,6 +73,7 @@ class Fixes(PointRows):
         smoothed, self.by_lag = smoothing(*track, state.constants[FIX_LAG2])
         added, self.by_motion, self.by_time = odometer_error(
             *track, state.constants[FIX_BY_MOTION], state.constants[FIX_TIME])
+        raw[:, 2] -= state.constants[HEIGHT_DRIFT] * self.t_fix
         self.raw = np.nan_to_num(raw) - smoothed - added
 
     def errors(self) -> Floats:
@@ -101,6 +103,7 @@ class Fixes(PointRows):
         # stamps late by d: the place is that of d before
         c[:, :, GNSS_DELAY] = self.v_n
         c[:, :, GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
+        c[:, 2, HEIGHT_DRIFT] = -self.t_fix
         c[:, :, FIX_LAG2] = -self.by_lag
         c[:, :, FIX_BY_MOTION], c[:, :, FIX_TIME] = -self.by_motion, -self.by_time
         c[:, :, ACCEL] = self.C @ self.points.FF

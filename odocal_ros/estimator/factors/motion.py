@@ -102,7 +102,10 @@ class Motion:
         W = skew(w)
         dv, dp = turn(self.C, intervals.dv), turn(self.C, intervals.dp)
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
-        way = turn(intervals.S, self.f + self._vary()) * self.varied
+        along = self.f + self._vary()
+        # the odometer measures the path, wherever the body points
+        along *= state.scale / np.linalg.norm(along, axis=1, keepdims=True)
+        way = turn(intervals.S, along) * self.varied
         self.faster = self._by_odometer_filter()
         self.rolled = turn(half @ self.C, way)
         self.way = self.rolled + self.heaved

@@ -24,6 +24,7 @@ from odocal_ros.estimator.state import (
     GNSS_ARM,
     GNSS_CLOCK,
     GNSS_DELAY,
+    HEIGHT_DRIFT,
     IMPERFECT,
     KIND_OF,
     KIND_SIZES,
@@ -158,6 +159,8 @@ class PriorRows(Factor):
         first = self.with_wanted(marginals[0][None])[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
+        drift = 2 * self.n + HEIGHT_DRIFT
+        yield 'slow_fix_errors', first[:, [drift]] / self.priors.constants[HEIGHT_DRIFT]
 
     def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
         """Yield names and effects, (3, k), of errors that all legs share."""

@@ -10,7 +10,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.priors import PriorRows, SIZES
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.prepare import NO_ERROR
-from odocal_ros.estimator.state import CONSTANTS
+from odocal_ros.estimator.state import CONSTANTS, HEIGHT_DRIFT
 
 
 def border_of(fit: Fit, configured: Floats) -> Border:
@@ -30,4 +30,5 @@ def border_of(fit: Fit, configured: Floats) -> Border:
         (fit.solved.reduced - np.diag(weight)) * np.outer(free, free),
         (fit.solved.g_reduced + weight * (at - priors.centre)) * free, priors.centre + configured,
         fit.first.constants, priors.constants).doubted(
-            fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data
+            fit.by_levels[:, :-len(SIZES)]).loosened(     # sizes are of the priors, no data
+                {CONSTANTS[HEIGHT_DRIFT]: np.inf})        # each leg has its own
