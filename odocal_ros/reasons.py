@@ -129,6 +129,8 @@ class Code(Enum):
                             'deviates from the fixes (slip, gaps, bad fixes), then drive again.')
     WHEEL_SLIP = CAUTION, ('Drive gently on a firm, dry road, or use a wheel that is not driven. '
                            'The uncertainty was increased by the slip found.')
+    TRAVEL_MISSING = NOTE, ('Check the odometer at low speed: truncated speeds, a dead band, or a '
+                            'sensor that misses pulses. The uncertainty was increased.')
     SCALE_VARIES = NOTE, ('No action needed. For a value that stays valid longer, drive with '
                           'warm tyres at typical speeds, and combine several legs.')
     FIXES_SMOOTHED = NOTE, ('If possible, switch off smoothing in the receiver (position filter, '

@@ -25,7 +25,7 @@ from odocal_ros.data.pieces import by_row, by_step
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import A
-from odocal_ros.nav.rotations import matrix_from_quat, skew
+from odocal_ros.nav.rotations import matrix_from_quat, quat_conjugate, quat_multiply, skew
 
 # m, 1 sigma of the height of fixes that have none, which are put on the ellipsoid. Physical: roads
 # lie up to 2 km above it, most below 500 m; it makes 80 ppm of the scale
@@ -52,8 +52,8 @@ def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> d
 
     Returns
     -------
-    dict of name to (3, k) array: bias by axis of b, noise and bias walk (columns of a root of the
-    covariance): integrals of r x (the error) over the leg.
+    dict of name to (3, k) array: bias by axis of b, scale and directions of the axes, noise and
+    bias walk (columns of a root of the covariance): integrals of r x (the error) over the leg.
 
     """
     r = D[-1] - D
@@ -61,10 +61,15 @@ def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> d
     # e = integral of (C_nb db) x r
     turn = by_step(_turn, r, q_nb)
     bias = np.einsum('nij,n->ij', turn, dt) * alignment.gyro_bias_sigma
+    # an axis j that is off shows a share of the turn about each axis k
+    axes = np.einsum('nij,nk->ijk', turn, by_step(_turned, q_nb)).reshape(3, 9)
+    scale, off = np.eye(3, dtype=bool).ravel(), ~np.eye(3, dtype=bool).ravel()
     # R(u): what is left of the integral of r from u on; a step of the bias at u turns all of it
     slices = (r[:-1] + r[1:]) / 2 * dt[:, None]
     R = np.concatenate([np.cumsum(slices[::-1], axis=0)[::-1], np.zeros((1, 3))])
     return {f'gyro_bias_{axis}': bias[:, i:i + 1] for i, axis in enumerate('xyz')} | {
+            'gyro_scale': axes[:, scale] * alignment.gyro_scale_sigma,
+            'gyro_axes': axes[:, off] * alignment.gyro_axes_sigma,
             'gyro_noise': alignment.gyro_noise * _root(_spread(r, dt)),
             'gyro_bias_walk': alignment.gyro_bias_walk * _root(_spread(R, dt))}
 
@@ -75,6 +80,13 @@ def _turn(r: Floats, q_nb: Floats) -> Floats:
     mean = turn[:-1] + turn[1:]
     mean /= 2
     return mean
+
+
+def _turned(q_nb: Floats) -> Floats:
+    """Return the rotation of each step about the axes of b: (n, 4) to (n - 1, 3) rad."""
+    step = quat_multiply(quat_conjugate(q_nb[:-1]), q_nb[1:])
+    turned: Floats = 2 * step[:, :3] * np.sign(step[:, 3:])
+    return turned
 
 
 def _spread(r: Floats, dt: Floats) -> Floats:
@@ -160,8 +172,10 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
         'projection': np.zeros((3, 1)),
     }
     gradient = parameter_gradient(f) @ np.linalg.inv(M)
-    shared = {'fix_latency', 'antenna_lever_arm', 'odometer_delay', 'height', 'initial_level'} | (
-        {'initial_heading'} if alignment.heading_shared else set())
+    shared = {'fix_latency', 'antenna_lever_arm', 'odometer_delay', 'height', 'initial_level',
+              'gyro_scale', 'gyro_axes'}
+    if alignment.heading_shared:
+        shared.add('initial_heading')
     sources = [Source(name, gradient @ e, name in shared) for name, e in chord.items()]
     height = start.covariance_n[2, 2] + end.covariance_n[2, 2]
     return (*sources, _second_order(t, D, alignment, height * fix_scale[2]**2))

@@ -37,6 +37,9 @@ SPIN_TURN = 0.1
 # odometer counts that rounding may make of a window: one over the 0.8 s of a pin is 5 over the
 # window, its own ends 1 more; the rest is margin: judgement
 PIN_COUNTS = 8.0
+# m/s^2: a sliding wheel brakes the vehicle by no less, even on ice (friction 0.1). Physical
+LEAST_BRAKING = 0.5
+BRAKES_BESIDE = 1.0  # s beside a slip in which the vehicle may brake, a keyframe: judgement
 # s by which the odometer may be late, looked at: judgement; a bus or a filter takes less
 LATE = 0.05 * np.arange(-10, 21)
 
@@ -47,11 +50,13 @@ class Slips(NamedTuple):
 
     t : (k,) s, middle of each slip.   size : (k,) m, > 0 where the wheel spun, < 0 where it slid.
     late : s by which the odometer is late against the IMU, where it would look like slip, else 0.
+    missing : (k,) bool, travel that the odometer lacks although no wheel slid.
     """
 
     t: Floats
     size: Floats
     late: float = 0.0
+    missing: Bools = np.empty(0, bool)
 
 
 def rounding(travel: Travel) -> float:
@@ -84,7 +89,10 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     late = float(LATE[np.argmin([np.abs(windows.excess(late)).mean() for late in LATE])])
     t, size = windows.events(late)
     hidden = len(windows.events(0.0)[0]) > len(t)
-    return Slips(t, size, late if hidden else 0.0)
+    speed = K * np.diff(np.interp(grid + late, track.t, track.s)) / SPIN_GRID
+    missing = [without_braking(at - SPIN_WINDOW / 2, SPIN_WINDOW, metres, grid[:-5], np.convolve(
+        speed, np.full(5, 0.2), 'valid')) for at, metres in zip(t, size, strict=True)]
+    return Slips(t, size, late if hidden else 0.0, np.array(missing, bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +167,30 @@ def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Float
     return middle[k], excess[k]
 
 
+def without_braking(t: float, duration: float, metres: float, t_speed: Floats,
+                    speed: Floats) -> bool:
+    """
+    Return True if a wheel travels less than the vehicle, which does not brake: it does not slide.
+
+    t, duration : s.   metres : by which the wheel turned beyond the ground.   t_speed, speed :
+    (n,) s, m/s, of the vehicle, < 0 backwards.
+    """
+    inside = slice(*np.searchsorted(t_speed, (t - BRAKES_BESIDE, t + duration + BRAKES_BESIDE)))
+    size, way = np.abs(speed[inside]), speed[inside].sum()
+    if len(size) < 2 or metres * way >= 0:
+        return False
+    return bool((np.diff(size) / np.diff(t_speed[inside])).min() > -LEAST_BRAKING)
+
+
+def missing_reasons(t: Floats, metres: Floats) -> list[Reason]:
+    """Return TRAVEL_MISSING of travel that the odometer lacks: (k,) s, m; empty where none."""
+    if not len(t):
+        return []
+    return [Reason(Code.TRAVEL_MISSING, f'the odometer counts {np.abs(metres).sum():.2f} m less '
+                   f'than the vehicle moves, at {len(t)} place{"s" * (len(t) > 1)} without '
+                   f'braking, most at t = {t[np.argmax(np.abs(metres))]:.0f} s')]
+
+
 def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floats) -> Source:
     """Return slips as a source of error: one for all, since wheels spin in one direction."""
     along_n = track.C_nb_at(t) @ f / np.linalg.norm(f) * np.abs(size)[:, None]
@@ -167,12 +199,12 @@ def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floa
 
 def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
     """
-    Return DELAY_SEEN and WHEEL_SLIP with what was seen, empty where nothing was.
+    Return DELAY_SEEN, WHEEL_SLIP and TRAVEL_MISSING with what was seen, empty where nothing was.
 
     slips : Slips.   time_offset : odometer.time_offset as set, s.
     """
     found: tuple[Reason, ...] = ()
-    t, size, late = slips
+    t, size, late = slips.t[~slips.missing], slips.size[~slips.missing], slips.late
     if late:
         found += (Reason(
             Code.DELAY_SEEN, f'odometer stamps are about {abs(late):.2f} s '
@@ -183,4 +215,4 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
             Code.WHEEL_SLIP, f'odometer and IMU disagree by {np.abs(size).sum():.2f} m in total '
             f'at {len(t)} place{"s" * (len(t) > 1)}, first by {size[0]:+.2f} m at t = {t[0]:.1f} '
             's: the wheel spun or slid'),)
-    return found
+    return (*found, *missing_reasons(slips.t[slips.missing], slips.size[slips.missing]))

@@ -40,7 +40,7 @@ class Alignment:
     heading_source : where the heading is from; ``course`` holds the mounting angle itself.
     heading_shared : its error is the same in every leg.
     standstill : begin and end, s, of the standstill used, None when aligned in motion.
-    gyro_scale_sigma : relative error of the gyro's scale.
+    gyro_scale_sigma : relative error of the gyro's scale.   gyro_axes_sigma : rad, of an axis.
     """
 
     t: float
@@ -55,6 +55,7 @@ class Alignment:
     heading_shared: bool
     standstill: tuple[float, float] | None = None
     gyro_scale_sigma: float = 0.0
+    gyro_axes_sigma: float = 0.0
 
     @property
     def heading_separable(self) -> bool:
@@ -101,6 +102,9 @@ class Grade(Protocol):
 
     @property
     def gyro_scale_error(self) -> float: ...
+
+    @property
+    def axis_error(self) -> float: ...
 
 
 def level_frame(up_b: Floats) -> Floats:
@@ -211,7 +215,7 @@ def complete(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bo
     sigma_b = np.sqrt(np.einsum('ni,n->i', C_nb**2, sigma_n**2))
     return Alignment(level.t, C_nb, transpose(C_nb) @ bias_n, level.level_sigma, float(yaw_sigma),
                      sigma_b, gyro_noise, grade.gyro_bias_walk, source, shared, level.standstill,
-                     grade.gyro_scale_error)
+                     grade.gyro_scale_error, grade.axis_error)
 
 
 def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, origin: Origin,

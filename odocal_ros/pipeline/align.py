@@ -26,18 +26,20 @@ from odocal_ros.nav.alignment import (
     level_in_motion,
     MOTION_LEVEL,
     off_the_earth,
+    REST_EDGE,
 )
 from odocal_ros.nav.angles import wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin
 from odocal_ros.nav.earth import C_en
-from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
+from odocal_ros.nav.rotations import matrix_from_quat, quat_at, quat_from_matrix, transpose
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import G, Grade, grade_of
+from odocal_ros.settings.grades import G, Grade, grade_as_seen, grade_of, with_turn_on_level
 
+FEWEST_AT_REST = 20     # statistical: IMU rows, a sigma by 20 is good to 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])
 Found = tuple[tuple[float, float] | None, str]      # yaw and sigma, rad; or None and why
 
@@ -50,10 +52,15 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     inputs : screened leg.   spans : (k, 2) standstills, s.   metres_per_unit : rough scale.
     fixes_n : (n, 3) fixes in n, m.   origin : where n is fixed.   config : heading source, grade.
     """
-    grade = grade_of(config.imu)
+    span = choose_standstill(spans)
+    noise = {} if span is None else _noise_at_rest(inputs, span)
+    grade = with_turn_on_level(grade_as_seen(config.imu, {
+        name: sigma**2 for name, sigma in noise.items() if sigma}), config.imu)
     if not inputs.felt:
         grade = replace(grade, accel_bias=TILT_SIGMA * G)
-    level, gyro_noise, reasons = _level(inputs, spans, metres_per_unit, origin.latitude, grade)
+    gyro_noise = max(grade.gyro_noise, noise.get('gyro', 0.0))
+    level, reasons = _level(inputs, span, metres_per_unit, origin.latitude, grade, gyro_noise)
+    reasons += _against_grade(noise.get('gyro', 0.0), grade_of(config.imu))
     level = replace(level, C_np=_from_place(inputs, level.standstill, fixes_n, origin))
     yaw, sigma, source, shared, why = _heading(inputs, level, origin.latitude, grade, config)
     reasons += why
@@ -61,6 +68,27 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
         yaw, sigma, why = _course(inputs, level, metres_per_unit, fixes_n, origin, grade)
         reasons += why
     return complete(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
+
+
+def with_seen_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
+                   epochs: tuple[Floats, Floats], earth_rate_n: Floats) -> Alignment:
+    """
+    Return an alignment whose gyro bias walks no less than later standstills show.
+
+    A gyro warms up. spans : (k, 2) standstills, s.   epochs : attitude, t (m,) s and q_nb (m, 4).
+    """
+    walked = []
+    for begin, end in spans[spans[:, 0] > alignment.t] if alignment.standstill else ():
+        rows = slice(*np.searchsorted(inputs.t_imu, (begin + REST_EDGE, end - REST_EDGE)))
+        t = inputs.t_imu[rows]
+        if len(t) < FEWEST_AT_REST:
+            continue
+        C_nb = matrix_from_quat(quat_at(np.mean(t, keepdims=True), *epochs))[0]
+        off = inputs.w_b[rows].mean(axis=0) - earth_rate_n @ C_nb - alignment.gyro_bias
+        variance = alignment.gyro_noise**2 / (t[-1] - t[0]) + alignment.gyro_bias_sigma**2
+        walked.append((off**2 - variance).mean() / (t.mean() - alignment.t))
+    seen = np.sqrt(max(np.median(walked), 0.0)) if walked else 0.0
+    return replace(alignment, gyro_bias_walk=max(alignment.gyro_bias_walk, float(seen)))
 
 
 def choose_standstill(spans: Iterable[Span]) -> Span | None:
@@ -86,14 +114,10 @@ def _from_place(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes
     return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
 
 
-def _level(inputs: Inputs, spans: Floats, metres_per_unit: float, latitude: float,
-           grade: Grade) -> tuple[Level, float, tuple[Reason, ...]]:
-    span = choose_standstill(spans)
+def _level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude: float,
+           grade: Grade, gyro_noise: float) -> tuple[Level, tuple[Reason, ...]]:
     if span is not None:
-        seen = _measured_noise(inputs, span)
-        noise = max(grade.gyro_noise, seen)
-        level = level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, noise)
-        return level, noise, _against_grade(seen, grade)
+        return level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, gyro_noise), ()
     t = inputs.t_imu
     first = max(0.0, float(t[0]))
     pick = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
@@ -109,7 +133,7 @@ def _level(inputs: Inputs, spans: Floats, metres_per_unit: float, latitude: floa
     found = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level estimated '
                    f'over {t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
                    f'(+-{np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
-    return level, grade.gyro_noise, (found,)
+    return level, (found,)
 
 
 def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
@@ -123,14 +147,15 @@ def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
                    f'its grade{unit}'),)
 
 
-def _measured_noise(inputs: Inputs, span: Floats) -> float:
-    """Return the white gyro noise at rest, rad/s/sqrt(Hz), of the largest axis."""
+def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
+    """Return the white noise of gyro and accelerometer, per root of Hz, of the largest axis."""
     pick = (inputs.t_imu >= span[0]) & (inputs.t_imu <= span[1])
-    t, w = inputs.t_imu[pick], inputs.w_b[pick]
-    if len(t) < 20:
-        return 0.0
-    return float((np.diff(w, axis=0).std(axis=0) / np.sqrt(2)).max()
-                 * np.sqrt((t[-1] - t[0]) / (len(t) - 1)))
+    t, signals = inputs.t_imu[pick], {'gyro': inputs.w_b[pick], 'accel': inputs.f_b[pick]}
+    if len(t) < FEWEST_AT_REST:
+        return {}
+    root_hz = np.sqrt((len(t) - 1) / (t[-1] - t[0]))
+    return {name: float((np.diff(x, axis=0).std(axis=0) / np.sqrt(2)).max() / root_hz)
+            for name, x in signals.items() if inputs.felt or name == 'gyro'}
 
 
 def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,

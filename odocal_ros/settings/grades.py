@@ -29,6 +29,11 @@ class Grade:
     gyro_by_force: float = 0.0       # rad/s per m/s^2, what a force makes a gyro show
 
     @property
+    def axis_error(self) -> float:
+        """Return the angle between an axis of the gyro and one of the accelerometer, rad."""
+        return math.sqrt(2) * self.misalignment
+
+    @property
     def level_bias(self) -> float:
         """Return the bias of a level accelerometer, m/s^2: its own and what its axis has of g."""
         return math.hypot(self.accel_bias, math.sqrt(2) * G * self.misalignment)
@@ -83,6 +88,11 @@ def turn_on_bias(imu: ImuConfig) -> tuple[float, float]:
     usual = TURN_ON.get(imu.grade, (0.0, 0.0))
     return (max(grade.gyro_bias, usual[0] if math.isnan(imu.gyro_bias) else 0.0),
             max(grade.accel_bias, usual[1] if math.isnan(imu.accel_bias) else 0.0))
+
+
+def with_turn_on_level(grade: Grade, imu: ImuConfig) -> Grade:
+    """Return a grade with the usual turn-on bias of its accelerometer, which tilts the level."""
+    return dataclasses.replace(grade, accel_bias=max(turn_on_bias(imu)[1], grade.accel_bias))
 
 
 SETTINGS = {'gyro_scale_error': 'gyro_scale_sigma',

@@ -196,6 +196,23 @@ def test_height_makes_the_earth_larger(truth):
     assert sources(track)['projection'].effects.any() == np.False_
 
 
+@pytest.mark.parametrize('about', [0, 1, 2])
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_gyro_scale_and_axes(leg, truth, axis, about):
+    """An axis that shows a share of the turn about another."""
+    found = sources(truth[0], gyro_scale_sigma=SMALL, gyro_axes_sigma=SMALL)
+    others = [k for k in range(3) if k != axis]
+    column = (found['gyro_scale'].effects[:, axis] if axis == about else
+              found['gyro_axes'].effects[:, 2 * axis + others.index(about)])
+    w = np.zeros_like(leg.w)
+    w[:, axis] = SMALL * leg.w[:, about]
+    # the sign is that of the correction; but all columns share it
+    np.testing.assert_allclose(-differ(leg, truth, {'w_error': w}, {'w_error': -w}), column,
+                               atol=2e-3 * np.abs(column).max() + 1e-7 * SMALL)
+    assert found['gyro_scale'].shared
+    assert found['gyro_axes'].shared
+
+
 @pytest.mark.parametrize('name', ['gyro_noise', 'gyro_bias_walk'])
 def test_gyro_noise_and_walk_against_monte_carlo(leg, truth, name):
     """
@@ -256,7 +273,7 @@ class TestWhole:
             assert np.linalg.norm(by_name) == pytest.approx(e.sigma)
         assert {s.name for s in result.sources if s.shared} == {
             'initial_heading', 'initial_level', 'fix_latency', 'antenna_lever_arm',
-            'odometer_delay', 'height'}
+            'odometer_delay', 'height', 'gyro_scale', 'gyro_axes'}
 
     def test_a_late_odometer_in_a_whole_leg(self, made):
         config = settings(made, odometer__time_sigma=0.05)

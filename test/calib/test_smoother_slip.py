@@ -11,6 +11,7 @@ import pytest
 from reversing_drives import made as by_hand
 from smoother_legs import leg_of, made
 
+from odocal_ros.calib.slip import without_braking
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.result.outcome import in_words
 from odocal_ros.nav.odometer import Travel
@@ -86,6 +87,30 @@ def test_a_level_that_no_row_determines_is_not_reported():
     method = smooth(leg_of(drive.leg(), config), config)
     assert method.details['noise']['along_hard'] == pytest.approx(0.01)     # where the fit began
     assert not said(method)
+
+
+def test_travel_that_a_counter_loses_without_braking_is_no_slip():
+    """A wheel that travels less than the vehicle slides, and brakes it."""
+    drive, config, leg = made(**SHORT, fix_noise='rtk')
+    t = np.arange(40.0, 150.0)
+    speed = drive.truth.scale * np.diff(np.interp(t, leg.travel.t, leg.travel.s))
+    least = [np.diff(speed[k:k + 8]).min() for k in range(100)]     # m/s^2 in 8 s
+    at = next(k for k in range(100) if least[k] > -0.1 and speed[k:k + 8].min() > 4.0)
+    leg, _ = slipping(leg, t[at] + 3.0, 3.0, -0.1)
+    method = smooth(leg, config)
+    assert not said(method)
+    (lost,) = (r.text for r in method.reasons if r.code is Code.TRAVEL_MISSING)
+    assert 'without braking' in lost
+
+
+@pytest.mark.parametrize('forward', [1.0, -1.0])
+@pytest.mark.parametrize(('metres', 'acceleration', 'slides'), [
+    (0.5, 1.0, True), (0.5, -2.0, True), (-0.5, 1.0, False), (-0.5, 0.0, False),
+    (-0.5, -0.3, False), (-0.5, -2.0, True)])
+def test_a_wheel_slips_only_as_a_force_makes_it(metres, acceleration, slides, forward):
+    t = np.arange(0.0, 20.0, 1.0)
+    speed = 10.0 + acceleration * np.clip(t - 9.0, 0.0, 2.0)
+    assert without_braking(9.0, 2.0, forward * metres, t, forward * speed) is not slides
 
 
 def low_passed(leg, seconds):

@@ -21,10 +21,12 @@ from odocal_ros.nav.rotations import (
     transpose,
 )
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.pipeline.align import align, choose_standstill
+from odocal_ros.pipeline.align import align, choose_standstill, with_seen_walk
+from odocal_ros.pipeline.prepared import attitude_of
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.grades import GRADES
 from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -151,6 +153,41 @@ def test_level_in_motion_is_within_its_sigma(seed, grade):
     # four sigmas in twelve drives of two axes: 1.5e-3 to fail by chance
     assert np.abs(tilt[:2]).max() < 4 * a.level_sigma
     assert a.level_sigma < 0.03
+
+
+@pytest.mark.parametrize('slope', [0.0, 2e-7])
+def test_a_gyro_that_warms_up_walks_as_its_standstills_show(slope):
+    """The bias changes by slope T until a standstill, as a walk of slope sqrt(T) does."""
+    case = Case(TURNING)
+    alignment, _ = case.align()
+    late = np.clip(case.inputs.t_imu - alignment.t, 0.0, None)
+    inputs = replace(case.inputs, w_b=case.inputs.w_b + slope * late[:, None])
+    epochs = attitude_of(inputs, case.origin, alignment.t, alignment.q_nb, alignment.gyro_bias)
+    later = case.spans[case.spans[:, 0] > alignment.t]
+    assert len(later) > 1
+    seen = with_seen_walk(alignment, inputs, case.spans, epochs, case.origin.earth_rate_n)
+    # the heading of a course has an error, and with it the Earth rate
+    walk = slope * np.sqrt(np.median(later.mean(axis=1) - alignment.t))
+    assert seen.gyro_bias_walk == pytest.approx(max(walk, alignment.gyro_bias_walk), rel=0.1)
+    if slope:
+        assert walk > 10 * alignment.gyro_bias_walk
+    unknown = with_seen_walk(replace(alignment, standstill=None), inputs, case.spans, epochs,
+                             case.origin.earth_rate_n)
+    assert unknown.gyro_bias_walk == alignment.gyro_bias_walk
+
+
+def test_an_imu_taken_for_better_than_it_is_has_the_errors_of_its_noise():
+    """The noise at rest is that of the consumer grade; its accelerometer tilts the level."""
+    noisy = replace(PLAIN, imu_grade='consumer')
+    alignment, _ = Case(noisy, settings(imu__grade='tactical')).align()
+    own, _ = Case(noisy, settings(imu__grade='consumer')).align()
+    grade = GRADES['consumer']
+    assert alignment.gyro_bias_walk == own.gyro_bias_walk == grade.gyro_bias_walk
+    assert alignment.gyro_scale_sigma == grade.gyro_scale_error
+    assert alignment.gyro_axes_sigma == pytest.approx(np.sqrt(2) * grade.misalignment)
+    # sold with a bias of 25 mg
+    assert own.level_sigma == pytest.approx(
+        np.hypot(25e-3, np.sqrt(2) * grade.misalignment), rel=0.01)
 
 
 def test_level_in_motion_takes_the_acceleration_out():
