@@ -23,12 +23,17 @@ def border_of(fit: Fit, configured: Floats) -> Border:
     configured : (M,) values of the settings that constants are corrections to.
     """
     at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
+    reduced, g_reduced = fit.solved.reduced, fit.solved.g_reduced
+    # each leg has its own drift, with its own prior
+    own = reduced[HEIGHT_DRIFT] / reduced[HEIGHT_DRIFT, HEIGHT_DRIFT]
+    reduced = reduced - np.outer(own, reduced[HEIGHT_DRIFT])
+    g_reduced = g_reduced - own * g_reduced[HEIGHT_DRIFT]
     weight = 1 / priors.constants**2
     free = priors.constants > NO_ERROR
+    free[HEIGHT_DRIFT] = False
     return Border(
         CONSTANTS, at + configured,
-        (fit.solved.reduced - np.diag(weight)) * np.outer(free, free),
-        (fit.solved.g_reduced + weight * (at - priors.centre)) * free, priors.centre + configured,
+        (reduced - np.diag(weight)) * np.outer(free, free),
+        (g_reduced + weight * (at - priors.centre)) * free, priors.centre + configured,
         fit.first.constants, priors.constants).doubted(
-            fit.by_levels[:, :-len(SIZES)]).loosened(     # sizes are of the priors, no data
-                {CONSTANTS[HEIGHT_DRIFT]: np.inf})        # each leg has its own
+            fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data
