@@ -115,6 +115,7 @@ setup(
             'pytest>=7.4',
             'pytest-cov>=4',
             'pytest-xdist>=3.5',
+            'pyubx2>=1.2',
             'rich>=13',
             'ruff>=0.6',
         ],

@@ -39,6 +39,7 @@ RUNS = {        # effects, kinds of drive, figures of Real, reasons that name it
     'held_speed': (('held_speed',), ROADS, {}, ('SPEED_ON_CHANGE',)),
     'filtered_speed': (('filtered_speed',), ROADS, {}, ('SPEED_FILTERED',)),
     'late_fixes': (('late_fixes',), ROADS, {}, ('FIXES_LATE', 'DELAY_SEEN')),
+    'clocks': (('clocks',), ROADS, {}, ('CLOCKS_DRIFT',)),
     'tunnels': (('tunnels',), ROADS, {}, ('FIXES_DEAD_RECKONED',)),
     'reflections': (('reflections',), ROADS, {}, ('FIXES_NOISIER_THAN_SAID',)),
     'kerbs': (('kerbs',), ('yard',), {}, ()),

@@ -96,3 +96,23 @@ def data_dir() -> Recordings:
     if not DATA.is_dir():
         pytest.skip(f'NO REAL DATA at {DATA}: set ODOCAL_DATA to the folder of recordings')
     return Recordings()
+
+
+@pytest.fixture(scope='session')
+def made():
+    """Return the straight drive; a module with another drive has its own fixture."""
+    import drives
+    return drives.drive(**drives.STRAIGHT)
+
+
+@pytest.fixture
+def leg(made):
+    """Return the leg of the drive."""
+    return made.leg()
+
+
+@pytest.fixture(scope='session')
+def town():
+    """Return a drive in town."""
+    import drives
+    return drives.drive(**drives.TOWN)

@@ -29,7 +29,8 @@ DEVICES = {              # how the line begins that the system is to be given
     'u-blox': 'CFG-SFODO-FACTOR = ',          # ZED-F9R application note UBX-22035176, page 22
     'SBG': 'gain: ',                          # sbg_ros2_driver, config/example; sbgEComCmdOdo.h
     'OxTS': 'Pulses per metre = ',            # RT3000 manual, NAVconfig, wheel speed input
-    'NovAtel': 'SETWHEELPARAMETERS '}         # novatel_span_driver; OEM7 SPAN manual v14, page 119
+    'NovAtel': 'SETWHEELPARAMETERS ',         # novatel_span_driver; OEM7 SPAN manual v14, page 119
+    'ArduPilot': 'WENC_RADIUS '}              # AP_WheelEncoder.cpp
 UBLOX_FACTOR_ID = '0x40070007'                # u-blox_config_keys.h of SparkFun; ublox_dgnss
 # what docs/recipes.md and config/ekf_odocal.yaml set: node -> parameters
 RECIPES = {

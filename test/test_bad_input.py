@@ -21,7 +21,6 @@ from drives import (
     settings,
     shifted,
     STRAIGHT,
-    TOWN,
 )
 import numpy as np
 import pytest
@@ -32,21 +31,6 @@ from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
 
 RAD_TO_DEG = 180 / np.pi
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(**STRAIGHT)
-
-
-@pytest.fixture(scope='module')
-def town():
-    return drive(**TOWN)
-
-
-@pytest.fixture(scope='module')
-def leg(made):
-    return made.leg()
 
 
 def run(leg, config):

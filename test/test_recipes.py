@@ -18,7 +18,7 @@ def blocks():
     texts = ['\n'.join(lines) for language, lines in fenced(PAGE) if language == 'text']
     ros = [yaml.safe_load(text) for text in texts if 'ros__parameters' in text]
     plain = [dict(line.split() for line in text.splitlines()) for text in texts
-             if 'ros__parameters' not in text]
+             if text.startswith('WENC')]
     return ros, plain
 
 

@@ -66,6 +66,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.CLOCKS_DIFFER: 'The stamps of a topic differ by more than 0.5 s from the stamps of '
         'IMU messages that arrived at the same time, or a clock was set during the leg. '
         'Positions and travel would be combined at wrong times.',
+        Code.CLOCKS_DRIFT: 'The delay of one sensor changes during the leg by more than three '
+        'sigmas and 10 ms: its clock is faster or slower than that of the IMU. Quartz clocks '
+        'differ by up to 100 ppm, 0.1 s in 17 minutes. The smoother estimates the rate and '
+        'accounts for it.',
         Code.DELAY_SEEN: 'While the vehicle accelerates and brakes, the stamps of one sensor are '
         'late or early relative to the others, by more than three sigmas and by enough to matter '
         'at this speed. The smoother estimates the delay and accounts for it; other software '

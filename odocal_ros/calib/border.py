@@ -39,11 +39,11 @@ class Border:
     evidence: dict[str, Floats] = field(default_factory=dict)
 
     def widened(self, factor: float) -> 'Border':
-        """Return what data are worth whose sigmas are too small by a factor."""
+        """Return the information with all sigmas multiplied by a factor."""
         return replace(self, information=self.information / factor**2, pull=self.pull / factor**2)
 
     def plus(self, other: 'Border') -> 'Border':
-        """Return what both tell, on the same constants, where this one was linearised."""
+        """Return the sum of both, of the same constants, at this one's linearisation point."""
         pull = other.pull - other.information @ (self.value - other.value)
         return replace(self, information=self.information + other.information,
                        pull=self.pull + pull, sigma=np.maximum(self.sigma, other.sigma),
@@ -101,7 +101,7 @@ class Border:
 
     def determined(self, unit: Floats) -> 'Border':
         """
-        Return what is left of it in directions in which it is worth a prior, or more.
+        Return the part in directions with at least the information of a prior.
 
         unit : (m,) prior sigmas, in which such information is 1.
         """

@@ -95,7 +95,7 @@ def _root(covariance: Floats) -> Floats:
 def _late_odometer(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,
                    end: MarkFix) -> Floats:
     """
-    Return what an odometer that is late by 1 s does to the chord, (3,) m.
+    Return the change of the chord by an odometer delay of 1 s, (3,) m.
 
     Travel is then put on attitudes that come after it: the integral of dC/dt f ds, less what the
     track has at one end and lacks at the other, v(end) - v(start).
@@ -147,7 +147,7 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
         'fix_start': fix_scale[:, None] * _root(start.covariance_n),
         'fix_end': fix_scale[:, None] * _root(end.covariance_n),
         'initial_heading': np.cross([0.0, 0.0, alignment.heading_sigma], D[-1])[:, None],
-        # about b's own axes: an accelerometer bias tilts the level of every leg alike
+        # about b's own axes: an accelerometer bias tilts the level of every leg equally
         'initial_level': np.stack([np.cross(axis, D[-1]) for axis in C_first.T[:2]], -1)
         * alignment.level_sigma,
         **drift_sources(t, D, q_nb, alignment),
@@ -168,7 +168,7 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
 
 
 def _height_sigma(start: MarkFix, end: MarkFix) -> float:
-    """Return how well the height that both ends share is known, m."""
+    """Return the sigma of the height that both ends share, m."""
     if not (start.height_known and end.height_known):
         return HEIGHT_UNKNOWN
     return float(np.sqrt((start.covariance_n[2, 2] + end.covariance_n[2, 2]) / 2))
@@ -176,9 +176,9 @@ def _height_sigma(start: MarkFix, end: MarkFix) -> float:
 
 def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: float) -> Source:
     """
-    Return what is of second order in the scale: docs/method.md (T12).
+    Return the second-order error of the scale: docs/method.md (T12).
 
-    Half the distance-weighted variance of a wandering attitude, for a gyro bias
+    Half the distance-weighted variance of a drifting attitude, for a gyro bias
     and noise of the size of their sigmas, and half the square of the tilt that height errors of
     the fixes feign.
     """
@@ -196,12 +196,12 @@ def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: f
 
 
 def epochs_between(track: Track, begin: float, end: float) -> slice:
-    """Return which epochs of a track lie between two times, s, those at them too."""
+    """Return the epochs of a track between two times, s, both included."""
     return slice(np.searchsorted(track.t, begin), np.searchsorted(track.t, end, side='right'))
 
 
 def displacement(track: Track, rows: slice, t_start: float, f: Floats) -> Floats:
-    """Return how far f takes a track at some epochs from where it is at t_start: (m, 3) m."""
+    """Return the displacement of a track by f from t_start to some epochs: (m, 3) m."""
     start = track.at(t_start)
     return by_row(lambda P: (P - start) @ f, track.P[rows])
 

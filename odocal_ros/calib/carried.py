@@ -32,12 +32,12 @@ class Carried:
     legs: int
 
     def goes_on_from(self, other: 'Carried') -> bool:
-        """Return whether all that another holds is in it."""
+        """Return True if it contains all the information of another."""
         return self.first_ns == other.first_ns and self.legs > other.legs
 
     def only(self, names: Sequence[str], keeps: float | Floats) -> 'Carried':
         """
-        Return what it tells of some constants.
+        Return the information on some constants.
 
         keeps : of each prior sigma, the share by which it may have changed until it is used.
         """
@@ -56,7 +56,7 @@ class Carried:
 
 def carried_from(content: dict[str, Any]) -> Carried:
     """
-    Return what ``as_dict`` gave, null for what is not finite.
+    Return the Carried from the dict of ``as_dict``; null stands for values that are not finite.
 
     Raises
     ------

@@ -50,7 +50,7 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     covariance_n : (n, 3, 3) as stated, m^2.   drift : what the gyros may have bent the track by,
     m: taken out of the residuals. What is left may still hold errors of the track, so this errs on
     the wide side; below NOISIER_WORTH the stated sigmas stand.   marks : the two that the track is
-    pinned to: it has their errors, in proportion to the way a third of the variance of each, and
+    pinned to: it has their errors, in proportion to the path a third of the variance of each, and
     the factor is theirs too.
     """
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
@@ -66,7 +66,7 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
 
 def _believable(sigma: float, distance: float) -> float:
     """
-    Return how far a track may stray from fixes, m.
+    Return the limit of the distance between track and fixes, m.
 
     Four sigmas (once in 16 000 by chance), and 0.2 % of the distance for slip, suspension and road
     (judgement).
@@ -76,7 +76,7 @@ def _believable(sigma: float, distance: float) -> float:
 
 def mismatch(check: TrackCheck, fix_sigma: float, drift: float,
              distance: float) -> tuple[Reason, ...]:
-    """Return TRACK_MISMATCH where the corrected track strays from the fixes beyond its sigmas."""
+    """Return TRACK_MISMATCH where the corrected track differs from the fixes beyond its sigmas."""
     allowed = _believable(np.hypot(np.sqrt(2) * fix_sigma, drift), distance)
     if check.rms <= allowed:
         return ()
@@ -115,7 +115,7 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
 
 def steady(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
     """
-    Tell which fixes are no outliers beside their neighbours, and how noisy they are.
+    Return the fixes that are no outliers beside their neighbours, and their noise.
 
     residual : (n, 2 or more) corrected track less fixes, m, whatever is wrong with the track.
 

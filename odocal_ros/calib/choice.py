@@ -10,11 +10,11 @@ from odocal_ros.reasons import Code, Reason, Verdict
 
 ORDER = ('smoother', 'two_point')
 PLANAR = 'planar'        # the only method of legs that the others cannot compute
-ALWAYS = 'two_point'     # the operator's own marks: computed and shown whatever is asked
+ALWAYS = 'two_point'     # the operator's own marks: computed and shown for every setting
 BY = {'patent': 'smoother', 'wheels': 'smoother'}     # asked for: the method that decides then
 # what the smoother refuses end points do not know either: they have but the accelerometer's level
 REFUSED_FOR_ALL = 'smoother', 'pitch_mounting_angle'
-# what a reason speaks of: nothing to say where another method gives it
+# value that a reason is about: left out if another method gives the value
 ABOUT = {
     Code.SCALE_NOT_DETERMINED: 'scale_factor', Code.SCALE_SIGMA_TOO_LARGE: 'scale_factor',
     Code.SCALE_FAR_FROM_NOMINAL: 'scale_factor',
@@ -53,7 +53,7 @@ def choose(methods: Mapping[str, MethodResult],
     estimates : dict of Estimate
         Each with the method it is from; value None where no method has it.
     giving : tuple of str
-        The methods that gave any, or all that were asked where none is usable.
+        The methods that gave any, or all selected ones where none is usable.
 
     """
     found = [methods[name] for name in dict.fromkeys((*deciding(asked), PLANAR))
@@ -88,7 +88,7 @@ def passed_over(methods: Mapping[str, MethodResult], asked: str | tuple[str, ...
 
 
 def leg_estimates(leg: LegResult) -> dict[str, Estimate]:
-    """Return what a LegResult says, each value by the method that gives it."""
+    """Return the estimates of a LegResult, each from the method that gives it."""
     return choose(leg.methods, leg.deciding or ORDER)[0]
 
 

@@ -67,7 +67,7 @@ def combine_method(name: str, results: Sequence[MethodResult],
 def newest(results: Sequence[MethodResult],
            estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """
-    Return what belongs to a leg alone (gyro bias) from the last leg that knows it.
+    Return the values of a single leg (gyro bias) from the last leg that has them.
 
     Legs with one counter have no estimates of two wheels. The heading error, which older results
     hold, is each leg's own at its start: of several there is none.
@@ -102,12 +102,12 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
     x = np.array([r.estimates[parameter].value for r in have])
     y = np.log(x) if relative else x
     angle = have[0].estimates[parameter].unit == 'rad'
-    if angle:       # of an Imu that faces backwards they lie about +-pi
+    if angle:       # of an IMU that faces backwards they are near +-pi
         y = x - ((x - x[0]) - wrap(x - x[0]))
     own = np.array([sum(s.effects[i] @ s.effects[i] for s in r.sources if not s.shared)
                     for r in have])
     own = np.diag(np.maximum(own, 1e-18))
-    if relative:    # back from the last leg, two of them have walked the way of the nearer alike
+    if relative:    # from the last leg back, two legs share the random walk up to the nearer one
         own += np.minimum.outer(walked, walked)
     names = {s.name for r in have for s in r.sources if s.shared}
     by_leg = {n: np.stack([_effect(r, n, i) for r in have]) for n in sorted(names)}

@@ -18,7 +18,7 @@ from odocal_ros.settings.levels import FASTEST, TYRE_SPREAD
 
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
-    """Judge a drive between the marks: its way, as ``judge_way`` does, and its turns."""
+    """Return the reasons of a drive between the marks: path, by ``judge_way``, and turns."""
     distance, found = judge_way(track, t_stop, metres_per_unit, leg)
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
@@ -72,7 +72,7 @@ def rate_over_second(t: Floats, x: Floats) -> Floats:
 
 
 def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
-    """Say where the odometer begins after the start mark or ends before the stop mark."""
+    """Return a reason if the odometer begins after the start mark or ends before the stop mark."""
     late, early = float(travel.t[0]), float(t_stop - travel.t[-1])
     # s worth saying, of a topic that comes seldom half as much again as it takes anyway
     edge = max(0.5, 1.5 * float(np.median(np.diff(travel.t))) if len(travel.t) > 1 else 0.0)
@@ -87,7 +87,7 @@ def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
 def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
                t_stop: float, least: float = GNSS_MOVES) -> tuple[Reason, ...]:
     """
-    Return why there is no leg where wheels or fixes show no motion, empty where both do.
+    Return the reasons if wheels or fixes show no motion, empty if both do.
 
     least : distance over which fixes surely move, m.
     """
@@ -106,7 +106,7 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
     wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
     if wheels_move and fixes_move:
-        # m: physical, no wheel slides and no fix strays so far
+        # m: physical, no wheel slides and no fix deviates so far
         return _stopped(travel, t_here, here, max(100.0, 10 * fix_sigma))
     if fixes_move:
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, but the odometer does not'),)
@@ -115,14 +115,14 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
 
 
 def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Reason, ...]:
-    """Say where a counter stood while (k, 2) fixes at (k,) s spread by ``least`` m and more."""
+    """Return a reason if a counter stood while (k, 2) fixes at (k,) s moved by ``least`` m."""
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
     lost = [(_gone(fixes[(t >= begin[k]) & (t <= end[k])], least), begin[k], end[k])
             for k in np.flatnonzero(end - begin > least / FASTEST)]
     far, since, until = max(lost, default=(0.0, 0.0, 0.0))
-    # of the way: a counter that lacks less is within what tyres differ by, and seen elsewhere
+    # of the path: a counter that lacks less is within the spread of tyres, and found elsewhere
     if far < least or far < TYRE_SPREAD * way_and_chord(t, fixes)[0]:
         return ()
     return (Reason(Code.ODOMETER_STILL, f'the fixes move by {far:.0f} m from t = {since:.0f} s '
@@ -131,9 +131,9 @@ def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Re
 
 def _gone(fixes: Floats, least: float) -> float:
     """
-    Return how far (k, 2) fixes surely move from begin to end, m, 0 if by less than ``least``.
+    Return the significant motion of (k, 2) fixes from begin to end, m, 0 below ``least``.
 
-    One jump of them is no motion, nor is noise, nor what strays and comes back.
+    A single jump is no motion, nor is noise, nor an outlier episode.
     """
     stretches = 20      # so many that motion is in more than two of them
     if len(fixes) < stretches:
@@ -150,10 +150,10 @@ def _gone(fixes: Floats, least: float) -> float:
 def way_and_chord(t_fix: Floats, fixes_n: Floats,
                   least: float = GNSS_MOVES) -> tuple[float, float]:
     """
-    Return the way driven and the distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
+    Return path length and distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 
-    The way goes from fix to fix at least ten times their white noise apart: nearer ones would
-    add it up. Those that no vehicle gets to are none of it.   least : distance over which fixes
+    The path connects fixes at least ten times their white noise apart: nearer ones would
+    add it up. Fixes that no vehicle reaches are left out.   least : distance over which fixes
     surely move, m.
     """
     p = fixes_n[within_reach(t_fix, fixes_n), :2]
@@ -165,7 +165,7 @@ def way_and_chord(t_fix: Floats, fixes_n: Floats,
 
 
 def within_reach(t_fix: Floats, fixes_n: Floats) -> Bools:
-    """Tell which fixes a vehicle gets to from the one amid them, fix by fix: (k,) bool."""
+    """Return the fixes that a vehicle reaches from the middle one, fix by fix: (k,) bool."""
     p = fixes_n[:, :2]
     steps = np.hypot(*np.diff(p, axis=0).T)
     astray = 50.0       # m by which any fix may be off: physical, multipath in a street

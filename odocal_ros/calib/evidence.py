@@ -53,7 +53,7 @@ class Evidence:
     excluded_because: tuple[str, ...]    # (x,)
     fixes: int                           # before decimation
     excluded: int
-    gaps: tuple[tuple[str, float, float], ...] = ()   # of Imu and odometer: which, begin, end
+    gaps: tuple[tuple[str, float, float], ...] = ()   # of IMU and odometer: which, begin, end
     t_fit: float = np.inf                # s: what comes after it was kept back from the fit
     by_speed: SpeedScale = SpeedScale(NO_BINS)     # of the odometer as sent
     # (w, 4) as window_scale
@@ -108,7 +108,7 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
 
 def _gaps(inputs: Inputs, span: tuple[float, float],
           config: Config) -> tuple[tuple[str, float, float], ...]:
-    """Return where IMU or odometer pause while the vehicle moves: (which, begin, end)."""
+    """Return the gaps of IMU and odometer while the vehicle moves: (which, begin, end)."""
     travel = inputs.travel
     found = [('IMU', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
     found += [('odometer', a, b) for a, b in gaps_in_rhythm(travel.t)

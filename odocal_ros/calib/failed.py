@@ -16,7 +16,7 @@ TRACE = 'trace'      # of the details: what a developer needs
 
 
 def raised_if_wild() -> np.errstate:
-    """Return a context in which what runs away raises FloatingPointError, in place of warnings."""
+    """Return a context in which overflow raises FloatingPointError instead of a warning."""
     return np.errstate(over='raise', divide='raise', invalid='raise')
 
 

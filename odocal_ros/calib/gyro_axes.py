@@ -4,7 +4,7 @@
 """
 Gyro axes against the accelerometer and against the course of the fixes.
 
-A rotation of the whole Imu (imu.mounting_rpy) turns gyro and accelerometer together. Here the gyro
+A rotation of the whole IMU (imu.mounting_rpy) turns gyro and accelerometer together. Here the gyro
 alone has an axis with the wrong sign, or two axes swapped: no rotation corrects that.
 """
 

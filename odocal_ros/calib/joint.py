@@ -31,13 +31,13 @@ class Joint:
     The constants by all legs.
 
     names, value, covariance : (m,), (m, m), of the last leg where they walk.
-    sigma, used : (m,) of the priors, first and with what legs gainsaid.
+    sigma, used : (m,) of the priors, first and with what legs contradicted.
     chi2, freedom : disagreement of the legs before anything was widened, and what it should be.
     between : sigma by which a constant scatters between legs, by name.   disputed : constants in
     which legs differ for certain.   deviation : (J, m) of each leg from the others, in sigmas,
     without scatter.   factor : on all sigmas, in ``covariance``.
     bent : (J,) rad, error of taking the leg's equations to where the constants are.
-    carried : what all of them tell, for legs to come.
+    carried : information of all of them, for later legs.
     """
 
     names: tuple[str, ...]
@@ -119,7 +119,7 @@ class Scatter:
 
 def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
     """
-    Return how much these constants scatter between the legs, docs/method.md (S38).
+    Return the scatter of these constants between the legs, docs/method.md (S38).
 
     By restricted likelihood, with a half-Cauchy prior whose scale is the usual sigma (Gelman
     2006).
@@ -147,7 +147,7 @@ def _averaged(legs: LinkedLegs, scatter: Scatter,
     """
     Return the unknowns at this scatter, and their covariance over all scatters.
 
-    Few legs hardly tell how much a constant scatters: docs/method.md (S39).
+    Few legs hardly determine the scatter of a constant: docs/method.md (S39).
     """
     x, C = legs.solve(scatter.sigmas)
     out = C.copy()
@@ -169,7 +169,7 @@ def _disputed(legs: LinkedLegs, between: Mapping[str, float],
     def deviates(name: str) -> float:
         now, freedom = legs.disagreement({**between, name: usual.get(name, 0.0)})
         left, rest = legs.disagreement({**between, name: np.inf})
-        # less is no constant that legs tell
+        # less is no constant that legs determine
         return deviate(now - left, freedom - rest) if freedom - rest > 0.5 else -np.inf
     if len(legs.borders) < 2:
         return ()
@@ -180,7 +180,7 @@ def _disputed(legs: LinkedLegs, between: Mapping[str, float],
 
 
 def _bend(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
-    """Give each leg an error of its own for the way from where it was linearised; (J,) of it."""
+    """Give each leg an error for the distance from its linearisation point; return it, (J,)."""
     first, at = legs.borders, [legs.names.index(n) for n in curved]
     bent = np.zeros(len(first))
     for _ in range(3 if curved else 0):     # legs of less weight move the others less

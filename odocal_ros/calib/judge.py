@@ -22,7 +22,7 @@ MISTAKEN = {
 
 
 def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
-    """Return which unit a scale so far from its nominal looks like, and what to set then."""
+    """Return the probable unit of a scale this far from its nominal, and the setting for it."""
     for known, what in MISTAKEN.get(unit, {}).items():
         if abs(ratio / known - 1) < 0.04:      # what tyres add: the ratios lie farther apart
             return f', typical for {what}', (
@@ -33,7 +33,7 @@ def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
 
 def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
           config: Config) -> tuple[Reason, ...]:
-    """Return what the asked sigmas and the nominal values say of estimates."""
+    """Return the reasons from required sigmas and nominal values."""
     reasons = []
     scale, yaw = estimates['scale_factor'], estimates['yaw_mounting_angle']
     if scale.value is not None:

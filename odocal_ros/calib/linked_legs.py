@@ -53,12 +53,12 @@ class LinkedLegs:
 
     def determined(self) -> list[Border]:
         """Return of each leg what it determines at least as well as the priors do."""
-        if self._determined is None:      # asked for each constant anew
+        if self._determined is None:      # requested for each constant
             self._determined = [b.determined(self.unit) for b in self.borders]
         return self._determined
 
     def columns(self, j: int) -> Ints:
-        """Return where the constants of leg j stand among the unknowns: z, then k by leg."""
+        """Return the indices of the constants of leg j in the unknowns: z, then k by leg."""
         m = len(self.names)
         where = np.arange(m)
         where[self.drifting] = m + j
@@ -82,7 +82,7 @@ class LinkedLegs:
         return np.concatenate([*A, walk])[:, used] * scale, np.concatenate([*b, np.zeros(J - 1)])
 
     def place(self, j: int) -> Ints:
-        """Return where the constants of leg j stand among the columns of ``system``."""
+        """Return the indices of the constants of leg j in the columns of ``system``."""
         where = self.columns(j)
         return where - (where > self.drifting)
 
@@ -122,7 +122,7 @@ class LinkedLegs:
     def carried(self, value: Floats, spread: dict[str, float],
                 evidence: dict[str, Floats]) -> Border:
         """
-        Return what all legs tell, of the last leg's constants, where those are ``value``.
+        Return the information of all legs on the last leg's constants, at ``value``.
 
         evidence : on the scatter between legs.
         """
@@ -146,8 +146,8 @@ class LinkedLegs:
         equations need not be true.
         """
         A, b = self.system(spread, self.determined())
-        # priors hold what no leg tells: else two legs that tell half of the constants each, in
-        # directions that are never the same, would have one set of them, however far apart
+        # priors hold what no leg determines: else two legs that determine half of the constants
+        # each, in directions that are never the same, would have one set, however far apart
         prior, centre = self._prior_rows(A.shape[1])
         U, size, _ = np.linalg.svd(np.concatenate([A, prior]), full_matrices=False)
         of_legs, U = slice(len(A)), U[:, size > 1e-8 * size[0]]      # below is rounding
@@ -168,14 +168,14 @@ class LinkedLegs:
             D, where = border.information, self.place(j)
             pull = border.pull - D @ (x[where] - border.value)
             variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
-            # of a constant of which the others foresee all, to a millionth, a leg tells no news
+            # if the others predict all of a constant, to a millionth, a leg adds nothing
             news = variance > np.maximum(1e-6 * np.diag(D), 1e-300)
             out[j, news] = pull[news] / np.sqrt(variance[news])
         return out
 
 
 def _scattering(border: Border, spread: dict[str, float] | None) -> Border:
-    """Return the border of a leg whose constants scatter; combined legs tell their mean."""
+    """Return the border of a leg whose constants scatter; combined legs determine their mean."""
     return border.loosened(spread) if spread and not border.evidence else border
 
 

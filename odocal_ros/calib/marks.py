@@ -4,8 +4,8 @@
 """
 Reference positions at the marks: fixes averaged over a standstill, or fitted around a mark.
 
-How far fixes average down depends on how long their errors stay alike. The covariance that comes
-with them states the whole error; their scatter shows what part of it changes from fix to fix. Only
+How far fixes average down depends on the correlation time of their errors. Their covariance
+states the whole error; their scatter shows what part of it changes from fix to fix. Only
 that part averages down, unless the data show that the slow part moved on within the window too.
 """
 
@@ -80,7 +80,7 @@ def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
 
 
 def _near_middle(position_n: Floats, covariance_n: Floats) -> Bools:
-    """Tell which fixes are within five robust sigmas of the median, in the level and in height."""
+    """Return the fixes within five robust sigmas of the median, horizontally and in height."""
     off = np.abs(position_n - np.median(position_n, axis=0))
     level, up = np.hypot(off[:, 0], off[:, 1]), off[:, 2]
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
@@ -92,7 +92,7 @@ def _near_middle(position_n: Floats, covariance_n: Floats) -> Bools:
 
 def _share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
            correlation_time: float) -> float:
-    """Return which part of a single fix's variance is left in the mean: docs/method.md (T7)."""
+    """Return the share of a single fix's variance left in the mean: docs/method.md (T7)."""
     n = len(t)
     white = float(weight @ weight)          # 1/n for equal weights
     if n == 1 or correlation_time == 0:
@@ -126,7 +126,7 @@ def _left(t: Floats, weight: Floats, tau: float) -> float:
 
 
 def _correlation_time(t: Floats, z: Floats, fast: float, slow: float) -> float:
-    """Return how fast the slow part moves, from the structure function at a quarter window."""
+    """Return the correlation time of the slow part: structure function at a quarter window."""
     lag = max(1, len(t) // 4)
     grown = ((z[lag:] - z[:-lag])**2).mean() / 2 - fast
     moved = np.clip(grown / slow, 0.0, 0.95) if slow > 0 else 0.95

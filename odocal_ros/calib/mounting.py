@@ -18,8 +18,8 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import FEWEST_BINS_FACING, pushes
 from odocal_ros.screening.inputs import Inputs
 
-# rad of yaw from nominal: a nominal rotation or heading is wrong; no mounting, but the other way
-# round. Judgement: nobody mounts an Imu 20 deg askew unawares, and quarter turns are set
+# rad of yaw from nominal: a nominal rotation or heading is wrong; no mounting, but reversed.
+# Judgement: nobody mounts an IMU 20 deg askew unawares, and quarter turns are set
 FAR_YAW, BACKWARDS_YAW = np.deg2rad(20.0), np.deg2rad(160.0)
 # rad within which an axis is meant to be another: a third of a quarter turn, to its sigma of half
 # of that an axis is named at all. Judgement
@@ -53,7 +53,7 @@ class Mounting:
 
 
 def remedy(found: Mounting) -> str:
-    """Return what to set, '' where the drive does not tell."""
+    """Return the setting to make, '' where the drive does not determine it."""
     if found.rpy is None:
         return ''
     rpy = ','.join(f'{x:.10g}' for x in found.rpy)
@@ -73,7 +73,7 @@ def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
 def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
              metres_per_unit: float) -> Mounting:
     """
-    Tell how an IMU sits.
+    Return the mounting of an IMU.
 
     t, w_i, f_i : (n,), (n, 3), (n, 3) times, s, turn rate, rad/s, and specific force, m/s^2 or g,
     in the sensor's frame.   travel : odometer; positive is taken as forward.   metres_per_unit :

@@ -35,9 +35,9 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
         found.append(f'the scale of leg {high.leg} is {100 * more:.1f} % above '
                      f'that of leg {low.leg}')
     yaws = _values('yaw_mounting_angle', estimates)
-    # of an Imu that faces backwards they lie about +-180 deg
+    # of an IMU that faces backwards they are near +-180 deg
     far = _farthest([yaw._replace(value=float(wrap(yaw.value - yaws[0].value))) for yaw in yaws])
-    # rad, 5 deg: no mounting gives way so far
+    # rad, 5 deg: no mounting bends so far
     if far and (more := far[1].value - far[0].value) > 0.087:
         low, high = far
         found.append(f'the yaw mounting of leg {high.leg} is {math.degrees(more):.1f} deg above '

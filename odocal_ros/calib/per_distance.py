@@ -18,13 +18,13 @@ PIECE_STARTS = 10                       # definition: of pieces, on the length o
 
 def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
     """
-    Return the relative error of two tracks, pinned anew to a fix for each piece.
+    Return the relative error of two tracks, pinned again to a fix for each piece.
 
     way : (k,) m driven at each fix.   before, after : (k, 3) track less fixes, m, pinned anywhere.
 
     Returns
     -------
-    One entry for each length that the way holds: rms of what track and fixes differ by at the end
+    One entry for each length that the path holds: rms of what track and fixes differ by at the end
     of a piece that begin together, the fixes' own noise at both ends in it.
 
     """
@@ -57,7 +57,7 @@ def check_worse(way: Floats, before: Floats, after: Floats, configured: bool) ->
     """
     Return CHECK_WORSE where the correction takes the track farther from the fixes, beyond chance.
 
-    way, before, after : as for ``per_distance``.   configured : whether a nominal scale is.
+    before, after, way : as for ``per_distance``.   configured : whether a nominal scale is.
     """
     for length, pieces, (was, now) in _lengths(way, before, after):
         more = now - was

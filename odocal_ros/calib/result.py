@@ -91,12 +91,12 @@ class TrackCheck:
 
 @dataclass(frozen=True)
 class PerDistance:
-    """Error of dead reckoning that begins at a fix, after some way driven: rms in m."""
+    """Error of dead reckoning that begins at a fix, after some path length: rms in m."""
 
     length: float       # m driven
     before: float
     after: float
-    pieces: float       # that the way holds, end to end
+    pieces: float       # that the path holds, end to end
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class LegResult:
 
     @property
     def driven_ns(self) -> int:
-        """Return when it was driven: of parts of a leg the same, no scale walks between them."""
+        """Return the time of driving: of parts of a leg the same, no scale walks between them."""
         return self.start_ns if self.cut_from_ns is None else self.cut_from_ns
 
     @cached_property

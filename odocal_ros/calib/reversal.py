@@ -48,7 +48,7 @@ def level_track(way: Floats, turned: Floats) -> Floats:
     """
     Return the path of travel on level ground, but for a rotation: (n, 2) in units of travel.
 
-    way, turned : (n,) arrays, travel, and turn about the upward axis, rad.
+    turned, way : (n,) arrays, turn about the upward axis, rad, and travel.
     """
     middle = (turned[1:] + turned[:-1]) / 2
     step = np.diff(way)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
@@ -77,14 +77,14 @@ def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Piece
 
 def backwards(found: Pieces) -> Bools:
     """
-    Tell which pieces run backwards: (k,) bool.
+    Return True for pieces that run backwards: (k,) bool.
 
     The offset of the heading is a random walk: its variance grows with the time between pieces,
     and its size is the median of what the offset changes by. What changes by half a turn, and by
     FAULT_SIGMAS of that walk, is a flip. Where the walk may reach a flip nothing is known of what
     follows; each part between such gaps has its own forward direction, in which most pieces run.
 
-    As far as the fixes go back the counter goes on: a piece on the spot, or in which fixes jump,
+    While the fixes go back the counter continues: a piece on the spot, or in which fixes jump,
     has no direction.
     """
     back = np.zeros(len(found.t), bool)
@@ -108,7 +108,7 @@ def backwards(found: Pieces) -> Bools:
 
 
 def _without_bias(found: Pieces) -> Pieces:
-    """Return pieces without what is left of the gyro's bias, which turns all of them alike."""
+    """Return pieces without the remaining gyro bias, which turns all of them equally."""
     if len(found.t) < 2:
         return found
     rate = np.median(wrap(np.diff(found.off)) / np.diff(found.t))
@@ -117,7 +117,7 @@ def _without_bias(found: Pieces) -> Pieces:
 
 def _stays_back(found: Pieces, run: Ints, forward: Ints) -> bool:
     """
-    Tell whether the fixes stay behind after a run of pieces, as a reversal leaves them.
+    Return True if the fixes stay behind after a run of pieces, as after a reversal.
 
     Against a heading that drifts each piece is held by that of the next one forwards.
     run, forward : indices of the pieces that may run backwards, and of those that do not.
@@ -128,7 +128,7 @@ def _stays_back(found: Pieces, run: Ints, forward: Ints) -> bool:
     nearest = forward[np.argmin(np.abs(t[about][:, None] - t[forward]), axis=1)]
     ahead = found.length[about] * (
         np.cos(found.off[about] - found.off[nearest]) - found.stretch[about])
-    # of the way twice the run that the fixes lack they make up all or nothing
+    # of twice the run, which the fixes lack, they make up all or nothing
     return bool(ahead.sum() < found.length[run].sum())
 
 

@@ -29,7 +29,7 @@ class ScaleStep:
 def scale_steps(borders: Sequence[Border], steps: Sequence[float] | Floats, drifting: str,
                 angles: Sequence[str] = ()) -> list[ScaleStep]:
     """
-    Hold each leg's scale against what those before foretell.
+    Compare each leg's scale with its prediction by those before.
 
     borders : by time.   steps : (J - 1,) sigma by which ``drifting`` walks from leg to leg.
     drifting, angles : as for ``joint``.

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scale by section of the way, each with the sigma that its own fixes leave."""
+"""Scale by section of the path, each with the sigma that its own fixes leave."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,7 +24,7 @@ class Sections:
     """
     Scale by section: length by the fixes over length dead reckoned as calibrated.
 
-    begin, end : (k,) m driven.   ratio, sigma : (k,), NaN where the fixes do not tell.
+    begin, end : (k,) m driven.   ratio, sigma : (k,), NaN where the fixes do not determine it.
     """
 
     begin: NDArray[np.float64]
@@ -35,7 +35,7 @@ class Sections:
 
 def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> Sections:
     """
-    Return the scale of each tenth of the way, relative to the one used in dead reckoning.
+    Return the scale of each tenth of the path, relative to the one used in dead reckoning.
 
     The dead-reckoned piece is turned, stretched and shifted onto its fixes by least squares; the
     stretch is the ratio, so no heading enters. Its sigma is by what the fixes leave after that,
@@ -89,7 +89,7 @@ def _errors(fits: list[Stretch], stated: float) -> list[float]:
     whole = sum(np.vdot(left, left).real for _, left, _ in fits)
     at = np.arange(len(MEMORIES))
     # white noise on top hides a memory at the next block, not further on: the longer one counts,
-    # where there are enough blocks for it to tell
+    # where there are enough blocks to determine it
     memory = max(np.interp(sum(np.vdot(left[:-lag], left[lag:]).real for _, left, _ in fits)
                            / whole if whole else 0.0, row, at)
                  for lag, row in zip(BLOCK_LAGS, alike, strict=True) if lag == 1 or n >= 16)
@@ -102,7 +102,7 @@ def _errors(fits: list[Stretch], stated: float) -> list[float]:
 @lru_cache(maxsize=32)
 def _process(n: int) -> Floats:
     """
-    Return what a line fitted to n rows of a first-order process leaves, by its memory.
+    Return the residual of a line through n rows of a first-order process, by its memory.
 
     Mean power left, the variance of the slope over that of white noise, and the correlation left
     at each lag, of a process of variance 1: each (len(MEMORIES),). Closed form: traces with the

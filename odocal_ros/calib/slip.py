@@ -4,7 +4,7 @@
 """
 Wheel slip: where the odometer runs farther than the IMU's acceleration allows.
 
-Over a few seconds the way is the integral of speed, and the speed that of the specific force along
+Over a few seconds the path is the integral of speed, and speed that of the specific force along
 the forward axis less gravity. With the speed pinned to the odometer's at both ends of the window,
 a steady accelerometer bias and a tilt drop out; what a wheel spun in between does not. An odometer
 that is late, or whose speed is low-pass filtered, departs from the IMU at every change of
@@ -64,7 +64,7 @@ def rounding(travel: Travel) -> float:
 def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: float,
                quantum: float) -> Slips:
     """
-    Return when and how far the odometer ran ahead of the IMU, its lateness taken out.
+    Return times and sizes of the slips of the odometer against the IMU, after its delay.
 
     t_imu, f_b : (n,), (n, 3) specific force, s, m/s^2.   track : attitude and travel.   f : (3,)
     scale times forward axis.   latitude : rad.   quantum : size of an odometer count, scale units.
@@ -113,7 +113,7 @@ class _Windows:
         excess = self.excess(late)
         # what the drive as a whole does (rough road, soft suspension) is no event
         usual = robust_sigma(excess[excess != 0.0]) if excess.any() else 0.0
-        least = 0.45    # m, 3 sigmas: a tilt that wanders makes 0.1 m/s^2 of a window, 0.15 m
+        least = 0.45    # m, 3 sigmas: a tilt that drifts makes 0.1 m/s^2 of a window, 0.15 m
         limit = max(least, PIN_COUNTS * self.quantum * self.K, 6 * usual)
         return _events(self.grid[PIN_STEPS:-SPAN - PIN_STEPS] + SPIN_WINDOW / 2, excess, limit)
 
@@ -130,7 +130,7 @@ def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward
 
 def excess_way(span: int, a: Floats, way: Floats) -> Floats:
     """
-    Return the odometer's way over each window less that by acceleration: (m,) m.
+    Return the odometer's path over each window less that by acceleration: (m,) m.
 
     The speed by acceleration is set to the odometer's at both ends by a straight line; both are
     taken as means over the same few steps, so that a jump of acceleration there does no harm.
@@ -160,7 +160,7 @@ def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Float
 
 
 def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floats) -> Source:
-    """Return slips as a source of error: one for all of them, since wheels spin one way."""
+    """Return slips as a source of error: one for all, since wheels spin in one direction."""
     along_n = track.C_nb_at(t) @ f / np.linalg.norm(f) * np.abs(size)[:, None]
     return Source('wheel_slip', gradient @ along_n.sum(axis=0)[:, None])
 

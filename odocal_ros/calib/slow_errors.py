@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Fix errors that stay alike over a mark: seen along the leg, where a mark cannot see them."""
+"""Fix errors that are constant over a mark: observable along the leg, but not at the mark."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ def slow_variance(t: Floats, along: Floats, way: Floats, variance: Floats,
 
     Means of the residuals over windows hold it, where white errors have averaged down. A fifth of
     the variance being slow is not seen in a mark's own scatter, and yet rules its mean. Along the
-    chord, since gyros bend a track across it; less a straight line over the way, which is what
+    chord, since gyros bend a track across it; less a straight line over the path, which is what
     the errors of the two marks themselves make.
 
     t, along, way : (n,) times, s, corrected track less fixes along the chord, m, and how far along
@@ -58,8 +58,8 @@ def slow_variance(t: Floats, along: Floats, way: Floats, variance: Floats,
 
 
 def _lasting(alike: float) -> float:
-    """Return the time constant, s, that makes neighbouring means of SLOW_WINDOW so alike."""
-    times = np.geomspace(2.0, 2000.0, 100)      # s, that such a window can tell
+    """Return the time constant, s, that makes neighbouring means of SLOW_WINDOW so correlated."""
+    times = np.geomspace(2.0, 2000.0, 100)      # s, that such a window can determine
     x = SLOW_WINDOW / times
     correlation = (1 - np.exp(-x))**2 / (2 * (x - 1 + np.exp(-x)))
     return float(np.interp(alike, correlation, times))

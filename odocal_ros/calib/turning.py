@@ -14,7 +14,7 @@ from odocal_ros.nav.local_frame import GNSS_MOVES
 from odocal_ros.reasons import Code, Reason
 
 # statistical: correlation of turns by gyro and by course from which they are the same turns, and
-# sigmas of the slope, since of a few courses chance makes some alike
+# sigmas of the slope, since of a few courses chance makes some correlated
 SAME_TURNS, SLOPE_SIGMAS = 0.9, 8.0
 
 
@@ -61,7 +61,7 @@ def _pivots(ends: Floats, angle: Floats) -> Bools:
 
 
 def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
-    """Return GYRO_SIGN or IMU_UNITS where such a ratio, with such an imu.gyro_scale, tells it."""
+    """Return GYRO_SIGN or IMU_UNITS where such a ratio, with such an imu.gyro_scale, shows it."""
     if ratio is None or ONE_MOTION_RATIO[0] < ratio < ONE_MOTION_RATIO[1]:
         return ()
     if ratio < -ONE_MOTION_RATIO[0]:

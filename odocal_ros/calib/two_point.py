@@ -105,7 +105,7 @@ def _C_bv(yaw: float, pitch: float) -> Floats:
 
 
 def refusal(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
-    """Return why the leg's chord cannot carry the method, empty if it can."""
+    """Return the reasons against the method on the leg's chord, empty if there are none."""
     between = (chord.track.t >= chord.start.t) & (chord.track.t <= chord.end.t)
     path = np.abs(np.diff(chord.track.s[between])).sum() * scale_guess
     length = np.hypot(*(chord.end.position_n - chord.start.position_n)[:2])

@@ -73,7 +73,7 @@ def imperfect_sigmas(grade: Grade) -> Floats:
     Return the sigmas of IMPERFECT, 0 for none: (k,).
 
     Those of the IMU by its grade. A receiver that smooths does so over a second;
-    most have no odometer (SIZE_SPREADS).
+    most have no odometer (SIZE_SPREADS). Clocks differ by 20 ppm.
     Tyres change by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within ten minutes or so, and
     slip by 0.4 % for each m/s^2;
     a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2, both late by 0.1 s.
@@ -86,6 +86,7 @@ def imperfect_sigmas(grade: Grade) -> Floats:
         'accelerometer_scale': grade.accel_scale_error, 'accelerometer_axis': axes,
         'fix_lag_square': 1.0,                      # s^2
         'fix_error_by_motion': 1.4e-3,
+        'clock_rate': 2e-5,
         'odometer_lag_square': 0.1,                 # s^2
         'scale_by_speed': 1e-4,                     # s/m at FAST_SPEED
         'scale_by_time': 2.5e-3 / WARM_TIME,        # 1 / s

@@ -52,7 +52,8 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_lever_arm_x', 'odometer_lever_arm_y', 'odometer_lever_arm_z',
              'antenna_lever_arm_x', 'antenna_lever_arm_y', 'antenna_lever_arm_z',
              'odometer_delay', 'gnss_delay', 'heading_offset', *GYRO_ERRORS, *ACCEL_ERRORS,
-             'fix_lag_square', 'fix_error_by_motion', 'odometer_lag_square',
+             'fix_lag_square', 'fix_error_by_motion', 'gnss_clock_rate', 'odometer_clock_rate',
+             'odometer_lag_square',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking', 'squat',
              'sideslip', 'squat_by_jerk', 'sideslip_by_jerk', 'pitch_centre',
              'pitch_centre_of_bumps',
@@ -79,6 +80,8 @@ ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_yz')
 # s^2, of a receiver's filter: square of the time constant of the mean of the past, or, below zero,
 # of a filter of position and velocity (nav/receiver_filter.py)
 FIX_LAG2 = CONSTANTS.index('fix_lag_square')
+# relative: by how much the clock of its stamps is faster than that of the IMU
+GNSS_CLOCK, ODO_CLOCK = map(CONSTANTS.index, ('gnss_clock_rate', 'odometer_clock_rate'))
 # s^2, of a low-pass filter on the odometer's speed: square of its time constant
 ODO_LAG2 = CONSTANTS.index('odometer_lag_square')
 # of an odometer in the receiver: its relative error, and the time constant, logarithm of s, with
@@ -99,7 +102,7 @@ IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre_of_bumps')
 # kinds of these with one size each, and their numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
-              'odometer_lag_square': 1,
+              'clock_rate': 2, 'odometer_lag_square': 1,
               'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2, 'squat': 1,
               'sideslip': 1, 'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 2}
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECT

@@ -19,12 +19,19 @@ from odocal_ros.forecast.planned_drive import from_rates
 from odocal_ros.nav.alignment import Alignment, HEADING_LIMIT
 from odocal_ros.pipeline.methods import METHODS
 from odocal_ros.screening.glitches import Oriented, oriented
-from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM, SKID, with_settings
 
 EXACT_HEADING = 1e-6      # rad; judgement: of a heading with a configured sigma of 0
 COURSE_FIX_SIGMA = 1.5    # m; physical: fixes of a single receiver, for a course
 SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topic',
            'imu_orientation': 'the IMU orientation', 'gyrocompass': 'the gyrocompass'}
+# values of the planar estimator
+OF_DRIVE = {
+    DIFFERENTIAL: ('the scale', 'left and right wheel', 'the track width (in turns)'),
+    SKID: ('the scale', 'left and right wheel', 'the track width (on the spot)',
+           'the track width arc (on arcs)'),
+    MECANUM: ('the scale', 'the rotation lever (in turns)',
+              'the lateral scale factor (in sideways motion)')}
 ALL_SAMPLES = 'smoother'   # the method that needs no external heading
 
 
@@ -35,7 +42,7 @@ class Received:
 
     variances : of the yaw, rad^2, in ``heading_topic`` and ``imu_orientation``, inf if none is
     sent.   rested_s : length of the current or last standstill.   latitude : rad.   height : the
-    fixes have one.   felt : the IMU has an accelerometer.
+    fixes have one.   felt : the IMU has an accelerometer.   imu : there is one.
     """
 
     variances: dict[str, float]
@@ -44,6 +51,7 @@ class Received:
     height: bool = True
     two_wheels: bool = False
     felt: bool = True
+    imu: bool = True
 
 
 @dataclass(frozen=True)
@@ -66,6 +74,10 @@ class Ability:
 
 def ability(config: Config, received: Received) -> Ability:
     """Return the values that a leg can estimate with these settings, and those it cannot."""
+    drive = config.odometer.drive
+    if not received.imu or drive != DIFFERENTIAL:
+        return Ability(OF_DRIVE[drive], (
+            'yaw and pitch of the IMU' if received.imu else 'yaw and pitch (no IMU)',))
     methods = [name for name in METHODS if name in deciding(config.method)
                and (received.felt or name != ALL_SAMPLES)]
     values = [(True, 'the scale'), _yaw(config, received, methods),

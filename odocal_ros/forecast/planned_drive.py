@@ -20,6 +20,7 @@ from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.rotations import matrix_from_rpy
 
 REST_SPEED = 1e-6     # m/s, judgement: below it a planned drive stands
+SPOT_TURN = 0.05       # rad/s, judgement: a robot that turns on the spot is not at rest
 DRIVE_STEP = 0.1      # s, judgement: of drives made here
 BRAKING = 1.5    # m/s^2, judgement: as in a town
 QUARTER = np.pi / 2    # definition: rad
@@ -93,7 +94,8 @@ class PlannedDrive:
 
     def standstills(self, shortest: float) -> list[tuple[float, float]]:
         """Return begin and end of the stretches at rest that last ``shortest`` s or more."""
-        rest = np.abs(self.speed) <= REST_SPEED
+        turning = np.abs(np.gradient(self.yaw, self.t)) > SPOT_TURN      # on the spot
+        rest = (np.abs(self.speed) <= REST_SPEED) & ~turning
         spans = self.t[runs(rest) - [0, 1]]
         return [(float(a), float(b)) for a, b in spans if b - a >= shortest]
 

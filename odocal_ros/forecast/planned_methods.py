@@ -50,7 +50,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     problem = problem_of(made.leg, sigmas.config, made.imu)
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
-        fit = _fit(problem, made, levels)
+        fit = fit_at(problem, made, levels)
     except (NotPositive, np.linalg.LinAlgError) as error:
         return refused([Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}')],
                        '1')
@@ -90,7 +90,7 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
         correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
 
 
-def _fit(problem: Problem, made: Ideal, levels: Levels) -> Fit:
+def fit_at(problem: Problem, made: Ideal, levels: Levels) -> Fit:
     """Return the fit at the true state, without any step."""
     state, priors = made.state, problem.priors
     weighted = Equations(problem, state, priors).at(levels)

@@ -7,7 +7,7 @@ from collections.abc import Set
 from dataclasses import dataclass
 import math
 
-from odocal_ros.calib.choice import ABOUT
+from odocal_ros.calib.choice import ABOUT, PLANAR
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.forecast.forecast import Forecast
@@ -25,6 +25,7 @@ class Quantity:
     estimates: tuple[str, ...]
     relative: bool
     of_two_wheels: bool = False
+    of_imu: bool = False      # the planar estimator has none
 
     def limit(self, config: Config) -> float:
         """Return the largest sigma that is good enough, a share of the value or rad."""
@@ -36,8 +37,8 @@ class Quantity:
 
 QUANTITIES = {
     'scale': Quantity('scale', ('scale_factor',), True),
-    'yaw': Quantity('yaw', ('yaw_mounting_angle',), False),
-    'pitch': Quantity('pitch', ('pitch_mounting_angle',), False),
+    'yaw': Quantity('yaw', ('yaw_mounting_angle',), False, of_imu=True),
+    'pitch': Quantity('pitch', ('pitch_mounting_angle',), False, of_imu=True),
     'left_right': Quantity('left and right wheel', ('scale_factor_left', 'scale_factor_right'),
                            True, True),
     'track_width': Quantity('track width', ('track_width',), True, True),
@@ -63,6 +64,8 @@ def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
     for name, quantity in QUANTITIES.items():
         if quantity.of_two_wheels and (not two_wheels or forecast.wheels is None):
             continue
+        if quantity.of_imu and PLANAR in forecast.methods:
+            continue
         good = NO if lost else _within(forecast.sigma(name), quantity.limit(config))
         if good == NO and _given(name, config):
             good = UNKNOWN
@@ -87,8 +90,11 @@ def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: boo
     their use.
     """
     ok = nothing_known()
+    planar = any(e.method == PLANAR for e in estimates.values())
     for name, quantity in QUANTITIES.items():
         found = [estimates.get(part) for part in quantity.estimates]
+        if quantity.of_imu and planar:
+            continue
         if quantity.of_two_wheels and not two_wheels and not any(
                 e is not None and e.value is not None for e in found):
             continue

@@ -94,19 +94,20 @@ def with_running(forecast: Forecast, running: Running, config: Config) -> Foreca
         yaw = _yaw(running, yaw.asked)
     if known[2] and (by.get(PITCH) == 'smoother' or pitch is None):
         pitch = float(running.sigmas[2])
-    return replace(forecast, scale=scale, yaw=yaw, pitch=pitch, wheels=_wheels(method))
+    return replace(forecast, scale=scale, yaw=yaw, pitch=pitch, wheels=wheels_of(method))
 
 
-def _wheels(method: MethodResult) -> WheelsForecast | None:
+def wheels_of(method: MethodResult) -> WheelsForecast | None:
     """Return the running estimate of two wheels, None for one counter."""
     if 'track_width' not in method.estimates:
         return None
-    left, right, width = (_relative(method.estimates[name]) for name in (
+    left, right, width = (relative(method.estimates[name]) for name in (
         'scale_factor_left', 'scale_factor_right', 'track_width'))
     return WheelsForecast(None if left is None or right is None else max(left, right), width)
 
 
-def _relative(e: Estimate) -> float | None:
+def relative(e: Estimate) -> float | None:
+    """Return the sigma over the value, None without them."""
     return None if e.value is None or e.sigma is None else e.sigma / abs(e.value)
 
 
@@ -116,7 +117,7 @@ def _scale(running: Running, asked: float) -> Prospect:
     slow = _slow_share(running)
     power = PATH_POWER_SLOW * slow + PATH_POWER * (1 - slow)
     metres = _metres(running, sigma / asked, power)
-    now = '' if e.value is None or e.sigma is None else _digits(e.value, e.sigma)
+    now = '' if e.value is None or e.sigma is None else digits(e.value, e.sigma)
     if now and e.unit != '1':
         now += f' {e.unit}'
     return Prospect(sigma, asked, metres, sources_of(running.method, SCALE),
@@ -141,7 +142,7 @@ def _yaw(running: Running, asked: float) -> Prospect:
         stops = math.ceil(max(running.agility, one / 2) * (ratio**2 - 1) / one)
         often = 'often' if stops > MOST_STOPS else f'{stops} time{"s" * (stops > 1)}'
         lack = f'for the yaw: stop and start {often}, or make as many turns'
-    now = '' if e.value is None or e.sigma is None else _digits(
+    now = '' if e.value is None or e.sigma is None else digits(
         math.degrees(e.value), math.degrees(e.sigma))
     return Prospect(sigma, asked, _metres(running, ratio, 2.0),
                     sources_of(running.method, YAW), '', now, lack)
@@ -153,7 +154,7 @@ def _metres(running: Running, ratio: float, power: float) -> float | None:
     return metres if metres <= FARTHEST_M else None
 
 
-def _digits(value: float, sigma: float) -> str:
+def digits(value: float, sigma: float) -> str:
     """Return a value to a tenth of its sigma, with at most eight digits."""
     size = max(abs(value), sigma)
     places = math.floor(math.log10(size)) - math.floor(math.log10(sigma)) + 2

@@ -78,14 +78,15 @@ class ThinnedLeg:
         self._cells[slot], self._width_ns[slot] = cells, width_ns
 
     def leg(self, start_ns: int) -> Leg:
-        """Return the samples so far as a leg that ends with the last cell of the IMU."""
+        """Return the samples so far as a leg, up to the last cell of IMU, or else odometer."""
         form, cells = self.form, self._cells | {slot: self._newest(slot) for slot in self._late}
         if form.quantity != 'rate':
             whole = np.issubdtype(cells['odometer'].value.dtype, np.integer) \
                 if 'odometer' in cells else True
             form = replace(COUNTER if whole else UNROLLED, scale_unit=form.scale_unit,
                            sides=form.sides)
-        stop_ns = int(self._cells['imu'].stamp_ns[-1]) if 'imu' in self._cells else start_ns
+        leading = cells.get('imu', cells.get('odometer'))
+        stop_ns = start_ns if leading is None else int(leading.stamp_ns[-1])
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form, **cells)
 
     def _newest(self, slot: str) -> OdometerSamples:

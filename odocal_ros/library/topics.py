@@ -12,7 +12,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, TRANSFORMS, types_of
-from odocal_ros.settings.config import Config, DIFFERENTIAL, OdometerConfig, SIDES
+from odocal_ros.settings.config import Config, OdometerConfig
 
 NEVER = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
 COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # asked of a vehicle, not measured
@@ -131,15 +131,10 @@ def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str,
             f'({topics[fix].msgtype}); another one: {topic_option("fix")}')
 
 
-def imu_needed(config: Config) -> bool:
-    """Return False for several wheels, which are sufficient on a level floor."""
-    return len(config.odometer.keys) < len(SIDES) and config.odometer.drive == DIFFERENTIAL
-
-
 def _optional(slot: str, config: Config, found: list[str]) -> bool:
     """Return True if a leg does not need a slot whose topic is missing or ambiguous."""
     if slot == 'imu':
-        return not found and not imu_needed(config)
+        return not found and not config.odometer.needs_imu
     return slot == 'fix_velocity' or (
         slot == 'heading' and config.alignment.heading_source != 'heading_topic')
 

@@ -79,7 +79,7 @@ class AutomaticLegs(LegCompletion):
                 search.spans.popleft()
                 self._end_leg(span.stop_ns)
         elif not session.open_leg and not session.busy and not self._why_not():
-            if span.start_ns < self._recording.newest_imu_ns - self._config().leg.preroll * 1e9:
+            if span.start_ns < self._recording.newest_ns - self._config().leg.preroll * 1e9:
                 search.spans.popleft()      # its samples are forgotten
             else:
                 self._begin_leg(span.start_ns, by_itself=True)
@@ -92,7 +92,7 @@ class AutomaticLegs(LegCompletion):
 
     def _drop_leg(self, text: str = '', lost: str = '') -> None:
         super()._drop_leg(text, lost)
-        self._look_after(self._recording.newest_imu_ns, at_rest=True)
+        self._look_after(self._recording.newest_ns, at_rest=True)
 
     def _start_time_anew(self) -> None:
         super()._start_time_anew()

@@ -19,6 +19,8 @@ FEWEST_MARKS = 2         # judgement: marks after which the operator knows
 DRIVE = 'drive '
 STRAIGHT = 'drive straight at speed until left and right wheel are separable'
 TURNS = 'for the track width: turn by 90 deg in total or more'
+SPOT_TURNS = ('for the track width: turn on the spot in both directions, and drive straight for a '
+              'metre after each turn')
 
 
 def hint(now: SessionView) -> str:
@@ -39,8 +41,9 @@ def hint(now: SessionView) -> str:
         actions, facts = _while_recording(now)
         return '; '.join([*facts, *actions])
     if state is State.IDLE:
-        return ('start driving: a leg starts automatically' if now.config.leg.automatic
-                else _before_start(now.still_s))
+        if now.config.leg.automatic and now.imu:
+            return 'start driving: a leg starts automatically'
+        return _before_start(now.still_s)
     return after_result(now)
 
 
@@ -105,7 +108,7 @@ def _of_two_wheels(now: SessionView) -> list[str]:
     if wheels is not None and not (wheels.left_right is not None and wheels.left_right <= asked):
         wants.append(STRAIGHT)
     if not config.odometer.track_width and (wheels is None or wheels.track_width is None):
-        wants.append(TURNS)
+        wants.append(TURNS if now.imu else SPOT_TURNS)
     return wants
 
 

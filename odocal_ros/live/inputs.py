@@ -18,7 +18,7 @@ class Inputs:
     """All topics of the node that a configuration uses."""
 
     def __init__(self, node: Node, config: Config) -> None:
-        self._node = node
+        self._node, self._needs_imu = node, config.odometer.needs_imu
         self.by_slot: dict[str, Input] = {}
         for slot, allowed in _wanted(config).items():
             one = self.by_slot[slot] = Input(node, slot, allowed)
@@ -49,10 +49,24 @@ class Inputs:
     def required(self, config: Config) -> list[Input]:
         """Return the topics without which no leg can be started."""
         surveyed = config.reference.start and config.reference.end
-        slots = ['imu', 'odometer'] + ['odometer_right'] * config.odometer.own_topics
+        slots = ['imu'] * (not self.without_imu) + ['odometer']
+        slots += ['odometer_right'] * config.odometer.own_topics
         slots += [] if surveyed else ['fix']
         slots += ['heading'] * (config.alignment.heading_source == 'heading_topic')
         return [self.by_slot[slot] for slot in slots if slot in self.by_slot]
+
+    @property
+    def without_imu(self) -> bool:
+        """Return True if a leg needs no IMU, and nobody publishes one."""
+        imu = self.by_slot['imu']
+        return not (self._needs_imu or imu.publishers or imu.health.received_ns)
+
+    @property
+    def leading(self) -> Input:
+        """Return the topic whose stamps are those of the marks: the IMU, or else the odometer."""
+        imu = self.by_slot['imu']
+        leads = self._needs_imu or imu.newest_ns
+        return imu if leads else self.by_slot['odometer']
 
     def missing(self, config: Config) -> list[str]:
         """Return the causes why a leg cannot start, one line per missing topic."""
@@ -78,8 +92,9 @@ class Inputs:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Return slot -> topic of those that are listened to."""
-        return {slot: one.topic for slot, one in self.by_slot.items() if one.reader is not None}
+        """Return slot -> topic of those that are listened to and published."""
+        return {slot: one.topic for slot, one in self.by_slot.items()
+                if one.reader is not None and not (slot == 'imu' and self.without_imu)}
 
     @property
     def form(self) -> OdometerForm | None:

@@ -83,7 +83,7 @@ class LegCompletion:
         if self._at_stop is not None and self.session.state is State.COMPUTING:
             self._computing.answer_late(partial(answers.provisional, self._at_stop))
         if self.session.state is State.RECORDING:
-            self._watch.look(self._recording.newest_imu_ns)
+            self._watch.look(self._recording.newest_ns)
             self._report_silence()
         self._journal.tick(self._config(), self.session.busy)
 
@@ -135,7 +135,7 @@ class LegCompletion:
         in_leg = session.state is State.RECORDING
         if in_leg:
             self._distance_m = progress.distance_m()
-        end_ns = session.stop_ns or recording.newest_imu_ns
+        end_ns = session.stop_ns or recording.newest_ns
         forecast = self._watch.forecast
         if self._at_stop is not None and session.state is State.COMPUTING:
             forecast = self._at_stop.forecast
@@ -153,7 +153,7 @@ class LegCompletion:
             computed=self._computing.at, saved=self._filing.saved, lost=self._lost_leg(),
             save_trouble=self._filing.trouble, journal=self._journal.folder,
             journal_trouble=self._journal.trouble, received=recording.received(),
-            local=recording.local)
+            local=recording.local, imu=not inputs.without_imu)
 
     def show_status(self) -> None:
         """Publish the current status and log what is new in it."""
@@ -165,15 +165,15 @@ class LegCompletion:
     # the processing of a leg
 
     def _mark_ns(self) -> int:
-        """Return the stamp of the newest IMU sample: marks are on the sensors' own clock."""
+        """Return the newest stamp of the IMU, or else of the odometer, on the sensors' clock."""
         self.pump()
-        return self._recording.newest_imu_ns
+        return self._recording.newest_ns
 
     def _stop_when_too_long(self) -> None:
         session = self.session
         if session.state is not State.RECORDING:
             return
-        gone_s = (self._recording.newest_imu_ns - session.start_ns) * 1e-9
+        gone_s = (self._recording.newest_ns - session.start_ns) * 1e-9
         if gone_s > session.config.leg.max_duration:
             self._log.warning(
                 f'leg {session.leg_id} is longer than leg.max_duration and is stopped')
@@ -205,7 +205,7 @@ class LegCompletion:
         return text
 
     def end_leg_now(self) -> None:
-        """End the leg at the newest IMU stamp."""
+        """End the leg at the newest stamp."""
         self._end_leg(self._mark_ns())
 
     def _end_leg(self, mark_ns: int) -> None:

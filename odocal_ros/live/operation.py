@@ -30,7 +30,7 @@ class Operation(AutomaticLegs):
     """
 
     def start_leg(self) -> tuple[bool, str]:
-        """Open a leg at the newest IMU stamp."""
+        """Open a leg at the newest stamp."""
         session, mark_ns = self.session, self._mark_ns()
         if session.state is State.RECORDING and not session.by_itself:
             return True, (f'recording since {iso(session.start_ns)}, leg '
@@ -51,7 +51,7 @@ class Operation(AutomaticLegs):
         if session.state is State.RECORDING and still_s < MARK_STILL_S:
             raise Refused(f'the wheels have stood for {still_s:.1f} s, required: '
                           f'{MARK_STILL_S:g} s; stand on the point and call again')
-        delay_s = self._recording.inputs.by_slot['imu'].health.delay_s
+        delay_s = self._recording.inputs.leading.health.delay_s
         mark = session.mark(newest_ns - round(WITHIN * 1e9), newest_ns + round(delay_s * 1e9))
         self._recording.add_marks(mark_positions(session.config, [mark]), session.config)
         self.show_status()

@@ -110,7 +110,7 @@ class Publishing:
             input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.why(),
                          one in needed, time.monotonic_ns())
             for slot, one in recording.inputs.by_slot.items()
-            if one in needed or one.reader is not None]))
+            if one in needed or slot in recording.inputs.topics]))
 
     def _array(self, statuses: list[DiagnosticStatus]) -> DiagnosticArray:
         array = DiagnosticArray(status=statuses)

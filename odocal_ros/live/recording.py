@@ -106,9 +106,9 @@ class Recording:
         return WHEELS[1:] if several else ()
 
     @property
-    def newest_imu_ns(self) -> int:
-        """Return the stamp of the newest IMU sample decoded, 0 before the first."""
-        return self.inputs.by_slot['imu'].health.newest_ns
+    def newest_ns(self) -> int:
+        """Return the newest stamp of the leading topic, by which marks are set; 0 before it."""
+        return self.inputs.leading.newest_ns
 
     def passed(self, mark_ns: int) -> bool:
         """Return True if every topic with messages has passed a mark."""
@@ -125,8 +125,8 @@ class Recording:
 
     @property
     def time_jumped(self) -> bool:
-        """Return True if the clock or the IMU stamps went back."""
-        return self._clock_jumped or self.inputs.by_slot['imu'].health.jumped_back
+        """Return True if the clock or the stamps of the leading topic went back."""
+        return self._clock_jumped or self.inputs.leading.health.jumped_back
 
     def start_anew(self) -> None:
         """Drop everything, as after a jump of time."""
@@ -145,7 +145,8 @@ class Recording:
 
     def received_before(self, preroll_s: float) -> Received:
         """Return the samples so far that determine what a leg can estimate."""
-        return replace(self.progress.received_before(preroll_s), two_wheels=self.two_wheels())
+        return replace(self.progress.received_before(preroll_s), two_wheels=self.two_wheels(),
+                       imu=not self.inputs.without_imu)
 
     def rates_hz(self) -> dict[str, float]:
         """Return the rate of each topic by its stamps."""
@@ -157,9 +158,10 @@ class Recording:
         return any(one.health.received_ns for one in self.inputs.by_slot.values())
 
     def imu_silent_s(self) -> float:
-        """Return for how long the IMU has said nothing while others did."""
+        """Return for how long the IMU has sent nothing while others did; 0 without an IMU."""
         received_ns = {slot: one.health.received_ns for slot, one in self.inputs.by_slot.items()}
-        return max(0, max(received_ns.values()) - received_ns['imu']) * 1e-9
+        silent_ns = max(received_ns.values()) - received_ns['imu']
+        return 0.0 if self.inputs.without_imu else max(0, silent_ns) * 1e-9
 
     def close(self) -> None:
         """Let go of the clock."""

@@ -13,11 +13,13 @@ from odocal_ros.data.samples import join, OdometerForm, take
 from odocal_ros.forecast.forecast import Abandoned, better, Forecast
 from odocal_ros.forecast.foresight import forecast_of
 from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps, screened_in_cells
+from odocal_ros.forecast.planar_so_far import planar_forecast
 from odocal_ros.forecast.smoother_so_far import SmootherSoFar
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.live.answers import one_line
 from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import Worker
+from odocal_ros.pipeline.planar_run import is_planar
 from odocal_ros.reasons import Code, gravest_first, Reason
 from odocal_ros.settings.config import Config
 
@@ -157,9 +159,12 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], s
     try:
         _bring_up_to_date(thinned, before, fresh, over)
         leg = thinned.leg(start_ns)
-        found = faults_in_cells(leg, config)
-        forecast = forecast_of(leg, thinned.fix_rate(), config,
-                             lambda: not over.is_set(), smoother)
+        if is_planar(leg, config):
+            forecast = planar_forecast(leg, config, lambda: not over.is_set())
+        else:
+            found = faults_in_cells(leg, config)
+            forecast = forecast_of(leg, thinned.fix_rate(), config, lambda: not over.is_set(),
+                                   smoother)
     except Exception as error:  # an error of the running estimate does not end the leg
         failure = error
     finally:

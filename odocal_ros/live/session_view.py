@@ -45,6 +45,7 @@ class SessionView:
     journal_trouble: str = ''                    # why it cannot be written
     received: bool = True                           # any message on any topic so far
     local: bool = False                          # positions are in a local frame
+    imu: bool = True                             # the robot has one
 
     @property
     def state(self) -> str:

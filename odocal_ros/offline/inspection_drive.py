@@ -20,7 +20,6 @@ from odocal_ros.data.pieces import lengths, medians
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.asked import EACH_STOP, LegSpan
 from odocal_ros.library.legs import find_legs, marked_legs, stops_of
-from odocal_ros.library.topics import imu_needed
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.stretches import (
     Drive,
@@ -200,7 +199,7 @@ def lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> l
     out = [Reason(code, f'no topic for the {word}') for slot, code, word in (
         ('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER, 'odometer'),
         ('fix', Code.NO_FIX, 'fixes'))
-        if slot not in mapping and (slot != 'imu' or imu_needed(config))]
+        if slot not in mapping and (slot != 'imu' or config.odometer.needs_imu)]
     drive = found['drive']
     if not drive:
         return out

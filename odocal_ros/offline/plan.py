@@ -48,6 +48,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '1 sigma, white at 10 Hz (default 0.05: ordinary road)')
     add('--slip-walk', type=float, metavar='M/SQRT(S)', help='wheel slip while driving (default '
         '0.01)')
+    add('--indoor', nargs='?', const='all', metavar='RUN', help='run of a small robot on a level '
+        'floor: straight, square, figure_eight or spot (default: all)')
+    add('--reference', metavar='NAME', help='with --indoor: mocap, total_station, slam, amcl or '
+        'marks (default slam)')
+    add('--drive', metavar='NAME', help='with --indoor: as odometer.drive (default differential)')
+    add('--no-imu', action='store_true', help='with --indoor: a robot without an IMU')
+    add('--size', type=float, metavar='M', help='with --indoor: length of a straight (default 4)')
+    add('--rounds', type=int, metavar='N', help='with --indoor: how often (default 1)')
+    add('--track-width', type=float, metavar='M', help='with --indoor: distance of left and right '
+        'wheels (default 0.3)')
     add('--config', metavar='FILE', help='ROS parameter file, as for replay')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
@@ -59,6 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Predict and print; return 0."""
+    if args.indoor:
+        return _indoor(args)
     from odocal_ros.library.plan import plan
     from odocal_ros.offline.plan_text import screen
     drive = {name: getattr(args, name) for name in (
@@ -71,6 +83,23 @@ def run(args: argparse.Namespace) -> int:
         say('')
     else:
         say(screen(planned))
+    return 0
+
+
+def _indoor(args: argparse.Namespace) -> int:
+    """Predict and print runs of a small robot; return 0."""
+    from odocal_ros.library.plan_indoor import plan_indoor
+    from odocal_ros.offline.plan_text import indoor_screen
+    asked = {'reference': args.reference, 'drive': args.drive, 'size': args.size,
+             'rounds': args.rounds, 'speed': args.speed, 'track_width': args.track_width,
+             'slip': args.slip_walk}
+    runs = plan_indoor(args.indoor, imu=not args.no_imu, config=_config(args), **{
+        name: value for name, value in asked.items() if value is not None})
+    if args.json:
+        json.dump([one.to_dict() for one in runs], sys.stdout, indent=2, allow_nan=False)
+        say('')
+    else:
+        say(indoor_screen(runs))
     return 0
 
 

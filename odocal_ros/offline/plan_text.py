@@ -10,9 +10,10 @@ from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE
 from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
+from odocal_ros.library.plan_indoor import PlannedRun, SHOWN
 from odocal_ros.library.what_helps import Change, ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines
-from odocal_ros.output.figures import length, share, table_row, time_span
+from odocal_ros.output.figures import length, share, table_row, time_span, wrapped
 
 WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 
@@ -22,6 +23,38 @@ def screen(planned: Planned) -> str:
     before, sigmas, found = planned.plan, planned.sigmas, planned.helps
     return '\n'.join([*_head(before, sigmas), '', *_methods(before), '', *_budgets(before),
                       *_helps(before, found), *_reasons(before)])
+
+
+def indoor_screen(runs: list[PlannedRun]) -> str:
+    """Return the predictions of runs of a small robot as one screen of plain text."""
+    robot, by = runs[0].robot, runs[0].method
+    names = [name for name in SHOWN if name in by.estimates
+             and not (name == 'yaw_mounting_angle' and by.name == 'planar')]
+    drift = f', drift {1000 * robot.drift:.2g} mm' if robot.drift else ''
+    where = ' at rests' if robot.at_rests else f' at {robot.rate:g} Hz'
+    lines = [f'{robot.drive}, {robot.wheels} wheels, {"with" if robot.imu else "without"} an IMU; '
+             f'method {by.name}',
+             f'positions {1000 * robot.white:.2g} mm{where}{drift}; wheel slip '
+             f'{1000 * robot.slip:.2g} mm/√s', '']
+    heads = ['scale', 'right / left', *(SHOWN[name] for name in names[1:])]
+    widths = (28, *(max(len(head) + 3, 11) for head in heads))
+    lines.append(table_row(('predicted sigma', *heads), widths))
+    for one in runs:
+        name = f'{one.name}, {one.motion.distance:.0f} m, {one.motion.t[-1]:.0f} s'
+        sigmas = [one.sigma(n) for n in (names[0], 'ratio', *names[1:])]
+        lines.append(table_row((name, *(_indoor_sigma(sigma, head) for sigma, head in zip(
+            sigmas, heads, strict=True))), widths))
+    missing = {r.text: r for one in runs for r in one.method.reasons
+               if len(runs) == 1 and r.code.name.endswith(('_NOT_DETERMINED', '_SEPARABLE'))}
+    for r in missing.values():
+        lines += ['', *wrapped(f'{r.code.name}: {r.text}. {r.remedy}')]
+    return '\n'.join(lines)
+
+
+def _indoor_sigma(sigma: float | None, head: str) -> str:
+    if sigma is None:
+        return 'unknown'
+    return f'{math.degrees(sigma):.2g} deg' if head == 'yaw' else f'{100 * sigma:.2g} %'
 
 
 def _head(before: Plan, sigmas: Sigmas) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Collection
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.inputs import topic_option
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.topics import candidates, choose_topics, imu_needed, named, wanted
+from odocal_ros.library.topics import candidates, choose_topics, named, wanted
 from odocal_ros.messages.sensor_types import FIX
 from odocal_ros.outside.names import for_shell
 from odocal_ros.settings.config import Config, with_settings
@@ -78,7 +78,7 @@ def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str,
 def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
             mapping: dict[str, str], extra: list[str]) -> str:
     """Return the suggested replay command; '' if an input is missing."""
-    needed = {'odometer', 'fix'} | ({'imu'} if imu_needed(config) else set())
+    needed = {'odometer', 'fix'} | ({'imu'} if config.odometer.needs_imu else set())
     if not needed <= mapping.keys():
         return ''
     words = ['odocal', 'replay', path]

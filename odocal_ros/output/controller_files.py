@@ -112,11 +112,14 @@ def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -
 def _device_settings(scale: float, pulses: float) -> list[tuple[str, str]]:
     """Return (where it goes, the line) for each system; a line is empty where it lacks a fact."""
     per_metre = f'{1 / scale:.9g}'
-    wheel = ''
+    wheel, radius = '', ''
     if pulses and pulses == round(pulses):
         wheel = f'SETWHEELPARAMETERS {pulses:.0f} {pulses * scale:.9g} {scale:.9g}'
+        radius = f'WENC_RADIUS {pulses * scale / tau:.7g}'
+    needed = 'Needs a whole number in wheels.pulses_per_revolution.'
     return [
-        ('u-blox F9 dead reckoning (UBX-CFG-VALSET, key 0x40070007, U4): whole um per tick',
+        ('u-blox F9 dead reckoning (UBX-CFG-VALSET, key 0x40070007, U4): whole um per tick, '
+         f'rounded by up to {0.5 / scale:.2g} ppm',
          f'CFG-SFODO-FACTOR = {scale * MICRO:.0f}'),
         ('SBG Systems, sbg_ros2_driver with device configuration by ROS parameters: group odom; '
          'with the sbgECom library: member gain of SbgEComOdoConf, sent by '
@@ -126,4 +129,6 @@ def _device_settings(scale: float, pulses: float) -> list[tuple[str, str]]:
          f'Pulses per metre = {per_metre}'),
         ('NovAtel SPAN, firmware up to 7.06: ticks per revolution, circumference m, spacing of '
          'ticks m. Later firmware (DMICONFIG) takes no size; it estimates it.'
-         + ('' if wheel else ' Needs a whole number in wheels.pulses_per_revolution.'), wheel)]
+         + ('' if wheel else f' {needed}'), wheel),
+        ('ArduPilot rover: wheel radius m, '
+         + (f'for WENC_CPR {pulses:.0f}' if radius else f'for WENC_CPR. {needed}'), radius)]

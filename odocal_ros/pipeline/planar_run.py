@@ -55,11 +55,12 @@ def planar_leg(leg: Leg, config: Config, notes: Sequence[Reason],
     if run is None:
         methods = {PLANAR: refused(lacking, inputs.scale_unit)}
         return leg_result(leg, inputs, (*reasons, *lacking), methods, deciding=(PLANAR,))
-    method, more = _guarded(run, inputs, config)
+    method, more = _guarded(run, inputs, config, progress)
     return leg_result(leg, inputs, reasons, {PLANAR: method}, deciding=(PLANAR,), **more)
 
 
-def _guarded(run: Run, inputs: Inputs, config: Config) -> tuple[MethodResult, dict[str, Any]]:
+def _guarded(run: Run, inputs: Inputs, config: Config, progress: Callable[[Stage], None],
+             ) -> tuple[MethodResult, dict[str, Any]]:
     """Return the method's result and what a report draws; what breaks costs the method alone."""
     from odocal_ros.calib.planar.fit import fit
     unit = inputs.scale_unit
@@ -68,7 +69,8 @@ def _guarded(run: Run, inputs: Inputs, config: Config) -> tuple[MethodResult, di
         return refused([why], unit)
     try:
         with raised_if_wild():
-            found = fit(run, _known(run, inputs, config))
+            found = fit(run, _known(run, inputs, config), lambda passes, change: progress(
+                Stage(PLANAR, passes=passes, change=change)))
             method = result_of(found, unit, nominal_scale(config, unit), config,
                                shortened_by_slopes(inputs))
             return method, _tracks(run, found)

@@ -70,8 +70,8 @@ def arrival_jitter(t: Floats) -> float | None:
 
 
 def intervals(t: Floats) -> list[float]:
-    """Return candidates of the sender's interval, s: the median, the mean if different."""
-    interval_span = 5.0    # s over which the mean is taken
+    """Return candidates of the sender's interval, s: that of sent rows, of received ones."""
+    interval_span = 5.0    # s over which means are taken
     n = max(1, int(interval_span * (len(t) - 1) / max(t[-1] - t[0], interval_span)))
     step = np.diff(t)
     usual, mean = median(step), median(t[n:] - t[:-n]) / n
@@ -81,7 +81,10 @@ def intervals(t: Floats) -> list[float]:
     even_share = 0.3    # share of the intervals that are within a quarter of the usual one
     even = np.mean(np.abs(step - usual) < usual / 4) > even_share
     # where more than half are lost the median is not the interval
-    return [usual, mean] if even and usual > mean / 2 else [mean]
+    if not even or usual < mean / 2:
+        return [mean]
+    sent = np.append(0.0, np.cumsum(np.round(step / usual)))    # with the lost rows
+    return [median((t[n:] - t[:-n]) / np.maximum(sent[n:] - sent[:-n], 1.0)), mean]
 
 
 def _put_back(t: Floats, travel: Floats, least: float) -> Floats:
@@ -167,7 +170,9 @@ def _soonest(t: Floats, usual: float) -> Floats:
     rows = usual * np.arange(len(t))
     window = min(int(ON_TIME_WINDOW / usual) + 1, len(t))
     least = _least_of_next(t - rows, window)
-    least[len(t) - window + 1:] = -np.inf       # of whole windows only
+    # within a window of the end, an increase by whole intervals is of lost rows
+    end, jitter = least[len(t) - window:], 0.25     # of an interval: the least jitter of few rows
+    end[:] = end[0] + usual * np.floor((end - end[0]) / usual + jitter)
     even = rows - _least_of_next(-least[::-1], window)[::-1]
     out: Floats = even + np.median(t - even)      # a constant delay is not corrected
     return out

@@ -26,7 +26,7 @@ from odocal_ros.screening.glitches import (
 )
 from odocal_ros.settings.config import Config
 
-LABEL = {slot: one.label for slot, one in INPUTS.items()} | {'fix_velocity': 'fix velocity'}
+LABEL = {slot: one.label for slot, one in INPUTS.items()}
 NOTHING = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
            **dict.fromkeys(WHEELS, Code.NO_ODOMETER)}
 

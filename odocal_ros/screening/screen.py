@@ -9,7 +9,7 @@ is an IMU stamp, so the IMU's time offset is subtracted from those of the others
 """
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,20 +18,20 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import by_step
+from odocal_ros.data.samples import FixSamples, ImuSamples, VelocitySamples
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.nav.statistics import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
 from odocal_ros.screening.clocks import judge_clocks, offsets
 from odocal_ros.screening.fix_screen import contradicted, reckoned, usable_fixes
+from odocal_ros.screening.gaps import topic_gap
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import with_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import usable_rows
-from odocal_ros.screening.wheel_travel import wheels
+from odocal_ros.screening.wheel_travel import Wheels, wheels
 from odocal_ros.settings.config import Config, ImuConfig, SIDES
 
 MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not a second IMU
@@ -47,15 +47,51 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     leg, unfelt = with_force(leg, config)
     leg, local = without_north(leg, config)
     found: list[Reason] = [*unfelt, *local, *_other_imus(leg, config.imu)]
-    for slot in ('imu', 'odometer', 'fix'):
-        if not len(getattr(leg, slot).stamp_ns):
-            code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
-            if any(r.code is code for r in found):      # a frame_id that is not sent
-                continue
-            found.append(Reason(code, f'no {INPUTS[slot].label} message between the marks'))
-    offset = offsets(config)
+    found += _missing(leg, found)
     if judged:
         found += judge_clocks(leg, config)
+    rows = _usable(leg, config, judged, found)
+    inputs = _in_base(leg, config, rows, _fixes(leg, config, rows, found))
+    inputs = replace(inputs, felt=not unfelt, local=bool(local))
+    found += _wheel_gaps(leg, rows.wheels)
+    if judged:
+        found += frozen(inputs.t_imu, rows.imu.w_i, rows.wheels.mean, config.leg.max_gap)
+        wheels, why = _axles(inputs, rows.wheels)
+        inputs = replace(inputs, **_travel(leg, wheels))
+        found += why
+    let_go()
+    if judged and not local:
+        inputs = _without_reckoned(inputs, config, found)
+    return (inputs if unfelt else _without_reversing(inputs, config, found)), tuple(found)
+
+
+def _missing(leg: Leg, found: list[Reason]) -> list[Reason]:
+    """Return the reasons for required topics without messages, but for those found already."""
+    codes = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}
+    known = {reason.code for reason in found}      # a frame_id that is not sent
+    return [Reason(code, f'no {INPUTS[slot].label} message between the marks')
+            for slot, code in codes.items()
+            if not len(getattr(leg, slot).stamp_ns) and code not in known]
+
+
+@dataclass(frozen=True, eq=False)
+class Usable:
+    """Usable rows of each topic, as sent, and their times from the start mark, s."""
+
+    imu: ImuSamples
+    t_imu: Floats
+    heading: Any
+    t_heading: Floats
+    velocity: VelocitySamples
+    t_velocity: Floats
+    wheels: Wheels
+    fix: FixSamples
+    t_fix: Floats
+
+
+def _usable(leg: Leg, config: Config, judged: bool, found: list[Reason]) -> Usable:
+    """Return the usable rows of each topic; add the reasons for the others."""
+    offset = offsets(config)
 
     def rows(slot: str) -> tuple[Any, Floats]:
         return usable_rows(slot, leg, config, offset[slot], found)
@@ -70,49 +106,68 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     travelled = wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
               for form in (leg.form, leg.form_right) if form and form.chosen]
-    fix, t_fix = rows('fix')
+    return Usable(imu, t_imu, heading, t_heading, velocity, t_velocity, travelled, *rows('fix'))
+
+
+def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[str, Any]:
+    """Return fixes and velocity as fields of Inputs; add the reasons against others."""
+    fix, velocity, t_velocity = rows.fix, rows.velocity, rows.t_velocity
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
     found += why
-    _gaps('fix', t_fix, found)       # of the stream: what is screened here is no gap in it
-    t_fix, geodetic = t_fix[use], np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
-    unlike = contradicted(t_velocity, velocity.velocity_n, t_fix, geodetic, covariance[use]) \
+    found += topic_gap('fix', rows.t_fix)       # of the stream: a rejected fix is no gap in it
+    t_fix, covariance = rows.t_fix[use], covariance[use]
+    geodetic = np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
+    unlike = contradicted(t_velocity, velocity.velocity_n, t_fix, geodetic, covariance) \
         if config.gnss.use_velocity else ()
     found += unlike
     some = slice(0 if unlike else None)
-    _gaps('odometer', travelled.mean.t, found)
-    for slot, one in zip(leg.wheel_slots[1:], travelled.each[1:], strict=False):
-        _gaps(slot, one.t, found)        # the mean stands on the first wheel's rows
-    if judged:
-        found += frozen(t_imu, imu.w_i, travelled.mean, config.leg.max_gap)
+    return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
+            'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum()),
+            't_velocity': t_velocity[some], 'velocity_n': velocity.velocity_n[some],
+            'velocity_variance': velocity.variance_n[some]}
+
+
+def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:
+    """Return the arrays of a leg, the IMU turned by its nominal mounting."""
+    imu, heading = rows.imu, rows.heading
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
-    t_stop = (leg.stop_ns - leg.start_ns) * 1e-9
-    w_b = _turned(imu.w_i, config.imu.gyro_scale, C_bi)
-    f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
-    if judged and (len(travelled.each) > 1 and not unfelt or len(travelled.each) > len(SIDES)):
-        travelled, of_axles = judged_axles(travelled, (t_imu, w_b, f_b), (0.0, t_stop))
-        found += of_axles
-    let_go()
-    inputs = Inputs(
-        t_stop=t_stop, t_imu=t_imu, w_b=w_b, f_b=f_b,
+    return Inputs(
+        t_stop=(leg.stop_ns - leg.start_ns) * 1e-9, t_imu=rows.t_imu,
+        w_b=_turned(imu.w_i, config.imu.gyro_scale, C_bi),
+        f_b=_turned(imu.f_i, config.imu.accel_scale, C_bi),
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
-        travel=travelled.mean,
-        # of two wheels of unknown sides only the mean has a meaning
-        travels=travelled.several if leg.form.sides else (),
-        doubt_t=travelled.doubt_t, doubt_sigma=travelled.doubt_sigma,
-        t_fix=t_fix, geodetic=geodetic, covariance_n=covariance[use],
-        t_heading=t_heading, q_heading=heading.q_ni, heading_variance=heading.yaw_variance,
-        t_velocity=t_velocity[some], velocity_n=velocity.velocity_n[some],
-        velocity_variance=velocity.variance_n[some],
-        fixes_rejected=len(leg.fix.stamp_ns) - int(use.sum()),
-        scale_unit=leg.form.scale_unit, felt=not unfelt, local=bool(local))
-    if judged and not local:
-        inputs = _without_reckoned(inputs, config, found)
-    if unfelt:
-        return inputs, tuple(found)
-    back = reversed_starts(inputs.travel, t_imu, w_b, f_b, (0.0, t_stop))
+        t_heading=rows.t_heading, q_heading=heading.q_ni, heading_variance=heading.yaw_variance,
+        scale_unit=leg.form.scale_unit, **_travel(leg, rows.wheels), **fixes)
+
+
+def _travel(leg: Leg, wheels: Wheels) -> dict[str, Any]:
+    """Return the travel of wheels as fields of Inputs."""
+    # of two wheels of unknown sides only the mean has a meaning
+    return {'travel': wheels.mean, 'travels': wheels.several if leg.form.sides else (),
+            'doubt_t': wheels.doubt_t, 'doubt_sigma': wheels.doubt_sigma}
+
+
+def _wheel_gaps(leg: Leg, wheels: Wheels) -> list[Reason]:
+    """Return the gaps of the wheels; the mean stands on the rows of the first one."""
+    others = zip(leg.wheel_slots[1:], wheels.each[1:], strict=False)
+    return [*topic_gap('odometer', wheels.mean.t),
+            *(reason for slot, one in others for reason in topic_gap(slot, one.t))]
+
+
+def _axles(inputs: Inputs, wheels: Wheels) -> tuple[Wheels, list[Reason]]:
+    """Return the wheels that count, and reasons; of one axle only with an accelerometer."""
+    if len(wheels.each) > (1 if inputs.felt else len(SIDES)):
+        return judged_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop))
+    return wheels, []
+
+
+def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
+    """Return inputs with the counts of starts in reverse made negative; add the reason."""
+    back = reversed_starts(inputs.travel, inputs.t_imu, inputs.w_b, inputs.f_b,
+                           (0.0, inputs.t_stop))
     metres = place(inputs, config).rough or None if len(back) else None
     found += said_of(back, inputs.travel, metres, BY_IMU, config.odometer.signed)
-    return inputs.mirrored(back), tuple(found)
+    return inputs.mirrored(back)
 
 
 def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
@@ -137,30 +192,6 @@ def _turned(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:
         return vector_i if scale == 1.0 else vector_i * scale
     x, y, z = vector_i.T
     return np.stack([x * a + y * b + z * c for a, b, c in scale * C_bi], -1)
-
-
-def _gaps(slot: str, t: Floats, found: list[Reason]) -> None:
-    """Add TOPIC_GAP for the longest gap of a topic far beyond its own rhythm."""
-    gaps = gaps_in_rhythm(t)
-    if len(gaps):
-        begin, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]
-        found.append(Reason(Code.TOPIC_GAP, f'{INPUTS[slot].label} gap of {end - begin:.2f} s at '
-                            f't = {begin:.2f} s (median interval {np.median(np.diff(t)):.3f} s)'))
-
-
-def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
-    """Return IMU_GAP where the IMU misses more than ``limit`` s between t_from and t_stop."""
-    t = t_imu[np.searchsorted(t_imu, t_from - 1e-9):
-              np.searchsorted(t_imu, t_stop + 1e-9, side='right')]
-    long = np.flatnonzero(by_step(lambda t: np.diff(t) > limit, t))
-    ends = [(t_from, t[0]), *zip(t[long], t[long + 1], strict=True), (t[-1], t_stop)] \
-        if len(t) else [(t_from, t_stop)]
-    gaps = [(float(b - a), float(a)) for a, b in ends if b - a > limit]
-    if not gaps:
-        return ()
-    length, at = max(gaps)
-    return (Reason(Code.IMU_GAP, f'no IMU data for {length:.2f} s at t = {at:.2f} s ({len(gaps)} '
-                   f'gap{"s" * (len(gaps) > 1)}; the limit is {limit:g} s)'),)
 
 
 def _other_imus(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:

@@ -32,6 +32,7 @@ HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'c
 NAN = math.nan
 SIDES = ('left', 'right')     # names of two wheels
 DRIVES = DIFFERENTIAL, SKID, MECANUM = 'differential', 'skid', 'mecanum'
+HOLONOMIC = (MECANUM,)        # drives that move sideways
 
 TYPICAL = 'typical value of IMUs sold in this grade'
 
@@ -91,6 +92,11 @@ class OdometerConfig:
     def own_topics(self) -> bool:
         """Return True if the left and the right wheel have a topic each."""
         return 'topic' in (self.left, self.right)
+
+    @property
+    def needs_imu(self) -> bool:
+        """Return False for several wheels, which are sufficient on a level floor."""
+        return len(self.keys) < len(SIDES) and self.drive == DIFFERENTIAL
 
     def names(self, count: int) -> tuple[str, ...]:
         """Return the names of so many wheels, for people and results: '' of a single one."""

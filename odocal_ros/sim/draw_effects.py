@@ -213,6 +213,12 @@ def filtered_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
             {'speed_filter': float(rng.uniform(0.2, 0.6))})
 
 
+def clocks(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Stamp each topic by a quartz of its own."""
+    odometer, fix = rng.uniform(2e-5, 1e-4, 2) * rng.choice((-1, 1), 2)
+    return {}, {'odometer_clock_rate': float(odometer), 'fix_clock_rate': float(fix)}
+
+
 def late_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Stamp fixes at reception, after a latency that varies."""
     return {'fix_delay': 0.25}, {'fix_jitter': float(rng.uniform(0.05, 0.1))}
@@ -245,4 +251,4 @@ EFFECTS = {f.__name__: f for f in (
     lever_arms, receiver_lag, fix_stamps, slow_errors, multipath, covariance, outages)}
 # only with --effect NAME: receivers and buses of some vehicles
 RARE = {f.__name__: f for f in (fused_fixes, tracked_fixes, held_speed, filtered_speed,
-                                late_fixes, tunnels, reflections, kerbs)}
+                                late_fixes, tunnels, reflections, kerbs, clocks)}

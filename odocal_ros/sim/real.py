@@ -21,7 +21,8 @@ WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_slope',
           'accel_slope', 'warm_rise', 'rectification', 'speed_law', 'warming', 'imu_arm_error',
           'odometer_arm_error', 'antenna_arm_error', 'receiver_odometer', 'sideslip',
-          'squat', 'body_roll', 'tunnel_odometer', 'tunnel_heading')
+          'squat', 'body_roll', 'tunnel_odometer', 'tunnel_heading', 'odometer_clock_rate',
+          'fix_clock_rate')
 PAIRS = {'slow_errors': 'sigma and correlation time, such as ((1.2,60),(0.9,900))',
          'tunnels': 'begin and length, such as ((200,60),(400,30))'}
 POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_factor',
@@ -62,6 +63,7 @@ class Real:
     speed_hold: float = 0.0          # change of speed that is published
     speed_filter: float = 0.0        # s, time constant of a low-pass filter on the speed
     odometer_jitter: float = 0.0     # s, 1 sigma, on top of odometer_delay
+    odometer_clock_rate: float = 0.0    # relative, of its clock against that of the IMU
     speed_law: float = 0.0           # relative growth of the tyres at 36 m/s, as v^2
     warming: float = 0.0             # relative growth of the tyres, warm against cold
     warming_time: float = 600.0      # s of driving
@@ -98,6 +100,7 @@ class Real:
     tunnel_heading: float = 0.0      # rad, heading error at the end of a tunnel's first minute
     drops: float = 0.0               # share of the fixes that never come
     fix_jitter: float = 0.0          # s, 1 sigma, on top of fix_delay
+    fix_clock_rate: float = 0.0      # relative, of its clock against that of the IMU
     stated_factor: float = 1.0       # stated sigma over true sigma
     told_grade: str | None = None    # imu.grade as set; None: the right one
 

@@ -131,9 +131,10 @@ def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
 
 
 def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
-    """Return stamps that are late by a topic's delay and jitter."""
-    delay, jitter = (getattr(owner, f'{name}_{what}') for owner, what in (
-        (options, 'delay'), (options.real, 'jitter')))
+    """Return stamps that are late by a topic's delay and jitter, by a clock of its own."""
+    delay, jitter, rate = (getattr(owner, f'{name}_{what}') for owner, what in (
+        (options, 'delay'), (options.real, 'jitter'), (options.real, 'clock_rate')))
+    ns = ns + np.rint(rate * ns).astype(np.int64)
     if not jitter:
         late: Ints = ns + round(delay * 1e9)
         return late

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.estimator.factors.odometer_filter import as_rolled, REACH
-from odocal_ros.estimator.state import M, ODO_DELAY, ODO_LAG2
+from odocal_ros.estimator.state import M, ODO_CLOCK, ODO_DELAY, ODO_LAG2
 from odocal_ros.nav.odometer import Travel
 
 SPEED, SWING, RATE = 10.0, 5.0, 0.5     # m/s, m, rad/s: travel SPEED t + SWING sin(RATE t)
@@ -66,3 +66,13 @@ def test_a_drive_that_ends_in_motion_has_the_acceleration_of_its_last_second():
     readings = Travel(AT, push * AT**2 / 2, 0.0)
     expected = push * (AT**2 - T**2) / 2
     np.testing.assert_allclose(as_rolled(readings, constants)(AT), expected, atol=1e-9)
+
+
+def test_a_fast_clock_is_corrected():
+    """The delay is that at 0, where the clocks agree but for it."""
+    fast, constants = 1e-3, np.zeros(M)
+    constants[ODO_DELAY], constants[ODO_CLOCK] = T, fast
+    readings = Travel(FINE * (1 + fast) + T, travel(FINE), 0.0)
+    # readings are straight lines between samples
+    loose = SWING * RATE**2 * (FINE[1] - FINE[0])**2 / 8 + 1e-9
+    np.testing.assert_allclose(as_rolled(readings, constants)(AT), travel(AT), atol=loose)

@@ -197,4 +197,4 @@ def test_a_velocity_is_screened():
     inputs, found = screen(replace(leg, fix_velocity=changed(leg.fix_velocity, velocity_n=spoil)),
                            config)
     assert len(inputs.t_velocity) == len(leg.fix_velocity.stamp_ns) - 3
-    assert any('3 of' in r.text and 'fix velocity messages' in r.text for r in found)
+    assert any('3 of' in r.text and 'GNSS velocity messages' in r.text for r in found)

@@ -27,11 +27,13 @@ from odocal_ros.estimator.state import (
     FIX_LAG2,
     FIX_TIME,
     GNSS_ARM,
+    GNSS_CLOCK,
     GNSS_DELAY,
     GYRO,
     IMPERFECT,
     LN_K,
     M,
+    ODO_CLOCK,
     ODO_DELAY,
     ODO_LAG2,
     P,
@@ -50,6 +52,8 @@ from odocal_ros.nav.odometer import Travel
 
 pytestmark = pytest.mark.slow
 N = WITH_SLOW
+CLOCKS = {GNSS_CLOCK: GNSS_DELAY, ODO_CLOCK: ODO_DELAY}    # and the delays they grow to
+END = 60.0      # s
 # relative errors that are left out of derivatives. Motion: Earth rate times a second, 7e-5 rad,
 # and half the attitude residual, 2e-4. Instants: what a turn of 1e-3 rad leaves of second order
 LOOSE = {'motion': 3e-4, 'fixes': 1e-3, 'velocity': 2e-3, 'heading': 2e-3, 'steps': 2e-3}
@@ -76,7 +80,7 @@ def shaken():
     """Return the problem of a leg with all sensors, and a state where no term vanishes."""
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, heading_sigma=0.0,
                             antenna_lever_arm=(0.5, -0.3, 1.2))
-    leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0,
+    leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=END,
                   imu_arm=np.array([1.2, 0.3, 0.4]))
     problem, state = problem_of(leg, config), truth(drive, config, leg)
     rng = np.random.default_rng(1)
@@ -86,8 +90,8 @@ def shaken():
     # derivatives by biases take these as constant over HILL_INTERVALS: no centre of bumps
     # of the size that there is: derivatives leave out how these change what the others do
     c[SPEED_OFFSET], c[FIX_TIME] = 0.0, np.log(5.0)
-    c[IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.0, 0.03, 0.003, *[0.0] * 6,
-                     1e3, 0.0]
+    c[IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03, 0.003,
+                     *[0.0] * 6, 1e3, 0.0]
     c[FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
     c[VELOCITY_LAG2] = 2.1e-4
     return problem, state.moved(step, c)
@@ -139,9 +143,10 @@ def test_derivatives_are_those_of_finite_differences(shaken, stepping, name):
         if (i, name) == (N + ODO_LAG2, 'motion'):   # of seconds: test_odometer_filter.py
             continue
         h = 1.0 if (i, name) == (E, 'motion') else 1e-5 if name == 'motion' else 1e-4
+        h /= END if i - N in CLOCKS else 1.0
         point = problem
-        if (i, name) == (N + ODO_DELAY, 'motion'):      # counts have steps, a derivative has none
-            point, h = without_steps(problem, state), 1e-3
+        if i - N in (ODO_DELAY, ODO_CLOCK) and name == 'motion':      # counts have steps
+            point, h = without_steps(problem, state), 1e-3 / (END if i - N in CLOCKS else 1.0)
 
         def raw(size, i=i, point=point):
             step, c = np.zeros((len(state.t), N)), np.zeros(M)
@@ -154,10 +159,12 @@ def test_derivatives_are_those_of_finite_differences(shaken, stepping, name):
         expected = constants[:, :, i - N] if i >= N else np.where(
             even[k][:, None], begin[:, :, i], end[:, :, i])
         loose = LOOSE[name] if name == 'motion' else BIASES.get(i, LOOSE[name])
-        loose = SWING.get(name, loose) if i in (N + GNSS_DELAY, N + ODO_DELAY) else loose
+        loose = SWING.get(name, loose) if i - N in (GNSS_DELAY, ODO_DELAY, *CLOCKS) else loose
         # ahead turns with the bias as well: half as much again of what a turn makes of it
         loose = 1.5 * loose if name == 'steps' and i in BIASES else loose
         found, size = (raw(h) - raw(-h)) / (2 * h), max(1.0, np.abs(expected).max())
+        if i - N in CLOCKS:         # a delay of so much at the end of the leg
+            size = max(1.0, END * np.abs(constants[:, :, CLOCKS[i - N]]).max())
         if name == 'velocity' and i - N in MEANS:
             found, expected, loose = by_second(found, k), by_second(expected, k), MEANS[i - N]
         np.testing.assert_allclose(found, expected, err_msg=str(i), atol=loose * size)

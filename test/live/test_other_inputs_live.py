@@ -55,6 +55,20 @@ def skid(tmp_path_factory):
 
 
 @pytest.fixture(scope='module')
+def bare(tmp_path_factory):
+    """Drive 90 s of a robot with two wheels and motion capture, without an IMU."""
+    return driven(tmp_path_factory.mktemp('bare'), {
+        'scenario': 'indoor', 'duration': 110.0, 'imu': False, 'odometer': 'angle',
+        'odometer_rate': 25.0, 'reference': 'mocap', 'fix_rate': 10.0, 'slip_walk': 5e-4,
+        'seed': 3},
+        lambda drive: {'imu': None,
+                       'odometer': encode.joints('joint_states', joints(drive)),
+                       'fix': encode.pose('mocap', drive.fix, drive.positions())},
+        lambda drive: {'odometer.left': drive.joints[0], 'odometer.right': drive.joints[1]},
+        rest_s=4.0, leg_s=100.0, speed=10.0, names={'fix': '/mocap', 'odometer': '/joint_states'})
+
+
+@pytest.fixture(scope='module')
 def four(tmp_path_factory):
     """Drive some minutes of town with four wheels, the front ones of which steer."""
     return driven(tmp_path_factory.mktemp('four'), {
@@ -67,7 +81,7 @@ def four(tmp_path_factory):
         rest_s=30.0, leg_s=160.0)
 
 
-@pytest.mark.parametrize('leg', ['posed', 'skid', 'four'])
+@pytest.mark.parametrize('leg', ['posed', 'skid', 'bare', 'four'])
 def test_a_journal_replays_to_the_last_bit(leg, request):
     seen = request.getfixturevalue(leg)
     assert 'no NavSatFix' not in check_replay(seen.live, seen.journal)    # it names its topics
@@ -89,6 +103,20 @@ def test_skid_steering_gives_the_effective_width(skid):
     assert abs(width['value'] - true) < SIGMAS * width['sigma'] < 0.02 * true
 
 
+def test_a_robot_without_an_imu_is_calibrated_by_its_wheels(bare):
+    assert bare.live['verdict'] == 'accepted'
+    assert 'imu' not in bare.live['inputs'][0]['topics']
+    assert 'not observable: yaw and pitch (no IMU)' in bare.node.text
+    for side, true in zip(('left', 'right'), bare.drive.truth.wheel_scales, strict=True):
+        scale = bare.live['result'][f'scale_factor_{side}']
+        assert scale['method'] == 'planar'
+        assert abs(scale['value'] - true) < SIGMAS * scale['sigma'] < 0.004 * true
+    width, true = bare.live['result']['track_width'], bare.drive.options.track_width
+    assert abs(width['value'] - true) < SIGMAS * width['sigma'] < 0.01 * true
+    assert (bare.status['scale_ok'], bare.status['yaw_ok']) == ('yes', 'unknown')
+    assert 'no forecast for the leg' not in bare.node.text
+
+
 def test_status_and_answer_have_each_of_four_wheels_by_its_name(four):
     for name, true in zip(four.drive.joints, four.drive.truth.wheel_scales, strict=True):
         assert f', {name} 0.3' in four.stop.message
@@ -98,6 +126,19 @@ def test_status_and_answer_have_each_of_four_wheels_by_its_name(four):
         assert four.live['result'][f'scale_factor_{name}']['value'] == value
     assert four.status['left_right_ok'] == 'unknown'
     assert 'WHEELS_STEERED' in four.status['reasons']
+
+
+def test_an_imu_is_required_if_it_is_published(start, connect):
+    """A node with two wheels does not ask for an IMU until somebody publishes one."""
+    from sensor_msgs.msg import Imu
+    start('-p', 'odometer.left:=left', '-p', 'odometer.right:=right')
+    client = connect()
+    missing = client.until(state='waiting')['missing']
+    assert 'no odometer on /odometer' in missing
+    assert '/imu/data' not in missing
+    client.node.create_publisher(Imu, '/imu/data', 1)
+    wait_for(lambda: '/imu/data: 1 publisher found (reliable) but no message yet'
+             in client.status['missing'], 'the IMU in the status')
 
 
 def test_one_topic_is_not_odometer_and_reference(start):

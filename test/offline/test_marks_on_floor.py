@@ -36,6 +36,18 @@ def asked(made, **more):
 TOPICS = {'odometer': '/odometer/left', 'odometer_right': '/odometer/right'}
 
 
+def test_marks_are_sufficient_without_an_imu(tmp_path):
+    """Four steps between marks are compared with the wheels at first: fewer fit any path."""
+    made, bag = robot(tmp_path, imu=False)
+    found = calibrate_bag(bag, TOPICS, asked(made, **{'verdict.max_scale_sigma': 0.005}))
+    assert found.verdict.value == 'accepted', found.reasons
+    for name, true in (('scale_factor_left', made.truth.wheel_scales[0]),
+                       ('scale_factor_right', made.truth.wheel_scales[1]),
+                       ('track_width', made.options.track_width)):
+        one = found.result.estimates[name]
+        assert abs(one.value - true) < 3 * one.sigma < 3 * 4e-3 * true, name
+
+
 def test_without_noise_wheels_and_width_are_those_of_the_closed_form(tmp_path):
     """
     Borenstein and Feng 1996, with the counts of each side and turn instead of end points.

@@ -194,8 +194,10 @@ def test_the_methods_asked_for_are_planned(method, shown, by):
 
 
 @pytest.mark.core
-def test_the_page_shows_what_is_printed(capsys):
-    section = (Path(__file__).parents[2] / 'docs' / 'planning.md').read_text(encoding='utf-8')
+@pytest.mark.parametrize('begin', ['# Plan a drive', '## Small robots'])
+def test_the_page_shows_what_is_printed(begin, capsys):
+    page = (Path(__file__).parents[2] / 'docs' / 'planning.md').read_text(encoding='utf-8')
+    section = page.partition(begin)[2]
     command = next(line for line in section.splitlines() if line.startswith('odocal plan '))
     assert main(shlex.split(command)[1:]) == 0
     shown = section.partition('```text\n')[2].partition('```')[0].split()

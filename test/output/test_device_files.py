@@ -76,15 +76,17 @@ def test_devices_are_told_the_wheel_in_their_units(good):
     lines = texts(good, wheels__pulses_per_revolution=40.0)['wheel_input.txt'].splitlines()
     assert [line for line in lines if line and not line.startswith('#')] == [
         'CFG-SFODO-FACTOR = 50000', 'gain: 20.0', 'Pulses per metre = 20',
-        'SETWHEELPARAMETERS 40 2 0.05']
+        'SETWHEELPARAMETERS 40 2 0.05', 'WENC_RADIUS 0.3183099']      # 2 m / (2 pi)
+    assert '10 ppm' in ' '.join(lines)                         # 0.5 um of 50 000
     assert '# one pulse: 50000.0 ± 1.2 um; 20.00000 ± 0.00048 pulses/m' in lines
     assert all(len(line) <= 99 for line in lines[3:])
 
 
 @pytest.mark.parametrize('pulses', [0.0, 40.5])
-def test_novatel_is_left_out_without_whole_ticks_a_turn(good, pulses):
+def test_systems_that_count_turns_are_left_out_without_whole_ticks_a_turn(good, pulses):
     text = texts(good, wheels__pulses_per_revolution=pulses)['wheel_input.txt']
     assert 'SETWHEELPARAMETERS' not in text
+    assert 'WENC_RADIUS' not in text
     assert 'wheels.pulses_per_revolution' in text
 
 

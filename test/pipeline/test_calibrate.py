@@ -14,8 +14,6 @@ from drives import (
     rejecting,
     settings,
     shifted,
-    STRAIGHT,
-    TOWN,
 )
 import numpy as np
 import pytest
@@ -29,16 +27,6 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
-
-
-@pytest.fixture(scope='module')
-def made():
-    return drive(**STRAIGHT)
-
-
-@pytest.fixture(scope='module')
-def town():
-    return drive(**TOWN)
 
 
 @pytest.mark.parametrize('odometer', ['counts', 'angle', 'speed'])

@@ -137,6 +137,28 @@ def test_lost_rows_keep_their_place_among_late_ones(made, true):
     assert np.percentile(np.abs(later - np.median(later)), 95) < 0.006
 
 
+@pytest.mark.parametrize('share', [0.05, 0.15, 0.25])
+@pytest.mark.parametrize('seconds', [0.0, 0.001])
+def test_rows_lost_by_chance_do_not_make_the_others_late(made, true, share, seconds):
+    """By an arrival jitter of 1 ms no row is 20 ms late, the limit; a lost row would be."""
+    late = arrivals(made.odometer, seconds, lost=share)
+    inputs, found = screened(made, late)
+    assert Code.ODOMETER_LATE not in {r.code for r in found}
+    moved = inputs.travel.t - (late.stamp_ns - made.leg().start_ns) * 1e-9
+    # later by the median delay at most, earlier by the largest
+    assert moved.max() <= seconds + 1e-6
+    assert -moved.min() <= 20 * seconds + 1e-6
+
+
+@pytest.mark.parametrize('share', [0.0, 0.05, 0.25])
+def test_the_interval_is_that_of_the_sender_if_rows_are_lost(made, share):
+    """Stamps uniform over 6 ms: of 80 times 5 s the interval has a sigma of 0.05 ms."""
+    rng = np.random.default_rng(3)
+    t = made.odometer.stamp_ns * 1e-9 - made.odometer.stamp_ns[0] * 1e-9
+    t = (t + rng.uniform(0.0, 0.006, len(t)))[rng.random(len(t)) >= share]
+    assert late_rows.intervals(t)[0] == pytest.approx(0.02, abs=2e-5)
+
+
 def test_increments_that_arrive_together_are_all_counted(made):
     steps, form = increments(made)
     inputs, found = screened(made, arrivals(steps, 0.05), form=form)

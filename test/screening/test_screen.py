@@ -19,16 +19,6 @@ pytestmark = pytest.mark.core
 MS = 10**6
 
 
-@pytest.fixture(scope='module')
-def made():
-    return drive(**STRAIGHT)
-
-
-@pytest.fixture(scope='module')
-def leg(made):
-    return made.leg()
-
-
 def said(leg, config=None):
     inputs, found = screen(leg, config or Config())
     return inputs, {r.code: r.text for r in found}, [r.text for r in found]

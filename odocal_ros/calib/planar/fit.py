@@ -7,6 +7,7 @@ The planar estimate: poses, wheel constants and noise levels of a run, in one fi
 Gauss-Newton for poses and constants; levels by restricted likelihood, docs/decisions/0024.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -35,8 +36,12 @@ MOST_PASSES = 80
 CONVERGED = 0.02    # sigmas of a constant, and of the logarithm of a level
 
 
-def fit(run: Run, known: Known) -> Fit:
-    """Return the estimate of a run."""
+def fit(run: Run, known: Known, passed: Callable[[int, float], None] = lambda *_: None) -> Fit:
+    """
+    Return the estimate of a run.
+
+    passed : called with the passes made and the largest step of a constant, in sigmas.
+    """
     at_first = first_values(run, known.width)
     scale = (at_first.left + at_first.right) / 2
     state, c, prior = _begin(run, known, at_first)
@@ -59,18 +64,42 @@ def fit(run: Run, known: Known) -> Fit:
         for name, by in step.items():
             theta[name] *= float(np.exp(by))
         sigma = np.sqrt(np.diag(solved.covariance))
-        converged = bool((np.abs(solved.constants) < CONVERGED * sigma).all()
-                         and max(map(abs, step.values())) < CONVERGED)
-    # weights of the information of Student's distribution, which has 3/4 of a normal one
+        change = float((np.abs(solved.constants) / sigma).max())
+        converged = change < CONVERGED and max(map(abs, step.values())) < CONVERGED
+        passed(passes, change)
+    found = fit_at(run, known, state, c, theta, first, prior, student)
+    return replace(found, passes=passes, converged=converged, swapped=at_first.swapped)
+
+
+def fit_at(run: Run, known: Known, state: Floats, c: Floats, theta: dict[str, float],
+           first: Floats, prior: Floats, student: dict[str, Floats] | None = None) -> Fit:
+    """
+    Return the fit at states (n + 1, 5) and constants (m,): covariance, without a step.
+
+    theta : level of each noise, variance.   first : scale, scale and curvature to which residuals
+    refer.   prior : (m,) information.   student : weights, None: equal.
+    """
+    # the information of Student's distribution is 3/4 of that of a normal one
+    even = {'white': np.ones(len(run.node)), 'drift': np.ones(len(state))}
     student = {name: weight * (FREEDOM + 2) / (FREEDOM + 4) / weight.mean()
-               for name, weight in student.items()}
-    rows = _rows(run, known, state, c, metres, first, student)
-    solved = _solved({name: Equations(r, n) for name, r in rows.items()}, theta, prior, 0 * prior)
+               for name, weight in (student or even).items()}
+    rows = _rows(run, known, state, c, noise_path(run, first[0]), first, student)
+    parts = {name: Equations(r, len(state)) for name, r in rows.items()}
+    solved = _solved(parts, theta, prior, 0 * prior)
     names = (*run.wheels.names, 'ahead', 'left_of', 'delay',
              *(('gyro_scale', 'gyro_bias') if len(run.gyro) else ()))
     return Fit(names, c, solved.covariance, state[:, :3],
-               {name: float(np.sqrt(theta[name])) for name in ESTIMATED}, passes, converged,
-               at_first.swapped)
+               {name: float(np.sqrt(theta[name])) for name in ESTIMATED}, 0, True, False)
+
+
+def priors(run: Run, known: Known, left: float, right: float, width: float,
+           ) -> tuple[Floats, Floats]:
+    """Return first values and information of the constants, (m,), by scales and track width."""
+    value, sigma = run.wheels.prior(left, right, width)
+    more = [(known.offset[0], known.offset_sigma), (known.offset[1], known.offset_sigma),
+            (0.0, known.delay_sigma)]
+    more += [(0.0, known.gyro_scale_sigma), (0.0, known.gyro_bias_sigma)] * bool(len(run.gyro))
+    return (np.append(value, [v for v, _ in more]), np.append(sigma, [s for _, s in more])**-2.0)
 
 
 def _begin(run: Run, known: Known, at_first: First) -> tuple[Floats, Floats, Floats]:
@@ -79,12 +108,7 @@ def _begin(run: Run, known: Known, at_first: First) -> tuple[Floats, Floats, Flo
     state[:, 0], state[:, 1] = (np.interp(run.t, run.t[run.node], axis)
                                 for axis in run.position.T)
     state[:, 2] = at_first.heading
-    value, sigma = run.wheels.prior(at_first.left, at_first.right, at_first.width)
-    more = [(known.offset[0], known.offset_sigma), (known.offset[1], known.offset_sigma),
-            (0.0, known.delay_sigma)]
-    more += [(0.0, known.gyro_scale_sigma), (0.0, known.gyro_bias_sigma)] * bool(len(run.gyro))
-    return (state, np.append(value, [v for v, _ in more]),
-            np.append(sigma, [s for _, s in more])**-2.0)
+    return state, *priors(run, known, at_first.left, at_first.right, at_first.width)
 
 
 def noise_path(run: Run, scale: float) -> Floats:

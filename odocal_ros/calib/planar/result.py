@@ -124,7 +124,7 @@ def unknown(unit: str) -> dict[str, Estimate]:
 
 
 def _doubts(fit: Fit) -> list[Reason]:
-    """Return what is wrong with a fit as a whole."""
+    """Return the reasons against a fit as a whole."""
     found = [] if fit.converged else [Reason(
         Code.MODEL_MISMATCH, f'the planar fit has not converged after {fit.passes} passes')]
     if fit.swapped:

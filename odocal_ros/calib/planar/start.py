@@ -18,6 +18,8 @@ MINIMA, ALIKE = 5, 1.3     # judgement: minima compared, and costs that do not d
 SWAPPED = 0.3              # judgement: of the cost, if mirrored
 # m of wheel path in which a dead-reckoned path is compared. Judgement: several moves and turns
 WINDOW = 6.0
+# judgement: steps in a window between distant positions, such as marks; two fit any path
+WINDOW_STEPS = 4
 
 
 class First(NamedTuple):
@@ -38,10 +40,10 @@ def first_values(run: Run, width: float = 0.0) -> First:
     """
     Return the first values of a run; width : m, as configured, 0 unknown.
 
-    Dead-reckoned paths for each of WIDTHS and RATIOS, in windows of WINDOW, are rotated and scaled
-    onto the positions. Turns on the spot by 90 deg and by 450 deg look the same: of several
-    minima that fit about equally well the one nearest to the configured width is taken, without
-    one the largest, which has the smallest turns.
+    Dead-reckoned paths for each of WIDTHS and RATIOS, in windows of WINDOW or WINDOW_STEPS steps
+    between positions, are rotated and scaled onto the positions. Turns on the spot by 90 deg and
+    by 450 deg look the same: of several minima that fit about equally well the one nearest to the
+    configured width is taken, without one the largest, which has the smallest turns.
     """
     z = run.position[:, 0] + 1j * run.position[:, 1]
     s = np.append(0.0, np.cumsum(run.wheels.path))[run.node]
@@ -86,9 +88,12 @@ def _rough(z: Complexes, s: Floats) -> float:
 
 
 def _windows(s: Floats) -> Ints:
-    """Return first and last + 1 position of each window: (w, 2)."""
-    begins = np.arange(s[0], max(s[-1] - WINDOW / 2, s[0] + 1e-9), WINDOW / 2)
-    spans = np.stack([np.searchsorted(s, begins), np.searchsorted(s, begins + WINDOW)], -1)
+    """Return first and last + 1 position of each window, by the wheel path at each: (w, 2)."""
+    steps = np.sort(np.diff(s))
+    usual = steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)]    # of half of the path
+    length = max(WINDOW, WINDOW_STEPS * usual)
+    begins = np.arange(s[0], max(s[-1] - length / 2, s[0] + 1e-9), length / 2)
+    spans = np.stack([np.searchsorted(s, begins), np.searchsorted(s, begins + length)], -1)
     fewest = 3
     spans = spans[spans[:, 1] - spans[:, 0] >= fewest]
     return spans if len(spans) else np.array([[0, len(s)]])

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Faults of two wheels by the gyro: exchanged, one slipping, counting unlike each other.
+Faults of two wheels by the gyro: swapped, one slipping, different counters.
 
-The ways of the two wheels differ by the track width times the turn. What is left of the
+The paths of the two wheels differ by the track width times the turn. What is left of the
 difference is rounding and gyro noise, millimetres over seconds; a wheel that spins or slides on
 its own stands out of it by centimetres, where the IMU's acceleration alone sees half a metre.
 """
@@ -54,12 +54,12 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
                  max_deviation: float = 0.35,
                  count: int = 2) -> tuple[tuple[Reason, ...], WheelSlips]:
     """
-    Return what the gyro finds wrong with wheels that both count, and the slips of one of them.
+    Return the faults of two counting wheels by the gyro, and the slips of one of them.
 
     axle : (2,) sequence of Travel the left and the right wheel, scale units.   imu : (t, w_b, f_b)
     (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.   between : (2,) the marks, s.   track : dead
     reckoned with their mean: attitude.   latitude : rad.   metres_per_unit : rough scale of the
-    mean of both.   track_width : m, 0 unknown.   doubt_t : (d,) s, where travel is in doubt for
+    mean of both.   track_width : m, 0 unknown.   doubt_t : (d,) s, where travel is uncertain for
     other reasons (gaps, resets).   max_deviation : ratio of the counts less one, from which on it
     is said.   count : of the wheels in the mean.
 
@@ -102,7 +102,7 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
 
 def _level(two: Pair, apart: Floats, quantum_m: float) -> Floats:
     """
-    Return the difference of the ways, m, without the slope it has on most of the way.
+    Return the difference of the paths, m, without the slope it has on most of the drive.
 
     Rounding at a steady speed makes slopes too, of two counts over a window at most: they stay.
     """
@@ -130,7 +130,7 @@ def _events(two: Pair, apart: Floats, quantum_m: float,
     """
     Return (begin, end, size) of the jumps of the difference: s, s, m, in order.
 
-    apart : m, what turn and ratio leave of the difference; the ratio as most of the way has it is
+    apart : m, what turn and ratio leave of the difference; the ratio as most of the path has it is
     taken off here. Those that are over, and those that may be a change of the ratio.
     """
     apart = _level(two, apart, quantum_m)
@@ -158,7 +158,7 @@ def _events(two: Pair, apart: Floats, quantum_m: float,
 
 
 def _ends(two: Pair, apart: Floats, event: Event) -> bool:
-    """Tell whether a slip is over: short, or the wheels go on after it as they did before it."""
+    """Return True if a slip is over: short, or the wheels continue after it as before it."""
     way = _way(two)
     begin, end = np.interp(event[:2], two.t, way)
     if end - begin < way[-1] / 16:      # half a step of the places that `changed` looks at
@@ -172,7 +172,7 @@ def _ends(two: Pair, apart: Floats, event: Event) -> bool:
 
 
 def _slope(two: Pair, event: Event) -> float:
-    """Return the size of a slip by the way it took, seen from a tenth to nine tenths of it."""
+    """Return the size of a slip from its course between a tenth and nine tenths of it."""
     begin, end = np.interp(event[:2], two.t, _way(two))
     out: float = 0.8 * event[2] / max(end - begin, 1e-9)
     return out
@@ -183,7 +183,7 @@ def _way(two: Pair) -> Floats:
 
 
 def _limit(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -> Floats:
-    """Return how far each jump between two means may go by chance, m."""
+    """Return the limit of each jump between two means by chance, m."""
     n, ends = len(jump), span + MEAN_STEPS - 1
     way = _way(two)
     turned = np.append(0.0, np.cumsum(np.abs(np.diff(two.turn))))
@@ -228,7 +228,7 @@ def _measured(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Floats,
 def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
            latitude: float, event: Event) -> int:
     """
-    Return which wheel slipped: -1, +1, or 0 where acceleration does not tell.
+    Return the wheel that slipped: -1, +1, or 0 where acceleration does not show it.
 
     A slip of the right wheel by x takes the mean ahead of the IMU by x / 2, one of the left by -x
     back by as much: the odds of the two come from how far mean and IMU part elsewhere.
@@ -248,7 +248,7 @@ def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: T
         return 0
     sigma = robust_sigma(excess[straight]) + 1e-3
     log_odds = excess[at] * size / sigma**2
-    # once in 150 the other wheel; parts mean and Imu by less than a quarter of the half, the slip
+    # once in 150 the other wheel; parts mean and IMU by less than a quarter of the half, the slip
     # begins or ends elsewhere
     clear = abs(log_odds) > 5.0 and abs(excess[at]) > abs(size) / 8
     return int(np.sign(log_odds)) if clear else 0

@@ -29,7 +29,7 @@ class WheelSlips:
 
     begin, end : (k,) s.   size : (k,) m, > 0 where the wheel ran farther than the ground (for a
     wheel that is not known: right less left).   wheel : (k,) -1 left, +1 right, 0 one of them.
-    change : of the ratio right over left at some place, as much as at half the way does the same.
+    change : of the ratio right over left at some place, as much as at half the path does the same.
     count : of the wheels in the mean.
     """
 
@@ -47,7 +47,7 @@ class WheelSlips:
 
     def doubts(self) -> tuple[Floats, Floats]:
         """
-        Return where the mean of the wheels is in doubt, and by how much: (d,) s, (d,) m.
+        Return the times at which the mean of the wheels is uncertain, and its error: (d,) s, m.
 
         A slip of one of two wheels is half as large in the mean, drawn out over the seconds it
         lasts.
@@ -80,7 +80,7 @@ def slips_of(events: list[tuple[float, float, float]], wheel: list[int]) -> Whee
 
 
 def slip_reason(slips: WheelSlips, names: tuple[str, ...]) -> tuple[Reason]:
-    """Say which wheel slipped most, by how much and when."""
+    """Return the reason that names the wheel with most slip, its size and time."""
     n = len(slips.size)
     worst = int(np.argmax(np.abs(slips.size)))
     left, right = (f'the {name} wheel' for name in names)

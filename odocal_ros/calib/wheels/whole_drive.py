@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Regression of the right wheel's way on the left one's, turn and load, over the whole drive.
+Regression of the right wheel's path on the left one's, turn and load, over the whole drive.
 
-The right wheel's way is that of the left one, the track width times the turn, and little more.
-What this says of the drive as a whole: exchanged, one counter sent twice, unlike counts, a ratio
-that changes on the way.
+The right wheel's path is that of the left one, the track width times the turn, and little more.
+This shows of the drive as a whole: swapped wheels, one counter sent twice, different counters, a
+ratio that changes during the drive.
 """
 
 import numpy as np
@@ -24,9 +24,9 @@ MEAN_STEPS = 10     # steps that speed, turn rate and the ends of a window are a
 
 def signals_of(two: Pair, metres_per_unit: float) -> Floats:
     """
-    Return what the right way is made of, at the edges: (n, 6).
+    Return the signals that make up the right path, at the edges: (n, 6).
 
-    The left way, turn and time (gyro bias); speed (the wheels' stamps apart), turn rate (the
+    The left path, turn and time (gyro bias); speed (the wheels' stamps apart), turn rate (the
     IMU's stamps apart) and the load that sideways acceleration moves from tyre to tyre.
     """
     half = MEAN_STEPS // 2
@@ -52,7 +52,7 @@ def fitted(two: Pair, signals: Floats, metres_per_unit: float,
     if keep.sum() < 20:
         return None, None
     width = TRACK_WIDTH.first_sigma / metres_per_unit
-    late = 0.05     # s, sigma of the delay between the wheels, and of wheels to Imu
+    late = 0.05     # s, sigma of the delay between the wheels, and of wheels to IMU
     load = 2e-3     # s^2/m, of the change of rolling radius by sideways acceleration
     prior = np.array([np.inf, width, np.inf, late, late * 1.5 / metres_per_unit, load])
     prior = np.append(prior, np.full(signals.shape[1] - len(prior), np.inf))
@@ -80,25 +80,25 @@ def swapped(two: Pair, width: float, sigma: float, track_width: float) -> tuple[
 def changed(two: Pair, signals: Floats, metres_per_unit: float,
             count: int) -> tuple[tuple[Reason, ...], float]:
     """
-    Say that the wheels' ratio is not the same before and after some place of the way.
+    Return a reason if the wheels' ratio is not the same before and after some place.
 
     count : of the wheels in the mean.
 
     Returns
     -------
-    Reasons; what the sigmas are to hold, as a change of the ratio at half the way, 0 for none.
+    Reasons; what the sigmas are to hold, as a change of the ratio at half the path, 0 for none.
 
     """
     way = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
     best = (0.0, 0.0, 0.0, 0)
-    for share in np.arange(1, 8) / 8:       # of the way
+    for share in np.arange(1, 8) / 8:       # of the path
         at = int(np.searchsorted(way, share * way[-1]))
         late = np.where(np.arange(len(way)) > at, two.left - two.left[at], 0.0)
         x, covariance = fitted(two, np.column_stack([signals, late]), metres_per_unit)
         if x is None or covariance is None or x[0] <= 0:
             continue
         change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
-        least = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)       # tyres warm up alike to that
+        least = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)       # tyres warm up equally to that
         if abs(change) > least and abs(change) / sigma > best[0]:
             best = (abs(change) / sigma, float(change), share, at)
     odds, change, share, at = best
@@ -118,7 +118,7 @@ def changed(two: Pair, signals: Floats, metres_per_unit: float,
 
 
 def unlike(two: Pair, ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
-    """Say that one wheel counts far finer: the mean count is no longer of the axle's middle."""
+    """Return a reason if one wheel counts far finer: the mean is not of the axle's middle."""
     if max(ratio, 1 / ratio) <= 1 + limit:
         return ()
     # the mean count weighs each wheel by its counts a metre

@@ -21,6 +21,7 @@ from odocal_ros.estimator.state import (
     FIX_LAG2,
     FIX_TIME,
     GNSS_ARM,
+    GNSS_CLOCK,
     GNSS_DELAY,
     M,
     P,
@@ -46,7 +47,7 @@ class Fixes(PointRows):
         leg, state, points = problem.leg, point.state, point.points['fixes']
         self.state, self.points, self.root = state, points, problem.root
         k, tau = points.interval, points.tau[:, None]
-        self.k = k
+        self.k, self.t_fix = k, leg.t_fix[problem.use]
         self.C = state.C_nb[k]
         dp = turn(self.C, points.dp)
         v = state.v_n[k]
@@ -99,6 +100,7 @@ class Fixes(PointRows):
         c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
         # stamps late by d: the place is that of d before
         c[:, :, GNSS_DELAY] = self.v_n
+        c[:, :, GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
         c[:, :, FIX_LAG2] = -self.by_lag
         c[:, :, FIX_BY_MOTION], c[:, :, FIX_TIME] = -self.by_motion, -self.by_time
         c[:, :, ACCEL] = self.C @ self.points.FF
@@ -113,7 +115,9 @@ class Fixes(PointRows):
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
         """Return the times of validity of the used fixes, s."""
-        out: Floats = problem.leg.t_fix[problem.use] - constants[GNSS_DELAY]
+        t = problem.leg.t_fix[problem.use]
+        # the delay is that at the start mark
+        out: Floats = t - constants[GNSS_DELAY] - constants[GNSS_CLOCK] * t
         return out
 
     def stated(self, rows: Floats) -> Floats:

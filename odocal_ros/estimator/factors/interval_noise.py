@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
+from odocal_ros.estimator.factors.odometer_filter import stamp_of
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.state import BA, BG, ODO_DELAY, P, PHI, V
+from odocal_ros.estimator.state import BA, BG, P, PHI, V
 from odocal_ros.nav.rotations import skew
 
 Floats = NDArray[np.float64]
@@ -187,10 +188,9 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     extra[:, PHI] = (rate * gap[:, None])**2
     extra[:, V] = (force * gap[:, None])**2
     extra[:, P] = (force * gap * T)[:, None]**2
-    t = motion.state.t
-    way = leg.travel
-    delay = motion.state.constants[ODO_DELAY]
-    outside = (t[:-1] + delay < way.t[0] - 0.1) | (t[1:] + delay > way.t[-1] + 0.1)
+    t, way = motion.state.t, leg.travel
+    stamp = stamp_of(t, motion.state.constants)
+    outside = (stamp[:-1] < way.t[0] - 0.1) | (stamp[1:] > way.t[-1] + 0.1)
     extra[outside, D] = ABSENT_VARIANCE
     for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
         k = np.searchsorted(t, at) - 1

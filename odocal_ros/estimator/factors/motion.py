@@ -28,6 +28,7 @@ from odocal_ros.estimator.state import (
     LN_K,
     M,
     ODO_ARM,
+    ODO_CLOCK,
     ODO_DELAY,
     ODO_LAG2,
     P,
@@ -50,8 +51,8 @@ ROWS = D.stop
 # judgement: intervals of a hill; what pitches the body faster is a bump of the road, or squat
 HILL_INTERVALS = 5
 # of Motion, what each interval has
-EACH = ('T', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed', 'nose_down',
-        'from_mean', 'varied', 'travelled', 'residual')
+EACH = ('T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed',
+        'nose_down', 'from_mean', 'varied', 'travelled', 'residual')
 
 
 def rotvec(C: Floats) -> Floats:
@@ -167,9 +168,10 @@ class Motion:
         state, T, c = self.state, self.T, self.state.constants
         self.pushed = self.axle.accelerations()
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
-        t = (state.t[1:] + state.t[:-1]) / 2
+        self.t_middle = (state.t[1:] + state.t[:-1]) / 2
         self.from_mean = varies_with(
-            speed, t - state.t[0], self.axle.acceleration()) - self.axle.means_by_way(self.sums)
+            speed, self.t_middle - state.t[0],
+            self.axle.acceleration()) - self.axle.means_by_way(self.sums)
         self.varied = 1 + self.from_mean @ c[TYRES, None]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
         # nose down about a point ahead, the odometer goes up
@@ -246,8 +248,9 @@ class Motion:
         # stamps late by d: the reading at a time is the travel d before it
         ahead = (self.f_n + self.f_n_end) / 2
         c[:, D, [ODO_DELAY, ODO_LAG2]] = -ahead[:, :, None] * self.faster[:, None]
+        c[:, D, ODO_CLOCK] = c[:, D, ODO_DELAY] * self.t_middle[:, None] - self.rolled
         if self.by_steps:       # only the direction of the path is used; these do not change it
-            c[:, D, [LN_K, ODO_DELAY, ODO_LAG2, SPEED_OFFSET]] = 0.0
+            c[:, D, [LN_K, ODO_DELAY, ODO_CLOCK, ODO_LAG2, SPEED_OFFSET]] = 0.0
             c[:, D, TYRES] = 0.0
         c[:, :, GYRO] = gyro[:, :, 3:]
         c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.state import ODO_DELAY, ODO_LAG2
+from odocal_ros.estimator.state import ODO_CLOCK, ODO_DELAY, ODO_LAG2
 from odocal_ros.nav.odometer import Travel
 
 # s to each side of a time, for the derivatives at it. Judgement: with a filter of 0.4 s the
@@ -18,6 +18,12 @@ REACH = 0.5
 STENCIL = REACH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 BY_SQUARE = np.array([1.0, 0.0, -2.0, 0.0, 1.0]) / REACH**2
 BY_CUBE = np.array([-1.0, 2.0, 0.0, -2.0, 1.0]) * 4 / REACH**3
+
+
+def stamp_of(t: Floats, constants: Floats) -> Floats:
+    """Return the stamps, s, of readings of the wheel at some times; the delay is that at 0."""
+    out: Floats = t + constants[ODO_DELAY] + constants[ODO_CLOCK] * t
+    return out
 
 
 def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
@@ -31,11 +37,11 @@ def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
 
     travel : of the readings.   constants : (M,), with D, s, and T^2, s^2.
     """
-    delay, square = float(constants[ODO_DELAY]), float(constants[ODO_LAG2])
+    square = float(constants[ODO_LAG2])
     weights = -square / 2 * BY_SQUARE + max(square, 0.0)**1.5 / 3 * BY_CUBE
 
     def rolled(t: Floats) -> Floats:
-        at = t + delay
+        at = stamp_of(t, constants)
         # at the ends that of the first and last second: beyond them there is no reading
         middle = np.clip(at, travel.t[0] + REACH, travel.t[-1] - REACH)
         out: Floats = travel.at(at) + sum(

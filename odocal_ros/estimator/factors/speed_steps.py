@@ -25,6 +25,7 @@ from odocal_ros.estimator.state import (
     LN_K,
     M,
     ODO_ARM,
+    ODO_CLOCK,
     ODO_DELAY,
     PHI,
     PITCH,
@@ -82,7 +83,8 @@ class SpeedSteps(PointRows):
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
         """Return the times of the steps, s."""
-        out: Floats = _within(problem).t - constants[ODO_DELAY]
+        t = _within(problem).t
+        out: Floats = t - constants[ODO_DELAY] - constants[ODO_CLOCK] * t
         return out
 
     @classmethod
@@ -116,7 +118,7 @@ class SpeedSteps(PointRows):
             c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
                 rate, gradient @ self.arm_v) @ state.forward
         c[:, ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
-        c[:, ODO_DELAY] = self.gained
+        c[:, ODO_DELAY], c[:, ODO_CLOCK] = self.gained, self.gained * self.instants.t
         c[:, GYRO_SCALE] = J[:, BG.start + 2] * rate[:, 2]
         c[:, ACCEL] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.F)
         return J[:, None], c[:, None]

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reasons about filters in receiver and odometer, and an odometer in the receiver."""
+"""Reasons about clocks and filters of receiver and odometer, and a receiver's odometer."""
 
 import numpy as np
 
@@ -38,3 +38,13 @@ def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
         return ()
     return (Reason(Code.SPEED_FILTERED, 'the odometer speed is low-pass filtered with a time '
                    f'constant of about {np.sqrt(square):.2f} s; accounted for'),)
+
+
+def clock_reasons(name: str, rate: float, sigma: float, duration: float) -> tuple[Reason, ...]:
+    """Return CLOCKS_DRIFT, where so; of the rate of a clock and its sigma, of a leg in s."""
+    worth = 0.01        # s: two samples of most odometers are further apart
+    if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= worth:
+        return ()
+    return (Reason(Code.CLOCKS_DRIFT, f'{name} stamps: the clock is {1e6 * abs(rate):.0f} ppm (+-'
+                   f'{1e6 * sigma:.0f}) {"fast" if rate > 0 else "slow"} relative to the IMU, '
+                   f'{abs(rate) * duration:.3f} s in this leg; accounted for'),)

@@ -14,7 +14,7 @@ from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import imperfect_sigmas
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result.filters import lag_reasons, odometer_reasons
+from odocal_ros.estimator.result.filters import clock_reasons, lag_reasons, odometer_reasons
 from odocal_ros.estimator.state import (
     BA,
     BY_SPEED,
@@ -24,9 +24,11 @@ from odocal_ros.estimator.state import (
     FIX_LAG2,
     FIX_TIME,
     GNSS_ARM,
+    GNSS_CLOCK,
     IMPERFECT,
     LN_K,
     ODO_ARM,
+    ODO_CLOCK,
     PITCH,
     YAW,
 )
@@ -35,6 +37,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
+CLOCKS = {'fix': GNSS_CLOCK, 'odometer': ODO_CLOCK}
 IMU_SCALES = tuple(i for i, name in enumerate(CONSTANTS) if name.startswith(
     ('gyro_scale', 'accelerometer_scale')))
 AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
@@ -106,6 +109,8 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[R
     c = fit.state.constants
     said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
             *odometer_reasons(c[FIX_BY_MOTION], sigma[FIX_BY_MOTION], c[FIX_TIME]),
+            *(reason for name, i in CLOCKS.items()
+              for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
             *_varies(fit, sigma)]
     usual = imperfect_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))

@@ -28,7 +28,7 @@ from odocal_ros.data.pieces import by_row
 from odocal_ros.estimator.factors.interval_noise import hard_and_turning
 from odocal_ros.estimator.factors.motion import rotvec
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.factors.odometer_filter import as_rolled
+from odocal_ros.estimator.factors.odometer_filter import as_rolled, stamp_of
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
@@ -38,6 +38,7 @@ from odocal_ros.estimator.state import (
     GYRO_AXIS,
     GYRO_SIGNAL,
     LN_K,
+    ODO_CLOCK,
     ODO_DELAY,
     State,
 )
@@ -90,7 +91,7 @@ def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
     wheels, state = problem.leg.wheels, fit.state
     if len(wheels) < 2:
         return {}
-    t = state.t + state.constants[ODO_DELAY]
+    t = stamp_of(state.t, state.constants)
     inside = np.flatnonzero((t >= max(w.t[0] for w in wheels))
                             & (t <= min(w.t[-1] for w in wheels)))
     if len(inside) < FEWEST:
@@ -100,7 +101,9 @@ def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
     if len(at) < FEWEST:
         return {}
     common = _Common(problem, fit, inside[at], s[:, at])
-    delay = float(np.sqrt(covariance[ODO_DELAY, ODO_DELAY]))
+    late = np.array([ODO_DELAY, ODO_CLOCK])
+    row = np.array([1.0, state.t.mean()])
+    delay = float(np.sqrt(row @ covariance[np.ix_(late, late)] @ row))
     own = [LN_K, *range(GYRO.start, GYRO.stop)]
     lines = [common.line(i, delay, drift, width) for i in range(len(wheels))]
     return {wheel.name: _wheel(line, common.moved(i, line), covariance[np.ix_(own, own)])
@@ -153,9 +156,9 @@ class _Common:
         # a second of driving each, less where wheels hardly turn, whatever they stood before
         rolled = np.abs(np.diff(s)).max(axis=0)
         self.share = np.clip(rolled, 0.02 * np.minimum(self.T, 1.0), self.T)
-        delay = state.constants[ODO_DELAY]
+        stamp = stamp_of(self.t, state.constants)
         for begin, end in _unknown(problem.leg):
-            self.share[(self.t[1:] > begin - delay) & (self.t[:-1] < end - delay)] = DOUBTED
+            self.share[(stamp[1:] > begin) & (stamp[:-1] < end)] = DOUBTED
         self.scale = state.scale
         self.steer = {i: self._steering(state, up, i) for i, fixed in enumerate(self.fixed)
                       if not fixed}

@@ -1,0 +1,130 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""How good a run of a small robot will be: patterns, references and drives."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.data.arrays import Floats
+from odocal_ros.errors import BadUsage
+from odocal_ros.forecast.indoor_motion import MOTION_STEP, pattern, PATTERNS, RobotMotion
+from odocal_ros.forecast.planned_indoor import predict_robot, ratio_sigma, Robot
+from odocal_ros.library.asked import config_of, Settings
+from odocal_ros.settings.config import DRIVES, HOLONOMIC, SKID
+from odocal_ros.sim.options import SimOptions
+from odocal_ros.sim.references import REFERENCES
+from odocal_ros.sim.scenarios import motion_of
+from odocal_ros.sim.wheels import effective_width, STRAIGHT
+
+MARKS = 'marks'
+KINDS = ('mocap', 'total_station', 'slam', 'amcl', MARKS)
+# m, judgement: of a run between marks: path in which a correlated error is forgotten
+MARKS_LENGTH = 1.0
+SHOWN = {'scale_factor': 'scale', 'track_width': 'track width', 'rotation_lever':
+         'rotation lever', 'track_width_arc': 'width on arcs', 'lateral_scale_factor': 'lateral',
+         'yaw_mounting_angle': 'yaw'}
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedRun:
+    """A run and its prediction."""
+
+    name: str
+    motion: RobotMotion
+    robot: Robot
+    method: MethodResult
+
+    def sigma(self, name: str) -> float | None:
+        """Return the sigma of an estimate or of ``ratio``, relative, or rad; None: unknown."""
+        if name == 'ratio':
+            return ratio_sigma(self.method)
+        one = self.method.estimates.get(name)
+        if one is None or one.value is None or one.sigma is None:
+            return None
+        return one.sigma if one.unit == 'rad' else one.sigma / abs(one.value)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry of ``odocal plan --indoor --json``."""
+        return {'run': self.name, 'duration': float(self.motion.t[-1]),
+                'distance': self.motion.distance, 'method': self.method.name,
+                'sigmas': {name: self.sigma(name) for name in (
+                    *(n for n in SHOWN if n in self.method.estimates), 'ratio')},
+                'reasons': [r.as_dict() for r in self.method.reasons]}
+
+
+def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'differential',
+                imu: bool = True, size: float = 4.0, rounds: int = 1, speed: float = 0.5,
+                track_width: float = 0.3, wheels: int | None = None, slip: float = 1e-3,
+                points_sigma: float | None = None, config: Settings = None,
+                ) -> list[PlannedRun]:
+    """
+    Predict the sigmas of runs of a small robot on a level floor.
+
+    Parameters
+    ----------
+    run
+        Of PATTERNS, or ``all``.
+    reference, drive, imu
+        Of KINDS; as ``odometer.drive``; False: the robot has no IMU.
+    size, rounds, speed
+        m of a straight, how often, m/s.
+    track_width, wheels, slip
+        m between the wheels (of skid steering it is widened by 1.7 on the spot and 1.4 straight
+        on); how many wheels; m/sqrt(s) of each.
+    points_sigma
+        m, accuracy of the robot on its marks; None: ``reference.points_sigma``.
+    config : Config, mapping of dotted names, or a parameter file, optional
+        Settings: grade of the IMU and the like.
+
+    Raises
+    ------
+    BadUsage, BadConfig
+        A name is unknown, or a figure is out of range.
+
+    """
+    for flag, value, names in (('--indoor', run, ('all', *PATTERNS)), ('--drive', drive, DRIVES),
+                               ('--reference', reference, KINDS)):
+        if value not in names:
+            raise BadUsage(f'{flag} {value}: required: one of {", ".join(names)}')
+    if not track_width > 0 or not slip > 0:
+        raise BadUsage('--track-width and --slip-walk: required: numbers above 0')
+    settings = config_of(config)
+    options = SimOptions(scenario='indoor', drive=drive, track_width=track_width, imu=imu,
+                         slip_walk=slip, wheels=wheels or (4 if drive != DRIVES[0] else 2),
+                         reference='mocap' if reference == MARKS else reference)
+    robot = robot_of(options)
+    if reference == MARKS:
+        sigma = settings.reference.points_sigma if points_sigma is None else points_sigma
+        robot = replace(robot, white=sigma, drift=sigma, drift_length=MARKS_LENGTH, rate=10.0,
+                        at_rests=True)
+    names = tuple(PATTERNS) if run == 'all' else (run,)
+    motions = {name: pattern(name, size, rounds, drive, speed) for name in names}
+    return [PlannedRun(name, motion, robot, predict_robot(motion, robot, settings))
+            for name, motion in motions.items()]
+
+
+def robot_of(options: SimOptions) -> Robot:
+    """Return the robot and reference of options of a simulated run."""
+    usual = dict(REFERENCES[options.reference].usual)
+    drift, length = usual.get('reference_drift', 0.0), usual.get('drift_length', 0.0)
+    model = Robot.drift_length
+    # forgotten with the path: its own sigma; else that of the model with the same steps
+    stationary = drift * np.sqrt((length or model) / 2)
+    straight = STRAIGHT * options.track_width if options.drive == SKID else 0.0
+    return Robot(drive=options.drive, imu=options.imu, width=effective_width(options),
+                 straight_width=straight, wheels=max(options.wheels or 2, 2),
+                 slip=options.slip_walk, white=usual['fix_sigma'], rate=usual['fix_rate'],
+                 drift=float(stationary))
+
+
+def motion_of_drive(options: SimOptions) -> RobotMotion:
+    """Return the motion of resolved options of a simulated run."""
+    made = motion_of(options)
+    t: Floats = MOTION_STEP * np.arange(int(made.duration / MOTION_STEP) + 1, dtype=float)
+    state = made.at(t)
+    side: Floats = state.sway[:, 0] * (options.drive in HOLONOMIC)
+    return RobotMotion(t, state.speed, side, state.yaw_rate, np.empty((0, 2)))

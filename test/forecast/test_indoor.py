@@ -1,0 +1,80 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The forecast of indoor runs: closed forms, and the sigmas of simulated runs."""
+
+import math
+
+import numpy as np
+import pytest
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.forecast.indoor_motion import pattern, PATTERNS
+from odocal_ros.forecast.planned_indoor import predict_robot, ratio_sigma, Robot
+from odocal_ros.library.plan_indoor import motion_of_drive, plan_indoor, robot_of
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SLIP = 1e-3      # m/sqrt(s)
+
+
+@pytest.mark.parametrize('drive', ['differential', 'mecanum'])
+@pytest.mark.parametrize('name', PATTERNS)
+def test_a_pattern_ends_where_its_moves_end(name, drive):
+    """Out and back: both turn directions are equal, a round ends at the heading of its start."""
+    d = pattern(name, 3.0, 1, drive).increments
+    assert abs(d[:, 2].sum()) < 1e-9
+    forward = {'straight': 6.0, 'square': 24.0, 'figure_eight': 3 * math.pi, 'spot': 6.0}[name]
+    assert d[:, 0].sum() == pytest.approx(forward, rel=1e-9)
+    assert bool(np.abs(d[:, 1]).sum() > 0) is (drive == 'mecanum' and name != 'figure_eight')
+
+
+def test_the_scale_of_exact_positions_is_limited_by_the_slip():
+    """Of two wheels: slip sqrt(T / 2) over the path, T s in motion straight ahead."""
+    motion = pattern('straight', 4.0, 3, 'differential')
+    robot = Robot(drive='differential', imu=False, width=0.3, slip=SLIP, white=1e-5)
+    found = predict_robot(motion, robot, Config())
+    moving = (motion.speed > 0).sum() * 0.1
+    closed = SLIP * math.sqrt(moving / 2) / motion.distance
+    # the level by metres is that of the mean speed: ramps weigh more than they should
+    assert found.estimates['scale_factor'].sigma == pytest.approx(closed, rel=0.15)
+    assert ratio_sigma(found) == pytest.approx(2 * closed, rel=0.15)
+
+
+@pytest.mark.parametrize(('drive', 'imu', 'values'), [
+    ('differential', False, {'scale_factor': 1.5, 'track_width': 1.6}),
+    ('differential', True, {'yaw_mounting_angle': 1.5, 'track_width': 1.6}),
+    ('skid', False, {'scale_factor': 1.5, 'track_width_arc': 1.3})])
+def test_the_forecast_is_near_the_sigma_of_a_simulated_run(drive, imu, values):
+    """Its own noise levels are estimated: benchmarks/indoor_bound.py has their spread."""
+    made = simulate(SimOptions(
+        scenario='indoor', duration=150.0, drive=drive, imu=imu, reference='total_station',
+        slip_walk=SLIP, odometer='angle', imu_grade='industrial', seed=5))
+    config = with_settings(Config(), {
+        'odometer.left': 'left', 'odometer.right': 'right', 'odometer.drive': drive,
+        'imu.grade': 'industrial'})
+    method = calibrate(made.leg(), config).methods['smoother' if imu else 'planar']
+    found = predict_robot(motion_of_drive(made.options), robot_of(made.options), config)
+    for name, most in values.items():
+        then, now = method.estimates[name], found.estimates[name]
+        size = 1.0 if now.unit == 'rad' else then.value / now.value
+        assert 1 / most < then.sigma / (now.sigma * size) < most, name
+
+
+def test_marks_determine_the_width_by_squares_and_not_by_an_eight():
+    square, eight = (plan_indoor(run, reference='marks', imu=False)[0]
+                     for run in ('square', 'figure_eight'))
+    assert square.sigma('track_width') < 0.01
+    assert eight.sigma('scale_factor') is None
+
+
+@pytest.mark.parametrize(('asked', 'said'), [
+    ({'run': 'circle'}, '--indoor circle: required: one of all, straight'),
+    ({'reference': 'gps'}, '--reference gps: required: one of mocap'),
+    ({'size': 0.0}, '--size 0: required: a number above 0'),
+    ({'size': 1e9}, 'more than ten hours'),
+    ({'track_width': 0.0}, '--track-width')])
+def test_wrong_figures_are_refused(asked, said):
+    with pytest.raises(BadUsage, match=said):
+        plan_indoor(**asked)
