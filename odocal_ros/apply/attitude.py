@@ -79,20 +79,20 @@ def rotation_increment(t: Sequence[float], w: Sequence[Sequence[float]], k: int)
 
     t : s.   w : rad/s.   To the last digit ``nav.strapdown.rotation_increments``.
     """
-    h = t[k + 1] - t[k]
-    rise = [b - a for a, b in zip(w[k], w[k + 1], strict=True)]
-    mid = [(a + b) * 0.5 for a, b in zip(w[k], w[k + 1], strict=True)]
+    h, first, second = t[k + 1] - t[k], w[k], w[k + 1]
+    rise = [b - a for a, b in zip(first, second, strict=True)]
+    mid = [(a + b) * 0.5 for a, b in zip(first, second, strict=True)]
     mean = [m * h for m in mid]
     if 0 < k < len(t) - 2:
-        before, own, after = (max(b - a, LEAST_INTERVAL) for a, b in (
-            (t[k - 1], t[k]), (t[k], t[k + 1]), (t[k + 1], t[k + 2])))
+        before, own = max(t[k] - t[k - 1], LEAST_INTERVAL), max(h, LEAST_INTERVAL)
+        after = max(t[k + 2] - t[k + 1], LEAST_INTERVAL)
         if max(before, after) < EVEN_RATIO * own and own < EVEN_RATIO * min(before, after):
             weight = own * own / 4 / (before + own + after)
             of_left, of_right = weight * (own / 2 + after), weight * (own / 2 + before)
-            for i in range(3):
+            for i, (a, b, c, d) in enumerate(zip(w[k - 1], first, second, w[k + 2], strict=True)):
                 slope = rise[i] / own
-                left = (slope - (w[k][i] - w[k - 1][i]) / before) / (before + own)
-                right = ((w[k + 2][i] - w[k + 1][i]) / after - slope) / (own + after)
+                left = (slope - (b - a) / before) / (before + own)
+                right = ((d - c) / after - slope) / (own + after)
                 bow = left * of_left + right * of_right
                 mid[i] -= bow
                 rise[i] -= (right - left) * (weight * own)

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32': '<i4',
          'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8', 'float32': '<f4', 'float64': '<f8'}
+# format: of struct, by numpy's
+CODES = dict(zip(KINDS.values(), 'bBhHiIqQfd', strict=True))
 INDEXED = re.compile(r'(.+)\[(\d+)\]')
 
 
@@ -79,12 +81,13 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 
 
 class Run(NamedTuple):
-    """Values of one kind side by side: bytes, kind, kind of all of them as one item, number."""
+    """Values of one kind side by side: bytes, kind, kind of all as one item, number, reader."""
 
     place: slice
     dtype: np.dtype[Any]
     together: np.dtype[Any]
     width: int
+    packed: struct.Struct
 
 
 @dataclass
@@ -141,6 +144,12 @@ class Layout:
             -1, run.width) for run in runs]
         return values[0] if len(values) == 1 else np.concatenate(values, axis=1)
 
+    def row(self, raw: bytes, paths: Sequence[str]) -> list[Any] | None:
+        """Return the values at some paths of one message of this layout, None as ``columns``."""
+        runs = self._places(tuple(paths))
+        return None if runs is None else [value for run in runs for value in
+                                          run.packed.unpack_from(raw, run.place.start)]
+
     def fits(self, raw: bytes) -> bool:
         """Return True if a message has this layout."""
         return self.size <= len(raw) and all(
@@ -163,7 +172,8 @@ def _side_by_side(places: Sequence[tuple[int, str] | None]) -> list[Run] | None:
         else:
             found.append((offset, dtype, 1))
     return [Run(slice(first, first + count * np.dtype(kind).itemsize), np.dtype(kind),
-                np.dtype((np.void, count * np.dtype(kind).itemsize)), count)
+                np.dtype((np.void, count * np.dtype(kind).itemsize)), count,
+                struct.Struct(f'<{count}{CODES[kind]}'))
             for first, kind, count in found]
 
 

@@ -22,7 +22,7 @@ from odocal_ros.messages import cdr
 from odocal_ros.messages.fields import MessageView, View
 from odocal_ros.messages.frames import FrameFilter
 from odocal_ros.messages.odometer_types import OdometerPlan
-from odocal_ros.messages.raws import Raws, Table, tables
+from odocal_ros.messages.raws import FEW_ROWS, Raws, Table, tables
 from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan, TRANSFORMS
 from odocal_ros.settings.config import Config
 
@@ -94,11 +94,11 @@ class Reader:
             The messages can never give what was asked: no such field, not a number.
 
         """
-        other, raws = None, Raws.of(raws)
+        other, raws = None, raws if len(raws) <= FEW_ROWS else Raws.of(raws)
         if self.frames is not None and len(raws):
             keep, other = self.frames.sort(raws, received_ns, deserialize)
             if other is not None:
-                raws = raws.take(keep)
+                raws = Raws.of(raws).take(keep)
                 received_ns = np.asarray(received_ns, np.int64)[keep]
         found = self._rows(raws, received_ns, deserialize)
         return found if other is None else [*found, ('imu_other', other)]
@@ -113,6 +113,8 @@ class Reader:
         n = len(raws)
         if not n:
             return []
+        if few := self._few(raws):
+            return plan.build(np.array(received_ns, np.int64), few)
         out: list[NDArray[Any]] = []
         good = np.ones(n, bool)
         for layout, rows, table in tables(self.msgtype, raws):
@@ -133,6 +135,20 @@ class Reader:
         if not good.all():
             out, received = [values[good] for values in out], received[good]
         return plan.build(received, out) if len(received) else []
+
+    def _few(self, raws: Sequence[bytes]) -> list[NDArray[Any]]:
+        """Return the columns of a few ordinary messages; none where one of them needs more."""
+        out: list[NDArray[Any]] = []
+        if len(raws) > FEW_ROWS:
+            return out
+        layouts = [cdr.layout_of(self.msgtype, raw) for raw in raws]
+        for column in self._plan.columns:
+            rows = [column.of_raw(layout, raw) if layout else None
+                    for layout, raw in zip(layouts, raws, strict=True)]
+            if None in rows:
+                return []
+            out.append(np.array(rows, column.dtype))
+        return out
 
     def _values(self, layout: cdr.Layout, table: Table) -> list[NDArray[Any]] | None:
         """Return the columns of messages of one layout; None where one is not there."""

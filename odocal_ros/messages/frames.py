@@ -4,17 +4,15 @@
 """Messages of one topic by their frame_id: of several IMUs on one topic, only one is used."""
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 import struct
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.data.samples import FRAME_BYTES, OtherImuSamples
 from odocal_ros.messages import cdr
-from odocal_ros.messages.raws import Raws
+from odocal_ros.messages.raws import FEW_ROWS, Raws
 
 SETTLED = 3     # judgement: messages that decide the frame; a damaged one does not
 TEXT_AT = cdr.FRAME_AT - 4      # format: where the length of the text stands
@@ -42,7 +40,7 @@ class FrameFilter:
         while not self._settled and first < len(raws):
             self._count(self._frame(raws[first], deserialize))
             first += 1
-        keep[first:] = self._alike(Raws.of(raws)[first:])
+        keep[first:] = self._alike(raws[first:])
         if keep.all():
             return keep, None
         other, stamps = [], []
@@ -68,12 +66,18 @@ class FrameFilter:
         if self._seen[frame] >= SETTLED:
             self.frame, self._settled = frame, True
 
-    def _alike(self, raws: Raws) -> Bools:
-        """Return a mask of messages with the frame at its place in CDR, vectorised."""
-        at, pattern = _pattern(self.frame)
-        alike: Bools = raws.size > at[-1]
-        data = np.frombuffer(raws.data, np.uint8)
-        alike[alike] = (data[raws.start[alike][:, None] + at] == pattern).all(axis=1)
+    def _alike(self, raws: Sequence[bytes]) -> Bools:
+        """Return a mask of messages with the frame at its place in CDR, little endian."""
+        text = self.frame.encode() + b'\0'
+        pattern = b'\0\1' + struct.pack('<I', len(text)) + text
+        end = TEXT_AT + len(pattern) - 2
+        if len(raws) <= FEW_ROWS:
+            return np.array([raw[:2] + raw[TEXT_AT:end] == pattern for raw in raws], bool)
+        packed = Raws.of(raws)
+        at = np.concatenate([[0, 1], np.arange(TEXT_AT, end)])
+        alike: Bools = packed.size > at[-1]
+        data, shown = (np.frombuffer(x, np.uint8) for x in (packed.data, pattern))
+        alike[alike] = (data[packed.start[alike][:, None] + at] == shown).all(axis=1)
         return alike
 
     def _frame(self, raw: bytes, deserialize: Callable[[bytes], Any]) -> str | None:
@@ -83,14 +87,6 @@ class FrameFilter:
             return str(deserialize(raw).header.frame_id) if frame is None else frame
         except Exception:       # rclpy and rosbags fail with exceptions of their own
             return None
-
-
-@lru_cache(maxsize=1)
-def _pattern(frame: str) -> tuple[Ints, NDArray[np.uint8]]:
-    """Return the places in CDR, little endian, that determine the frame_id, and their bytes."""
-    text = frame.encode() + b'\0'
-    pattern = np.frombuffer(b'\0\1' + struct.pack('<I', len(text)) + text, np.uint8)
-    return np.concatenate([[0, 1], np.arange(TEXT_AT, TEXT_AT + len(pattern) - 2)]), pattern
 
 
 def _stamp_ns(raw: bytes) -> int:

@@ -17,6 +17,7 @@ Rows = Ints | Bools | slice
 Table = NDArray[np.uint8]
 # judgement: per call; a stream with more is odd enough to be read message by message
 MAX_LAYOUTS = 16
+FEW_ROWS = 8      # judgement: messages up to which one after another takes less time than a table
 
 
 class Raws(Sequence[bytes]):
