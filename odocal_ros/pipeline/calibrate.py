@@ -5,7 +5,7 @@
 The pipeline: one pure function from a leg to its result, one from results to a calibration.
 
 No state, no clock, no files: the live node and the replay call these and nothing else. A leg is
-cut at gaps of the IMU, and where it was carried without a count; its parts are legs of the same vehicle.
+cut at gaps of the IMU, and where the vehicle was carried; its parts are legs of the same vehicle.
 """
 
 from collections.abc import Callable, Sequence
