@@ -59,7 +59,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'The turns of the vehicle in this time are unknown, so the track is lost.',
         Code.LEG_CUT: 'The IMU was silent for longer than `leg.max_gap`. The leg is cut there; '
         'its sections are calibrated as legs and combined. A section too short to calibrate is '
-        'left out. If no section is long enough, the leg is rejected (`IMU_GAP`).',
+        'left out. If no section is long enough, the leg is rejected (`IMU_GAP`). Or the vehicle '
+        'was carried, as by a ferry: the fixes move by 100 m or more, and the odometer only '
+        'counts before and after it.',
         Code.TOPIC_GAP: 'Odometer or fixes are silent for more than five of their usual '
         'intervals, or the odometer starts late or ends early. Travel across the gap is '
         'interpolated; its uncertainty is part of the sigma.',
@@ -104,7 +106,7 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'backwards, or the IMU x axis points backwards. Accelerations then point backwards in '
         'the IMU frame.',
         Code.ODOMETER_STILL: 'The fixes move, but the counter does not: from the start, or for '
-        '100 m or more of the drive.',
+        '100 m or more of the drive. If it counts again, the leg is cut there (`LEG_CUT`).',
         Code.SEVERAL_IMUS: 'Messages on the IMU topic have different frame_ids. Only one IMU '
         'was used, the first on the topic. Which one is meant cannot be decided from the data.',
         Code.IMU_UNITS: 'Gravity is not 9.8 m/s^2, or the gyro shows much larger turns than the '

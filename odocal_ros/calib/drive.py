@@ -15,6 +15,8 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST, TYRE_SPREAD
 
+FURTHEST_SLIDE = 100.0   # m, physical: no wheel slides and no fix strays so far
+
 
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
@@ -106,8 +108,7 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
     wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
     if wheels_move and fixes_move:
-        # m: physical, no wheel slides and no fix deviates so far
-        return _stopped(travel, t_here, here, max(100.0, 10 * fix_sigma))
+        return _stopped(travel, t_here, here, max(FURTHEST_SLIDE, 10 * fix_sigma))
     if fixes_move:
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, but the odometer does not'),)
     return (Reason(Code.LEG_TOO_SHORT, 'the odometer counts, but the fixes do not move'
@@ -116,17 +117,42 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
 
 def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Reason, ...]:
     """Return a reason if a counter stood while (k, 2) fixes at (k,) s moved by ``least`` m."""
-    counts = np.flatnonzero(np.diff(travel.s))
-    begin = travel.t[np.append(0, counts + 1)]
-    end = travel.t[np.append(counts, len(travel.t) - 1)]
-    lost = [(_gone(fixes[(t >= begin[k]) & (t <= end[k])], least), begin[k], end[k])
-            for k in np.flatnonzero(end - begin > least / FASTEST)]
-    far, since, until = max(lost, default=(0.0, 0.0, 0.0))
+    far, since, until = max(_without_counts(travel, t, fixes, least), default=(0.0, 0.0, 0.0))
     # of the path: a counter that lacks less is within the spread of tyres, and found elsewhere
     if far < least or far < TYRE_SPREAD * way_and_chord(t, fixes)[0]:
         return ()
     return (Reason(Code.ODOMETER_STILL, f'the fixes move by {far:.0f} m from t = {since:.0f} s '
                    f'to {until:.0f} s, but the odometer does not count'),)
+
+
+def _without_counts(travel: Travel, t: Floats, fixes: Floats,
+                    least: float) -> list[tuple[float, float, float]]:
+    """Return how far fixes move, m, from when to when, s, in intervals without a count."""
+    counts = np.flatnonzero(np.diff(travel.s))
+    begin = travel.t[np.append(0, counts + 1)]
+    end = travel.t[np.append(counts, len(travel.t) - 1)]
+    return [(_gone(fixes[(t >= begin[k]) & (t <= end[k])], least), begin[k], end[k])
+            for k in np.flatnonzero(end - begin > least / FASTEST)]
+
+
+def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
+    """
+    Return when a vehicle was carried, as by a ferry: begin and end of motion, (k, 2) s.
+
+    The fixes move without counts, and the odometer counts again after it.
+    """
+    least = max(FURTHEST_SLIDE, 10 * fix_sigma)
+    spans = []
+    for far, begin, end in _without_counts(travel, t_fix, fixes_n[:, :2], least):
+        rows = np.flatnonzero((t_fix >= begin) & (t_fix <= end))
+        if far < least or end >= travel.t[-1]:
+            continue
+        t, p, few = t_fix[rows], fixes_n[rows, :2], 3     # fixes, of which one may be an outlier
+        near = max(GNSS_MOVES, 10 * fix_sigma)
+        first, last = (np.hypot(*(p - np.median(of, axis=0)).T) > near
+                       for of in (p[:few], p[-few:]))
+        spans.append((t[np.argmax(first)], t[len(t) - 1 - np.argmax(last[::-1])]))
+    return np.reshape(np.array(spans, float), (-1, 2))
 
 
 def _gone(fixes: Floats, least: float) -> float:

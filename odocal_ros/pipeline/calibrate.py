@@ -4,8 +4,8 @@
 """
 The pipeline: one pure function from a leg to its result, one from results to a calibration.
 
-No state, no clock, no files: the live node and the replay call these and nothing else. A leg with
-gaps of the IMU is cut at them; its parts are legs of the same vehicle.
+No state, no clock, no files: the live node and the replay call these and nothing else. A leg is
+cut at gaps of the IMU, and where the vehicle was carried; its parts are legs of the same vehicle.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from odocal_ros.calib.drive import carried
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Floats, Ints
@@ -29,7 +30,7 @@ from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.facing import imu_sanity, UNUSABLE
-from odocal_ros.screening.inputs import Inputs
+from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
 from odocal_ros.screening.screen import screen
@@ -143,7 +144,11 @@ def _turned_over(inputs: Inputs) -> Inputs:
 
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     """Return a leg cut where its IMU is silent for longer; itself without gaps, or of many."""
-    gaps = _gaps(leg, limit_s)
+    return _beside(leg, _gaps(leg, limit_s))
+
+
+def _beside(leg: Leg, gaps: Ints) -> list[Leg]:
+    """Return the parts of a leg beside gaps, (k, 2) ns; itself without gaps, or of many."""
     most_parts = 20    # with more gaps the leg is rejected
     if not 0 < len(gaps) < most_parts:
         return [leg]
@@ -171,6 +176,14 @@ def _gaps(leg: Leg, limit_s: float) -> Ints:
     return np.stack([begin, end], -1)[t[:, 1] - t[:, 0] > limit_s]
 
 
+def _carried(leg: Leg, config: Config) -> Ints:
+    """Return begin and end of motion without counts, ns: (k, 2)."""
+    inputs = screened(leg, config).inputs
+    placed = place(inputs, settings_by_frame(leg.fix, config))
+    spans = carried(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma)
+    return leg.start_ns + np.round(spans * 1e9).astype(np.int64)
+
+
 def _near(stamps: Ints, first_ns: int, stop_ns: int) -> Ints:
     """Return the stamps between two, rising: a view where they rise as they came."""
     if by_step(lambda stamps: np.diff(stamps) > 0, stamps).all():
@@ -184,29 +197,38 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
     """
     Return the results of a leg: one, or one of each part long enough to calibrate.
 
-    Arguments as for ``calibrate``. Where no part is long enough, or a gap is not what rejects the
-    leg, the result is that of the whole.
+    Arguments as for ``calibrate``. If no part can be calibrated, the result is that of the whole.
     """
-    parts = parts_of(leg, config.leg.max_gap)
-    results = []
-    for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):
-        def report(stage: Stage, k: int = k) -> None:
-            if progress is not None:
-                progress(replace(stage, done=(k + stage.done) / len(parts)))
-        results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
-    good = [one for one in results if one.verdict is not Verdict.REJECTED]
+    def good_of(parts: list[Leg]) -> list[LegResult]:
+        results = []
+        for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):
+            def report(stage: Stage, k: int = k) -> None:
+                if progress is not None:
+                    progress(replace(stage, done=(k + stage.done) / len(parts)))
+            results.append(calibrate(part, config, notes=notes, holdout=holdout,
+                                     progress=report))
+        return [one for one in results if one.verdict is not Verdict.REJECTED]
+
+    good, why = good_of(parts_of(leg, config.leg.max_gap)), None
     if not good:
-        return [calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)]
+        whole = calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)
+        why = next((r for r in whole.reasons if r.code is Code.ODOMETER_STILL), None)
+        good = good_of(_beside(leg, _carried(leg, config))) if why else []
+        if not good:
+            return [whole]
     if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:
         return good      # the gap lay before the mark
-    return [replace(one, reasons=(*one.reasons, _cut(leg, one, len(good))),
+    return [replace(one, reasons=(*one.reasons, _cut(leg, one, len(good), why)),
                     cut_from_ns=leg.start_ns) for one in good]
 
 
-def _cut(leg: Leg, one: LegResult, count: int) -> Reason:
+def _cut(leg: Leg, one: LegResult, count: int, why: Reason | None) -> Reason:
     begin, end = ((t - leg.start_ns) * 1e-9 for t in (one.start_ns, one.stop_ns))
-    return Reason(Code.LEG_CUT, f'this section covers {begin:.1f} to {end:.1f} s of the '
-                  f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s leg'
-                  + (f', one of {count} '
-                     'sections' if count > 1 else ', the only section long enough '
-                     'to calibrate'))
+    text = (f'this section covers {begin:.1f} to {end:.1f} s of the '
+            f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s leg'
+            + (f', one of {count} sections' if count > 1 else
+               ', the only section long enough to calibrate'))
+    if why is None:
+        return Reason(Code.LEG_CUT, text)
+    return Reason(Code.LEG_CUT, f'{why.text}; {text}', 'If the vehicle was carried (ferry, '
+                  'train), ignore. Otherwise check the wheel sensor and the odometer topic.')

@@ -100,3 +100,59 @@ def test_where_no_part_carries_the_leg_is_rejected_as_it_is(made):
     (only,) = calibrate_parts(full, config)
     assert only.verdict is Verdict.REJECTED
     assert Code.IMU_GAP in {r.code for r in only.reasons}
+
+
+def ferried(leg, at_s, wait_s, metres):
+    """Return a leg that stands at a time for so long, on a ship that goes north."""
+    wait_ns, window = round(wait_s * 1e9), 2.0      # s of rows that are repeated while it stands
+
+    def later(samples):
+        t = seconds(leg, samples)
+        rows = np.flatnonzero((t >= at_s - window) & (t < at_s))
+        times = int(wait_s / window)
+        index = np.r_[np.flatnonzero(t < at_s), np.tile(rows, times), np.flatnonzero(t >= at_s)]
+        shift_ns = np.r_[np.zeros((t < at_s).sum(), int),
+                         np.repeat(np.arange(1, times + 1), len(rows)) * round(window * 1e9),
+                         np.full((t >= at_s).sum(), wait_ns)]
+        out = take(samples, index)
+        return replace(out, stamp_ns=out.stamp_ns + shift_ns,
+                       received_ns=out.received_ns + shift_ns)
+    fix = later(leg.fix)
+    gone = np.clip((seconds(leg, fix) - at_s - 20.0) / (wait_s - 40.0), 0.0, 1.0)
+    return replace(leg, stop_ns=leg.stop_ns + wait_ns, imu=later(leg.imu),
+                   odometer=later(leg.odometer), fix=replace(
+                       fix, latitude=fix.latitude + gone * metres / 6.37e6))
+
+
+def test_a_leg_is_cut_where_a_ferry_carried_the_vehicle():
+    made = drive(scenario='town', duration=600.0, imu_grade='industrial', seed=8)
+    leg, config = made.leg(), settings(made, heading_sigma=None, method='smoother')
+    t = seconds(leg, leg.odometer)
+    still = np.interp(np.arange(0.0, 580.0), t[1:], np.diff(leg.odometer.value)) == 0
+    at = next(k for k in range(250, 400) if still[k - 4:k + 1].all())
+    wait, metres = 200.0, 2000.0
+    leg = ferried(leg, at, wait, metres)
+    assert Code.ODOMETER_STILL in {r.code for r in calibrate(leg, config).reasons}
+    results = calibrate_parts(leg, config)
+    assert len(results) == 2
+    # cut where the ship moves, to the time that a fix takes to show 10 sigmas of motion
+    (_, end), (begin, _) = (((r.start_ns - leg.start_ns) * 1e-9, (r.stop_ns - leg.start_ns) * 1e-9)
+                            for r in results)
+    assert end == pytest.approx(at + 20.0, abs=5.0)
+    assert begin == pytest.approx(at + wait - 20.0, abs=5.0)
+    for one in results:
+        assert 'the fixes move by' in {r.code: r.text for r in one.reasons}[Code.LEG_CUT]
+        assert Code.NO_STANDSTILL not in {r.code for r in one.reasons}
+    found = combine(results, config)
+    assert found.verdict is not Verdict.REJECTED
+    scale = found.estimates[SCALE]
+    assert abs(scale.value - made.truth.scale) < 3.3 * scale.sigma
+
+
+def test_a_counter_that_never_counts_again_rejects_the_leg(made):
+    leg = made.leg()
+    value = np.minimum(leg.odometer.value, np.interp(150.0, seconds(leg, leg.odometer),
+                                                     leg.odometer.value).astype(np.int64))
+    dead = replace(leg, odometer=replace(leg.odometer, value=value))
+    (only,) = calibrate_parts(dead, settings(made, heading_sigma=None, method='smoother'))
+    assert Code.ODOMETER_STILL in {r.code for r in only.reasons}
