@@ -16,6 +16,9 @@ from odocal_ros.settings.config import MECANUM, OMNI, SKID
 SIDE_ROWS = np.array([[1.0, 0.0, -1.0], [1.0, 0.0, 1.0]])
 # definition: front left, front right, rear left, rear right
 MECANUM_ROWS = np.array([[1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
+# relative, 1 sigma, of the wheels of a robot that moves sideways. Judgement: without it the scale
+# of a run of 7 m with few turns was 1.9 % off (sigma 1.9 %), now 0.04 % (0.08 %)
+UNEQUAL = 0.03
 
 
 def rows_of(kind: str, count: int, offset: float = 0.0) -> Floats:
@@ -139,13 +142,16 @@ class Wheels:
                         -1), J
 
     def prior(self, left: float, right: float, width: float) -> tuple[Floats, Floats]:
-        """Return first values and sigmas of the constants by the first values of a run."""
+        """Return first values (m,) and their covariance (m, m) by the first values of a run."""
         wide = 0.35     # relative, judgement: no information for any run with a result
         w, scale = self.count.shape[1], (left + right) / 2
         scales = [left, right] if w == len(SIDE_ROWS) else [scale] * w
         more = {SKID: [(0.0, 1 / width)], MECANUM: [(1.0, 1.0)]}.get(self.kind, [])
-        return (np.array([*scales, 1 / width, *(value for value, _ in more)]),
-                np.array([wide * scale] * w + [1 / width, *(sigma for _, sigma in more)]))
+        covariance = np.diag([(wide * scale)**2] * w + [
+            width**-2.0, *(sigma**2 for _, sigma in more)])
+        if w > len(SIDE_ROWS):
+            covariance[:w, :w] = scale**2 * (wide**2 + UNEQUAL**2 * np.eye(w))
+        return np.array([*scales, 1 / width, *(value for value, _ in more)]), covariance
 
 
 def of_sides(left: Floats, right: Floats, kind: str) -> Wheels:
