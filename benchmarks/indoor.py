@@ -20,8 +20,9 @@ within 1.96 sigma, the rms and the largest of error over sigma, the largest of a
 the median sigma; verdicts; in how many drives each reason was given.
 
 Kinds ROBOT_REFERENCE have no IMU: ``wheels`` is the differential robot, ``skid`` slides in turns
-on four wheels, and ``mecanum`` has four wheels and moves sideways (sim/wheels.py). Their values:
-width is that on the spot (of mecanum the rotation lever), arc at a radius of two widths.
+on four wheels, and ``mecanum`` (four wheels) and ``omni`` (three or four) move sideways
+(sim/wheels.py). Their values: width is that on the spot (of the last two the rotation lever), arc
+at a radius of two widths.
 """
 
 from collections import Counter
@@ -38,8 +39,9 @@ from zoo_table import print_errors
 FIRST_SEED, SEEDS_A_KIND = 193_000_000, 1_000_000
 REFERENCES = ('mocap', 'total_station', 'slam', 'amcl')
 # planar estimator: what SimOptions has of each, without an IMU
-PLANAR = {'wheels': {}, 'skid': {'drive': 'skid', 'wheels': 4}, 'mecanum': {'drive': 'mecanum'}}
-SHORTEST = {'wheels': 30.0, 'skid': 30.0, 'mecanum': 70.0}     # s
+PLANAR = {'wheels': {}, 'skid': {'drive': 'skid', 'wheels': 4}, 'mecanum': {'drive': 'mecanum'},
+          'omni': {'drive': 'omni'}}
+SHORTEST = {'wheels': 30.0, 'skid': 30.0, 'mecanum': 70.0, 'omni': 70.0}     # s
 KINDS = (*REFERENCES, *(f'{robot}_{reference}' for robot in PLANAR
                         for reference in REFERENCES))
 GRADES = ('consumer', 'industrial')
@@ -62,7 +64,9 @@ def options_of(seed):
            'imu_lever_arm': tuple(map(float, rng.normal(0, 0.05, 3))),
            'scale': 8.9e-5 * (1 + 0.03 * float(rng.standard_normal()))}
     robot, _, reference = KINDS[e].partition('_') if e >= len(REFERENCES) else ('', '', KINDS[e])
-    if robot:       # the first sideways move of a mecanum robot ends within a minute
+    if robot == 'omni':
+        own['wheels'] = 3 + k % 2
+    if robot:       # the first sideways move of a robot ends within a minute
         own |= PLANAR[robot] | {'imu': False, 'duration': max(own['duration'], SHORTEST[robot])}
     return drawn(seed, 'indoor', GRADES[k % 2], IMU_EFFECTS, **own, nominal_scale=8.9e-5,
                  slope=0.0, odometer_lever_arm=(0.0, 0.0, 0.0), antenna_lever_arm=(0.0, 0.0, 0.0),

@@ -21,6 +21,8 @@ ROS2_CONTROLLERS = {     # ros2_controllers, <name>/src/<name>.yaml or <name>_pa
     'tricycle_controller': {'wheel_radius'}}
 # ros2_controllers, mecanum_drive_controller, jazzy: group kinematics; Odometry::setWheelsParams
 MECANUM_KINEMATICS = {'wheels_radius', 'sum_of_robot_center_projection_on_X_Y_axis'}
+# ros2_controllers, omni_wheel_drive_controller_parameters.yaml
+OMNI_WHEEL_DRIVE = {'wheel_offset', 'robot_radius', 'wheel_radius'}
 # ros2_controllers, diff_drive_controller_parameter.yaml: six values, in the order of a Twist
 TWIST_COVARIANCE = 'twist_covariance_diagonal'
 # VINS-Fusion forks with wheels (VIW-Fusion), estimator/parameters.cpp; m/s per sqrt(Hz)

@@ -158,10 +158,10 @@ def test_the_walk_through_a_room_prints_what_the_page_says(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     lines = [shlex.split(line)[1:] for page, line in all_commands('odocal') if page == INDOOR]
     assert [words[0] for words in lines] == ['simulate', 'inspect', 'replay'] + [
-        'simulate', 'replay'] * 4
+        'simulate', 'replay'] * 5
     shown = [text for language, text in fenced(page_of(INDOOR)) if language == 'text']
     # blocks of the page after the replay of each bag
-    count = {'robot': 2, 'square': 1, 'wheels': 1, 'skid': 1, 'mecanum': 2}
+    count = {'robot': 2, 'square': 1, 'wheels': 1, 'skid': 1, 'mecanum': 2, 'omni': 1}
     assert len(shown) == sum(count.values())
     for words in lines:
         capfd.readouterr()

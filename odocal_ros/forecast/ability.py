@@ -19,7 +19,7 @@ from odocal_ros.forecast.planned_drive import from_rates
 from odocal_ros.nav.alignment import Alignment, HEADING_LIMIT
 from odocal_ros.pipeline.methods import METHODS
 from odocal_ros.screening.glitches import Oriented, oriented
-from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM, SKID, with_settings
+from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM, OMNI, SKID, with_settings
 
 EXACT_HEADING = 1e-6      # rad; judgement: of a heading with a configured sigma of 0
 COURSE_FIX_SIGMA = 1.5    # m; physical: fixes of a single receiver, for a course
@@ -31,7 +31,9 @@ OF_DRIVE = {
     SKID: ('the scale', 'left and right wheel', 'the track width (on the spot)',
            'the track width arc (on arcs)'),
     MECANUM: ('the scale', 'the rotation lever (in turns)',
-              'the lateral scale factor (in sideways motion)')}
+              'the lateral scale factor (in sideways motion)'),
+    OMNI: ('the scale', 'the rotation lever (in turns)',
+           'the factor of each wheel (in sideways motion)')}
 ALL_SAMPLES = 'smoother'   # the method that needs no external heading
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.planar.drive import Wheels
+from odocal_ros.calib.planar.drive import of_sides, rows_of, Wheels
 from odocal_ros.calib.planar.fit import fit_at, LEAST, LEVELS, priors
 from odocal_ros.calib.planar.problem import Known, Run
 from odocal_ros.calib.planar.result import result_of
@@ -32,7 +32,15 @@ from odocal_ros.forecast.planned_methods import (
 from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.forecast.smoother_forecast import relative
 from odocal_ros.nav.earth import rate_without_north
-from odocal_ros.settings.config import Config, DIFFERENTIAL, HOLONOMIC, SIDES, SKID, with_settings
+from odocal_ros.settings.config import (
+    Config,
+    DIFFERENTIAL,
+    HOLONOMIC,
+    MECANUM,
+    SIDES,
+    SKID,
+    with_settings,
+)
 from odocal_ros.settings.grades import grade_of
 
 # m^2/m, judgement: what fits of robots without sideways slip find, 0.3 mm in a metre
@@ -68,17 +76,8 @@ class Robot:
 def planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Floats]:
     """Return the run of a motion without errors, true states (n + 1, 5) and constants (w,)."""
     d = motion.increments
-    curvature = np.array([1 / robot.width])
-    apart, own = d[:, 2] * robot.width, [1.0, 1.0, *curvature]
-    if robot.drive == SKID:
-        arc = 1 / (robot.straight_width or robot.width) - 1 / robot.width
-        own.append(arc)
-        for _ in range(50):      # the width depends on the wheels
-            share = Wheels(d[:, 0] - apart / 2, d[:, 0] + apart / 2, 0 * apart,
-                           SKID).straightness
-            apart = d[:, 2] / (1 / robot.width + arc * share)
-    own += [1.0, 0.0] * (robot.drive in HOLONOMIC)
-    wheels = Wheels(d[:, 0] - apart / 2, d[:, 0] + apart / 2, d[:, 1], robot.drive)
+    wheels, more = _wheels(d, robot)
+    own = [*np.ones(wheels.count.shape[1]), 1 / robot.width, *more]
     heading = np.append(0.0, np.cumsum(d[:, 2]))
     chord = (d[:, 0] + 1j * d[:, 1]) * np.sinc(d[:, 2] / (2 * np.pi))
     z = np.append(0.0, np.cumsum(chord * np.exp(1j * (heading[1:] + heading[:-1]) / 2)))
@@ -86,8 +85,23 @@ def planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Floats]:
     node = _measured(motion, robot)
     gyro = d[:, 2] if robot.imu else np.empty(0)
     run = Run(motion.t, wheels, node, state[node, :2], np.full(len(node), robot.white), gyro)
-    more = [0.0] * (3 + 2 * robot.imu)
-    return run, state, np.array([*own, *more])
+    return run, state, np.array([*own, *[0.0] * (3 + 2 * robot.imu)])
+
+
+def _wheels(d: Floats, robot: Robot) -> tuple[Wheels, list[float]]:
+    """Return the wheels of body increments, (n, 3), and the constants after the curvature."""
+    if robot.drive in HOLONOMIC:
+        rows = rows_of(robot.drive, robot.wheels)
+        count = (d * [1.0, 1.0, robot.width / 2]) @ rows.T
+        return Wheels(count, rows, robot.drive), [1.0] * (robot.drive == MECANUM)
+    apart = d[:, 2] * robot.width
+    arc = 1 / (robot.straight_width or robot.width) - 1 / robot.width
+
+    def of(apart: Floats) -> Wheels:
+        return of_sides(d[:, 0] - apart / 2, d[:, 0] + apart / 2, robot.drive)
+    for _ in range(50 * (robot.drive == SKID)):      # the width depends on the wheels
+        apart = d[:, 2] / (1 / robot.width + arc * of(apart).straightness)
+    return of(apart), [arc] * (robot.drive == SKID)
 
 
 def _measured(motion: RobotMotion, robot: Robot) -> Ints:
@@ -112,11 +126,11 @@ def predict_planar(motion: RobotMotion, robot: Robot, config: Config) -> MethodR
                   gyro_bias_sigma=max(grade.gyro_bias, 1e-6))
     _, prior = priors(run, known, 1.0, 1.0, robot.width)
     first = np.array([1.0, 1.0, 1 / robot.width])
-    found = fit_at(run, known, state, constants, _levels(motion, robot), first, prior)
+    found = fit_at(run, known, state, constants, _levels(motion, robot, run), first, prior)
     return result_of(found, '1', 0.0, config)
 
 
-def _levels(motion: RobotMotion, robot: Robot) -> dict[str, float]:
+def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:
     """Return the noise levels that a fit would estimate, at the mean path of a wheel."""
     d = motion.increments
     path = np.hypot(d[:, 0], d[:, 1]) + np.abs(d[:, 2]) * robot.width / 2
@@ -127,10 +141,10 @@ def _levels(motion: RobotMotion, robot: Robot) -> dict[str, float]:
         """Return the variance of the slip of one wheel a metre of its path."""
         metres = (path[of] + 0.1 * MOTION_STEP).sum() if of.any() else 1.0
         return float(robot.slip**2 * max(of.sum(), 1) * MOTION_STEP / metres)
-    sides = robot.wheels / 2      # wheels whose mean is a side
-    found = {'along': level(moving) / (2 * sides), 'turn': 2 * level(moving & ~spins) / sides,
-             'spin': 2 * level(spins) / sides, 'drift': robot.drift**2,
-             'side': level(moving) / (2 * sides) if robot.drive in HOLONOMIC else NO_SIDE_SLIP,
+    table = (run.wheels.table**2).sum(1) * len(run.wheels.rows) / robot.wheels
+    side = level(moving) * table[1] if robot.drive in HOLONOMIC else NO_SIDE_SLIP
+    found = {'along': level(moving) * table[0], 'turn': level(moving & ~spins) * table[2],
+             'spin': level(spins) * table[2], 'drift': robot.drift**2, 'side': side,
              'white': 0.0 if robot.at_rests else 1.0, 'gyro': 1.0}
     return {name: max(value, LEAST * LEVELS[name]) for name, value in found.items()}
 

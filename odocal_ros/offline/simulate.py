@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--wheels', type=int, metavar='N', help='number of wheels, 1 to 8 (default 1; indoor '
         '2); more than 2 are joints of one JointState')
     add('--drive', metavar='KIND', help='of a robot (indoor, square): differential (default), '
-        'skid or mecanum (4 wheels, sideways moves)')
+        'skid, mecanum (4 wheels) or omni (3 or more), with sideways moves')
     add('--no-imu', action='store_const', const=False, dest='imu', help='a robot without an IMU')
     add('--front-fixed', action='store_const', const=False, dest='front_steers',
         help='the front ones of more than 2 wheels do not steer')

@@ -11,7 +11,7 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.output.figures import inverse, known, with_sigma
 from odocal_ros.output.file_head import head
 from odocal_ros.outside.yaml_text import parameters
-from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM, SKID
+from odocal_ros.settings.config import Config, DIFFERENTIAL, HOLONOMIC, MECANUM, OMNI, SKID
 from odocal_ros.settings.nominal import nominal_scale
 
 CONTROLLERS = 'ros2_controllers.yaml'
@@ -20,6 +20,10 @@ RADIUS = {'ackermann_steering_controller': 'traction_wheels_radius',
           'tricycle_steering_controller': 'traction_wheels_radius',
           'bicycle_steering_controller': 'traction_wheel_radius',
           'tricycle_controller': 'wheel_radius'}
+# their parameters for radius and rotation lever
+HOLONOMIC_KEYS = {
+    MECANUM: ('wheels_radius', 'sum_of_robot_center_projection_on_X_Y_axis'),
+    OMNI: ('wheel_radius', 'robot_radius')}
 DEVICES = 'wheel_input.txt'
 MICRO = 1e6    # definition: millionths in 1
 
@@ -44,11 +48,17 @@ def controllers(calibration: Calibration, config: Config,
 def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any]]:
     """Return the parameters by controller, of those that fit the drive."""
     radius = wheel_radius(calibration, config)
-    if config.odometer.drive == MECANUM:
+    if config.odometer.drive in HOLONOMIC:
         lever = known(calibration.estimates, 'rotation_lever').value
-        found = {'wheels_radius': radius, 'sum_of_robot_center_projection_on_X_Y_axis': lever}
-        own = {key: value for key, value in found.items() if value is not None}
-        return {'mecanum_drive_controller': {'kinematics': own}} if own else {}
+        keys = HOLONOMIC_KEYS[config.odometer.drive]
+        own = {key: value for key, value in zip(keys, (radius, lever), strict=True)
+               if value is not None}
+        if not own:
+            return {}
+        if config.odometer.drive == MECANUM:
+            return {'mecanum_drive_controller': {'kinematics': own}}
+        return {'omni_wheel_drive_controller': {
+            'wheel_offset': config.odometer.wheel_offset, **own}}
     multipliers = _multipliers(calibration, config)
     blocks: dict[str, dict[str, Any]] = (
         {'diff_drive_controller': multipliers} if multipliers else {})

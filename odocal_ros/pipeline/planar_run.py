@@ -10,7 +10,7 @@ import numpy as np
 
 from odocal_ros.calib.choice import PLANAR
 from odocal_ros.calib.failed import failed, raised_if_wild
-from odocal_ros.calib.planar.drive import Wheels
+from odocal_ros.calib.planar.drive import MECANUM_ROWS, of_sides, rows_of, Wheels
 from odocal_ros.calib.planar.problem import Fit, Known, Run
 from odocal_ros.calib.planar.result import refused, result_of
 from odocal_ros.calib.result import LegResult, MethodResult
@@ -24,17 +24,24 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.screen import screen
-from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM
+from odocal_ros.settings.config import (
+    Config,
+    DIFFERENTIAL,
+    FEWEST_OMNI,
+    HOLONOMIC,
+    MECANUM,
+    OMNI,
+)
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.nominal import nominal_scale
 
 LEAST_NODE, MOST_NODES = 0.1, 20_000      # s between nodes, judgement: 0.1 rad of a turn
 FEWEST_POSITIONS = 10       # judgement: as for other methods
-MECANUM_WHEELS = 4     # definition
 # m and sigmas of a height between places for a slope, judgement: longer than a room is high
 SLOPE_LENGTH, HEIGHT_SIGMAS = 5.0, 30.0
 # rad/sqrt(s), judgement: tilt and vibration of a robot, which the grade does not have
 GYRO_LEAST = 1e-3
+BY_AXLE = 'left before right of each axle from front to rear.'
 # codes of an IMU that the planar estimator can do without
 OF_IMU = {Code.NO_IMU, Code.NO_ACCELEROMETER, Code.IMU_GAP, Code.LOCAL_FRAME}
 
@@ -87,13 +94,8 @@ def _guarded(run: Run, inputs: Inputs, config: Config, progress: Callable[[Stage
 def _run_of(inputs: Inputs, config: Config) -> tuple[Run | None, list[Reason]]:
     """Return the run on nodes, or None and why."""
     travels, kind = inputs.travels, config.odometer.drive
-    needed = MECANUM_WHEELS if kind == MECANUM else 2
-    even = len(travels) % 2 == 0 and len(travels) >= needed
-    if not even or kind == MECANUM and len(travels) != MECANUM_WHEELS:
-        return None, [Reason(Code.NO_ODOMETER, f'{kind} drive: {max(len(travels), 1)} wheels with '
-                             f'known sides; required: {needed}',
-                             'Name the wheels in odometer.wheels, left before right of each axle '
-                             'from front to rear.')]
+    if lacking := _lacking_wheels(kind, len(travels)):
+        return None, [lacking]
     low = max(0.0, *(one.t[0] for one in travels))
     high = min(inputs.t_stop, *(one.t[-1] for one in travels))
     inside = np.flatnonzero((inputs.t_fix >= low) & (inputs.t_fix <= high))
@@ -107,12 +109,24 @@ def _run_of(inputs: Inputs, config: Config) -> tuple[Run | None, list[Reason]]:
     covariance = inputs.covariance_n[used]
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     steps = np.array([np.diff(one.at(t)) for one in travels])
-    left, right = steps[::2].mean(axis=0), steps[1::2].mean(axis=0)
-    lateral = (steps[1] - steps[0] + steps[2] - steps[3]) / 4 if kind == MECANUM else 0 * left
-    if not (np.abs(left) + np.abs(right)).any():
+    wheels = (Wheels(steps.T, rows_of(kind, len(steps), config.odometer.wheel_offset), kind)
+              if kind in HOLONOMIC else
+              of_sides(steps[::2].mean(axis=0), steps[1::2].mean(axis=0), kind))
+    if not wheels.count.any():
         return None, [Reason(Code.ODOMETER_STILL, 'the wheels do not turn during the leg')]
-    return Run(t, Wheels(left, right, lateral, kind), node, position, sigma,
-               _gyro(inputs, t)), []
+    return Run(t, wheels, node, position, sigma, _gyro(inputs, t)), []
+
+
+def _lacking_wheels(kind: str, count: int) -> Reason | None:
+    """Return the reason if a drive does not have so many wheels with known places."""
+    needed, fits, order = {
+        MECANUM: ('4', count == len(MECANUM_ROWS), BY_AXLE),
+        OMNI: (f'{FEWEST_OMNI} or more', count >= FEWEST_OMNI,
+               'counter-clockwise, the first at odometer.wheel_offset.')}.get(
+        kind, ('2', count >= 2 and count % 2 == 0, BY_AXLE))
+    return None if fits else Reason(
+        Code.NO_ODOMETER, f'{kind} drive: {max(count, 1)} wheels with known sides; required: '
+        f'{needed}', f'Name the wheels in odometer.wheels, {order}')
 
 
 def shortened_by_slopes(inputs: Inputs) -> float:
@@ -159,8 +173,9 @@ def _known(run: Run, inputs: Inputs, config: Config) -> Known:
     """Return the priors of the constants by the settings."""
     antenna, odometer = config.gnss.lever_arm, config.odometer.lever_arm
     known: dict[str, Any] = {
-        'width': config.odometer.track_width * (run.wheels.kind != MECANUM), 'offset_sigma': max(
-            config.gnss.lever_arm_sigma, 1e-3), 'delay_sigma': config.gnss.time_sigma,
+        'width': config.odometer.track_width * (run.wheels.kind not in HOLONOMIC),
+        'offset_sigma': max(config.gnss.lever_arm_sigma, 1e-3),
+        'delay_sigma': config.gnss.time_sigma,
         'offset': (antenna[0] - odometer[0], antenna[1] - odometer[1])}
     if len(run.gyro):
         grade = grade_of(config.imu)

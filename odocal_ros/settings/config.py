@@ -31,8 +31,9 @@ GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
 NAN = math.nan
 SIDES = ('left', 'right')     # names of two wheels
-DRIVES = DIFFERENTIAL, SKID, MECANUM = 'differential', 'skid', 'mecanum'
-HOLONOMIC = (MECANUM,)        # drives that move sideways
+DRIVES = DIFFERENTIAL, SKID, MECANUM, OMNI = 'differential', 'skid', 'mecanum', 'omni'
+HOLONOMIC = (MECANUM, OMNI)        # drives that move sideways
+FEWEST_OMNI = 3        # definition: wheels of such a drive
 
 TYPICAL = 'typical value of IMUs sold in this grade'
 
@@ -78,8 +79,11 @@ class OdometerConfig:
     right: str = setting('', ro=True, about='Right one of two wheels: joint name, array index, or '
                          "'topic' (odometer_right).")
     drive: str = setting(DIFFERENTIAL, choices=DRIVES, ro=True, about='Kinematics: differential '
-                         '(cars too), skid (wheels or tracks that slide in turns) or mecanum '
-                         '(four odometer.wheels: front left, front right, rear left, rear right).')
+                         '(cars too), skid (wheels or tracks that slide in turns), mecanum '
+                         '(four odometer.wheels: front left, front right, rear left, rear right) '
+                         'or omni (three or more, counter-clockwise in a circle).')
+    wheel_offset: float = setting(0.0, 'rad', -6.3, 6.3, ro=True, about='Of omni wheels: angle '
+                                  'from the x axis to the first, seen from the middle.')
     track_width: float = setting(0.0, 'm', 0.0, 20.0, about='Distance between the left and the '
                                  'right wheel; 0: unknown.')
 

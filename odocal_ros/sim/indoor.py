@@ -35,7 +35,7 @@ def stretches(duration: float, rng: np.random.Generator) -> list[Stretch]:
 
 
 def sideways(found: list[Stretch]) -> list[tuple[list[Piece], list[Piece], list[Piece]]]:
-    """Return stretches of a mecanum robot: every third move is to the left, with its turns."""
+    """Return stretches with every third move to the left, and its turns."""
     return [(hold(sum(d for d, _ in speed)), rate, speed) if k % 3 == 2 else
             (speed, rate, hold(sum(d for d, _ in speed))) for k, (speed, rate) in enumerate(found)]
 

@@ -9,7 +9,7 @@ import math
 from typing import Any
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.settings.config import DIFFERENTIAL, DRIVES, MECANUM
+from odocal_ros.settings.config import DIFFERENTIAL, DRIVES, FEWEST_OMNI, MECANUM, OMNI
 from odocal_ros.settings.grades import Grade, GRADES
 from odocal_ros.sim.real import NONE3, Real, Vector
 from odocal_ros.sim.references import REFERENCES
@@ -60,7 +60,7 @@ class SimOptions:
     scale: float = BY_SCENARIO   # m/pulse, 1 or m/rad: the true value
     nominal_scale: float = BY_SCENARIO   # K0, configured by the operator
     speed_noise: float = 0.0               # m/s, white, of kind speed
-    drive: str = DIFFERENTIAL              # of a robot: or skid, mecanum (4 wheels)
+    drive: str = DIFFERENTIAL              # of a robot: or skid, mecanum, omni
     two_wheels: bool = False               # as wheels = 2
     wheels: int = BY_SCENARIO              # more than 2: joints of one JointState
     wheel_difference: float = 0.004        # K_right / K_left - 1; of more wheels 1 sigma each
@@ -165,6 +165,8 @@ def resolved(options: SimOptions) -> SimOptions:
         _choice(f'--drive {options.drive}: --scenario', options.scenario, ROBOTS)
         options = replace(options, front_steers=False, wheelbase=options.track_width,
                           wheels=4 if options.drive == MECANUM else options.wheels)
+    if options.drive == OMNI:
+        options = replace(options, wheels=max(options.wheels, FEWEST_OMNI))
     if options.wheel_count > MOST_OWN_TOPICS and options.odometer == 'counts':
         options = replace(options, odometer='angle')
     scale, nominal = (INDOOR_SCALES if options.scenario in ROBOTS else SCALES)[options.odometer]

@@ -151,7 +151,7 @@ def square(duration: float, rng: np.random.Generator) -> Route:
     return _route([*small.square(), (hold(rest), hold(rest))])
 
 
-def mecanum(duration: float, rng: np.random.Generator) -> Route:
+def with_sideways_moves(duration: float, rng: np.random.Generator) -> Route:
     """Return the moves of ``indoor``, every third one sideways."""
     _rest('indoor', duration, 2 * small.STILL, least=math.ceil(3 * small.LONGEST))
     parts = small.sideways(small.stretches(duration, rng))

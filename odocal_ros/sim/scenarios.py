@@ -23,7 +23,7 @@ from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.local_frame import local_fixes
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.settings.config import MECANUM
+from odocal_ros.settings.config import HOLONOMIC
 from odocal_ros.sim import body, sensors
 from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
 from odocal_ros.sim.noise import stamps, stream
@@ -33,7 +33,7 @@ from odocal_ros.sim.real_fixes import velocity
 from odocal_ros.sim.real_imu import own_angles
 from odocal_ros.sim.references import Reference, REFERENCES
 from odocal_ros.sim.road import Hills
-from odocal_ros.sim.routes import mecanum, Route, ROUTES
+from odocal_ros.sim.routes import Route, ROUTES, with_sideways_moves
 from odocal_ros.sim.wheels import leg_factor, wheels_of
 
 __all__ = ['Drive', 'SCENARIOS', 'SimOptions', 'Truth', 'motion_of', 'simulate']
@@ -129,7 +129,7 @@ class Drive:
 
 def motion_of(options: SimOptions) -> Motion:
     """Return the true motion of resolved options."""
-    make = mecanum if options.drive == MECANUM else ROUTES[options.scenario]
+    make = with_sideways_moves if options.drive in HOLONOMIC else ROUTES[options.scenario]
     route = make(options.duration, stream(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))

@@ -23,7 +23,7 @@ from odocal_ros.nav.rotations import (
     quat_from_rotvec,
     quat_multiply,
 )
-from odocal_ros.settings.config import DIFFERENTIAL, MECANUM
+from odocal_ros.settings.config import DIFFERENTIAL, HOLONOMIC
 from odocal_ros.sim import body, real_fixes, real_imu
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State
 from odocal_ros.sim.noise import gauss_markov, PHASE, random_walk, stamps, stream, TRANSPORT, white
@@ -172,7 +172,7 @@ def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
     """Return the metres a wheel has spun beyond the ground by each time: (n,)."""
     spun = np.zeros(len(state.t))
     moving = (np.abs(state.speed) > AT_REST) | (np.abs(state.yaw_rate) > AT_REST)
-    if options.drive == MECANUM:
+    if options.drive in HOLONOMIC:
         moving |= np.abs(state.sway[:, 0]) > AT_REST
     steps = np.diff(state.t, prepend=state.t[:1]) * moving
     if options.slip_walk:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 import math
 from typing import Any
 
-from odocal_ros.settings.config import DIFFERENTIAL, MECANUM, SIDES
+from odocal_ros.settings.config import DIFFERENTIAL, MECANUM, SIDES, SKID
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import Drive
@@ -79,7 +79,7 @@ def _robot(options: SimOptions) -> dict[str, Any]:
     found = {'track_width': width}
     if options.drive == MECANUM:
         found |= {'lateral_scale_factor': SIDEWAYS * options.scale}
-    else:
+    elif options.drive == SKID:
         found |= {'track_width_arc': effective_width(options, 2 * width)}
     return {'robot': found}
 

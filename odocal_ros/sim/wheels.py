@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.integral import running_integral
-from odocal_ros.settings.config import MECANUM, SIDES, SKID
+from odocal_ros.settings.config import MECANUM, OMNI, SIDES, SKID
 from odocal_ros.sim.motion import contact_speed, State, turn_rate
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
@@ -53,6 +53,11 @@ def wheels_of(options: SimOptions) -> list[SimWheel]:
     if n == 1:
         return [SimWheel('wheel_joint', 'L', middle, options.scale)]
     half = np.array([0.0, options.track_width / 2, 0.0])
+    if options.drive == OMNI:
+        angle = omni_angles(n)
+        arms = options.track_width / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+        return [SimWheel(f'omni_{k}', f'omni_{k}', middle + arm, scale) for k, (arm, scale)
+                in enumerate(zip(arms, _scales(options, np.ones(n, bool)), strict=True), 1)]
     if n == len(SIDES):
         ratio = 1 + options.wheel_difference        # right over left
         left = options.scale * (1 + 1 / ratio) / 2
@@ -64,11 +69,23 @@ def wheels_of(options: SimOptions) -> list[SimWheel]:
     places += [('front', 'front', 0 * half)] * (n % 2)
     front = np.array([options.wheelbase, 0.0, 0.0])
     steered = np.array([axle == 'front' and options.front_steers for _, axle, _ in places])
+    return [SimWheel(name, name, middle + arm + front * (axle == 'front'), scale, steers)
+            for (name, axle, arm), scale, steers in zip(
+                places, _scales(options, ~steered), steered.tolist(), strict=True)]
+
+
+def _scales(options: SimOptions, counted: Bools) -> list[float]:
+    """Return the factors of more than two wheels, drawn; counted : (n,) those of the mean."""
+    n = len(counted)
     scales = 1 + options.wheel_difference * stream(options.seed, 'wheels').standard_normal(n)
-    scales *= options.scale * np.mean(1 / scales[~steered])
-    return [SimWheel(name, name, middle + arm + front * (axle == 'front'), float(scale), steers)
-            for (name, axle, arm), scale, steers in zip(places, scales, steered.tolist(),
-                                                        strict=True)]
+    scales *= options.scale * np.mean(1 / scales[counted])
+    return [float(scale) for scale in scales]
+
+
+def omni_angles(count: int) -> Floats:
+    """Return the angles of omni wheels from the x axis, counter-clockwise, rad: (n,)."""
+    out: Floats = 2 * np.pi * np.arange(count) / count
+    return out
 
 
 def steered_path(state: State, arm: Floats) -> Floats:
@@ -95,7 +112,13 @@ def _widening(radius: Floats, width: float) -> Floats:
 
 
 def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
-    """Return the metres that a wheel of skid steering or a mecanum wheel has rolled: (n,)."""
+    """Return the metres that a wheel of skid steering, mecanum or omni has rolled: (n,)."""
+    if options.drive == OMNI:       # it rolls clockwise about the middle, seen from above
+        x, y, _ = wheel.arm - np.asarray(options.odometer_lever_arm)
+        radius = np.hypot(x, y)
+        lateral = running_integral(state.t, state.sway[:, 0])
+        out: Floats = (y * state.travel - x * lateral) / radius - radius * state.turned
+        return out
     side = -1.0 if wheel.name.split('_joint')[0].removesuffix('_wheel').endswith(SIDES[0]) else 1.0
     if options.drive == MECANUM:
         lateral = running_integral(state.t, state.sway[:, 0]) / SIDEWAYS

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.calib.planar.drive import Wheels
+from odocal_ros.calib.planar.drive import of_sides, rows_of, Wheels
 from odocal_ros.calib.planar.fit import fit, LEVELS, noise_path
 from odocal_ros.calib.planar.problem import Known, Run
 
 LEFT, RIGHT, WIDTH = 0.0352, 0.0349, 0.31     # m/rad, m
+SCALES = np.array([0.0352, 0.0349, 0.0351, 0.0356])     # m/rad, of each wheel
 STEP = 0.1      # s
 
 
@@ -26,31 +27,39 @@ def body(moves):
     return np.concatenate(parts)
 
 
-def run_of(d, kind='differential', arc=0.0, lateral=0.03, slip=0.0, noise=1e-4, every=1, rng=None):
-    """Return a Run of body increments; slip m/sqrt(m) of each wheel, noise m of positions."""
+def run_of(d, kind='differential', arc=0.0, lateral=0.95, slip=0.0, noise=1e-4, every=1, rng=None,
+           offset=0.0, count=4):
+    """
+    Return a Run of body increments; slip m/sqrt(m) of each wheel, noise m of positions.
+
+    lateral : motion over rolling of mecanum wheels.   offset, count : of omni wheels.
+    """
     turn = np.append(0.0, np.cumsum(d[:, 2])) + 0.3
     chord = (d[:, 0] + 1j * d[:, 1]) * np.sinc(d[:, 2] / (2 * np.pi))
     z = np.append(0.0, np.cumsum(chord * np.exp(1j * (turn[1:] + turn[:-1]) / 2)))
-    lateral_counts = d[:, 1] / lateral
     apart = d[:, 2] * WIDTH
     for _ in range(50 * bool(arc)):     # the width depends on the wheels
-        straight = Wheels((d[:, 0] - apart / 2) / LEFT, (d[:, 0] + apart / 2) / RIGHT, 0 * apart,
-                          'skid').straightness
+        straight = of_sides((d[:, 0] - apart / 2) / LEFT, (d[:, 0] + apart / 2) / RIGHT,
+                            'skid').straightness
         apart = d[:, 2] / (1 / WIDTH + arc * straight)
-    metres = np.stack([d[:, 0] - apart / 2, d[:, 0] + apart / 2])
+    rows = rows_of(kind, count, offset)
+    side = d[:, 1] / (lateral if kind == 'mecanum' else 1.0)
+    metres = rows @ np.stack([d[:, 0], side, apart / 2])
     if slip:
         metres = metres + slip * np.sqrt(np.abs(metres)) * rng.standard_normal(metres.shape)
-    left, right = metres / np.array([[LEFT], [RIGHT]])
+    scales = SCALES[:len(rows)] if len(rows) > 2 else (LEFT, RIGHT)
+    counts = metres.T / scales
     node = np.arange(0, len(z), every)
     position = np.stack([z.real, z.imag], -1)[node]
     if rng is not None:
         position = position + noise * rng.standard_normal(position.shape)
-    return Run(STEP * np.arange(len(z)), Wheels(left, right, lateral_counts, kind), node, position,
+    return Run(STEP * np.arange(len(z)), Wheels(counts, rows, kind), node, position,
                np.full(len(node), noise))
 
 
 SQUARES = [m for side in (1, -1) for _ in range(4) for m in ((2, 0, 0), (0, 0, side * np.pi / 2))]
 SQUARES += [(2, 0, 0)]
+SIDEWAYS = [(2, 0, 0), (0, 1.5, 0), (0, 0, 2), (-1, 0, 0), (0, -1, 0), (0, 0, -1.5), (1, 1, 0)]
 
 
 def value(found, name):
@@ -79,11 +88,32 @@ def test_offset_of_the_tracked_point_is_estimated_exactly():
 
 
 def test_mecanum_straight_sideways_and_turn_are_exact():
-    """Each motion has its own constant; the run has all three."""
-    moves = [(2, 0, 0), (0, 1.5, 0), (0, 0, 2), (-1, 0, 0), (0, -1, 0), (0, 0, -1.5), (1, 1, 0)]
-    found = fit(run_of(body(moves * 2), 'mecanum', lateral=0.031), Known())
-    assert_allclose(found.value[:4], (LEFT, RIGHT, 1 / WIDTH, 0.031), rtol=1e-6)
-    assert abs(value(found, 'cross')[0]) < 1e-6
+    """Four unequal wheels, which couple the motions; the run has all three."""
+    found = fit(run_of(body(SIDEWAYS * 2), 'mecanum', lateral=0.9), Known())
+    assert_allclose(found.value[:6], (*SCALES, 1 / WIDTH, 0.9), rtol=1e-5)
+
+
+@pytest.mark.parametrize(('count', 'offset'), [(3, 0.0), (4, 0.0), (3, 0.5), (4, -2.0)])
+def test_omni_wheels_are_exact(count, offset):
+    """Unequal wheels in a circle, the first of them at an angle."""
+    found = fit(run_of(body(SIDEWAYS * 2), 'omni', offset=offset, count=count), Known())
+    assert_allclose(found.value[:count + 1], (*SCALES[:count], 1 / WIDTH), rtol=1e-5)
+
+
+@pytest.mark.parametrize('kind', ['differential', 'mecanum', 'omni'])
+def test_wheels_by_their_rows_give_the_motion_that_rolled_them(kind):
+    """The table is the pseudo-inverse of the rows: numpy.linalg.pinv."""
+    rows = rows_of(kind, 5, 0.3)
+    table = Wheels(np.zeros((1, len(rows))), rows, kind).table
+    assert_allclose(table, np.linalg.pinv(rows) * [[1], [1], [2]], atol=1e-12)
+
+
+def test_omni_rows_are_those_of_omni_wheel_drive_controller():
+    """ros2_controllers, test_odometry.cpp: 1 m/s turns wheels of 0.1 m by 0, 10, 0, -10 rad/s."""
+    forward, left, turn = (rows_of('omni', 4) @ np.eye(3) / 0.1).T
+    assert_allclose(forward, (0, 10, 0, -10), atol=1e-12)
+    assert_allclose(left, (-10, 0, 10, 0), atol=1e-12)
+    assert_allclose(turn, -10)
 
 
 def test_width_of_skid_steering_on_the_spot_and_on_arcs_is_exact():
@@ -127,19 +157,19 @@ def test_sigma_is_the_bound_of_a_straight_run():
     assert level['along'] == pytest.approx(LEVELS['along'], rel=0.5)
 
 
-@pytest.mark.parametrize('kind', ['differential', 'skid', 'mecanum'])
+@pytest.mark.parametrize('kind', ['differential', 'skid', 'mecanum', 'omni'])
 def test_truth_is_within_sigma(kind):
     """Ten runs with slip and noise: the rms of error over sigma is that of ten draws."""
-    sideways = [(0, 1, 0), (0, -1.2, 0)] * (kind == 'mecanum')
+    sideways = [(0, 1, 0), (0, -1.2, 0)] * (kind in ('mecanum', 'omni'))
     arcs = [(2, 0, 1.2), (2, 0, -1.5)]
     off = []
     for seed in range(10):
         rng = np.random.default_rng(100 + seed)
         d = body((SQUARES + arcs + sideways) * 2)
         found = fit(run_of(d, kind, arc=0.5 * (kind == 'skid'), slip=3e-3, noise=0.005, every=2,
-                           rng=rng), Known())
+                           rng=rng, count=3), Known())
         truth = {'left': LEFT, 'right': RIGHT, 'curvature': 1 / WIDTH, 'arc': 0.5,
-                 'lateral': 0.03, 'cross': 0.0}
+                 'lateral': 0.95} | {f'wheel_{k}': one for k, one in enumerate(SCALES, 1)}
         off.append([(value(found, n)[0] - truth[n]) / value(found, n)[1]
                     for n in run_names(found)])
     rms = np.sqrt(np.mean(np.square(off), axis=0))

@@ -42,7 +42,7 @@ def driven(drive='differential', **more):
 
 @pytest.mark.core
 @pytest.mark.parametrize(('drive', 'wheels'), [
-    ('differential', 2), ('skid', 2), ('skid', 4), ('mecanum', 4)])
+    ('differential', 2), ('skid', 2), ('skid', 4), ('mecanum', 4), ('omni', 3), ('omni', 4)])
 def test_values_are_within_their_sigmas(drive, wheels):
     """Each kind of robot, without an IMU: all values, none far off, none a caution."""
     made, config = driven(drive, wheels=wheels)
@@ -54,7 +54,8 @@ def test_values_are_within_their_sigmas(drive, wheels):
              'lateral_scale_factor': SIDEWAYS * made.truth.scale,
              'track_width_arc': effective_width(made.options, 2 * width)}
     names = {'differential': ['track_width'], 'skid': ['track_width', 'track_width_arc'],
-             'mecanum': ['rotation_lever', 'lateral_scale_factor']}[drive]
+             'mecanum': ['rotation_lever', 'lateral_scale_factor'],
+             'omni': ['rotation_lever']}[drive]
     for name in ('scale_factor', *names):
         one = estimates[name]
         assert abs(one.value - truth[name]) < SIGMAS * one.sigma, name
@@ -137,6 +138,12 @@ def test_controllers_of_each_drive():
     assert own['wheels_radius'] == pytest.approx(made.truth.scale, rel=2e-3)
     assert own['sum_of_robot_center_projection_on_X_Y_axis'] == pytest.approx(0.3, rel=1e-2)
     assert 'diff_drive' not in text
+    made, config = driven('omni')
+    own = yaml.safe_load(_controllers(made, with_settings(config, {'odometer.wheel_offset': 0.0})))
+    own = own['omni_wheel_drive_controller']['ros__parameters']
+    assert set(own) == foreign_keys.OMNI_WHEEL_DRIVE
+    assert own['wheel_radius'] == pytest.approx(made.truth.scale, rel=2e-3)
+    assert own['robot_radius'] == pytest.approx(0.15, rel=1e-2)
     made, config = driven('skid')
     assert 'wheel_separation_multiplier: 1.7' in _controllers(made, config)
     text = _controllers(made, with_settings(config, {'odometer.track_width': 0.0}))

@@ -58,6 +58,19 @@ def test_mecanum_wheels_obey_their_kinematics():
                     atol=1e-9)
 
 
+@pytest.mark.parametrize('count', [3, 4])
+def test_omni_wheels_obey_their_kinematics(count):
+    """Wheels in a circle: their least squares give the motion, numpy.linalg.lstsq."""
+    made = robot(drive='omni', wheels=count)      # its radius is 0.15 m
+    state, rolled = paths(made)
+    angle = 2 * np.pi * np.arange(count) / count
+    rows = np.stack([np.sin(angle), -np.cos(angle), -0.15 * np.ones(count)], -1)
+    motion, *_ = np.linalg.lstsq(rows, np.stack(list(rolled.values())), rcond=None)
+    lateral = np.append(0.0, np.cumsum(0.01 * (state.sway[1:, 0] + state.sway[:-1, 0]) / 2))
+    assert_allclose(motion, [state.travel, lateral, state.turned], atol=1e-9)
+    assert np.ptp(lateral) > 1.0
+
+
 def test_positions_of_a_mecanum_robot_move_sideways():
     """The path of the reference has the sideways moves."""
     made = robot(drive='mecanum', reference='mocap')

@@ -67,7 +67,7 @@ class Solved:
 
     def __init__(self, parts: list[Equations], weight: Floats, prior: Floats,
                  slope: Floats) -> None:
-        """Take the equations and 1 / level of each; prior (m,) and slope (m,) of constants."""
+        """Take the equations and 1 / level of each; prior (m, m) and slope (m,) of constants."""
         def whole(name: str) -> Floats:
             out: Floats = sum(w * getattr(p, name) for w, p in zip(weight, parts, strict=True))
             return out
@@ -77,7 +77,7 @@ class Solved:
         X = cho_solve_banded((self._band, False), np.column_stack([B, g]))
         # not by BLAS: its sums depend on the number of threads and on the place in memory
         taken = np.einsum('ki,kj->ij', B, X)
-        self.information = whole('constant') + np.diag(prior) - taken[:, :-1]
+        self.information = whole('constant') + prior - taken[:, :-1]
         self._root = cho_factor(self.information, lower=True)
         self.constants = cho_solve(self._root, -(whole('slope') + slope) + taken[:, -1])
         self.step = (-X[:, -1] - np.einsum('ij,j->i', X[:, :-1], self.constants)).reshape(n, s)

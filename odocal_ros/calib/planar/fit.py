@@ -54,7 +54,8 @@ def fit(run: Run, known: Known, passed: Callable[[int, float], None] = lambda *_
         passes += 1
         rows = _rows(run, known, state, c, metres, first, student)
         parts = {name: Equations(r, n) for name, r in rows.items()}
-        solved = _solved(parts, theta, prior, prior * (c - mean))
+        pull = np.einsum('ij,j->i', prior, c - mean)
+        solved = _solved(parts, theta, prior, pull)
         after = {name: replace(r, value=_after(r, solved)) for name, r in rows.items()}
         step = _level_steps(parts, after, theta, prior, solved)
         state, c = state + solved.step, c + solved.constants
@@ -77,7 +78,7 @@ def fit_at(run: Run, known: Known, state: Floats, c: Floats, theta: dict[str, fl
     Return the fit at states (n + 1, 5) and constants (m,): covariance, without a step.
 
     theta : level of each noise, variance.   first : scale, scale and curvature to which residuals
-    refer.   prior : (m,) information.   student : weights, None: equal.
+    refer.   prior : (m, m) information.   student : weights, None: equal.
     """
     # the information of Student's distribution is 3/4 of that of a normal one
     even = {'white': np.ones(len(run.node)), 'drift': np.ones(len(state))}
@@ -85,7 +86,7 @@ def fit_at(run: Run, known: Known, state: Floats, c: Floats, theta: dict[str, fl
                for name, weight in (student or even).items()}
     rows = _rows(run, known, state, c, noise_path(run, first[0]), first, student)
     parts = {name: Equations(r, len(state)) for name, r in rows.items()}
-    solved = _solved(parts, theta, prior, 0 * prior)
+    solved = _solved(parts, theta, prior, 0 * c)
     names = (*run.wheels.names, 'ahead', 'left_of', 'delay',
              *(('gyro_scale', 'gyro_bias') if len(run.gyro) else ()))
     return Fit(names, c, solved.covariance, state[:, :3],
@@ -94,16 +95,19 @@ def fit_at(run: Run, known: Known, state: Floats, c: Floats, theta: dict[str, fl
 
 def priors(run: Run, known: Known, left: float, right: float, width: float,
            ) -> tuple[Floats, Floats]:
-    """Return first values and information of the constants, (m,), by scales and track width."""
-    value, sigma = run.wheels.prior(left, right, width)
+    """Return first values (m,) and prior information (m, m) of the constants."""
+    value, covariance = run.wheels.prior(left, right, width)
     more = [(known.offset[0], known.offset_sigma), (known.offset[1], known.offset_sigma),
             (0.0, known.delay_sigma)]
     more += [(0.0, known.gyro_scale_sigma), (0.0, known.gyro_bias_sigma)] * bool(len(run.gyro))
-    return (np.append(value, [v for v, _ in more]), np.append(sigma, [s for _, s in more])**-2.0)
+    own = len(value)
+    information = np.diag(np.append(np.ones(own), [s**-2.0 for _, s in more]))
+    information[:own, :own] = np.linalg.inv(covariance)
+    return np.append(value, [v for v, _ in more]), information
 
 
 def _begin(run: Run, known: Known, at_first: First) -> tuple[Floats, Floats, Floats]:
-    """Return first states (n + 1, 5) and constants (m,), and the information of priors (m,)."""
+    """Return first states (n + 1, 5) and constants (m,), and the information of priors (m, m)."""
     state = np.zeros((len(run.t), 5))
     state[:, 0], state[:, 1] = (np.interp(run.t, run.t[run.node], axis)
                                 for axis in run.position.T)
@@ -143,7 +147,7 @@ def _level_steps(parts: dict[str, Equations], left: dict[str, Rows], theta: dict
     """
     steps, h, whole = {}, 1e-3, solved.log_determinant()
     for name in ESTIMATED:
-        other = _solved(parts, theta | {name: theta[name] * np.exp(-h)}, prior, 0 * prior)
+        other = _solved(parts, theta | {name: theta[name] * np.exp(-h)}, prior, 0 * prior[0])
         freedom = left[name].count - (other.log_determinant() - whole) / h
         chi2 = left[name].square() / theta[name]
         spread = SPREAD.get(name, WIDE)

@@ -16,7 +16,7 @@ from odocal_ros.calib.planar.problem import Fit
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, SIDES
 
 # relative sigmas from which a value is refused. Judgement, by measurement on 24 simulated runs:
 # the two without a straight after their only turn have widths that are 3 to 570 sigma off, with a
@@ -44,7 +44,7 @@ class Quantity(NamedTuple):
 
 
 QUANTITIES = {
-    'scale_factor': Quantity('left', lambda c: 2 / (1 / c['left'] + 1 / c['right']), MOST_SCALE,
+    'scale_factor': Quantity('curvature', lambda c: _mean_scale(c), MOST_SCALE,
                              Code.SCALE_NOT_DETERMINED, 'straights'),
     'scale_factor_left': Quantity('left', lambda c: c['left'], MOST_SCALE,
                                   Code.WHEELS_NOT_SEPARABLE, 'straights'),
@@ -55,12 +55,32 @@ QUANTITIES = {
     'track_width_arc': Quantity('arc', lambda c: 1 / (c['curvature'] + ARC * c['arc']),
                                 MOST_ARC, Code.PARAMETER_NOT_DETERMINED,
                                 'arcs with radii of two to four track widths, to both sides'),
-    'rotation_lever': Quantity('lateral', lambda c: 1 / (2 * c['curvature']), MOST,
+    'rotation_lever': Quantity('wheel_1', lambda c: 1 / (2 * c['curvature']), MOST,
                                Code.TRACK_WIDTH_NOT_DETERMINED, TURNS),
-    'lateral_scale_factor': Quantity('lateral', lambda c: c['lateral'], MOST,
+    'lateral_scale_factor': Quantity('lateral', lambda c: c['lateral'] * _mean_scale(c), MOST,
                                      Code.PARAMETER_NOT_DETERMINED,
                                      'sideways motion of a metre or more'),
 }
+
+
+def _mean_scale(c: Constants) -> float:
+    """Return the factor of the mean count of the wheels."""
+    scales = [value for name, value in c.items() if name in SIDES or name.startswith('wheel_')]
+    return len(scales) / sum(1 / value for value in scales)
+
+
+def _quantities(names: tuple[str, ...], config: Config) -> dict[str, Quantity]:
+    """Return the estimates of the constants of a fit, and one for each wheel."""
+    # wheels in a circle or of mecanum have half of the width: the lever
+    without = 'track_width' if 'wheel_1' in names else 'rotation_lever'
+    found = {name: one for name, one in QUANTITIES.items() if one.needs in names
+             and name != without}
+    wheels = [name for name in names if name.startswith('wheel_')]
+    for name, own in zip(wheels, config.odometer.names(len(wheels)), strict=False):
+        found[f'scale_factor_{own}'] = Quantity(
+            name, lambda c, name=name: c[name], MOST_SCALE,  # type: ignore[misc]
+            Code.PARAMETER_NOT_DETERMINED, 'straights, turns and sideways motion')
+    return found
 
 
 def result_of(fit: Fit, unit: str, nominal: float, config: Config,
@@ -74,10 +94,8 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config,
     estimates, effects, laws, reasons = unknown(unit), {}, {}, _doubts(fit)
     # what a fit that moves on may still change
     root = np.linalg.cholesky(fit.covariance) * (1.0 if fit.converged else 2.0)
-    for name, quantity in QUANTITIES.items():
-        # mecanum wheels have half of it: half the track width and half the wheelbase
-        if quantity.needs not in c or name == 'track_width' and 'lateral' in c:
-            continue
+    quantities = _quantities(fit.names, config)
+    for name, quantity in quantities.items():
         value, effect = quantity.value(c), _gradient(quantity, fit) @ root
         own = unit if 'scale' in name else 'm'
         law = slopes * value if 'scale' in name else LAW * abs(
@@ -101,7 +119,7 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config,
             'Drive on level ground, or record an IMU.'))
     if scale.value is not None and scale.sigma is not None and nominal:
         estimates['scale_ratio'] = Estimate(scale.value / nominal, scale.sigma / nominal, '1')
-    names = tuple(name for name in QUANTITIES if name in estimates)
+    names = tuple(quantities)
     sources = [Source(FIT_SOURCE, np.array([effects.get(name, 0 * root[0]) for name in names]))]
     for source, scales in ((LAW_SOURCE, False), (SLOPES, True)):
         own_laws = [laws.get(name, 0.0) * (('scale' in name) == scales) for name in names]

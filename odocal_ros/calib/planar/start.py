@@ -49,10 +49,11 @@ def first_values(run: Run, width: float = 0.0) -> First:
     s = np.append(0.0, np.cumsum(run.wheels.path))[run.node]
     rough = _rough(z, s)
     windows = _windows(s * rough)
+    forward, _, apart = run.wheels.body(run.wheels.count).T
+    left, right = forward - apart / 2, forward + apart / 2
 
     def aligned(x: Floats, z: Complexes = z) -> tuple[float, Complexes, Floats]:
-        turn = np.append(0.0, np.cumsum((1 + x[1] / 2) * run.wheels.right
-                                        - (1 - x[1] / 2) * run.wheels.left))
+        turn = np.append(0.0, np.cumsum((1 + x[1] / 2) * right - (1 - x[1] / 2) * left))
         turn *= rough / np.exp(x[0])
         return (*_aligned(run, z, turn, windows), turn)
     grid = [[np.array([np.log(w), r]) for r in RATIOS] for w in WIDTHS]
@@ -101,8 +102,8 @@ def _windows(s: Floats) -> Ints:
 
 def _aligned(run: Run, z: Complexes, turn: Floats, windows: Ints) -> tuple[float, Complexes]:
     """Return the sum of squared residuals of windows, m^2, and scale and rotation of each."""
-    w, middle = run.wheels, (turn[1:] + turn[:-1]) / 2
-    step = ((w.left + w.right) / 2 + 1j * w.lateral) * np.exp(1j * middle)
+    forward, side, _ = run.wheels.body(run.wheels.count).T
+    step = (forward + 1j * side) * np.exp(1j * (turn[1:] + turn[:-1]) / 2)
     path = np.append(0.0, np.cumsum(step))[run.node]
     count = np.diff(windows, axis=1)[:, 0]
 
