@@ -7,8 +7,8 @@ Rows of benchmarks/indoor.py beside their forecast: error over forecast sigma, a
     python benchmarks/indoor_bound.py [--file /tmp/indoor.jsonl]
 
 The forecast (odocal_ros/forecast/planned_indoor.py) has the true motion, wheels and noise of each
-run: it is the Cramer-Rao bound of the estimator's model. Printed by kind for each value: runs, the rms of
-error over forecast, the median of stated and of forecast sigma.
+run: it is the Cramer-Rao bound of the estimator's model. Printed by kind for each value: runs, the
+rms of error over forecast, the median of stated and of forecast sigma.
 """
 
 import argparse

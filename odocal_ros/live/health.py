@@ -81,7 +81,7 @@ class Health:
         return np.array(sound, bool)
 
     def _not_ahead(self, stamps: list[int]) -> list[bool]:
-        """Return which stamps exist and are not far ahead of the last one."""
+        """Return True for stamps that exist and are not far ahead of the last one."""
         sound, last = [stamp > 0 for stamp in stamps], self.newest_ns
         first = next((stamp for stamp in stamps if stamp > 0), 0)
         if not self._ahead and max(stamps, default=0) - (last or first) < WILD_STAMP_NS:
