@@ -157,6 +157,7 @@ def test_sigma_is_the_bound_of_a_straight_run():
     assert level['along'] == pytest.approx(LEVELS['along'], rel=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('kind', ['differential', 'skid', 'mecanum', 'omni'])
 def test_truth_is_within_sigma(kind):
     """Ten runs with slip and noise: the rms of error over sigma is that of ten draws."""
