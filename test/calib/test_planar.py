@@ -9,6 +9,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from odocal_ros.calib.planar import drive
 from odocal_ros.calib.planar.drive import of_sides, rows_of, Wheels
 from odocal_ros.calib.planar.fit import fit, LEVELS, noise_path
 from odocal_ros.calib.planar.problem import Known, Run
@@ -91,6 +92,15 @@ def test_mecanum_straight_sideways_and_turn_are_exact():
     """Four unequal wheels, which couple the motions; the run has all three."""
     found = fit(run_of(body(SIDEWAYS * 2), 'mecanum', lateral=0.9), Known())
     assert_allclose(found.value[:6], (*SCALES, 1 / WIDTH, 0.9), rtol=1e-5)
+
+
+def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch):
+    """A turn and no sideways motion: one difference of four wheels has its prior alone."""
+    run = run_of(body([(2, 0, 0), (0, 0, 1.5), (2, 0, 0)]), 'mecanum')
+    sigma = np.sqrt(np.diag(fit(run, Known()).covariance)[:4])
+    assert (sigma < 1.2 * drive.UNEQUAL * SCALES).all()
+    monkeypatch.setattr(drive, 'UNEQUAL', 0.3)
+    assert (np.sqrt(np.diag(fit(run, Known()).covariance)[:4]) > 2 * sigma).all()
 
 
 @pytest.mark.parametrize(('count', 'offset'), [(3, 0.0), (4, 0.0), (3, 0.5), (4, -2.0)])
