@@ -209,8 +209,8 @@ def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats, path: Floats,
     Return a mask of fixes that a receiver has reckoned, and FIXES_DEAD_RECKONED.
 
     t_fix : (k,) s.   fixes_n : (k, 3) m.   sigma : (k,) stated, of an axis, m.   path : (k,) path
-    length by the odometer, m, its scale good to 30 %.   turned : angle turned about the vertical by
-    (m,) times, rad: (m,).
+    length by the odometer, m, its scale good to 30 %.   turned : angle turned about the vertical
+    by (m,) times, rad: (m,).
     """
     spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, path, turned)
     found = np.zeros(len(t_fix), bool)
