@@ -144,6 +144,8 @@ class Wheel:
             value = before if self.form.quantity == 'rate' else value
         else:
             self._follow(dt, step, shown, off)
+        if self._strange:      # refused rows are interpolated at a speed that may be false
+            self._doubt_speed(dt)
         self._value = value
         self.usual += (dt - self.usual) * (0.1 if self.usual and not gap else not gap)
         self._add(t, self.s[-1] + step)
@@ -186,9 +188,11 @@ class Wheel:
         self.hung = not step and (self.hung or hangs or (
             self._refused > 0 and off > self._limit(dt)))
         if self._refused:
+            if not self._strange:      # else the speed itself is not explained
+                self._sure_speed, self._strange_travel = self.speed, 0.0
             back = abs(shown - self._sure_speed) * dt <= self._limit(dt) and self._strange > 0
-            self._strange = 0.0 if back else abs(shown - self.speed)
-            self._sure_speed, self._strange_travel, self._strange_time = self.speed, 0.0, 0.0
+            self._strange = 0.0 if back else abs(shown - self._sure_speed)
+            self._strange_time = 0.0
             self.speed = shown if off > self._limit(dt) else self.speed
         elif hangs:
             self.notes.append(f'the counter stops at once from {self.speed:.1f} m/s: it hangs, or '
@@ -198,16 +202,18 @@ class Wheel:
         elif off > self._limit(dt, SPEED_CHANGE):
             self._doubt(off**2)
         self._refused = 0
-        if self._strange:
-            path_length = self._strange_travel + self._strange * dt
-            self._doubt((path_length**2 - self._strange_travel**2) / 3)
-            self._strange_travel = path_length
-            self._strange_time += dt
-            if self._strange_time > STRANGE_TIME:      # motion itself may explain it
-                self._strange = max(self._strange - SPEED_CHANGE * dt, 0.0)
         self._jitter += (min(off / max(abs(self.speed), 1.0), STAMP_BURST)
                          - self._jitter) / JITTER_ROWS
         self.speed += (step / dt - self.speed) * min(1.0, dt / self._lag())
+
+    def _doubt_speed(self, dt: float) -> None:
+        """Add variance of the travel in dt s at a speed that nothing explains."""
+        path_length = self._strange_travel + self._strange * dt
+        self._doubt((path_length**2 - self._strange_travel**2) / 3)
+        self._strange_travel = path_length
+        self._strange_time += dt
+        if self._strange_time > STRANGE_TIME:      # motion itself may explain it
+            self._strange = max(self._strange - SPEED_CHANGE * dt, 0.0)
 
     def _doubt(self, variance: float) -> None:
         """Add variance of the travel, m^2, from the last row on."""

@@ -11,6 +11,8 @@ from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
 from odocal_ros.apply.odometry import Odometry
 from odocal_ros.apply.spikes import SpikeScreen
 from odocal_ros.apply.vehicle import vehicle_of
+from odocal_ros.apply.wheel import Wheel
+from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import with_settings
 
@@ -185,3 +187,15 @@ def test_stamps_of_fast_bags_are_usable_and_those_of_set_clocks_are_not():
     arrivals = Arrivals()
     assert (~arrivals.usable(few, stamp)).nonzero()[0].tolist() == [500, 501, 502]
     assert not arrivals.anew
+
+
+@pytest.mark.core
+def test_a_false_speed_at_rest_is_doubted_from_the_speed_before_all_of_it():
+    """It is accepted in two steps, as the speed follows: both are off the rest before them."""
+    t = np.arange(0.0, 22.3, 0.04)
+    value = np.where(t > 20.0, -22.1, 0.0)
+    wheel = Wheel(OdometerForm('rate', 0, '1'), 1.02)
+    for row in range(len(t)):
+        wheel.feed(t[row:row + 1], value[row:row + 1])
+        assert abs(wheel.s[-1]) <= 3 * np.sqrt(wheel.doubt(0.0, t[row])) + 0.02
+    assert wheel.s[-1] < -30.0         # false travel, of a vehicle at rest
