@@ -15,7 +15,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST, TYRE_SPREAD
 
-FURTHEST_SLIDE = 100.0   # m, physical: no wheel slides and no fix strays so far
+FURTHEST_SLIDE = 100.0   # m, physical: no wheel slides and no fix deviates so far
 
 
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
@@ -127,7 +127,7 @@ def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Re
 
 def _without_counts(travel: Travel, t: Floats, fixes: Floats,
                     least: float) -> list[tuple[float, float, float]]:
-    """Return how far fixes move, m, from when to when, s, in intervals without a count."""
+    """Return the distances of the fixes, m, and the ends, s, of intervals without a count."""
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
@@ -137,7 +137,7 @@ def _without_counts(travel: Travel, t: Floats, fixes: Floats,
 
 def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
     """
-    Return when a vehicle was carried, as by a ferry: begin and end of motion, (k, 2) s.
+    Return the times in which a vehicle was carried, as by a ferry: (k, 2) s.
 
     The fixes move without counts, and the odometer counts again after it.
     """
