@@ -32,8 +32,7 @@ HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'c
 NAN = math.nan
 SIDES = ('left', 'right')     # names of two wheels
 DRIVES = DIFFERENTIAL, SKID, MECANUM, OMNI = 'differential', 'skid', 'mecanum', 'omni'
-HOLONOMIC = (MECANUM, OMNI)        # drives that move sideways
-FEWEST_OMNI = 3        # definition: wheels of such a drive
+HOLONOMIC, FEWEST_OMNI = (MECANUM, OMNI), 3    # definition: move sideways; fewest wheels of omni
 
 TYPICAL = 'typical value of IMUs sold in this grade'
 

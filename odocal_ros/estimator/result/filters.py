@@ -41,7 +41,7 @@ def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 
 def clock_reasons(name: str, rate: float, sigma: float, duration: float) -> tuple[Reason, ...]:
-    """Return CLOCKS_DRIFT, where so; of the rate of a clock and its sigma, of a leg in s."""
+    """Return CLOCKS_DRIFT if a rate and its effect over ``duration``, s, are significant."""
     worth = 0.01        # s: two samples of most odometers are further apart
     if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= worth:
         return ()
