@@ -112,7 +112,8 @@ class Drive:
             fix = local_fixes(np.nan)(fix.stamp_ns, fix.received_ns, self.positions(), *stated)
         wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
         return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
-                   fix=fix, heading=self.heading, fix_velocity=self.velocity,
+                   fix=fix,
+                   outside={'heading': self.heading, 'fix_velocity': self.velocity},
                    form=self.form, **wheels)
 
     def positions(self) -> Floats:

@@ -279,11 +279,11 @@ def watched(drive, config, worker, log):
     recorder.form = leg.form
     half = leg.start_ns + 150 * SECOND
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         recorder.feed(slot, take(rows, rows.stamp_ns <= leg.start_ns))
     look.begin(recorder, leg.start_ns, config)
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         for first_ns in range(leg.start_ns, half, 10 * SECOND):
             look.feed(slot, take(rows, (rows.stamp_ns > first_ns)
                                  & (rows.stamp_ns <= first_ns + 10 * SECOND)))

@@ -102,10 +102,10 @@ def drive(request):
 
 def screened(drive, change, **options):
     leg = drive.leg()
-    leg = replace(leg, fix_velocity=changed(leg.fix_velocity, velocity_n=change))
+    leg = leg.with_rows(fix_velocity=changed(leg.rows('fix_velocity'), velocity_n=change))
     inputs, found = screen(leg, settings(drive, None, **options))
     said = [r.text for r in found if r.code is Code.VELOCITY_UNUSABLE]
-    assert len(said) == (not len(inputs.t_velocity))
+    assert len(said) == (not len(inputs.outside['fix_velocity'].t))
     return said
 
 
@@ -115,13 +115,14 @@ def test_that_of_the_fixes_is_used(drive, factor):
 
 
 def test_gaps_of_the_velocity_are_not_compared(drive):
-    leg, v = drive.leg(), drive.leg().fix_velocity
+    leg = drive.leg()
+    v = leg.rows('fix_velocity')
     t = (v.stamp_ns - leg.start_ns) * 1e-9
     fast = np.linalg.norm(v.velocity_n, axis=1) > 8.0      # a line between them is no stop
     kept = np.flatnonzero((t < 30.0) | (t > 170.0) | fast & (t % 60.0 < 15.0))
-    inputs, found = screen(replace(leg, fix_velocity=take(v, kept)), settings(drive, None))
+    inputs, found = screen(leg.with_rows(fix_velocity=take(v, kept)), settings(drive, None))
     assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
-    assert len(inputs.t_velocity)
+    assert len(inputs.outside['fix_velocity'].t)
 
 
 def test_wheel_speeds_units_and_axes_are_found(drive):
@@ -138,7 +139,8 @@ def test_wheel_speeds_units_and_axes_are_found(drive):
 
 def test_nothing_is_said_of_a_velocity_that_is_not_wanted(drive):
     leg = drive.leg()
-    leg = replace(leg, fix_velocity=changed(leg.fix_velocity, velocity_n=lambda v: v.fill(9.0)))
+    leg = leg.with_rows(fix_velocity=changed(leg.rows('fix_velocity'),
+                                             velocity_n=lambda v: v.fill(9.0)))
     _, found = screen(leg, settings(drive, None, gnss__use_velocity=False))
     assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
 
@@ -150,4 +152,4 @@ def test_a_vehicle_that_stands_says_nothing(drive):
         'stamp_ns', 'received_ns', 'latitude', 'longitude', 'height', 'covariance_n',
         'covariance_type', 'status'))))
     inputs, _ = screen(still, settings(drive, None))
-    assert len(inputs.t_velocity)
+    assert len(inputs.outside['fix_velocity'].t)
