@@ -242,7 +242,7 @@ def _judge_angles(alignment: Alignment, yaw: float, pitch: float, sources: tuple
                            f'{np.rad2deg(far):.1f} deg from its nominal value'),)
     if not vertical_known:
         reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the heights of the fixes are too '
-                           f'inaccurate for the pitch; 0 +- {np.rad2deg(PITCH_PRIOR):.1f} deg is '
+                           f'inaccurate for the pitch; 0 ± {np.rad2deg(PITCH_PRIOR):.1f} deg is '
                            'assumed'),)
     return reasons
 

@@ -173,7 +173,7 @@ def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
 
 
 def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
-    """Return the plain ratio of path lengths beside the scale factor, '' where there is none."""
+    """Return the median ratio of fixes and odometer beside the scale factor, '' without one."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     way = sum(distance for _, distance in ratios)
     if not scale.value or not way:
@@ -181,8 +181,8 @@ def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
     ratio = sum(r * distance for r, distance in ratios) / way
     unit = '' if scale.unit == '1' else f' {scale.unit}'
     plain = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'  # 4 digits
-    return _line('  path ratio', f'{plain}{unit}   fixes / odometer, uncorrected '
-                 f'({100 * (ratio / scale.value - 1):+.1f} %)')
+    return _line('  path ratio', f'{plain}{unit}   fixes / odometer, '
+                 f'{100 * (ratio / scale.value - 1):+.1f} % from the scale factor')
 
 
 def _gyro_scale(calibration: Calibration) -> str:
