@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What is known from outside besides fixes: the antenna's velocity, the heading of the IMU's x axis.
+External observations besides fixes: velocity of the antenna, heading of the IMU's x axis.
 
 A heading comes with one error for the whole leg (a mounting, a declination, a compass), which no
-number of messages averages out, and white noise on top; a heading that is given at the start mark
-is one such message.
+number of messages averages out, and white noise; a heading configured at the start mark is one
+such message.
 """
 
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config, GnssConfig
 
 Floats = NDArray[np.float64]
-VELOCITY_SIGMA = 0.1        # m/s, to start from where a receiver does not say: physical, Doppler
+VELOCITY_SIGMA = 0.1        # m/s, initial if a receiver states none: physical, Doppler
 # of a GNSS velocity, s and s^2, 1 sigma: physical, receivers are late by up to 0.25 s and smooth
 # over as much
 VELOCITY_TIME_SIGMA, VELOCITY_LAG2_SIGMA = 0.25, 0.1
@@ -72,7 +72,7 @@ class Heading:
 
 
 def outside_velocity(inputs: Inputs, config: Config, origin: Origin) -> Velocity:
-    """Return the velocity of the antenna, turned from where it is to n; empty: not used."""
+    """Return the velocity of the antenna, in n; empty: not used."""
     # without an accelerometer its change between keyframes is unknown
     if not (config.gnss.use_velocity and len(inputs.t_velocity) and inputs.felt):
         return Velocity()
@@ -91,7 +91,7 @@ def velocity_sigmas(gnss: GnssConfig) -> Floats:
 
 
 def outside_heading(inputs: Inputs, config: Config, origin: Origin) -> Heading:
-    """Return the heading that the settings ask for, else the heading topic; empty: none."""
+    """Return the configured heading, else that of the heading topic; empty: none."""
     asked, alignment = config.alignment.heading_source, config.alignment
     given = not np.isnan(alignment.heading)
     if given and asked in ('auto', 'fixed'):
@@ -109,6 +109,7 @@ def outside_heading(inputs: Inputs, config: Config, origin: Origin) -> Heading:
 
 def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float, config: Config,
           origin: Origin, C_ib: Floats, source: str) -> Heading:
+    """Return the heading of orientations q (m, 4) that an IMU or a topic publishes."""
     good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     t, q, variance = t[good], q[good], variance[good]
     if len(t) < 2 or not len(inputs.t_fix):
@@ -137,5 +138,6 @@ def _from_place(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
 
 
 def _convergence(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
+    """Return the yaw in n of east at the places of the vehicle: (m,) rad."""
     C_np = _from_place(inputs, t, origin)
     return arctan2(C_np[:, 1, 0], C_np[:, 0, 0])

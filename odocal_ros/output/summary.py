@@ -16,6 +16,7 @@ from odocal_ros.calib.result import (
     Estimate,
     FACTOR,
     LegResult,
+    MethodResult,
     wheel_factors,
 )
 from odocal_ros.output.budget_table import budget_lines, largest_source, source_label
@@ -259,8 +260,15 @@ def _method_table(calibration: Calibration) -> list[str]:
         scale, *angles = (known(method.estimates, n) for n in ('scale_factor', *ANGLES))
         rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
                      *('-' if a.value is None else with_sigma(a.value, a.sigma, DEG, signed=True)
-                       for a in angles), shown_verdict(method, calibration.legs)))
+                       for a in angles),
+                     shown_verdict(method, calibration.legs) + _refused(method)))
     return columns(rows)
+
+
+def _refused(method: MethodResult) -> str:
+    """Return the first code for which a method is rejected, '' if it is not."""
+    codes = [r.code.name for r in method.reasons if r.code.gravity is Verdict.REJECTED]
+    return f': {codes[0]}' if codes else ''
 
 
 def _leg_row(leg: LegResult) -> tuple[str, ...]:
