@@ -236,7 +236,7 @@ def _positions(name: str, kind: str, samples: FixSamples, position: Floats,
 
 
 def velocity(name: str, samples: VelocitySamples, frame: str = 'gnss') -> Topic:
-    """Return geometry_msgs/TwistWithCovarianceStamped of VelocitySamples: linear ones."""
+    """Return geometry_msgs/TwistWithCovarianceStamped of VelocitySamples; no angular rates."""
     layout = _Layout().header(frame).add('linear', VECTOR).add('angular', VECTOR).add(
         'cov', ('<f8', 36))
 

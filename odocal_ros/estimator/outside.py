@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rows of the sensors besides IMU, odometer and fixes, and what their preparations share."""
+"""External observations besides fixes, such as GNSS velocity: rows in n, and functions of them."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Self
@@ -46,6 +46,6 @@ def from_place(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
 
 
 def convergence(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
-    """Return the yaw in n of north at the places at times, rad."""
+    """Return the yaw in n of east at the places of the vehicle: (m,) rad."""
     C_np = from_place(inputs, t, origin)
     return arctan2(C_np[:, 1, 0], C_np[:, 0, 0])

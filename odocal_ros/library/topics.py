@@ -189,8 +189,8 @@ def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: s
                 f'{topic_option(slot)}: {_described(topics, found)}{hint}')
     types = tuple(_types(slot, config))
     if slot == 'fix':
-        return (f'no {INPUTS[slot].label} in the bag: a topic of {" or ".join(types)}, or a '
-                f'{TRANSFORMS} or nav_msgs/msg/Odometry that is named with {topic_option(slot)}')
+        return (f'no {INPUTS[slot].label} (a topic of {", ".join(types[:-1])} or {types[-1]}) in '
+                f'the bag; name a {TRANSFORMS} or nav_msgs/msg/Odometry with {topic_option(slot)}')
     what = ' or '.join(types) if len(types) < 3 else 'an odometer type'
     beside = ' besides the IMU' if slot == 'heading' else ''
     return f'no {INPUTS[slot].label} (a topic of {what}{beside}) in the bag'

@@ -34,5 +34,6 @@ def _value(held: Held) -> str:
     name = held.name.replace('_', ' ')
     limits = ' to '.join('any' if math.isinf(x) else f'{x * factor:g}'
                          for x in (held.low, held.high))
-    return (f'{held.decision.value:9} {name} {with_sigma(e.value, e.sigma, factor)}{unit}, '
-            f'limits {limits}')
+    shown = 'not determined' if e.value is None else (
+        f'{with_sigma(e.value, e.sigma, factor)}{unit}')
+    return f'{held.decision.value:9} {name} {shown}, limits {limits}{unit}'

@@ -82,4 +82,6 @@ def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool = False) -
             title = ''
             lines += wrapped(f'{reason.code.name}: {reason.text}', '    ', '   ', width)
             lines += wrapped(f'-> {reason.remedy}', '      ', '   ', width)
+    if any(re.search(r'\bt = ', line) for line in lines):
+        lines.append('  t: seconds from the start of the leg')
     return lines

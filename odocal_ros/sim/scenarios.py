@@ -61,7 +61,7 @@ class Truth:
     yaw: float                   # rad, mounting
     pitch: float                 # rad, mounting
     heading: float               # rad from north, clockwise, of b's x axis at the start mark
-    distance: float              # m rolled at the odometer's point
+    distance: float              # path length of the odometer's point, m
     start_ns: int                # start mark: the last IMU sample before the vehicle first moves
     stop_ns: int                 # stop mark: the last IMU sample
     gyro_bias: np.ndarray        # (3,) rad/s at turn-on, frame i

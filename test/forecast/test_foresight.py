@@ -439,7 +439,7 @@ NO_YAW = Prospect(None, 0.0087, None, (), 'limited by the heading uncertainty (1
 
 def test_a_coarse_scale_is_said_in_per_cent():
     assert Prospect(0.138, 1e-3, 2108.0, now='1.02').words('scale', 'ppm', 1e6) == (
-        'scale 1.02 +- 13.8 % so far; drive 2200 m more for the limit of 0.1 %')
+        'scale 1.02 ± 13.8 % so far; drive 2200 m more for the limit of 0.1 %')
     assert Prospect(0.0099, 1e-3, 0.0).words('scale', 'ppm', 1e6) == (
         'OK: scale 9900 ppm (limit 1000)')
 

@@ -309,7 +309,7 @@ def test_in_motion_a_heading_of_long_ago_is_none(plain):
 
 
 @pytest.mark.parametrize('source', ['imu_orientation', 'heading_topic'])
-@pytest.mark.parametrize(('variance', 'says'), [(np.nan, 'covariance[0] = -1'), (10.0, '+-181')])
+@pytest.mark.parametrize(('variance', 'says'), [(np.nan, 'covariance[0] = -1'), (10.0, '± 181')])
 def test_an_orientation_not_sent_or_worthless_is_refused(plain, source, variance, says):
     case = asked(plain, alignment__heading_source=source)
     rows = orientations(plain, 1.0, variance) if source == 'imu_orientation' else \

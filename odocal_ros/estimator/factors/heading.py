@@ -5,8 +5,8 @@
 A heading from outside as rows, docs/method.md (S19): yaw of the IMU's x axis.
 
 It has one error for the whole leg (a mounting, a declination, a compass), which no number of
-messages averages out, and white noise on top; a heading that is given at the start mark is one
-such message.
+messages averages out, and white noise; a heading configured at the start mark is one such
+message.
 """
 
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class HeadingRows(OutsideRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Heading | None:
-        """Return the heading that the settings ask for, else the heading topic."""
+        """Return the configured heading, else that of the heading topic."""
         asked, alignment = config.alignment.heading_source, config.alignment
         if not np.isnan(alignment.heading) and asked in ('auto', 'fixed'):
             yaw = yaw_from_heading(alignment.heading) + convergence(inputs, np.zeros(1), origin)
@@ -96,6 +96,7 @@ class HeadingRows(OutsideRows):
 
 def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float, config: Config,
           origin: Origin, C_ib: Floats, said_by: str) -> Heading | None:
+    """Return the heading of orientations q (m, 4) that an IMU or a topic publishes."""
     good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     t, q, variance = t[good], q[good], variance[good]
     if len(t) < 2 or not len(inputs.t_fix):

@@ -48,7 +48,7 @@ from odocal_ros.settings.config import Config
 
 # m/s, to start from: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
 FIRST_SIGMA = 0.5
-STATED_SIGMA = 0.1      # m/s, to start from where a receiver does not say: physical, Doppler
+STATED_SIGMA = 0.1      # m/s, initial if a receiver states none: physical, Doppler
 # of its stamps and its filter, s and s^2, 1 sigma: physical, receivers are late by up to 0.25 s
 # and smooth over as much
 TIME_SIGMA, LAG2_SIGMA = 0.25, 0.1
@@ -71,7 +71,7 @@ class VelocityRows(OutsideRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Velocity | None:
-        """Return the velocity of the antenna, turned from where it is to n."""
+        """Return the velocity of the antenna, in n."""
         sent, t = inputs.outside[cls.source]
         # without an accelerometer its change between keyframes is unknown
         if not (config.gnss.use_velocity and len(t) and inputs.felt):

@@ -30,7 +30,13 @@ from odocal_ros.estimator.result.filters import filter_reasons
 from odocal_ros.estimator.result.left_over import bias_sigmas, correlation, left_over, normalised
 from odocal_ros.estimator.result.mismatch import mismatch
 from odocal_ros.estimator.result.refusal import OPTIONAL, UNITS, unknown
-from odocal_ros.estimator.result.remarks import beside, level_pitch, MODEL_FLOOR, remarks
+from odocal_ros.estimator.result.remarks import (
+    beside,
+    contradicted_settings,
+    level_pitch,
+    MODEL_FLOOR,
+    remarks,
+)
 from odocal_ros.estimator.result.shares import shares
 from odocal_ros.estimator.result.slip import (
     along,
@@ -97,7 +103,10 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
         ratio[name] = float(bias_sigma[i] / fit.first.gyro_bias[i])
         if ratio[name] < INFORMED_SHARE:
             found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
-    unsaid = [name for name in ratio if name in found and found[name].value is None]
+    # of what the drive contradicts the fit does not use the setting, and another reason says so
+    contradicted = {CONSTANTS[i] for i in contradicted_settings(c, sigma)}
+    unsaid = [name for name in ratio if name in found and found[name].value is None
+              and name not in contradicted]
     if unsaid:
         reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: '
                               f'{in_words(unsaid)}; the configured values are used'))
