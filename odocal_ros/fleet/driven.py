@@ -18,7 +18,7 @@ from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.changes import covariance, History, history
 from odocal_ros.fleet.rows import legs_from, Row
 from odocal_ros.fleet.tables import utc
-from odocal_ros.library.bags import unique_names
+from odocal_ros.library.calibrate_bag import unique_names
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config

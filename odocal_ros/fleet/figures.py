@@ -20,7 +20,7 @@ TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting an
 
 def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[str, str, str]]:
     """Return (svg, title, what it shows) of what there is to draw."""
-    from odocal_ros.output.plots_svg import look
+    from odocal_ros.output.drawing import look
     drawn = []
     with look():
         for name in COMPARED:
@@ -35,7 +35,7 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[
 
 def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
     """Draw each vehicle's value against its model's mean, one column a model."""
-    from odocal_ros.output.plots_svg import BLUE, evenly, RED, sheet, svg
+    from odocal_ros.output.drawing import BLUE, evenly, RED, sheet, svg
     models = sorted({row['model'] for row in rows})
     figure, (ax,) = sheet(2.8)
     scale, every = name == 'scale_factor', []
@@ -65,7 +65,7 @@ def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
 
 def _within(ax: Any, points: np.ndarray) -> None:
     """Have the many fill the picture; those far beyond are arrows at its edge."""
-    from odocal_ros.output.plots_svg import RED
+    from odocal_ros.output.drawing import RED
     wide = 6.0    # medians of the distance that a picture shows
     usual = wide * float(np.median(np.abs(points[:, 1])))
     beyond = np.abs(points[:, 1]) > 2 * usual
@@ -80,7 +80,7 @@ def _within(ax: Any, points: np.ndarray) -> None:
 
 def _control(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, str] | None:
     """Draw the scale of legs over dates, those that changed or drift highlighted."""
-    from odocal_ros.output.plots_svg import BLUE, GREEN, GREY, PINK, RED, sheet, svg
+    from odocal_ros.output.drawing import BLUE, GREEN, GREY, PINK, RED, sheet, svg
     base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
     most_lines = 6    # vehicles that are highlighted
     named = [row['vehicle'] for row in vehicles if row['vehicle'] in base and any(

@@ -24,7 +24,7 @@ from odocal_ros.fleet.driven import (
 )
 from odocal_ros.fleet.rows import DONE, rows_of
 from odocal_ros.fleet.tables import leg_row, utc, VALUES
-from odocal_ros.output.acceptance import accept_line
+from odocal_ros.output.reason_lines import accept_line
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.acceptance import accept, Decision
 from odocal_ros.pipeline.calibrate import combine

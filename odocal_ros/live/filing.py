@@ -19,8 +19,7 @@ from odocal_ros.live import answers
 from odocal_ros.live.console import PlainLog
 from odocal_ros.live.result_folders import LATEST, ResultFolders
 from odocal_ros.live.worker import Worker
-from odocal_ros.output.stored import Stored
-from odocal_ros.output.worse import stored_in
+from odocal_ros.output.stored import Stored, stored_in
 from odocal_ros.outside.whole import new_folder
 from odocal_ros.settings.config import Config
 

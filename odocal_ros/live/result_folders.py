@@ -11,7 +11,7 @@ import shutil
 import time
 import uuid
 
-from odocal_ros.output.worse import replacing, stored_in
+from odocal_ros.output.stored import replacing, stored_in
 from odocal_ros.outside.whole import locked
 
 LATEST = 'latest'

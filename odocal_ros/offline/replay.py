@@ -163,7 +163,7 @@ def _size(stream: Any) -> tuple[int, int | None]:
 
 def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) -> int:
     from odocal_ros.output.files import Results
-    from odocal_ros.output.worse import replacing, stored_in
+    from odocal_ros.output.stored import replacing, stored_in
     screen = _Screen(args)
     old = stored_in(output)
     results = Results(calibration.result, calibration.config, output, list(calibration.inputs),
@@ -191,7 +191,7 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
 def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespace) -> int:
     """Return 0 for a good result, after printing the decision on limits."""
     from odocal_ros.offline.cli import OK, REJECTED
-    from odocal_ros.output.acceptance import accept_line, accept_words
+    from odocal_ros.output.reason_lines import accept_line, accept_words
     from odocal_ros.pipeline.acceptance import accept, Decision
     from odocal_ros.reasons import Verdict
     acceptance = accept(calibration, config)

@@ -6,8 +6,8 @@
 import math
 
 from odocal_ros.calib.result import Calibration, Estimate
+from odocal_ros.output.drawing import BAND, BLUE, GREEN, GREY, PINK, RED, relative, sheet, svg
 from odocal_ros.output.figures import known
-from odocal_ros.output.plots_svg import BAND, BLUE, GREEN, GREY, PINK, RED, relative, sheet, svg
 from odocal_ros.output.summary import ANGLES, DEG
 
 STYLES = (('o', BLUE), ('s', RED), ('^', GREEN), ('D', PINK), ('v', 'black'), ('P', GREY))

@@ -9,8 +9,8 @@ import numpy as np
 
 from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.data.arrays import Floats
+from odocal_ros.output.drawing import BLUE, Drawing, GREY, key, RED, sheet, svg
 from odocal_ros.output.figures import with_sigma
-from odocal_ros.output.plots_svg import BLUE, Drawing, GREY, key, RED, sheet, svg
 
 
 def draw_by_speed(ax: Any, found: SpeedScale) -> None:

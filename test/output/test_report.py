@@ -20,10 +20,10 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResu
 from odocal_ros.calib.sections import Sections
 from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.output import plots_compare, report
+from odocal_ros.output.drawing import look
 from odocal_ros.output.files import as_json, write_results
 from odocal_ros.output.plots import _biases, leg_figures
 from odocal_ros.output.plots_speed import by_speed, by_window
-from odocal_ros.output.plots_svg import look
 from odocal_ros.output.report import report_html, report_or_why
 from odocal_ros.settings.config import Config, with_settings
 
