@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import math
 
 from odocal_ros.errors import BadConfig
-from odocal_ros.settings.pattern_config import PatternConfig
+from odocal_ros.settings.node_configs import PatternConfig
 
 HALF_TURN = 3.0       # rad. Judgement: from here the robot may turn to either side
 LEAST_SIDE = 0.5      # m of the pattern. Judgement: below, a robot of 0.3 m turns more than drives

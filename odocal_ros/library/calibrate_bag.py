@@ -11,10 +11,18 @@ from typing import Any
 
 from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadUsage, OdocalError
-from odocal_ros.library.asked import config_of, Leg, legs_of, paths_of, Settings, topics_of
+from odocal_ros.library.asked import (
+    config_of,
+    Leg,
+    legs_of,
+    Listener,
+    Notes,
+    paths_of,
+    Settings,
+    topics_of,
+)
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.legs import open_ended, OPEN_LEG
-from odocal_ros.library.listener import Listener, Notes
 from odocal_ros.library.read_bag import journal_notes, read_bag, readers_of, Recording
 from odocal_ros.outside.names import one_line
 from odocal_ros.pipeline.prepared import Stage

@@ -11,15 +11,21 @@ from pathlib import Path
 
 import numpy as np
 
-from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.read import Bag, bag_sha256, open_bag, TopicInfo
+from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg, LegRecorder, SLOTS
 from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, LegSpan, Settings
+from odocal_ros.library.asked import (
+    config_of,
+    Leg as AskedLeg,
+    legs_of,
+    LegSpan,
+    Listener,
+    Settings,
+)
 from odocal_ros.library.legs import dropped_legs, find_legs, leg_statuses, marked_legs
-from odocal_ros.library.listener import Listener
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.transforms import with_static
 from odocal_ros.outside.limits import is_file

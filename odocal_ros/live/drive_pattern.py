@@ -20,7 +20,7 @@ from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.definitions import message_class
 from odocal_ros.live.process import run, SettledNode
-from odocal_ros.settings.pattern_config import PatternConfig
+from odocal_ros.settings.node_configs import PatternConfig
 
 PERIOD_S = 0.05       # judgement: base controllers stop after 0.2 s or more without a command
 ZEROS = 20            # judgement: commands of zero, since one may be lost

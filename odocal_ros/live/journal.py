@@ -23,7 +23,7 @@ from odocal_ros.live.recording import PREROLL_MARGIN_S
 from odocal_ros.live.session import Session
 from odocal_ros.live.topic_input import Input, StaticTransforms
 from odocal_ros.outside.names import for_shell
-from odocal_ros.outside.yaml_text import parameters
+from odocal_ros.outside.yaml_files import parameters
 from odocal_ros.settings.config import Config, flat
 
 BATCH_NS = 800_000_000    # judgement: with the writing, a kill then costs about a second

@@ -18,7 +18,6 @@ from odocal_ros.forecast.leg_so_far import SILENT_TIME
 from odocal_ros.forecast.progress import clocks_differ
 from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, jobs
-from odocal_ros.live.computing import Computing
 from odocal_ros.live.console import Console
 from odocal_ros.live.filing import Filing, iso
 from odocal_ros.live.guidance import after_result, hint, quantities_ok
@@ -28,9 +27,8 @@ from odocal_ros.live.process import SettledNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.running_estimate import RunningEstimate
-from odocal_ros.live.session import Session, State
-from odocal_ros.live.session_view import SessionView
-from odocal_ros.live.worker import FILES_GRACE_S, JOB_GRACE_S, Worker
+from odocal_ros.live.session import Session, SessionView, State
+from odocal_ros.live.worker import Computing, FILES_GRACE_S, JOB_GRACE_S, Worker
 from odocal_ros.outside.names import for_shell
 from odocal_ros.pipeline.floor_marks import with_marks
 from odocal_ros.settings.config import Config

@@ -33,7 +33,7 @@ from odocal_ros.live.topic_input import Input
 from odocal_ros.messages.cdr import layout_of
 from odocal_ros.messages.sensor_types import types_of
 from odocal_ros.outside.names import said_by
-from odocal_ros.settings.apply_config import ApplyConfig, OdomFrames
+from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 
 # judgement, all in s: between looks at the odometer, which poses are late by; between turns of the
 # executor, which cost most; before a pose is due, when messages are looked at; between turns

@@ -11,10 +11,10 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, jobs
 from odocal_ros.live.automatic_legs import AutomaticLegs
-from odocal_ros.live.computing import PATIENCE_S
 from odocal_ros.live.filing import iso
 from odocal_ros.live.guidance import after_result, hint, quantities_ok
 from odocal_ros.live.session import Refused, State
+from odocal_ros.live.worker import PATIENCE_S
 from odocal_ros.pipeline.floor_marks import mark_positions, place_of, WITHIN
 
 # the positions of a mark reach WITHIN to both sides, and another 0.5 s for the odometer's delay.

@@ -20,10 +20,10 @@ from odocal_ros.live import jobs, params
 from odocal_ros.live.filing import iso
 from odocal_ros.live.guidance import action_first
 from odocal_ros.live.recording import Recording
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import SessionView
 from odocal_ros.live.status import calibration_status, in_force, input_status
-from odocal_ros.live.status_listener import LATCHED
-from odocal_ros.outside.yaml_text import no_date
+from odocal_ros.live.watch import LATCHED
+from odocal_ros.outside.yaml_files import no_date
 from odocal_ros.settings.config import Config
 
 PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle',

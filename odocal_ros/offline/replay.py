@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 
 from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.listener import Listener
+from odocal_ros.library.asked import Listener
 from odocal_ros.offline.say import Phase, say, warn
 from odocal_ros.outside.names import one_line
 
@@ -123,8 +123,8 @@ class _Screen(Listener):
 
 def asked_config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings asked for: --config < --set < --accept and --method, each checked."""
-    from odocal_ros.settings.accept_config import parse_accept
     from odocal_ros.settings.config import Config, with_settings
+    from odocal_ros.settings.config_groups import parse_accept
     asked = asked_settings(args)
     for text in args.accept:
         asked |= parse_accept(text)

@@ -14,7 +14,7 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.output.figures import counted, inverse, known, with_sigma
 from odocal_ros.output.summary import sentence
 from odocal_ros.outside.names import for_comment, one_line
-from odocal_ros.outside.yaml_text import parameters
+from odocal_ros.outside.yaml_files import parameters
 from odocal_ros.settings.config import Config, DIFFERENTIAL, HOLONOMIC, MECANUM, OMNI, SKID
 from odocal_ros.settings.levels import INFORMED_SHARE
 from odocal_ros.settings.nominal import nominal_scale

@@ -34,7 +34,7 @@ from odocal_ros.outside.names import (
     is_frame,
     one_line,
 )
-from odocal_ros.outside.yaml_text import no_date, parameters
+from odocal_ros.outside.yaml_files import no_date, parameters
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config, with_settings
 

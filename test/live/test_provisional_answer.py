@@ -13,9 +13,8 @@ from player import messages_of, part, playing_to
 import pytest
 
 from odocal_ros.live import answers
-from odocal_ros.live.computing import PATIENCE_S
-from odocal_ros.live.session import Session
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView
+from odocal_ros.live.worker import PATIENCE_S
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config

@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.errors import BadConfig
 from odocal_ros.pattern import command, Progress, rectangle_of, route_of, why_stop
-from odocal_ros.settings.pattern_config import PatternConfig
+from odocal_ros.settings.node_configs import PatternConfig
 
 pytestmark = pytest.mark.core
 DT = 0.05
