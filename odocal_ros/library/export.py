@@ -180,11 +180,7 @@ def _there(module: str) -> bool:
 SERIES: dict[str, Callable[[Calibration], Series]] = {
     'trajectory': trajectory, 'track': trajectory, 'states': states, 'residuals': residuals,
     'scale_by_speed': scale_by_speed}
-
-
 TEXTS = {'tum': tum, 'csv': csv, 'kml': kml}
-
-
 KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
     f'{name}.{ending}' for name in ('trajectory', 'states', 'residuals', 'scale_by_speed')
     for ending in ('csv', 'parquet')), *(f'{name}{ending}' for name in ('scale_by_speed', 'map')

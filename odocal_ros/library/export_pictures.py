@@ -129,7 +129,7 @@ def scale_by_speed(result: Calibration) -> Series:
 def draw_scale_by_speed(result: Calibration, path: Path) -> None:
     """Write the picture of each leg's scale against speed, one above the other."""
     from odocal_ros.output.drawing import new_figure, save_figure
-    from odocal_ros.output.plots_speed import draw_by_speed, fit_text
+    from odocal_ros.output.plots_scale import draw_by_speed, fit_text
     most = 8     # legs in one picture, the newest
     found = _found(result)[-most:]
     figure = new_figure(7.0, 3.2 * len(found))

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from odocal_ros import pattern
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
-from odocal_ros.live.definitions import message_class
+from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.settings.node_configs import PatternConfig
 

@@ -26,8 +26,8 @@ from odocal_ros.data.inputs import WHEELS
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.console import LossReport, SILENCE_FIRST_NS, SILENCE_SELDOM_NS
-from odocal_ros.live.definitions import message_class
 from odocal_ros.live.inputs import LOOK_AROUND_S
+from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
 from odocal_ros.messages.cdr import layout_of

@@ -25,7 +25,7 @@ COMMANDS = {
                 'for a calibration'),
     'simulate': ('odocal_ros.offline.simulate', 'write a bag with known truth'),
     'plan': ('odocal_ros.offline.plan', 'predict the uncertainties of a planned drive'),
-    'watch': ('odocal_ros.live.watch_command', 'show the progress of a running node'),
+    'watch': ('odocal_ros.live.start', 'show the progress of a running node'),
     'doctor': ('odocal_ros.offline.doctor', 'show the installation, for bug reports'),
     'compare': ('odocal_ros.offline.compare', 'compare calibrations: changes in sigmas'),
     'paper': ('odocal_reproductions', 'reproduce tables 1-4 of the two-point paper'),

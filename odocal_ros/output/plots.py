@@ -28,7 +28,7 @@ from odocal_ros.output.drawing import (
     svg,
     thinned,
 )
-from odocal_ros.output.plots_speed import by_speed, by_window
+from odocal_ros.output.plots_scale import by_speed, by_window
 
 PAUSE = {'no fix used': PINK, 'no IMU': RED, 'no odometer': GREEN}
 STATUS = {-1: ('no fix (-1)', 'x', GREY), 0: ('fix (0)', 'o', BLUE),

@@ -144,7 +144,7 @@ def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing
     """
     from odocal_ros.output.drawing import look
     from odocal_ros.output.plots import leg_figures
-    from odocal_ros.output.plots_compare import compared
+    from odocal_ros.output.plots_scale import compared
     numbered, size = list(enumerate(calibration.legs, 1)), 0
     figures: dict[int, list[Drawing]] = {}
     shown = [(number, leg, leg.evidence) for number, leg in numbered if leg.evidence is not None]

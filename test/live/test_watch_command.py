@@ -15,8 +15,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import pytest
 from std_msgs.msg import Float64, String
 
+from odocal_ros.live.start import NEEDS
 from odocal_ros.live.watch import LATCHED, StatusListener
-from odocal_ros.live.watch_command import NEEDS
 
 ODOCAL = [sys.executable, '-m', 'odocal_ros.offline.cli', 'watch', '--once']
 
