@@ -24,13 +24,12 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
 from odocal_ros.screening.clocks import judge_clocks, offsets
 from odocal_ros.screening.fix_screen import contradicted, reckoned, usable_fixes
-from odocal_ros.screening.gaps import topic_gap
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.inputs import Inputs, place, UsableRows
 from odocal_ros.screening.leg_kind import with_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
-from odocal_ros.screening.row_screen import usable_rows
+from odocal_ros.screening.row_screen import topic_gap, usable_rows
 from odocal_ros.screening.wheel_travel import Wheels, wheels
 from odocal_ros.settings.config import Config, ImuConfig, SIDES
 

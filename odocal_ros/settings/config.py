@@ -13,15 +13,15 @@ import math
 from typing import Any
 
 from odocal_ros.data.inputs import TOPICS
-from odocal_ros.settings.accept_config import AcceptConfig
-from odocal_ros.settings.output_config import (
+from odocal_ros.settings.config_groups import (
+    AcceptConfig,
     FramesConfig,
     JournalConfig,
     OutputConfig,
     PublishConfig,
+    ReferenceConfig,
     UpdaterConfig,
 )
-from odocal_ros.settings.reference_config import ReferenceConfig
 from odocal_ros.settings.setting import (
     setting,
     settings_of as settings_of,  # for others too: they are its other half

@@ -13,9 +13,8 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.motion import inertial_v, Motion, State
-from odocal_ros.sim.profile import hermite, Profile
+from odocal_ros.sim.profile import hermite, Hills, Profile
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.road import Hills
 from odocal_ros.sim.zoo import G
 
 # physical: natural frequency of a car's body on its springs, damped by shock absorbers

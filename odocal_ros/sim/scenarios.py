@@ -28,11 +28,9 @@ from odocal_ros.sim import body, sensors
 from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
 from odocal_ros.sim.noise import stamps, stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
-from odocal_ros.sim.profile import hermite, Profile
-from odocal_ros.sim.real_fixes import velocity
-from odocal_ros.sim.real_imu import own_angles
+from odocal_ros.sim.profile import hermite, Hills, Profile
+from odocal_ros.sim.real_sensors import own_angles, velocity
 from odocal_ros.sim.references import Reference, REFERENCES
-from odocal_ros.sim.road import Hills
 from odocal_ros.sim.routes import Route, ROUTES, with_sideways_moves
 from odocal_ros.sim.wheels import leg_factor, wheels_of
 

@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.output.pictures import PICTURES
+from odocal_ros.output.drawing import PICTURES
 
 
 def add_outputs(parser: argparse.ArgumentParser, drawn: str) -> None:

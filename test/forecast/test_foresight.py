@@ -24,8 +24,7 @@ from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
 from odocal_ros.live import running_estimate as watch
 from odocal_ros.live.guidance import hint
 from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
-from odocal_ros.live.session import Session
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView
 from odocal_ros.live.worker import Worker
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code

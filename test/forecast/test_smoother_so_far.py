@@ -24,8 +24,7 @@ from odocal_ros.forecast.foresight import forecast_of
 from odocal_ros.forecast.smoother_forecast import look, with_running
 from odocal_ros.forecast.smoother_so_far import SmootherSoFar
 from odocal_ros.live.guidance import hint
-from odocal_ros.live.session import Session
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings

@@ -10,9 +10,8 @@ import pytest
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import attitude, Motion, Start, velocity_n
 from odocal_ros.sim.options import resolved, SimOptions
-from odocal_ros.sim.profile import chain, hermite, hold, ramp, turn
+from odocal_ros.sim.profile import chain, hermite, Hills, hold, ramp, turn
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.road import Hills
 from odocal_ros.sim.scenarios import motion_of, simulate
 from odocal_ros.sim.zoo import G
 
