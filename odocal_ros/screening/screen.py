@@ -19,6 +19,7 @@ from odocal_ros.data.inputs import INPUTS, OUTSIDE
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.samples import FixSamples, ImuSamples, VelocitySamples
+from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
@@ -169,10 +170,13 @@ def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> In
         return inputs
     rate = inputs.w_b @ inputs.up_b
     # straights, and turns to both sides: the median is the bias
-    angle = np.cumsum((rate[1:] - np.median(rate)) * np.diff(inputs.t_imu))
+    heading = np.exp(1j * running_integral(inputs.t_imu, rate - np.median(rate)))
+    x, y, _ = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
+    way = np.diff(inputs.travel.at(inputs.t_imu), prepend=0.0) * placed.rough
+    track = np.cumsum(heading * way) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
-    lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma, inputs.travel.at(inputs.t_fix)
-                         * placed.rough, lambda t: np.interp(t, inputs.t_imu[1:], angle))
+    lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma,
+                         np.interp(inputs.t_fix, inputs.t_imu, track))
     found += why
     return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],
                    covariance_n=inputs.covariance_n[~lost],

@@ -136,18 +136,15 @@ def motion_of(options: SimOptions) -> Motion:
     more: dict[str, Any] = {}
     hills = Hills(options.slope, kerbs=_kerbs(route, options))
     lean = (body.leaning(route.speed, route.yaw_rate, real)
-            if real.cross_slope or real.banking else None)
+            if real.cross_slope or real.banking or real.crossfall else None)
     if lean:
         more['lean'] = lean
     if route.side is not None:
         more['sway'] = route.side, STEADY
     elif options.sway or real.sideslip or lean:
         more['sway'] = _sway(route, options, lean)
-    if real.squat or real.body_roll or real.wheelbase or lean:
-        roll, pitch = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll, hills,
-                                 real.wheelbase)
-        roll = roll if lean is None else Profile(roll.breaks, roll.powers + lean.powers)
-        more['tilt'] = roll, pitch
+    if real.squat or real.body_roll or real.wheelbase or real.kneeling or lean:
+        more['tilt'] = body.tilts(route.speed, route.yaw_rate, real, hills, lean)
     return Motion(route.speed, route.yaw_rate, start, hills, **more)
 
 
@@ -174,7 +171,7 @@ def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Prof
     draws = size * stream(options.seed, 'sway').standard_normal((2, len(breaks)))
     side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / step], -1)) for x in draws)
     if options.real.sideslip:
-        v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, breaks)
+        v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, lean, breaks)
         side = _with(side, v)
     if lean:
         phi, rate = lean(breaks), lean.derivative()(breaks) * options.odometer_lever_arm[2]
