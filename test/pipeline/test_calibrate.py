@@ -10,7 +10,6 @@ from drives import (
     drive,
     errors_in_sigmas,
     everything_said,
-    LOW_RATES,
     rejecting,
     settings,
     shifted,
@@ -166,7 +165,8 @@ def test_sigmas_are_honest_over_many_drives(grade, noise):
     runs, z, slack = 60, [], 1.0 if noise == 'white' else 1.3
     for seed in range(runs):
         made = simulate(SimOptions(scenario='straight', duration=190.0, seed=seed,
-                                   imu_grade=grade, fix_noise=noise, **LOW_RATES))
+                                   imu_grade=grade, fix_noise=noise, imu_rate=25.0,
+                                   odometer_rate=10.0))
         error = 1e-3 * np.random.default_rng(seed).standard_normal()
         config = with_settings(settings(made), {
             'alignment.heading': float(made.truth.heading + error), 'verdict.max_yaw_sigma': 1.0,
