@@ -238,9 +238,9 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
 
 
 def whole_degrees(angle: float) -> str:
-    """Return an uncertainty, rad, in whole degrees, below one with one digit."""
+    """Return an uncertainty, rad, in whole degrees, below half of one with one digit."""
     degrees = math.degrees(angle)
-    return f'{degrees:.0f}' if degrees >= 1.0 else f'{degrees:.1g}'
+    return f'{degrees:.0f}' if degrees >= 0.5 else f'{degrees:.1g}'
 
 
 def _findings(found: dict[str, Any]) -> list[str]:
