@@ -18,9 +18,9 @@ from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.leg import COUNTER
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import CLOCK_APART
+from odocal_ros.settings.node_configs import ApplyConfig
 
 BEGINS_ANEW = 'odometry restarts'      # so begins each sentence that says it
 

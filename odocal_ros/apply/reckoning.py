@@ -36,8 +36,8 @@ from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.standstill import REST_TURN
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.levels import FASTEST
+from odocal_ros.settings.node_configs import ApplyConfig
 
 # judgement, all in s: between corrections; that a speed is taken over; without odometer, after
 # which attitude continues alone; without IMU, that hide motion

@@ -15,7 +15,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix
-from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.node_configs import ApplyConfig
 
 # rad, 1 sigma of what no calibration determined; judgement: 5 and 3 deg of a mounting by eye
 UNKNOWN_YAW, UNKNOWN_PITCH = 0.087, 0.05

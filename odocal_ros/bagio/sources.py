@@ -12,7 +12,7 @@ import sqlite3
 from typing import Any
 
 from odocal_ros.bagio.channels import possible
-from odocal_ros.bagio.numbered import JOURNAL, without_joined
+from odocal_ros.bagio.segments import JOURNAL, without_joined
 from odocal_ros.errors import BadBag
 from odocal_ros.outside.limits import (
     Allowance,
@@ -22,7 +22,7 @@ from odocal_ros.outside.limits import (
     read_text,
     zstd_module,
 )
-from odocal_ros.outside.yaml_tree import loader
+from odocal_ros.outside.yaml_files import loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}

@@ -115,6 +115,7 @@ SPEED_OFFSET = CONSTANTS.index('speed_offset')
 VELOCITY = constants_from('velocity_delay', 'velocity_scale')
 VELOCITY_DELAY, VELOCITY_LAG2, VELOCITY_SCALE = range(VELOCITY.start, VELOCITY.stop)
 M = len(CONSTANTS)
+NO_ERROR = 1e-12    # definition: prior sigma of what there is none of, in any unit
 
 
 @dataclass(frozen=True, eq=False)

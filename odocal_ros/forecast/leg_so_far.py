@@ -21,8 +21,8 @@ from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPE
 from odocal_ros.nav.integral import running_integral
 from odocal_ros.pipeline.calibrate import faults, Screened, screened
 from odocal_ros.reasons import Reason
-from odocal_ros.screening.gaps import imu_gap
 from odocal_ros.screening.inputs import Inputs, place, Placed
+from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config, SETTINGS, with_settings
 
 SILENT_TIME = 0.9    # s; judgement: delay of rows out of order; reported within a second

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import re
 
 from odocal_ros.bagio.read import TopicInfo
-from odocal_ros.data.inputs import INPUTS, topic_option
+from odocal_ros.data.inputs import INPUTS, OUTSIDE, topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
@@ -135,8 +135,8 @@ def _optional(slot: str, config: Config, found: list[str]) -> bool:
     """Return True if a leg does not need a slot whose topic is missing or ambiguous."""
     if slot == 'imu':
         return not found and not config.odometer.needs_imu
-    return slot == 'fix_velocity' or (
-        slot == 'heading' and config.alignment.heading_source != 'heading_topic')
+    return slot in OUTSIDE and not (
+        slot == 'heading' and config.alignment.heading_source == 'heading_topic')
 
 
 def _of_receiver(name: str) -> bool:

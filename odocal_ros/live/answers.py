@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
-from odocal_ros.live.session import Restored
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Restored, SessionView
 from odocal_ros.output.summary import sentence, values_in_words
 from odocal_ros.outside.names import said_by
 from odocal_ros.reasons import cautions, Verdict

@@ -9,8 +9,7 @@ from odocal_ros.calib.choice import ABOUT, deciding
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import REST_FORESEEN_S
 from odocal_ros.forecast.progress import clocks_differ
-from odocal_ros.live.session import State
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import SessionView, State
 from odocal_ros.reasons import cautions, Reason
 
 KMH = 3.6    # definition: km/h in a m/s

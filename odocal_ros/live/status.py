@@ -20,8 +20,7 @@ from odocal_ros.live.guidance import (
     seconds_to_stand,
 )
 from odocal_ros.live.health import Health
-from odocal_ros.live.session import Session, State
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Verdict
 

@@ -19,10 +19,9 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.errors import BadData, OdocalError
-from odocal_ros.live.definitions import message_class
 from odocal_ros.live.health import Health
 from odocal_ros.live.journal_writer import ALWAYS_NS
-from odocal_ros.live.waiting_messages import WaitingMessages
+from odocal_ros.live.messages import message_class, WaitingMessages
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES
 from odocal_ros.messages.sensor_types import Pairs, TRANSFORMS

@@ -20,9 +20,8 @@ from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
 from odocal_ros.messages.fields import MessageView, View
-from odocal_ros.messages.frames import FrameFilter
 from odocal_ros.messages.odometer_types import OdometerPlan
-from odocal_ros.messages.raws import FEW_ROWS, Raws, Table, tables
+from odocal_ros.messages.raws import FEW_ROWS, FrameFilter, Raws, Table, tables
 from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan, TRANSFORMS
 from odocal_ros.settings.config import Config
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 from odocal_ros.offline.say import say
 
 if TYPE_CHECKING:
-    from odocal_ros.library.changes import Change, Difference
-    from odocal_ros.library.compare import Comparison
+    from odocal_ros.library.compare import Change, Comparison, Difference
     from odocal_ros.output.stored import Stored
 
 
@@ -44,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 def _screen(found: 'Comparison') -> list[str]:
     from odocal_ros.library.compare import hints, label
     from odocal_ros.output.figures import columns, counted
-    from odocal_ros.output.worse import said as value_text
+    from odocal_ros.output.stored import said as value_text
     stored = found.stored
     width = max(len(s.name) for s in stored)
     lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, '

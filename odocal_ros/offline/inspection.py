@@ -24,7 +24,7 @@ from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.messages.transforms import with_static
 from odocal_ros.offline import survey
-from odocal_ros.offline.fix_path import fix_path, FixPath, Match
+from odocal_ros.offline.drive_survey import fix_path, FixPath, Match
 from odocal_ros.offline.inspection_drive import lacking, look
 from odocal_ros.offline.odometer_search import (
     best_topic,

@@ -125,7 +125,7 @@ def _config(args: argparse.Namespace) -> dict[str, Any]:
 
 def _figures(args: argparse.Namespace) -> dict[str, Any]:
     """Return the requested error parameters."""
-    from odocal_ros.library.what_helps import RTK
+    from odocal_ros.library.plan import RTK
     if args.rtk and args.fix_sigma is not None:
         raise BadUsage('--rtk and --fix-sigma exclude each other')
     asked = {'fix': RTK if args.rtk else args.fix_sigma, 'fix_rate': args.fix_rate,

@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 
 from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.listener import Listener
+from odocal_ros.library.asked import Listener
 from odocal_ros.offline.say import Phase, say, warn
 from odocal_ros.outside.names import one_line
 
@@ -124,8 +124,8 @@ class _Screen(Listener):
 
 def asked_config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings asked for: --config < --set < --accept and --method, each checked."""
-    from odocal_ros.settings.accept_config import parse_accept
     from odocal_ros.settings.config import Config, with_settings
+    from odocal_ros.settings.config_groups import parse_accept
     asked = asked_settings(args)
     for text in args.accept:
         asked |= parse_accept(text)
@@ -164,7 +164,7 @@ def _size(stream: Any) -> tuple[int, int | None]:
 
 def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) -> int:
     from odocal_ros.output.files import Results
-    from odocal_ros.output.worse import replacing, stored_in
+    from odocal_ros.output.stored import replacing, stored_in
     screen = _Screen(args)
     old = stored_in(output)
     results = Results(calibration.result, calibration.config, output, list(calibration.inputs),
@@ -192,7 +192,7 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
 def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespace) -> int:
     """Return 0 for a good result, after printing the decision on limits."""
     from odocal_ros.offline.cli import OK, REJECTED
-    from odocal_ros.output.acceptance import accept_line, accept_words
+    from odocal_ros.output.reason_lines import accept_line, accept_words
     from odocal_ros.pipeline.acceptance import accept, Decision
     from odocal_ros.reasons import Verdict
     acceptance = accept(calibration, config)

@@ -18,7 +18,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
 from odocal_ros.output.folder import ResultFolder
 from odocal_ros.output.report import NAME as REPORT, report_or_why
-from odocal_ros.output.track_table import in_pieces, overall
+from odocal_ros.output.tables import in_pieces, overall
 from odocal_ros.pipeline.acceptance import accept
 from odocal_ros.settings.config import Config, flat
 

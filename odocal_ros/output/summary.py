@@ -19,7 +19,6 @@ from odocal_ros.calib.result import (
     MethodResult,
     wheel_factors,
 )
-from odocal_ros.output.budget_table import budget_lines, largest_source, source_label
 from odocal_ros.output.figures import (
     beyond_one,
     columns,
@@ -34,9 +33,16 @@ from odocal_ros.output.figures import (
     with_sigma,
     with_unit,
 )
-from odocal_ros.output.leg_table import leg_verdicts, search_lines, shown_verdict
 from odocal_ros.output.reason_lines import bag_lines, reason_lines
-from odocal_ros.output.track_table import track_lines
+from odocal_ros.output.tables import (
+    budget_lines,
+    largest_source,
+    leg_verdicts,
+    search_lines,
+    shown_verdict,
+    source_label,
+    track_lines,
+)
 from odocal_ros.reasons import Verdict
 
 DEG = math.degrees(1.0)    # definition

@@ -212,8 +212,9 @@ def _imu_orientation(inputs: Inputs, level: Level, latitude: float, grade: Grade
 
 def _heading_topic(inputs: Inputs, level: Level, latitude: float, grade: Grade,
                    config: Config) -> Found:
-    return _from_quaternions(inputs.t_heading, inputs.q_heading, inputs.heading_variance, level,
-                             config, lambda C: C, config.alignment.heading_offset)
+    sent, t = inputs.outside['heading']
+    return _from_quaternions(t, sent.q_ni, sent.yaw_variance, level, config, lambda C: C,
+                             config.alignment.heading_offset)
 
 
 def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, config: Config,

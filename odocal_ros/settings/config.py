@@ -12,15 +12,16 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from odocal_ros.settings.accept_config import AcceptConfig
-from odocal_ros.settings.output_config import (
+from odocal_ros.data.inputs import TOPICS
+from odocal_ros.settings.config_groups import (
+    AcceptConfig,
     FramesConfig,
     JournalConfig,
     OutputConfig,
     PublishConfig,
+    ReferenceConfig,
     UpdaterConfig,
 )
-from odocal_ros.settings.reference_config import ReferenceConfig
 from odocal_ros.settings.setting import (
     setting,
     settings_of as settings_of,  # for others too: they are its other half
@@ -271,11 +272,10 @@ class Config:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Return the inputs that these settings use, with optional ones; see data/inputs.py."""
-        optional = {'odometer_right': self.odometer.own_topics,
-                    'fix_velocity': self.gnss.use_velocity,
-                    'heading': self.alignment.heading_source in ('auto', 'heading_topic')}
-        return 'imu', 'odometer', 'fix', *(slot for slot, used in optional.items() if used)
+        """Return the inputs that these settings use, with optional ones."""
+        used = {'odometer_right': self.odometer.own_topics, 'fix_velocity': self.gnss.use_velocity,
+                'heading': self.alignment.heading_source in ('auto', 'heading_topic')}
+        return tuple(slot for slot in TOPICS if used.get(slot, True))
 
     def in_local_frame(self) -> 'Config':
         """Return the settings of a leg whose positions are in a local frame."""

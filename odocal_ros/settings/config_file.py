@@ -16,7 +16,7 @@ from typing import Any
 
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.outside.limits import read_text
-from odocal_ros.outside.yaml_tree import composed
+from odocal_ros.outside.yaml_files import composed
 from odocal_ros.settings.config import Config, SETTINGS
 from odocal_ros.settings.setting import with_settings
 

@@ -24,8 +24,7 @@ from odocal_ros.nav.earth import (
     transport_rate_n,
 )
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.sim.profile import Profile
-from odocal_ros.sim.road import Hills
+from odocal_ros.sim.profile import Hills, Profile
 
 STEADY = Profile([0.0, 1.0], [[0.0]])     # definition: no sway
 GAUSS = tuple(zip(*np.polynomial.legendre.leggauss(4), strict=True))     # definition: on -1 to 1

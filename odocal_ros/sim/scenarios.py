@@ -28,11 +28,9 @@ from odocal_ros.sim import body, sensors
 from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
 from odocal_ros.sim.noise import stamps, stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
-from odocal_ros.sim.profile import hermite, Profile
-from odocal_ros.sim.real_fixes import velocity
-from odocal_ros.sim.real_imu import own_angles
+from odocal_ros.sim.profile import hermite, Hills, Profile
+from odocal_ros.sim.real_sensors import own_angles, velocity
 from odocal_ros.sim.references import Reference, REFERENCES
-from odocal_ros.sim.road import Hills
 from odocal_ros.sim.routes import Route, ROUTES, with_sideways_moves
 from odocal_ros.sim.wheels import leg_factor, wheels_of
 
@@ -112,7 +110,8 @@ class Drive:
             fix = local_fixes(np.nan)(fix.stamp_ns, fix.received_ns, self.positions(), *stated)
         wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
         return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
-                   fix=fix, heading=self.heading, fix_velocity=self.velocity,
+                   fix=fix,
+                   outside={'heading': self.heading, 'fix_velocity': self.velocity},
                    form=self.form, **wheels)
 
     def positions(self) -> Floats:
@@ -137,18 +136,15 @@ def motion_of(options: SimOptions) -> Motion:
     more: dict[str, Any] = {}
     hills = Hills(options.slope, kerbs=_kerbs(route, options))
     lean = (body.leaning(route.speed, route.yaw_rate, real)
-            if real.cross_slope or real.banking else None)
+            if real.cross_slope or real.banking or real.crossfall else None)
     if lean:
         more['lean'] = lean
     if route.side is not None:
         more['sway'] = route.side, STEADY
     elif options.sway or real.sideslip or lean:
         more['sway'] = _sway(route, options, lean)
-    if real.squat or real.body_roll or real.wheelbase or lean:
-        roll, pitch = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll, hills,
-                                 real.wheelbase)
-        roll = roll if lean is None else Profile(roll.breaks, roll.powers + lean.powers)
-        more['tilt'] = roll, pitch
+    if real.squat or real.body_roll or real.wheelbase or real.kneeling or lean:
+        more['tilt'] = body.tilts(route.speed, route.yaw_rate, real, hills, lean)
     return Motion(route.speed, route.yaw_rate, start, hills, **more)
 
 
@@ -175,7 +171,7 @@ def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Prof
     draws = size * stream(options.seed, 'sway').standard_normal((2, len(breaks)))
     side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / step], -1)) for x in draws)
     if options.real.sideslip:
-        v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, breaks)
+        v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, lean, breaks)
         side = _with(side, v)
     if lean:
         phi, rate = lean(breaks), lean.derivative()(breaks) * options.odometer_lever_arm[2]

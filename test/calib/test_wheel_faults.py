@@ -70,7 +70,7 @@ def spun(options, at, length, size):
 def said(made, **wheels):
     """Return what screening says of a leg whose counters are changed."""
     leg = made.leg()
-    leg = replace(leg, **{slot: changed(getattr(leg, slot), value=change)
+    leg = leg.with_rows(**{slot: changed(leg.rows(slot), value=change)
                           for slot, change in wheels.items()})
     return {r.code: r.text for r in screen(leg, settings(made))[1]}
 

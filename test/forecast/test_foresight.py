@@ -24,8 +24,7 @@ from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
 from odocal_ros.live import running_estimate as watch
 from odocal_ros.live.guidance import hint
 from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
-from odocal_ros.live.session import Session
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView
 from odocal_ros.live.worker import Worker
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
@@ -279,11 +278,11 @@ def watched(drive, config, worker, log):
     recorder.form = leg.form
     half = leg.start_ns + 150 * SECOND
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         recorder.feed(slot, take(rows, rows.stamp_ns <= leg.start_ns))
     look.begin(recorder, leg.start_ns, config)
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         for first_ns in range(leg.start_ns, half, 10 * SECOND):
             look.feed(slot, take(rows, (rows.stamp_ns > first_ns)
                                  & (rows.stamp_ns <= first_ns + 10 * SECOND)))

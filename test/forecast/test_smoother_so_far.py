@@ -24,8 +24,7 @@ from odocal_ros.forecast.foresight import forecast_of
 from odocal_ros.forecast.smoother_forecast import look, with_running
 from odocal_ros.forecast.smoother_so_far import SmootherSoFar
 from odocal_ros.live.guidance import hint
-from odocal_ros.live.session import Session
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
@@ -263,7 +262,7 @@ def test_an_imu_that_faces_down_is_read_as_such(config, looks):
     ({'odometer': slice(0, 1)}, 'and odometer')])
 def test_too_little_is_said_and_no_look_is_lost_by_it(config, looks, changed, words):
     leg, so_far = looks[0].leg, SmootherSoFar()
-    less = replace(leg, **{slot: take(getattr(leg, slot), rows) for slot, rows in changed.items()})
+    less = leg.with_rows(**{slot: take(leg.rows(slot), rows) for slot, rows in changed.items()})
     with pytest.raises(OdocalError, match=words):
         so_far.look(less, config)
     assert so_far.look(leg, config).distance > 50.0

@@ -29,6 +29,7 @@ from odocal_ros.estimator.state import (
     KIND_OF,
     KIND_SIZES,
     M,
+    NO_ERROR,
     ODO_ARM,
     ODO_CLOCK,
     ODO_DELAY,
@@ -80,11 +81,9 @@ class PriorRows(Factor):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
-        absent = {'heading', 'velocity'} - {*problem.outside}
-        coarse = problem.leg.travel.coarse
-        absent |= set() if coarse and coarse.truncation else {'speed_truncation'}
         self.level = not problem.leg.felt
-        self.shared = {name: where for name, where in SHARED.items() if name not in absent}
+        self.shared = {name: where for name, where in SHARED.items()
+                       if (problem.priors.constants[where] > NO_ERROR).any()}
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:

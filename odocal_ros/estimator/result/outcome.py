@@ -16,6 +16,7 @@ from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.slip import missing_reasons, without_braking
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals
+from odocal_ros.estimator.equations import OUTSIDE
 from odocal_ros.estimator.factors.fixes import Fixes
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.slide import assumed
@@ -52,7 +53,6 @@ from odocal_ros.estimator.state import (
     CONSTANTS,
     GNSS_ARM,
     GYRO,
-    HEADING,
     LN_K,
     M,
     ODO_ARM,
@@ -255,7 +255,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'f': K * state.forward,
         'noise': fit.levels.roots(),
         'iterations': fit.iterations, 'widened': float(widen),
-        'outside': _outside(leg, problem, fit, sigma),
+        'outside': _outside(problem, fit, sigma),
         'posterior_to_prior': ratio,
         **{CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
            for i in SCALES},
@@ -274,19 +274,9 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
     }
 
 
-def _outside(leg: SmootherLeg, problem: Problem, fit: Fit,
-             sigma: Floats) -> dict[str, dict[str, Any]]:
-    """Return details of GNSS velocity and external heading."""
-    out: dict[str, dict[str, Any]] = {}
-    for name, sent in problem.outside.items():
-        out[name] = {'messages': len(sent.t),
-                     'alike': problem.per_effective.get(name, 1.0)}
-    if 'velocity' in out:
-        out['velocity'] |= {CONSTANTS[i]: {'value': float(fit.state.constants[i]),
-                                           'sigma': float(sigma[i])}
-                            for i in range(VELOCITY.start, VELOCITY.stop)}
-    if 'heading' in out:
-        out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,
-                           'error': float(fit.state.constants[HEADING]),
-                           'error_sigma': float(sigma[HEADING])}
-    return out
+def _outside(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, dict[str, Any]]:
+    """Return details of the sensors besides IMU, odometer and fixes."""
+    return {part.name: {'messages': len(sent.t),
+                        'alike': problem.per_effective.get(part.name, 1.0),
+                        **part.details(sent, fit.state.constants, sigma)}
+            for part in OUTSIDE if (sent := problem.outside.get(part.name)) is not None}

@@ -1,20 +1,24 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A real receiver: filters, correlated errors, multipath, wrong stated sigmas, velocity."""
+"""What a real IMU and a real receiver add: triads, vibration, filters, multipath, wrong sigmas."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.nav.earth import radii
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import Motion, point
 from odocal_ros.sim.noise import gauss_markov, PHASE, stamps, stream, TRANSPORT
 from odocal_ros.sim.options import SimOptions
+from odocal_ros.sim.real import Real
 
+# physical: Hz, width, share: wheel hop, engine
+RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
+APART_NS = 50_000    # judgement: between the stamps of one batch
 # definition: ages, in time constants, and weights of a first-order filter: Gauss-Legendre rule on
 # pieces, fine enough for the kinks of a route
 EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
@@ -26,10 +30,112 @@ AVERAGING /= AVERAGING.sum()
 TRACKING = np.exp(-NODES / 2**0.5) * np.cos(NODES / 2**0.5) * np.repeat(np.diff(EDGES) / 2, 2)
 TRACKING /= TRACKING.sum()
 UP = 2.0             # judgement: errors of the height over those of east and north
-SPREAD = 0.9         # judgement: of the logarithm of a burst's size and length
 ONSET = (0.5, 1.5)   # judgement: of the mean time in which a burst comes and goes
 HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e-4 m/s
 OUTLIER = 5.0           # m/s, judgement: a wrong Doppler in a street
+
+
+def angles(d_b: Floats) -> tuple[float, float]:
+    """Return yaw and pitch mounting angle of the forward axis in b, rad."""
+    d = np.asarray(d_b, dtype=float)
+    return float(-np.arcsin(d[1])), float(np.arctan2(d[2], d[0]))
+
+
+def turn_and_push(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
+    """
+    Return the rotation that takes the turn-and-push frame to that of the matrices, (3, 3).
+
+    The triads measure ``I + M`` times a vector. To first order the rotation is ``I + [theta x]``
+    with theta = (M_g,yz, -M_g,xz, -M_a,yx).
+    """
+    gyro, accel = np.eye(3) + gyro_matrix, np.eye(3) + accel_matrix
+    z = np.linalg.solve(gyro, [0.0, 0.0, 1.0])
+    z /= np.linalg.norm(z)
+    x = np.cross(accel[1], z)      # not measured by the y accelerometer, perpendicular to z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], -1)
+
+
+def own_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
+               accel_matrix: Floats) -> tuple[float, float, float, float]:
+    """Return yaw and pitch by the IMU's own axes, then by its housing, rad; matrices in i."""
+    d = np.asarray(C_vb)[0]
+    R = turn_and_push(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
+    return *angles(R.T @ d), *angles(d)
+
+
+def crooked(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:
+    """Return turn rate and specific force with the errors of the triads: (n, 3) each."""
+    gyro, accel, G = (real.matrix(n) for n in ('gyro_matrix', 'accel_matrix', 'g_sensitivity'))
+    w_m = w_i + w_i @ gyro.T if gyro.any() else w_i
+    if G.any():
+        w_m = w_m + f_i @ G.T
+    return w_m, f_i + f_i @ accel.T if accel.any() else f_i
+
+
+def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float]:
+    """Return gyro and accelerometer errors by temperature, drift and vibration: (n, 3) or 0.0."""
+    real = options.real
+    warmth = real.warm_rise * -np.expm1(-t / real.warm_time)[:, None]
+    added = []
+    for name, shake in (('gyro', real.gyro_vibration), ('accel', real.vibration)):
+        slope, wander = getattr(real, f'{name}_slope'), getattr(real, f'{name}_wander')
+        total = warmth * np.array(slope) if real.warm_rise and any(slope) else 0.0
+        if wander:
+            total = total + _wander(stream(options.seed, f'real {name} wander'), wander,
+                                    real.wander_time, t)
+        if shake:
+            level = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + 5.0)    # half at 5 m/s
+            total = total + level * vibration(stream(options.seed, f'real {name} vibration'),
+                                              shake, options.imu_rate, len(t))
+            if name == 'accel' and real.rectification:
+                total = total + real.rectification * (shake * level)**2
+        added.append(total)
+    return added
+
+
+def _wander(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
+    """Return a Gauss-Markov process that starts at 0, linear between draws."""
+    knots = np.arange(0.0, t[-1] + 2.0, 1.0)    # s
+    x = gauss_markov(rng, sigma, tau, knots)
+    return np.stack([np.interp(t, knots, column) for column in (x - x[0]).T], -1)
+
+
+def vibration(rng: np.random.Generator, rms: float, rate: float, n: int) -> Floats:
+    """
+    Return accelerations of a vibrating body, (n, 3): around its resonances, zero at 0 Hz.
+
+    Below them the power falls as f^4, as for a bounded displacement.
+    """
+    f = np.fft.rfftfreq(n, 1 / rate)
+    power = np.zeros_like(f)
+    for middle, width, share in RESONANCES:
+        at = min(middle, 0.4 * rate)
+        power += share * np.minimum(f / at, 1.0)**4 / (1 + ((f - at) / width)**2)
+    shape = np.sqrt(power)[:, None]
+    x = np.fft.irfft(np.fft.rfft(rng.standard_normal((n, 3)), axis=0) * shape, n, axis=0)
+    # both halves of the spectrum: the mean square of the shape is that of the samples
+    weight = np.full(len(f), 2.0)
+    weight[0] = 1.0
+    weight[-1] = 1.0 if n % 2 == 0 else 2.0
+    shaking: Floats = rms * x / np.sqrt((weight * power).sum() / n)
+    return shaking
+
+
+def stamped(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
+            batch: int = 1) -> Ints:
+    """
+    Return stamps (ns) of samples measured at ``ns``: late, in order, and in batches.
+
+    The jitter has zero mean, but no stamp is before its sample.
+    """
+    late = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
+    stamp = ns + np.rint(late * 1e9).astype(np.int64)
+    apart = APART_NS * np.arange(len(ns))
+    if batch > 1:
+        last = np.minimum(np.arange(len(ns)) // batch * batch + batch - 1, len(ns) - 1)
+        stamp = stamp[last]
+    return np.maximum.accumulate(stamp - apart) + apart
 
 
 def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
@@ -88,7 +194,7 @@ def burst_errors(t: Floats, options: SimOptions) -> Floats:
     total, hours = np.zeros((len(t), 3)), t[-1] / 3600
     for _ in range(rng.poisson(real.bursts * hours)):
         begin, side = rng.uniform(0.0, t[-1]), rng.uniform(0, 2 * np.pi)
-        size, length = (median * np.exp(SPREAD * rng.standard_normal())
+        size, length = (median * np.exp(real.burst_spread * rng.standard_normal())
                         for median in (real.burst_size, real.burst_time))
         onset, up = real.burst_onset * rng.uniform(*ONSET), rng.normal()
         x = np.clip(np.minimum(t - begin, begin + length + onset - t) / onset, 0.0, 1.0)

@@ -1,11 +1,13 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How figures become parts of a page: one look, SVG with text as text, nothing left outside."""
+"""Figures of one look: as SVG parts of a page, or as files of their own."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 import io
+import os
+from pathlib import Path
 import re
 from typing import Any
 
@@ -13,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.errors import BadUsage
 
 # Okabe and Ito's colours, distinguishable with colour blindness, by shapes in grey
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
@@ -26,6 +29,7 @@ LOOK: dict[Any, Any] = {
     'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'axes.spines.top': False,
     'axes.spines.right': False, 'axes.unicode_minus': True, 'path.simplify': True,
     'legend.frameon': False, 'lines.linewidth': 1.4, 'mathtext.default': 'regular'}
+PICTURES = ('.png', '.svg', '.pdf')
 
 
 @contextmanager
@@ -120,3 +124,34 @@ def lengths(metres: float) -> tuple[float, str]:
 def relative(most: float) -> tuple[float, str]:
     """Return the factor and the unit for relative figures up to so much."""
     return (100.0, '%') if most > 0.005 else (1e6, 'ppm')
+
+
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty figure, inches, that no window will show."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    figure = Figure(figsize=(width, height), layout='constrained')
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """
+    Write a figure.
+
+    Raises
+    ------
+    BadUsage
+        The file cannot be written.
+
+    """
+    part = path.with_name(f'.{path.name}.part')
+    try:
+        ending = path.suffix[1:].lower()
+        # without a date, the same result gives the same file
+        figure.savefig(part, format=ending, dpi=150,
+                       metadata={'Date': None} if ending == 'svg' else None)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise BadUsage(f'--plot {path}: cannot write it ({error.strerror})') from None
