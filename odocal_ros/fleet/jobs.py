@@ -95,7 +95,7 @@ def _known(store: RowStore, job: BagJob) -> str | None:
 
 
 def _why(error: BaseException) -> str:
-    """Return the cause of the failure of a worker, for people."""
+    """Return the cause of a failed task, for people."""
     from distributed.scheduler import KilledWorker
     if isinstance(error, KilledWorker):
         return (f'its worker ended {error.allowed_failures + 1} times during the computation: '

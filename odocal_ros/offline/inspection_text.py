@@ -230,11 +230,17 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
     if mounting['assumed_forward']:
         how = 'level from gravity; the drive does not determine forward, x is assumed'
     else:
-        sure = math.degrees(mounting['forward_sigma'])
-        how = (f'forward direction from accelerations and turns, uncertainty {sure:.0f} deg (1 '
+        sure = whole_degrees(mounting['forward_sigma'])
+        how = (f'forward direction from accelerations and turns, uncertainty {sure} deg (1 '
                f'sigma); remaining misalignment {math.degrees(mounting["off"]):.1f} deg')
     text = 'set imu.mounting_rpy to' if mounting['needed'] else 'imu.mounting_rpy is correct:'
     return wrapped(f'axes: {text} [{rpy}] rad (roll, pitch, yaw {degrees} deg; {how})')
+
+
+def whole_degrees(angle: float) -> str:
+    """Return an uncertainty, rad, in whole degrees, below half of one with one digit."""
+    degrees = math.degrees(angle)
+    return f'{degrees:.0f}' if degrees >= 0.5 else f'{degrees:.1g}'
 
 
 def _findings(found: dict[str, Any]) -> list[str]:

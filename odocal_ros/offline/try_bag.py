@@ -5,7 +5,6 @@
 
 import argparse
 from dataclasses import dataclass
-import math
 import os
 from pathlib import Path
 import shlex
@@ -170,12 +169,13 @@ def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str])
 
 def _why_mounting(mounting: dict[str, Any] | None) -> str:
     """Return the source of the IMU orientation; '' if it is not estimated."""
+    from odocal_ros.offline.inspection_text import whole_degrees
     if not mounting or not mounting['needed']:
         return ''
     if mounting['assumed_forward']:
         return 'up is measured from gravity; x is assumed to be forward'
     return ('up is measured from gravity, forward from accelerations and turns '
-            f'(1 sigma: {math.degrees(mounting["forward_sigma"]):.0f} deg)')
+            f'(1 sigma: {whole_degrees(mounting["forward_sigma"])} deg)')
 
 
 def _open(report: Path, never: bool) -> None:

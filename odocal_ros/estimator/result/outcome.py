@@ -108,8 +108,7 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     unsaid = [name for name in ratio if name in found and found[name].value is None
               and name not in contradicted]
     if unsaid:
-        reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: '
-                              f'{in_words(unsaid)}; the configured values are used'))
+        reasons.append(not_observable('this drive', unsaid))
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
     sources = [*(_widened(s, widen) for s in shares(fit, near)),
@@ -182,6 +181,15 @@ def configured(leg: SmootherLeg) -> Floats:
     value = np.zeros(M)
     value[ODO_ARM], value[GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
     return value
+
+
+def not_observable(drives: str, names: list[str]) -> Reason:
+    """Return the reason that constants keep their configured values; names: of estimates."""
+    heights = all(name.endswith('_z') for name in names)
+    return Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on {drives}: '
+                  f'{in_words(names)}; the configured values are used',
+                  'Measure these heights and set them: turns, stops and starts hardly determine '
+                  'them.' if heights else '')
 
 
 def in_words(names: Iterable[str]) -> str:

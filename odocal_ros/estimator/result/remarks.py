@@ -149,9 +149,9 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
     said = []
     for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from low to high speed'),
                           (BY_TIME, motion.from_mean[:, 1], 'from start to end')):
-        change = c[i] * np.ptp(span)
-        if abs(c[i]) > REMARK_SIGMAS * sigma[i] and abs(change) > 3e-4:     # worth a word
-            said.append(f'{100 * change:+.2f} % {what}')
+        change, doubt = np.array([c[i], sigma[i]]) * np.ptp(span)
+        if abs(change) > max(REMARK_SIGMAS * doubt, 3e-4):     # worth a word
+            said.append(f'{100 * change:+.2f} ± {100 * doubt:.2f} % {what}')
     if not said:
         return []
     less = said[0].startswith('-') and 'speed' in said[0]
