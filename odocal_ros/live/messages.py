@@ -5,9 +5,10 @@
 Message classes by name with their definitions, and messages that wait until they are taken.
 
 They wait, serialised, in the middleware's queue: waking the executor for every message is nine
-tenths of what a node costs at 1 kHz. So it is kept away from the subscription, and ``take`` asks rclpy's handle for what waits by ``take_message``, as
-the executor itself does. That is no documented part of rclpy: where it is missing, or answers in
-another way, the executor takes the messages from then on. Only the CPU load changes.
+tenths of what a node costs at 1 kHz. So it is kept away from the subscription, and ``take`` asks
+rclpy's handle for what waits by ``take_message``, as the executor itself does. That is no
+documented part of rclpy: where it is missing, or answers in another way, the executor takes the
+messages from then on. Only the CPU load changes.
 """
 
 import importlib
