@@ -169,11 +169,7 @@ def _save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]]
     left empty. Returns the folder, why ``latest`` stays where it was, empty when it does not
     (``force`` moves it), and what adds the report, which takes long to draw.
 
-    Raises
-    ------
-    OdocalError
-        The folder cannot be written.
-
+    Raises OdocalError: the folder cannot be written.
     """
     from odocal_ros.output.files import Results
     from odocal_ros.output.ros_files import framed

@@ -37,10 +37,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
     calibration : the combination of all legs.   config : settings it was made with.   inputs : one
     a bag: its name, sha256 and topics.   created : ISO 8601 date and time.
 
-    Returns
-    -------
-    Plain dicts and lists, no NaN: a number that does not exist is None.
-
+    Returns plain dicts and lists, no NaN: a number that does not exist is None.
     """
     result: dict[str, Any] = {name: {'value': None, 'sigma': None, 'unit': unit, 'method': None}
                     for name, unit in ALWAYS.items()}
@@ -132,13 +129,8 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
 
     ``tell`` receives a sentence if the report cannot be drawn.
 
-    Raises
-    ------
-    BadUsage
-        There is a calibration.json and no ``force``, or the folder cannot be written.
-    KeyboardInterrupt
-        Saying what was written, where something was.
-
+    Raises BadUsage: there is a calibration.json and no ``force``, or the folder cannot be written.
+    Raises KeyboardInterrupt: saying what was written, where something was.
     """
     results = Results(calibration, config, directory, inputs, created)
     with results.said_when_interrupted():

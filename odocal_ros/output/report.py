@@ -33,11 +33,7 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
     calibration : the combination of all legs; what a leg lacks (track, evidence) is left out.
     config : settings it was made with.   content : of calibration.json, for bags and software.
 
-    Raises
-    ------
-    ImportError
-        matplotlib or jinja2 is missing.
-
+    Raises ImportError: matplotlib or jinja2 is missing.
     """
     from jinja2 import Environment, StrictUndefined
     folder = files('odocal_ros.output') / 'templates'
