@@ -59,7 +59,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
             (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_keeps).as_dict()
         if config.leg.automatic:
             left['carried'] = calibration.carried.as_dict()
-    content: dict[str, Any] = _plain({
+    content: dict[str, Any] = plain({
         'schema': SCHEMA, 'software': f'odocal_ros {__version__}', 'created': created,
         'vehicle': config.vehicle,
         'verdict': calibration.verdict.value,
@@ -108,14 +108,14 @@ def _per_distance(legs: list[LegResult] | tuple[LegResult, ...]) -> list[dict[st
     return [{'length': x.length, 'before': x.before, 'after': x.after} for x in in_pieces(legs)]
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return a value as JSON knows it: no numpy, no tuples, None for what is not finite."""
     if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
