@@ -58,12 +58,8 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
     share written. The bag appears under its name only when it is complete; ``force`` replaces
     one that is there.
 
-    Raises
-    ------
-    BadUsage
-        The path exists and ``force`` is not set; its folder cannot be written; an unknown
-        storage or a compression the storage does not have.
-
+    Raises BadUsage: the path exists and ``force`` is not set; its folder cannot be written; an
+    unknown storage or a compression the storage does not have.
     """
     path = Path(path)
     check_target(path, storage, compression, force)

@@ -130,11 +130,7 @@ def parse_accept(text: str) -> dict[str, float]:
     """
     Return the settings of one ``NAME=LOW:HIGH``; of ``NAME_deg`` the limits are in degrees.
 
-    Raises
-    ------
-    BadUsage
-        Not of that form, or of no result that has limits.
-
+    Raises BadUsage: not of that form, or of no result that has limits.
     """
     name, equals, limits = (part.strip() for part in text.partition('='))
     low, colon, high = limits.partition(':')

@@ -18,11 +18,10 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import foresight
 from odocal_ros.forecast.forecast import as_keys, Forecast, Prospect
 from odocal_ros.forecast.foresight import Abandoned, DriveSoFar, forecast_of
-from odocal_ros.forecast.leg_so_far import faults_in_cells
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.forecast.leg_so_far import faults_in_cells, SmootherSoFar
 from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
 from odocal_ros.live import running_estimate as watch
-from odocal_ros.live.guidance import hint
+from odocal_ros.live.answers import hint
 from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
 from odocal_ros.live.session import Session, SessionView
 from odocal_ros.live.worker import Worker
