@@ -24,8 +24,8 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from alarms import RTK
-from resumed import run_by_name
-from zoo import configured, outcome
+from harness import configured, run_by_name
+from zoo import outcome
 from zoo_table import FIGURES, print_errors
 
 FIRST_SEED, SEEDS_A_RUN = 91_000_000, 1_000_000
