@@ -37,7 +37,7 @@ def look(leg, config, state, before_ns, now_ns):
     thinned, smoother = state
     begin = time.thread_time()
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         thinned.feed(slot, take(rows, (rows.stamp_ns > before_ns) & (rows.stamp_ns <= now_ns)))
     try:
         seen = forecast_of(thinned.leg(leg.start_ns), thinned.fix_rate(), config,

@@ -24,7 +24,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.sim.wheels import wheels_of
 
 pytestmark = pytest.mark.slow
-ROUTE = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'industrial', 'seed': 3}
+ROUTE = {'scenario': 'town', 'duration': 200.0, 'imu_grade': 'industrial', 'seed': 3}
 FOUR = ['front_left', 'front_right', 'rear_left', 'rear_right']
 SIGMAS = 4.0        # 1 in 16 000 of a normal error; seeds are fixed
 
@@ -39,9 +39,13 @@ def config(one, **changes):
 
 
 @cache
-def calibrated(**options):
+def result_of(**options):
     one = made(**options)
-    return one, calibrate(one.leg(), config(one, method='smoother')).methods['smoother']
+    return calibrate(one.leg(), config(one, method='smoother'))
+
+
+def calibrated(**options):
+    return made(**options), result_of(**options).methods['smoother']
 
 
 def codes(reasons):
@@ -90,7 +94,8 @@ def test_the_mean_is_that_of_the_wheels_that_do_not_steer():
     rear = [wheel.s for wheel in inputs.travels[2:]]
     np.testing.assert_allclose(inputs.travel.s, (rear[0] + rear[1]) / 2, atol=1e-9)
     assert codes(found)[Code.WHEELS_STEERED] == (
-        'front_left and front_right are steered: the travel is more in turns. The scale factor is '
+        'front_left and front_right are steered: a steered wheel travels farther in turns. '
+        'The scale factor is '
         'that of the mean of rear_left and rear_right')
     fixed = made(front_steers=False)
     inputs, found = screen(fixed.leg(), config(fixed))
@@ -121,7 +126,7 @@ def test_a_steered_wheel_on_a_circle_rolls_about_the_centre():
 
 
 @pytest.mark.parametrize(('steers', 'dead'), [
-    (True, (0,)), (True, (1,)), (False, (0,)), (False, (3,))], ids=str)
+    (True, (1,)), (False, (0,)), (False, (3,))], ids=str)
 def test_an_axle_with_a_dead_wheel_is_left_out_with_a_caution(steers, dead):
     one = made(front_steers=steers)
     leg = replace(one.leg(), **{WHEELS[k]: changed(one.wheels[k], value=lambda a: 0 * a)
@@ -207,7 +212,7 @@ def test_wheels_go_in_pairs():
 def test_the_summary_has_a_line_for_each_wheel():
     one = made()
     its = config(one, method='smoother')
-    text = printed(combine([calibrate(one.leg(), its)], its))
+    text = printed(combine([result_of()], its))
     for name in FOUR:
         (line,) = [line for line in text.splitlines() if line.startswith(f'  wheel {name} ')]
         assert (' m left' if name.endswith('left') else ' m right') in line

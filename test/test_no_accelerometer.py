@@ -17,7 +17,7 @@ from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config
 
 pytestmark = pytest.mark.slow
-TOWN = {'scenario': 'town', 'duration': 300.0, 'slope': 0.03}
+TOWN = {'scenario': 'town', 'duration': 200.0, 'slope': 0.03}
 ANGLES = ('yaw_mounting_angle', 'pitch_mounting_angle')
 
 

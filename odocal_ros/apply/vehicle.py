@@ -97,7 +97,7 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     nominal = config.imu.nominal_yaw
     yaw = estimate_of('yaw_mounting_angle', 0.0 if math.isnan(nominal) else nominal, UNKNOWN_YAW)
     pitch = estimate_of('pitch_mounting_angle', 0.0, UNKNOWN_PITCH)
-    guessed = tuple(f'{name} is not in the calibration: assumed {value:.4g} +- {sigma:.2g} rad'
+    guessed = tuple(f'{name} is not in the calibration: assumed {value:.4g} ± {sigma:.2g} rad'
                     for name, (value, sigma) in (('yaw_mounting_angle', yaw),
                                                  ('pitch_mounting_angle', pitch))
                     if name not in estimates or estimates[name].value is None)

@@ -85,6 +85,10 @@ class Bag:
             if span and part.count >= span.count:
                 found.append(f'{note}, but all {span.count} messages were read')
                 continue
+            if not part.count:
+                found.append(Reason(Code.BAG_TRUNCATED, f'{note}: none of its messages can be '
+                                    'read'))
+                continue
             span = span or (known.whole if after is None else None)
             end_ns = span.end_ns if span else after.start_ns if after else None
             seconds = (part.end_ns - part.start_ns) * 1e-9

@@ -43,6 +43,8 @@ def drive_topics(drive: Any) -> list[Topic]:
         topics.append(encode.heading('/heading', drive.heading))
     if len(drive.velocity.stamp_ns):
         topics.append(encode.velocity('/fix_velocity', drive.velocity))
+    if len(drive.pressure.stamp_ns):
+        topics.append(encode.pressure('/pressure', drive.pressure))
     return topics
 
 

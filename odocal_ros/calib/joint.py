@@ -158,7 +158,7 @@ def _averaged(legs: LinkedLegs, scatter: Scatter,
     return x, out
 
 
-def _disputed(legs: LinkedLegs, between: Mapping[str, float],
+def _disputed(legs: LinkedLegs, between: dict[str, float],
               usual: Mapping[str, float]) -> tuple[str, ...]:
     """
     Return the constants in which legs differ for certain.
@@ -167,12 +167,14 @@ def _disputed(legs: LinkedLegs, between: Mapping[str, float],
     is left.
     """
     def deviates(name: str) -> float:
-        now, freedom = legs.disagreement({**between, name: usual.get(name, 0.0)})
+        now, freedom = (legs.disagreement({**between, name: usual[name]}) if name in usual
+                        else as_they_are)
         left, rest = legs.disagreement({**between, name: np.inf})
         # less is no constant that legs determine
         return deviate(now - left, freedom - rest) if freedom - rest > 0.5 else -np.inf
     if len(legs.borders) < 2:
         return ()
+    as_they_are = legs.disagreement(between)
     odds = {name: deviates(name) for name in legs.names}
     others = [name for name in legs.names if name not in between]
     sure = [*between, *([max(others, key=odds.__getitem__)] if others else [])]

@@ -151,8 +151,9 @@ def _heading_found(leg: Leg, config: Config) -> Config:
     def before(stamp_ns: Ints) -> Ints:
         return np.flatnonzero(stamp_ns <= leg.start_ns + ORIENTATION_NS)[-ORIENTATION_ROWS:]
 
+    heading = leg.rows('heading')
     return with_heading(config, {
-        'heading_topic': stated_variance(take(leg.heading, before(leg.heading.stamp_ns))),
+        'heading_topic': stated_variance(take(heading, before(heading.stamp_ns))),
         'imu_orientation': stated_variance(take(leg.imu, before(leg.imu.stamp_ns)))})
 
 

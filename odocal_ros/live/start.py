@@ -52,7 +52,8 @@ def run(args: Namespace) -> int:
         name = (error.name or '').partition('.')[0]
         raise BadUsage(f'odocal watch needs the package {name}: '
                        f'{NEEDS.get(name, NEEDS["rclpy"])}') from None
-    waiting = panel(b'\x03', args.node, {'state': f'no status on {args.node}/status yet'}, '')
+    waiting = panel(b'\x03', args.node, {'state': f'no status on {args.node}/status yet'},
+                    'start the node, or check its name (ros2 node list) and ROS_DOMAIN_ID')
     with StatusListener(args.node) as listener, Live(waiting, auto_refresh=False) as shown:
         for level, status, hint in listener:
             shown.update(panel(level, args.node, status, hint), refresh=True)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What ``~/status`` and ``/diagnostics`` say: keys for machines, a sentence for people."""
+"""Content of ``~/status`` and ``/diagnostics``: keys for machines, a sentence for people."""
 
 import math
 from typing import Any
@@ -117,7 +117,7 @@ def level(now: SessionView) -> Any:
 
 
 def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
-    """Return one sentence: what is, how good it is, and what to do next."""
+    """Return one sentence: the state, the accuracy, and the next action."""
     session = now.session
     legs = f'{len(session.legs)} leg{"s" * (len(session.legs) != 1)}'
     if session.carried:
@@ -144,7 +144,7 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
 
 
 def _computing(now: SessionView) -> dict[str, object]:
-    """Return the keys of how far the result of a leg is."""
+    """Return the keys of the progress of the computation of a leg."""
     stage = now.computed if now.session.state is State.COMPUTING else Stage()
     return {'computing_stage': stage.name, 'computing_passes': stage.passes,
             'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done}

@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument('bag', metavar='BAG', help='bag folder or file')
     parser.add_argument('--json', action='store_true', help='print everything as JSON')
-    add_input_arguments(parser)
+    add_input_arguments(parser, 'the most likely one')
 
 
 def run(args: argparse.Namespace) -> int:

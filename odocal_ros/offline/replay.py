@@ -42,20 +42,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
 
 
-def add_input_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options for settings and topics."""
+def add_input_arguments(parser: argparse.ArgumentParser,
+                        default: str = 'the only topic of a fitting type') -> None:
+    """Declare the options for settings and topics; ``default``: the topic without an option."""
     add = parser.add_argument
     add('--config', metavar='FILE', help='ROS parameter file, the same YAML as for the node')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
     for slot in TOPICS:
         add(topic_option(slot), metavar='TOPIC', dest=f'{slot}_topic',
-            help=f'topic of the {INPUTS[slot].label}; default: the only topic of a fitting type')
+            help=f'topic of the {INPUTS[slot].label}; default: {default}')
 
 
-def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
+def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) -> None:
     """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
-    add_input_arguments(parser)
+    add_input_arguments(parser, **topics)
     add = parser.add_argument
     add('--leg', action='append', default=[], metavar='A:B',
         help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '

@@ -215,6 +215,8 @@ def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool = False) -
             title = ''
             lines += wrapped(f'{reason.code.name}: {reason.text}', '    ', '   ', width)
             lines += wrapped(f'-> {reason.remedy}', '      ', '   ', width)
+    if any(re.search(r'\bt = ', line) for line in lines):
+        lines.append('  t: seconds from the start of the leg')
     return lines
 
 
@@ -240,5 +242,6 @@ def _value(held: Held) -> str:
     name = held.name.replace('_', ' ')
     limits = ' to '.join('any' if math.isinf(x) else f'{x * factor:g}'
                          for x in (held.low, held.high))
-    return (f'{held.decision.value:9} {name} {with_sigma(e.value, e.sigma, factor)}{unit}, '
-            f'limits {limits}')
+    shown = 'not determined' if e.value is None else (
+        f'{with_sigma(e.value, e.sigma, factor)}{unit}')
+    return f'{held.decision.value:9} {name} {shown}, limits {limits}{unit}'

@@ -211,10 +211,10 @@ def _pooled(length: float, parts: list[PerDistance]) -> PerDistance:
 
 
 def before_label(legs: list[LegResult] | tuple[LegResult, ...]) -> str:
-    """Return the label of the uncorrected track: configured values, or an approximate scale."""
+    """Return the label of the track before calibration."""
     configured = any('scale_ratio' in m.estimates and m.estimates['scale_ratio'].value is not None
                      for leg in legs for m in leg.methods.values())
-    return 'as configured' if configured else 'approximate scale'
+    return 'as configured' if configured else 'uncalibrated'
 
 
 def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str, list[str]]]]:

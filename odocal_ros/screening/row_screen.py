@@ -64,7 +64,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
 
     offset : s, added to the stamps.   found : takes what is wrong with the others.
     """
-    sent = getattr(leg, slot)
+    sent = leg.rows(slot)
     if slot in WHEELS:
         sent = _stood(sent)
     good, wild = _finite(sent, slot, leg, found)

@@ -148,3 +148,15 @@ def parse_accept(text: str) -> dict[str, float]:
     except ValueError:
         raise BadUsage(f'--accept {text}: {limits} are not two numbers; required: '
                        f'{WANTED}') from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictConfig:
+    max_scale_sigma: float = setting(0.001, '1', 0.0, 1.0, about='Required relative sigma of the '
+                                     'scale factor.')
+    max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Required sigma of the yaw '
+                                   'mounting angle.')
+    min_legs: int = setting(1, '', 1, 100, about='Fewer legs are a caution.')
+    scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='Random walk of '
+                                         'the scale factor between legs, relative, 1 sigma '
+                                         '(tyres).')

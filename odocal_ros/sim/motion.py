@@ -84,8 +84,10 @@ class Motion:
 
     @property
     def distance(self) -> float:
-        """Return the metres rolled over the whole drive."""
-        return float(self._travel(self.duration))
+        """Return the path length of the whole drive, m; reversing adds to it."""
+        step = 0.01     # s, definition: within it the direction of travel does not change
+        ends = np.linspace(0.0, self.duration, max(2, round(self.duration / step) + 1))
+        return float(np.abs(np.diff(self._travel(ends))).sum())
 
     def at(self, t: Floats) -> State:
         """Return the state at times t, (n,) s."""

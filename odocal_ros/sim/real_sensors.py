@@ -30,7 +30,6 @@ AVERAGING /= AVERAGING.sum()
 TRACKING = np.exp(-NODES / 2**0.5) * np.cos(NODES / 2**0.5) * np.repeat(np.diff(EDGES) / 2, 2)
 TRACKING /= TRACKING.sum()
 UP = 2.0             # judgement: errors of the height over those of east and north
-SPREAD = 0.9         # judgement: of the logarithm of a burst's size and length
 ONSET = (0.5, 1.5)   # judgement: of the mean time in which a burst comes and goes
 HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e-4 m/s
 OUTLIER = 5.0           # m/s, judgement: a wrong Doppler in a street
@@ -195,7 +194,7 @@ def burst_errors(t: Floats, options: SimOptions) -> Floats:
     total, hours = np.zeros((len(t), 3)), t[-1] / 3600
     for _ in range(rng.poisson(real.bursts * hours)):
         begin, side = rng.uniform(0.0, t[-1]), rng.uniform(0, 2 * np.pi)
-        size, length = (median * np.exp(SPREAD * rng.standard_normal())
+        size, length = (median * np.exp(real.burst_spread * rng.standard_normal())
                         for median in (real.burst_size, real.burst_time))
         onset, up = real.burst_onset * rng.uniform(*ONSET), rng.normal()
         x = np.clip(np.minimum(t - begin, begin + length + onset - t) / onset, 0.0, 1.0)

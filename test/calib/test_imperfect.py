@@ -23,7 +23,7 @@ from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.slow
 GRADE = 3e-3
-TOWN = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'sway': 0.05}
+TOWN = {'scenario': 'town', 'duration': 250.0, 'imu_grade': 'industrial', 'sway': 0.05}
 
 
 def test_fixes_that_tell_it_well_are_not_taken_for_telling_that_there_is_none():
@@ -70,7 +70,7 @@ ACCEL = (0.0, 0.0, 0.0, SKEW, 0.0, 0.0, SKEW, 0.0, 0.0)
 
 
 def test_angles_are_those_of_the_axes_that_the_imu_measures_in():
-    drive, config, leg = made(scenario='town', duration=400.0, imu_grade='consumer', seed=4,
+    drive, config, leg = made(scenario='town', duration=250.0, imu_grade='consumer', seed=4,
                               fix_noise='rtk', yaw=0.02, pitch=0.01,
                               real=Real(gyro_matrix=GYRO, accel_matrix=ACCEL))
     graded = with_settings(config, {'imu.misalignment_sigma': np.nan})
@@ -114,7 +114,7 @@ def test_nose_up_the_yaw_holds_what_y_has_of_z_where_axes_are_off(skew):
 
 def test_a_straight_drive_does_not_pull_the_yaw_to_zero():
     # with derivatives by the force as measured, its noise: 0.15 +- 0.22 deg, 1.7 is true
-    drive, config, leg = made(scenario='straight', duration=600.0, imu_grade='consumer', seed=4,
+    drive, config, leg = made(scenario='straight', duration=400.0, imu_grade='consumer', seed=4,
                               yaw=np.deg2rad(1.7))
     graded = with_settings(config, {'imu.accel_scale_sigma': np.nan,
                                     'imu.misalignment_sigma': np.nan})
@@ -150,9 +150,22 @@ def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, text, d
     assert ('easure' in reason.do) != ('larger' in text)
 
 
+def test_a_lever_arm_that_is_off_is_not_called_unobservable_too():
+    _, config, leg = made(scenario='town', duration=300.0, imu_grade='consumer', seed=4,
+                          antenna_lever_arm=(1.5, 0.0, 1.0))
+    config = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0),
+                                    'gnss.lever_arm_sigma': 0.1})
+    found = smooth(replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0])), config)
+    said = {r.code: r.text for r in found.reasons}
+    assert 'gnss.lever_arm x: set to +0.00 m, found +1.' in said[Code.LEVER_ARM_OFF]
+    # the sigma of this axis is no smaller than its prior; the other two are as configured
+    assert found.details['posterior_to_prior']['antenna_lever_arm_x'] > 0.5
+    assert 'the antenna lever arm (left, up)' in said[Code.PARAMETER_NOT_DETERMINED]
+
+
 def test_what_a_vehicle_shows_beside_its_values_is_said():
     real = Real(receiver_lag=0.8, speed_law=0.006, stated_factor=0.5)
-    drive, config, leg = made(scenario='town', duration=400.0, imu_grade='industrial', seed=4,
+    drive, config, leg = made(scenario='town', duration=250.0, imu_grade='industrial', seed=4,
                               fix_noise='rtk', real=real, antenna_lever_arm=(0.8, 0.0, 1.0))
     off = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0)})
     leg = replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0]))

@@ -176,7 +176,7 @@ def test_truth_is_within_sigma(kind):
     off = []
     for seed in range(10):
         rng = np.random.default_rng(100 + seed)
-        d = body((SQUARES + arcs + sideways) * 2)
+        d = body(SQUARES + arcs + sideways)
         found = fit(run_of(d, kind, arc=0.5 * (kind == 'skid'), slip=3e-3, noise=0.005, every=2,
                            rng=rng, count=3), Known())
         truth = {'left': LEFT, 'right': RIGHT, 'curvature': 1 / WIDTH, 'arc': 0.5,

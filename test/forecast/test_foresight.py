@@ -277,11 +277,11 @@ def watched(drive, config, worker, log):
     recorder.form = leg.form
     half = leg.start_ns + 150 * SECOND
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         recorder.feed(slot, take(rows, rows.stamp_ns <= leg.start_ns))
     look.begin(recorder, leg.start_ns, config)
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         for first_ns in range(leg.start_ns, half, 10 * SECOND):
             look.feed(slot, take(rows, (rows.stamp_ns > first_ns)
                                  & (rows.stamp_ns <= first_ns + 10 * SECOND)))
@@ -385,11 +385,16 @@ def looked_at(made, t_stop, **settings):
     return forecast_of(cells.leg(start_ns), cells.fix_rate(), config, smoother=SmootherSoFar())
 
 
+@pytest.fixture(scope='module')
+def found(two):
+    """Return the estimates of the smoother; wheels is another word for it."""
+    return calibrate(two.leg(), with_settings(Config(), {
+        'method': 'smoother', 'imu.grade': 'tactical'})).methods['smoother'].estimates
+
+
 @pytest.mark.parametrize('method', ['smoother', 'auto', 'wheels'])
-def test_two_wheels_are_foreseen_as_they_come_out(two, method):
+def test_two_wheels_are_foreseen_as_they_come_out(two, found, method):
     whole = two.leg()
-    found = calibrate(whole, with_settings(Config(), {
-        'method': method, 'imu.grade': 'tactical'})).methods['smoother'].estimates
     forecast = looked_at(two, (whole.stop_ns - whole.start_ns) / SECOND, method=method)
     left, right, width = (found[name] for name in (
         'scale_factor_left', 'scale_factor_right', 'track_width'))
@@ -437,7 +442,7 @@ NO_YAW = Prospect(None, 0.0087, None, (), 'limited by the heading uncertainty (1
 
 def test_a_coarse_scale_is_said_in_per_cent():
     assert Prospect(0.138, 1e-3, 2108.0, now='1.02').words('scale', 'ppm', 1e6) == (
-        'scale 1.02 +- 13.8 % so far; drive 2200 m more for the limit of 0.1 %')
+        'scale 1.02 ± 13.8 % so far; drive 2200 m more for the limit of 0.1 %')
     assert Prospect(0.0099, 1e-3, 0.0).words('scale', 'ppm', 1e6) == (
         'OK: scale 9900 ppm (limit 1000)')
 

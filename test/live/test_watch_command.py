@@ -55,7 +55,7 @@ def test_the_panel_shows_a_running_node(start, connect):
     ended = subprocess.run(ODOCAL, capture_output=True, text=True, timeout=PATIENCE, check=False,
                            env=os.environ | {'PYTHONPATH': paths, 'COLUMNS': '120'})
     assert ended.returncode == 0, ended.stderr
-    for words in ('/calibrator', 'waiting', 'no IMU on /imu/data', 'path', 'limit 1000 ppm'):
+    for words in ('/calibrator', 'waiting', 'no IMU on /imu/data', 'standstill', 'limit 1000 ppm'):
         assert words in ended.stdout
 
 
@@ -92,6 +92,8 @@ def test_the_bars_are_shares_of_what_is_asked():
     assert shares(done)['yaw'] == (1.0, '0.25 deg, limit 0.5 deg')
     assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, limit 1000 ppm')
     assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {}
+    # without a leg no metres are missing, and '0 m to go' would be wrong
+    assert 'path' not in shares({'state': 'waiting', 'metres_to_least': '0.0'})
 
 
 def test_what_anybody_publishes_does_not_reach_the_terminal():

@@ -115,7 +115,7 @@ def test_comma(data_dir, capsys):
     assert (pulses['odometer']['quantity'], pulses['rate_hz']) == (
         'cumulative', pytest.approx(82.9, abs=0.1))
     for line in ('looks z-down', 'no header: arrival time', 'arrival jitter', 'never at rest',
-                 'no covariance', '3 topics can be the odometer', '[180, 0, 0] deg'):
+                 'no covariance', '3 topics can be the odometer', '[3.141592654, 0, 0] rad'):
         assert line in text
 
 
@@ -153,7 +153,8 @@ def test_the_command_it_tells_runs(data_dir, capsys, tmp_path):
     for name in ('comma2k19_rav4', 'husky_parking_lot'):
         told, _ = inspect(data_dir / name / 'bag', capsys)
         words = shlex.split(told['command'])[1:]
-        code = main([*words, '--output', str(tmp_path / name), '--quiet', '--json'])
+        code = main([*words, '--output', str(tmp_path / name), '--quiet', '--json', '--set',
+                     'output.formats=[params]'])
         result = json.loads(capsys.readouterr().out)
         assert code in (0, 1)
         assert result['result']['scale_factor']['value'] is not None
@@ -192,7 +193,7 @@ def test_a_good_drive_lacks_only_a_heading(tmp_path, capsys):
     assert told['mounting'] == told['mounting'] | {'rpy': [0, 0, 0], 'needed': False}
     assert told['command'] == f'odocal replay {tmp_path / "bag"}'
     assert told['open'] == ''
-    assert 'imu.mounting_rpy is correct: [0, 0, 0] deg' in text
+    assert 'imu.mounting_rpy is correct: [0, 0, 0] rad' in text
 
 
 @pytest.mark.parametrize('rpy', [

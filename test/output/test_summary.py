@@ -222,4 +222,4 @@ def test_the_plain_ratio_of_path_lengths_stands_beside_the_scale(good):
                  for ratio, distance in ((0.0505, 1000.0), (0.0508, 2000.0)))
     line = next(x for x in screen(replace(good, legs=legs)).splitlines() if 'path ratio' in x)
     assert line.split()[2:4] == ['0.05070', 'm/pulse']
-    assert line.endswith('fixes / odometer, uncorrected (+1.4 %)')
+    assert line.endswith('fixes / odometer, +1.4 % from the scale factor')

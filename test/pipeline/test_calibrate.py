@@ -10,7 +10,6 @@ from drives import (
     drive,
     errors_in_sigmas,
     everything_said,
-    LOW_RATES,
     rejecting,
     settings,
     shifted,
@@ -56,7 +55,7 @@ def test_a_recorded_leg_gives_what_the_whole_drive_gives(made):
     """Pre-roll cut, topics raced, closed late: no digit changes."""
     recorder = LegRecorder()
     for slot in ('fix', 'odometer', 'imu'):
-        block = getattr(made.leg(), slot)
+        block = made.leg().rows(slot)
         for first in range(0, len(block.stamp_ns), 997):
             recorder.feed(slot, take(block, slice(first, first + 997)))
     leg = recorder.close(made.truth.start_ns, made.truth.stop_ns)
@@ -166,7 +165,8 @@ def test_sigmas_are_honest_over_many_drives(grade, noise):
     runs, z, slack = 60, [], 1.0 if noise == 'white' else 1.3
     for seed in range(runs):
         made = simulate(SimOptions(scenario='straight', duration=190.0, seed=seed,
-                                   imu_grade=grade, fix_noise=noise, **LOW_RATES))
+                                   imu_grade=grade, fix_noise=noise, imu_rate=25.0,
+                                   odometer_rate=10.0))
         error = 1e-3 * np.random.default_rng(seed).standard_normal()
         config = with_settings(settings(made), {
             'alignment.heading': float(made.truth.heading + error), 'verdict.max_yaw_sigma': 1.0,
@@ -193,7 +193,7 @@ class Corruption:
     def leg(self, leg):
         for _ in range(self.rng.integers(1, 4)):
             slot = str(self.rng.choice(list(self.COLUMNS)))
-            leg = replace(leg, **{slot: self._one(slot, getattr(leg, slot))})
+            leg = leg.with_rows(**{slot: self._one(slot, leg.rows(slot))})
         return leg
 
     def _one(self, slot, samples):

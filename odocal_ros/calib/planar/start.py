@@ -3,10 +3,10 @@
 
 """First values of a planar fit: scale, track width and headings without knowing any of them."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
+from numpy.typing import NDArray
 
 from odocal_ros.calib.planar.problem import Run
 from odocal_ros.data.arrays import Complexes, Floats, Ints
@@ -45,33 +45,29 @@ def first_values(run: Run, width: float = 0.0) -> First:
     by 450 deg look the same: of several minima that fit about equally well the one nearest to the
     configured width is taken, without one the largest, which has the smallest turns.
     """
+    # a node starts without it
+    from scipy.optimize import minimize
     z = run.position[:, 0] + 1j * run.position[:, 1]
     s = np.append(0.0, np.cumsum(run.wheels.path))[run.node]
     rough = _rough(z, s)
     windows = _windows(s * rough)
-    forward, _, apart = run.wheels.body(run.wheels.count).T
-    left, right = forward - apart / 2, forward + apart / 2
-
-    def aligned(x: Floats, z: Complexes = z) -> tuple[float, Complexes, Floats]:
-        turn = np.append(0.0, np.cumsum((1 + x[1] / 2) * right - (1 - x[1] / 2) * left))
-        turn *= rough / np.exp(x[0])
-        return (*_aligned(run, z, turn, windows), turn)
-    grid = [[np.array([np.log(w), r]) for r in RATIOS] for w in WIDTHS]
-    costs, mirrored = (np.array([[aligned(x, own)[0] for x in row] for row in grid])
-                       for own in (z, z.conj()))
+    aligned = _Alignment(run, z, windows, rough)
+    # cost of the positions and of their mirror image for each width and ratio
+    costs, mirrored = np.stack([aligned(w, RATIOS)[0] for w in np.log(WIDTHS)], axis=1)
     least = costs.min(axis=1)
     padded = np.pad(least, 1, constant_values=np.inf)
     minima = np.flatnonzero((least <= padded[:-2]) & (least <= padded[2:]))
     found = []
     for k in minima[np.argsort(least[minima])][:MINIMA]:
         guess = np.array([np.log(WIDTHS[k]), RATIOS[np.argmin(costs[k])]])
-        better = minimize(lambda x: aligned(x)[0], guess, method='Nelder-Mead', options={
-            'initial_simplex': guess + [[0, 0], [0.04, 0], [0, 0.003]], 'maxfev': 80})
+        better = minimize(lambda x: aligned(x[0], x[1:])[0][0, 0], guess, method='Nelder-Mead',
+                          options={'initial_simplex': guess + [[0, 0], [0.04, 0], [0, 0.003]],
+                                   'maxfev': 80})
         found.append((better.fun, better.x))
     limit = ALIKE * min(cost for cost, _ in found) + len(z) * 1e-6      # (1 mm)^2 each
     near = np.log(width or WIDTHS[-1])
     x = min((x for cost, x in found if cost <= limit), key=lambda x: abs(x[0] - near))
-    _, factor, turn = aligned(x)
+    _, (factor,), (turn,) = aligned(x[0], x[1:])
     middle = run.node[windows.sum(axis=1) // 2]
     heading = turn + np.interp(np.arange(len(turn)), middle, np.unwrap(np.angle(factor)))
     scale = float(np.median(np.abs(factor)))
@@ -100,20 +96,48 @@ def _windows(s: Floats) -> Ints:
     return spans if len(spans) else np.array([[0, len(s)]])
 
 
-def _aligned(run: Run, z: Complexes, turn: Floats, windows: Ints) -> tuple[float, Complexes]:
-    """Return the sum of squared residuals of windows, m^2, and scale and rotation of each."""
-    forward, side, _ = run.wheels.body(run.wheels.count).T
-    step = (forward + 1j * side) * np.exp(1j * (turn[1:] + turn[:-1]) / 2)
-    path = np.append(0.0, np.cumsum(step))[run.node]
-    count = np.diff(windows, axis=1)[:, 0]
+class _Alignment:
+    """Dead-reckoned paths on the positions, in windows; what does not depend on the wheels."""
 
-    def sums(x: Complexes) -> Complexes:
-        total = np.append(0.0, np.cumsum(x))
-        out: Complexes = total[windows[:, 1]] - total[windows[:, 0]]
+    def __init__(self, run: Run, z: Complexes, windows: Ints, rough: float) -> None:
+        forward, side, apart = run.wheels.body(run.wheels.count).T
+        self.node, self.windows, self.rough = run.node, windows, rough
+        self.left, self.right = forward - apart / 2, forward + apart / 2
+        self.moved = forward + 1j * side
+        self.count = np.diff(windows, axis=1)[:, 0]
+        y = z - z.mean()
+        self.y = np.stack([y, y.conj()])[:, None]
+        self.of_y = self._sums(self.y)
+        self.target = (self._sums(np.abs(y)**2) - np.abs(self.of_y[0, 0])**2 / self.count).real
+
+    def __call__(self, log_width: float, ratios: Floats) -> tuple[Floats, Complexes, Floats]:
+        """
+        Return costs, scales and rotations, and headings of r ratios of right over left wheel.
+
+        Costs are sums of squared residuals of windows, m^2, of the positions and of their mirror
+        image: (2, r).   Scales and rotations, of the positions, are complex: (r, w).   Headings
+        of all nodes: (r, n + 1) rad.
+        """
+        half = ratios[:, None] / 2
+        turn = _from_zero((1 + half) * self.right - (1 - half) * self.left)
+        turn *= self.rough / np.exp(log_width)
+        path = _from_zero(self.moved * np.exp(1j * (turn[:, 1:] + turn[:, :-1]) / 2))[:, self.node]
+        x = path - path.mean(axis=1, keepdims=True)
+        of_x = self._sums(x)
+        power = (self._sums(np.abs(x)**2) - np.abs(of_x)**2 / self.count).real
+        cross = self._sums(x.conj() * self.y) - of_x.conj() * self.of_y / self.count
+        factor = cross / np.maximum(power, 1e-30)
+        return (self.target - np.abs(factor)**2 * power).sum(axis=-1), factor[0], turn
+
+    def _sums(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Return the sums over each window, along the last axis."""
+        total = _from_zero(x)
+        out: NDArray[Any] = total[..., self.windows[:, 1]] - total[..., self.windows[:, 0]]
         return out
-    x, y = path - path.mean(), z - z.mean()
-    power = (sums(np.abs(x)**2) - np.abs(sums(x))**2 / count).real
-    target = (sums(np.abs(y)**2) - np.abs(sums(y))**2 / count).real
-    cross = sums(x.conj() * y) - sums(x).conj() * sums(y) / count
-    factor = cross / np.maximum(power, 1e-30)
-    return float((target - np.abs(factor)**2 * power).sum()), factor
+
+
+def _from_zero(steps: NDArray[Any]) -> NDArray[Any]:
+    """Return the cumulative sums along the last axis, 0 first."""
+    out = np.zeros((*steps.shape[:-1], steps.shape[-1] + 1), steps.dtype)
+    np.cumsum(steps, axis=-1, out=out[..., 1:])
+    return out
