@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from odocal_ros.data.samples import take  # noqa: E402
 from odocal_ros.errors import OdocalError  # noqa: E402
 from odocal_ros.forecast.foresight import forecast_of  # noqa: E402
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar  # noqa: E402
+from odocal_ros.forecast.leg_so_far import SmootherSoFar  # noqa: E402
 from odocal_ros.forecast.thinned_leg import ThinnedLeg  # noqa: E402
 from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, LOOK_SHARE  # noqa: E402
 from odocal_ros.pipeline.calibrate import calibrate  # noqa: E402

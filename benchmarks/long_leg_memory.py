@@ -70,7 +70,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.data.leg import LegRecorder
     from odocal_ros.data.samples import take
     from odocal_ros.forecast.foresight import forecast_of
-    from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+    from odocal_ros.forecast.leg_so_far import SmootherSoFar
     from odocal_ros.forecast.thinned_leg import ThinnedLeg
     import odocal_ros.live.node  # noqa: F401 all that a node holds
     from odocal_ros.live.worker import compute, give_back, hold_little

@@ -67,11 +67,7 @@ def route_of(config: PatternConfig, start: Point) -> tuple[Piece, ...]:
 
     start : position of the robot inside the rectangle, m.
 
-    Raises
-    ------
-    BadConfig
-        The rectangle is too small.
-
+    Raises BadConfig: the rectangle is too small.
     """
     left, low, right, high = rectangle_of(config)
     inner = left + config.margin, low + config.margin, right - config.margin, high - config.margin

@@ -127,7 +127,7 @@ def test_its_calibration_stands_beside_its_truth(made, drive, tmp_path, capsys):
     code = cli.main(['replay', str(made / 'bag'), '--imu-topic', '/imu/data_flu',
                      '--odometer-topic', '/odometer/pulses_derived', '--fix-topic', '/fix',
                      '--set', f'odometer.nominal_scale={truth["odometer"]["k0_m_per_pulse"]}',
-                     '--output', str(tmp_path / 'out')])
+                     '--set', 'output.formats=[params]', '--output', str(tmp_path / 'out')])
     assert code == 0
     result = tmp_path / 'out' / 'calibration.json'
     found = json.loads(result.read_text())['result']

@@ -4,6 +4,7 @@
 """Printed text and docs use the terms of CONTRIBUTING.md, not the words that these replace."""
 
 import ast
+from functools import cache
 import io
 import re
 import tokenize
@@ -67,11 +68,11 @@ def unused(text):
 
 def literals(path):
     """Return (line, text) of the string literals of a module but docstrings; {} for a value."""
-    tree = ast.parse(path.read_text(encoding='utf-8'))
-    inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding='utf-8'))))
+    inner = {id(part) for node in nodes if isinstance(node, ast.JoinedStr)
              for part in ast.walk(node) if part is not node}
-    inner |= {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
+    inner |= {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
         if id(node) in inner:
             continue
         if isinstance(node, ast.JoinedStr):
@@ -90,15 +91,19 @@ def printed():
             if len(text.split()) > (3 if path.parent.name == 'sim' else 1)]
 
 
-def remarks(path):
-    """Yield (line, text) of the docstrings and comments of a module."""
-    source = path.read_text(encoding='utf-8')
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            yield getattr(node, 'lineno', 1), ast.get_docstring(node) or ''
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            yield token.start[0], token.string
+@cache
+def remarks():
+    """Return (module:line, text) of all docstrings and comments."""
+    found = []
+    for path in MODULES:
+        source, name = path.read_text(encoding='utf-8'), path.relative_to(ROOT)
+        found += [(f'{name}:{getattr(node, "lineno", 1)}', ast.get_docstring(node) or '')
+                  for node in ast.walk(ast.parse(source))
+                  if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)]
+        found += [(f'{name}:{token.start[0]}', token.string)
+                  for token in tokenize.generate_tokens(io.StringIO(source).readline)
+                  if token.type == tokenize.COMMENT]
+    return found
 
 
 def test_printed_text_is_plain():
@@ -148,16 +153,15 @@ def test_settings_are_described_in_short_sentences():
 
 def test_docstrings_and_comments_are_plain():
     # 'name : meaning' and 'name=value' name parameters
-    found = [f'{path.relative_to(ROOT)}:{line}: {words}' for path in MODULES
-             for line, text in remarks(path)
+    found = [f'{where}: {words}' for where, text in remarks()
              if (words := unused(re.sub(r'\b\w+ :|\b\w+=', ' ', text)))]
     assert not found, '\n'.join(found)
 
 
 def test_docstrings_say_what_is_returned():
     vague = re.compile(r'Returns? (?:what|how|why|whether|where|which|when)\b|(?:Tell|Say)s?\b')
-    found = [f'{path.relative_to(ROOT)}:{line}: {text.splitlines()[0]}' for path in MODULES
-             for line, text in remarks(path) if vague.match(text)]
+    found = [f'{where}: {text.splitlines()[0]}' for where, text in remarks()
+             if vague.match(text)]
     assert not found, '\n'.join(found)
 
 

@@ -4,6 +4,7 @@
 """The package as pip and colcon install it: what is declared, and what starts."""
 
 import ast
+from functools import cache
 import os
 from pathlib import Path
 import re
@@ -41,6 +42,7 @@ BY_PIP = {'rosbags', 'rich', 'rerun'}
 WITH_ROSBAGS = {'lz4', 'backports', 'compression'}  # decompressors that rosbags itself requires
 
 
+@cache
 def imported():
     """Return the names of all foreign packages that the package and its launch files import."""
     names = set()

@@ -76,11 +76,7 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     """
     Return the vehicle of a calibration's estimates.
 
-    Raises
-    ------
-    BadConfig
-        They hold no scale factor, or more than two wheels are configured.
-
+    Raises BadConfig: they hold no scale factor, or more than two wheels are configured.
     """
     def estimate_of(name: str, otherwise: float, sigma: float = 0.0) -> tuple[float, float]:
         e = estimates.get(name)

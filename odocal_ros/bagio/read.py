@@ -111,11 +111,8 @@ class Bag:
         readers : topic -> reader of its messages.   feed : called with (slot, block) of samples,
         in order of bag time.   progress : called with the fraction done.
 
-        Raises
-        ------
-        BadUsage, BadData
-            A topic is not in the bag; none of a topic's messages can be used.
-
+        Raises BadUsage, BadData: a topic is not in the bag; none of a topic's messages can be
+        used.
         """
         for topic in readers.keys() - self.topics.keys():
             raise BadUsage(f'{self.name}: no topic {topic}; topics: {", ".join(self.topics)}')
@@ -194,11 +191,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     """
     Open a bag: a folder or a file, of any kind that ``sources`` knows. Use it in ``with``.
 
-    Raises
-    ------
-    BadBag
-        Missing, unreadable, empty, or nothing usable left in it.
-
+    Raises BadBag: missing, unreadable, empty, or nothing usable left in it.
     """
     with ExitStack() as stack:
         try:

@@ -68,11 +68,7 @@ def find(path: Path) -> Source:
     """
     Return the source that a path names: a folder, its metadata.yaml, or a file of a bag.
 
-    Raises
-    ------
-    BadBag
-        Nothing there, or nothing that is a bag.
-
+    Raises BadBag: nothing there, or nothing that is a bag.
     """
     path = Path(path)
     if not path.exists():

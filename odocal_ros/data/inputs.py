@@ -40,6 +40,7 @@ INPUTS = {
     'heading': Input('heading', 'HeadingSamples', ('q_ni',), '', 'heading', 5000),
     'fix_velocity': Input('GNSS velocity', 'VelocitySamples', ('velocity_n',), 'gnss',
                           'fix_velocity', 500),
+    'pressure': Input('air pressure', 'ScalarSamples', ('value',), '', 'pressure', 1000),
 }
 # the sensors besides IMU, odometer and fixes
 OUTSIDE = tuple(slot for slot in INPUTS if slot not in ('imu', *WHEELS, 'fix'))

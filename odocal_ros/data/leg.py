@@ -147,11 +147,7 @@ class LegRecorder:
         Rows up to the first one after ``stop_ns`` are kept in each topic, so that values can be
         interpolated at the mark; later ones are not, however late the leg is closed.
 
-        Raises
-        ------
-        BadData
-            The marks are days apart: what is computed second by second would not end.
-
+        Raises BadData: the marks are days apart: what is computed second by second would not end.
         """
         days = (stop_ns - start_ns) / 86400e9
         if days > MOST_DAYS:

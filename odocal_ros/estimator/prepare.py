@@ -11,6 +11,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.equations import FACTORS, OUTSIDE
 from odocal_ros.estimator.factors.axle import rates_at, WARM_TIME
 from odocal_ros.estimator.factors.fixes import whitener
+from odocal_ros.estimator.factors.priors import SHARED
 from odocal_ros.estimator.factors.slide import turned
 from odocal_ros.estimator.imu_noise import at_rest, shaken, unfelt
 from odocal_ros.estimator.imu_steps import ImuSteps
@@ -87,7 +88,7 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     grade = grade if leg.felt else unfelt(grade)
     root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
     made = Problem(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
-               _within(leg, t), turned(leg, imu), config.gnss.correlation_time,
+               _within(leg, t), _own(leg), turned(leg, imu), config.gnss.correlation_time,
                rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
                drift_time(leg, t))
     for part in FACTORS:
@@ -103,6 +104,12 @@ def _within(leg: SmootherLeg, t: Floats) -> dict[str, Outside]:
     """Return the rows of the other sensors within the keyframes, where there are any."""
     within = {name: sent.between(t[0], t[-1]) for name, sent in leg.outside.items()}
     return {name: sent for name, sent in within.items() if len(sent.t)}
+
+
+def _own(leg: SmootherLeg) -> dict[str, slice]:
+    """Return the constants of sensors that no other leg shares, by the source of their errors."""
+    return {part.source: part.constants for part in OUTSIDE
+            if part.name in leg.outside and part.name not in SHARED}
 
 
 def imperfect_sigmas(grade: Grade) -> Floats:

@@ -28,6 +28,7 @@ class Problem:
     root: np.ndarray         # (m, 3, 3) inverse roots of the stated covariances
     still: np.ndarray        # (N,) bool
     outside: dict[str, Outside]    # within the keyframes, where there are any
+    own: dict[str, slice]    # of their constants, by source: those that no other leg shares
     turned: float            # rad, in turns
     fix_time: float          # s, as gnss.correlation_time: 0 white, NaN to be judged
     rate_b: np.ndarray       # (N, 3) rad/s, measured at the keyframes

@@ -26,11 +26,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
     args : as replay's options parse them (``add_calibration_arguments``).   config : settings
     that take precedence, in any form accepted by the library.
 
-    Raises
-    ------
-    BadUsage, BadConfig
-        A setting or a settings file is wrong.
-
+    Raises BadUsage, BadConfig: a setting or a settings file is wrong.
     """
     from odocal_ros.library.asked import config_of, legs_of
     from odocal_ros.offline.replay import asked_config, asked_topics
@@ -107,11 +103,7 @@ def writable(folder: Path) -> None:
     """
     Make the output folder.
 
-    Raises
-    ------
-    BadUsage
-        It cannot be written.
-
+    Raises BadUsage: it cannot be written.
     """
     try:
         for part in ('rows', 'seen'):

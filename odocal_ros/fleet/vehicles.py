@@ -23,7 +23,7 @@ from odocal_ros.fleet.statistics import Change, covariance, History, history
 from odocal_ros.fleet.tables import leg_row, utc, VALUES
 from odocal_ros.library.calibrate_bag import unique_names
 from odocal_ros.nav.angles import wrap
-from odocal_ros.output.reason_lines import accept_line
+from odocal_ros.output.figures import accept_line
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.acceptance import accept, Decision
 from odocal_ros.pipeline.calibrate import combine

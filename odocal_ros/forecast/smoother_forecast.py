@@ -23,7 +23,7 @@ from odocal_ros.forecast.forecast import (
     sources_of,
     WheelsForecast,
 )
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.pipeline.calibrate import NOT_YET
 from odocal_ros.pipeline.planar_run import planar_leg
 from odocal_ros.pipeline.prepared import Stage

@@ -66,11 +66,7 @@ def paths_of(asked: Any) -> list[Path]:
     """
     Return the paths of one bag or several.
 
-    Raises
-    ------
-    BadUsage
-        There is none, or one that is no path at all.
-
+    Raises BadUsage: there is none, or one that is no path at all.
     """
     several = [asked] if isinstance(asked, (str, Path)) or not isinstance(asked, Iterable) \
         else list(asked)
@@ -104,11 +100,7 @@ def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> C
 
     asked : by dotted name, or a ROS parameter file; a Config is taken as it is.
 
-    Raises
-    ------
-    BadConfig, BadUsage
-        A setting is unknown or of a wrong value; the file cannot be read.
-
+    Raises BadConfig, BadUsage: a setting is unknown or of a wrong value; the file cannot be read.
     """
     if isinstance(asked, Config):
         return asked
@@ -130,11 +122,7 @@ def legs_of(asked: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
     asked : 'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates, 'each-stop',
         or (A, B), None for open; one or many.
 
-    Raises
-    ------
-    BadUsage
-        One is not of these forms.
-
+    Raises BadUsage: one is not of these forms.
     """
     if asked is None:
         return []
@@ -161,11 +149,7 @@ def parse_leg(text: str) -> LegSpan:
     """
     Return the leg of ``A:B`` (seconds) or ``A/B`` (ISO 8601); either side may be empty.
 
-    Raises
-    ------
-    BadUsage
-        Not of that form, or B not after A.
-
+    Raises BadUsage: not of that form, or B not after A.
     """
     separator = '/' if '/' in text else ':'
     parts = text.split(separator)

@@ -202,11 +202,7 @@ def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
     """
     Write series as files; their names select series and format: ``KNOWN``.
 
-    Raises
-    ------
-    BadUsage
-        A name is another, a leg gives no such series, a file cannot be written.
-
+    Raises BadUsage: a name is another, a leg gives no such series, a file cannot be written.
     """
     paths = [Path(file) for file in files]
     check_names(paths)

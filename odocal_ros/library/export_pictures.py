@@ -24,11 +24,7 @@ def draw_map(result: Calibration, path: Path) -> None:
     """
     Write the features of track.geojson as a picture.
 
-    Raises
-    ------
-    BadUsage
-        The positions are in a local frame.
-
+    Raises BadUsage: the positions are in a local frame.
     """
     from odocal_ros.output.drawing import look, save_figure
     shapes = [feature for number, leg in enumerate(result.legs, 1)
@@ -106,11 +102,7 @@ def scale_by_speed(result: Calibration) -> Series:
     speed_m_per_s, ratio, ratio_sigma : path by the fixes over the odometer as sent.   sections :
     in the group.   factor, offset, lag with sigma : of the leg's fit; NaN if not determined.
 
-    Raises
-    ------
-    BadUsage
-        No leg has enough sections.
-
+    Raises BadUsage: no leg has enough sections.
     """
     parts = []
     for number, one in _found(result):

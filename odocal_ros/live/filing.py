@@ -6,7 +6,6 @@
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime, UTC
 from functools import partial
 import os
 from pathlib import Path
@@ -23,6 +22,7 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.live import answers
 from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import Worker
+from odocal_ros.output.figures import iso
 from odocal_ros.output.stored import replacing, Stored, stored_in
 from odocal_ros.outside.whole import locked, new_folder
 from odocal_ros.settings.config import Config
@@ -147,11 +147,6 @@ def _point(link: Path, name: str) -> None:
     other.replace(link)
 
 
-def iso(stamp_ns: int) -> str:
-    """Return a stamp as ISO 8601, UTC, seconds."""
-    return f'{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}'
-
-
 def output_root(config: Config, node: str) -> Path:
     """Return the folder of results: the setting, else the node's own folder in the ROS home."""
     home = os.environ.get('ROS_HOME') or '~/.ros'
@@ -169,19 +164,14 @@ def _save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]]
     left empty. Returns the folder, why ``latest`` stays where it was, empty when it does not
     (``force`` moves it), and what adds the report, which takes long to draw.
 
-    Raises
-    ------
-    OdocalError
-        The folder cannot be written.
-
+    Raises OdocalError: the folder cannot be written.
     """
     from odocal_ros.output.files import Results
     from odocal_ros.output.ros_files import framed
     calibration, config = framed(calibration, config, imu_frame)
     root = output_root(config, inputs[0]['node'])
-    name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
     try:
-        folder = new_folder(root, name)
+        folder = new_folder(root, iso(now_ns).replace(':', '-'))
         try:
             results = Results(calibration, config, folder, inputs, iso(now_ns))
             results.write()

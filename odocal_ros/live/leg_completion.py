@@ -18,9 +18,9 @@ from odocal_ros.forecast.leg_so_far import SILENT_TIME
 from odocal_ros.forecast.progress import clocks_differ
 from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, worker
+from odocal_ros.live.answers import after_result, hint, quantities_ok
 from odocal_ros.live.console import Console
-from odocal_ros.live.filing import Filing, iso
-from odocal_ros.live.guidance import after_result, hint, quantities_ok
+from odocal_ros.live.filing import Filing
 from odocal_ros.live.journal import Journal, replay_command
 from odocal_ros.live.params import restored_from
 from odocal_ros.live.process import SettledNode
@@ -28,6 +28,7 @@ from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.running_estimate import RunningEstimate
 from odocal_ros.live.session import Session, SessionView, State
+from odocal_ros.output.figures import iso
 from odocal_ros.outside.names import for_shell
 from odocal_ros.pipeline.floor_marks import with_marks
 from odocal_ros.settings.config import Config

@@ -12,11 +12,12 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import Samples
 from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, worker
-from odocal_ros.live.filing import iso, latest_of
-from odocal_ros.live.guidance import after_result, hint, quantities_ok
+from odocal_ros.live.answers import after_result, hint, quantities_ok
+from odocal_ros.live.filing import latest_of
 from odocal_ros.live.leg_completion import LegCompletion
 from odocal_ros.live.session import Refused, State
 from odocal_ros.live.worker import Computed, LeftOut, PATIENCE_S
+from odocal_ros.output.figures import iso
 from odocal_ros.output.stored import Stored
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.pipeline.floor_marks import mark_positions, place_of, WITHIN

@@ -17,13 +17,13 @@ from std_msgs.msg import Float64, String
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.live import params
-from odocal_ros.live.filing import iso
-from odocal_ros.live.guidance import action_first
+from odocal_ros.live.answers import action_first
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session import SessionView
 from odocal_ros.live.status import calibration_status, in_force, input_status
 from odocal_ros.live.watch import LATCHED
 from odocal_ros.live.worker import Paths
+from odocal_ros.output.figures import iso
 from odocal_ros.outside.yaml_files import no_date
 from odocal_ros.settings.config import Config
 

@@ -11,14 +11,14 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from odocal_ros.calib.result import wheel_factors
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import as_keys
-from odocal_ros.live.console import losses_in_words
-from odocal_ros.live.guidance import (
+from odocal_ros.live.answers import (
     hint,
     manoeuvres,
     metres_to_go,
     quantities_ok,
     seconds_to_stand,
 )
+from odocal_ros.live.console import losses_in_words
 from odocal_ros.live.health import Health
 from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.pipeline.prepared import Stage

@@ -4,11 +4,9 @@
 """odocal compare: changes of the vehicle since earlier calibrations."""
 
 import argparse
-import json
-import sys
 from typing import TYPE_CHECKING
 
-from odocal_ros.offline.say import say
+from odocal_ros.offline.say import say, say_json
 
 if TYPE_CHECKING:
     from odocal_ros.library.compare import Change, Comparison, Difference
@@ -33,8 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.offline.cli import OK, REJECTED
     found = compare(*args.files)
     if args.json:
-        json.dump(found.to_dict(), sys.stdout, indent=2, allow_nan=False)
-        say('')
+        say_json(found.to_dict())
     else:
         say('\n'.join(_screen(found)))
     return OK if found.changed is False else REJECTED

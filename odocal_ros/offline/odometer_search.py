@@ -24,7 +24,7 @@ from odocal_ros.messages.fields import MessageView
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.nav.odometer import travel
-from odocal_ros.offline.drive_survey import FixPath, Match
+from odocal_ros.offline.survey import FixPath, Match
 from odocal_ros.offline.wheel_survey import sides, suggested
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.config_file import parse_set

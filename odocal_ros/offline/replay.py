@@ -4,7 +4,6 @@
 """odocal replay: the node's pipeline over recorded bags."""
 
 import argparse
-import json
 import os
 from pathlib import Path
 from shutil import get_terminal_size
@@ -15,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.asked import Listener
-from odocal_ros.offline.say import Phase, say, warn
+from odocal_ros.offline.say import Phase, say, say_json, warn
 from odocal_ros.outside.names import one_line
 
 if TYPE_CHECKING:
@@ -182,8 +181,7 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
         if trouble:
             screen.note(f'{results.report[0]}: could not be drawn: {trouble}')
         if args.json:
-            json.dump(calibration.to_dict(), sys.stdout, indent=2)
-            say('')
+            say_json(calibration.to_dict())
         elif not args.quiet:
             _show_files(calibration.result, output, written, results.report * (not trouble))
         return _exit_code(calibration.result, calibration.config, args)
@@ -192,7 +190,7 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
 def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespace) -> int:
     """Return 0 for a good result, after printing the decision on limits."""
     from odocal_ros.offline.cli import OK, REJECTED
-    from odocal_ros.output.reason_lines import accept_line, accept_words
+    from odocal_ros.output.figures import accept_line, accept_words
     from odocal_ros.pipeline.acceptance import accept, Decision
     from odocal_ros.reasons import Verdict
     acceptance = accept(calibration, config)

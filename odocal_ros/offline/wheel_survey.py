@@ -13,7 +13,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import MOST_DAYS
 from odocal_ros.messages.odometer_types import JOINTS
 from odocal_ros.messages.raws import tables
-from odocal_ros.offline.drive_survey import FixPath
+from odocal_ros.offline.survey import FixPath
 from odocal_ros.screening.glitches import beyond
 from odocal_ros.settings.config import SIDES
 

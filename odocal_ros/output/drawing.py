@@ -139,11 +139,7 @@ def save_figure(figure: Any, path: Path) -> None:
     """
     Write a figure.
 
-    Raises
-    ------
-    BadUsage
-        The file cannot be written.
-
+    Raises BadUsage: the file cannot be written.
     """
     part = path.with_name(f'.{path.name}.part')
     try:

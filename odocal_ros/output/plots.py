@@ -47,10 +47,8 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
     the correction rests on.   smoothed : details of the smoother: slips, and biases at its
     keyframes.
 
-    Returns
-    -------
-    (title, what it shows, svg element) of each figure; to be called under ``drawing.look``.
-
+    Returns (title, what it shows, svg element) of each figure; to be called under
+    ``drawing.look``.
     """
     if not len(found.t):
         return []

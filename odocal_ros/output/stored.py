@@ -59,11 +59,8 @@ def read_stored(path: Path) -> Stored:
     """
     Return the calibration in a file, or in the calibration.json of a folder.
 
-    Raises
-    ------
-    BadUsage
-        Missing, unreadable, no JSON, of another schema, or without what every result has.
-
+    Raises BadUsage: missing, unreadable, no JSON, of another schema, or without what every result
+    has.
     """
     path = Path(path)
     name = str(path)
@@ -121,11 +118,7 @@ def known_imu(config: Config) -> Carried | None:
     """
     Return the IMU information of the result at ``imu.constants``, None without one.
 
-    Raises
-    ------
-    BadUsage
-        It cannot be read, has no IMU constants, or is of another vehicle or IMU.
-
+    Raises BadUsage: it cannot be read, has no IMU constants, or is of another vehicle or IMU.
     """
     if not config.imu.constants:
         return None

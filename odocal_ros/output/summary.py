@@ -20,6 +20,7 @@ from odocal_ros.calib.result import (
     wheel_factors,
 )
 from odocal_ros.output.figures import (
+    bag_lines,
     beyond_one,
     columns,
     counted,
@@ -27,13 +28,13 @@ from odocal_ros.output.figures import (
     inverse,
     known,
     length,
+    reason_lines,
     share,
     time_span,
     WIDTH,
     with_sigma,
     with_unit,
 )
-from odocal_ros.output.reason_lines import bag_lines, reason_lines
 from odocal_ros.output.tables import (
     budget_lines,
     largest_source,

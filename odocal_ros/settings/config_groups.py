@@ -130,11 +130,7 @@ def parse_accept(text: str) -> dict[str, float]:
     """
     Return the settings of one ``NAME=LOW:HIGH``; of ``NAME_deg`` the limits are in degrees.
 
-    Raises
-    ------
-    BadUsage
-        Not of that form, or of no result that has limits.
-
+    Raises BadUsage: not of that form, or of no result that has limits.
     """
     name, equals, limits = (part.strip() for part in text.partition('='))
     low, colon, high = limits.partition(':')
@@ -152,3 +148,15 @@ def parse_accept(text: str) -> dict[str, float]:
     except ValueError:
         raise BadUsage(f'--accept {text}: {limits} are not two numbers; required: '
                        f'{WANTED}') from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictConfig:
+    max_scale_sigma: float = setting(0.001, '1', 0.0, 1.0, about='Required relative sigma of the '
+                                     'scale factor.')
+    max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Required sigma of the yaw '
+                                   'mounting angle.')
+    min_legs: int = setting(1, '', 1, 100, about='Fewer legs are a caution.')
+    scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='Random walk of '
+                                         'the scale factor between legs, relative, 1 sigma '
+                                         '(tyres).')

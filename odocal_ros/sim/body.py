@@ -57,7 +57,7 @@ def side_force(speed: Profile, yaw_rate: Profile, lean: Profile | None, t: Float
 
 
 def kneels(speed: Profile, t: Floats) -> Floats:
-    """Return the share by which a bus kneels at its stops on the way, 0 to 1: (n,)."""
+    """Return the share by which a bus kneels at its stops, 0 to 1: (n,)."""
     still = np.concatenate([[0], np.abs(speed(t)) < STILL, [0]]).astype(int)
     begin, end = (np.flatnonzero(np.diff(still) == sign) for sign in (1, -1))
     down = np.zeros(len(t))

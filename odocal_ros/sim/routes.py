@@ -19,7 +19,7 @@ BLEND = 0.4         # s in which an acceleration or a turn rate sets in
 Stretch = tuple[list[Piece], list[Piece]]     # accelerations and turn rates of equal duration
 
 
-def stretches(duration: float, rng: np.random.Generator) -> list[Stretch]:
+def robot_stretches(duration: float, rng: np.random.Generator) -> list[Stretch]:
     """
     Return cycles of a move and a turn on the spot, 5 s still before and after.
 
@@ -201,7 +201,7 @@ def yard(duration: float, rng: np.random.Generator) -> Route:
 def indoor(duration: float, rng: np.random.Generator) -> Route:
     """Return the moves and turns on the spot of a small robot, 5 s still before and after."""
     _rest('indoor', duration, 2 * STILL, least=math.ceil(LONGEST))
-    return _route(stretches(duration, rng))
+    return _route(robot_stretches(duration, rng))
 
 
 def square(duration: float, rng: np.random.Generator) -> Route:
@@ -213,7 +213,7 @@ def square(duration: float, rng: np.random.Generator) -> Route:
 def with_sideways_moves(duration: float, rng: np.random.Generator) -> Route:
     """Return the moves of ``indoor``, every third one sideways."""
     _rest('indoor', duration, 2 * STILL, least=math.ceil(3 * LONGEST))
-    parts = sideways(stretches(duration, rng))
+    parts = sideways(robot_stretches(duration, rng))
     route = _route([(speed, rate) for speed, rate, _ in parts])
     side = chain([piece for _, _, pieces in parts for piece in pieces])
     return replace(route, side=_clean(side.integral()))

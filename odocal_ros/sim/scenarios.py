@@ -17,6 +17,7 @@ from odocal_ros.data.samples import (
     ImuSamples,
     OdometerForm,
     OdometerSamples,
+    ScalarSamples,
     VelocitySamples,
 )
 from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
@@ -81,6 +82,7 @@ class Drive:
     fix: FixSamples
     heading: HeadingSamples
     velocity: VelocitySamples
+    pressure: ScalarSamples
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -111,7 +113,8 @@ class Drive:
         wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
         return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
                    fix=fix,
-                   outside={'heading': self.heading, 'fix_velocity': self.velocity},
+                   outside={'heading': self.heading, 'fix_velocity': self.velocity,
+                            'pressure': self.pressure},
                    form=self.form, **wheels)
 
     def positions(self) -> Floats:
@@ -203,7 +206,8 @@ def simulate(options: SimOptions | None = None) -> Drive:
         fix=sensors.fixes(motion, options),
         heading=(HeadingSamples.none() if options.heading_sigma is None
                  else sensors.heading(motion, options, options.heading_sigma)),
-        velocity=velocity(motion, options))
+        velocity=velocity(motion, options),
+        pressure=sensors.pressure(motion, options))
 
 
 def _truth(motion: Motion, options: SimOptions, imu: ImuSamples) -> Truth:

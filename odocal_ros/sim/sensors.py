@@ -15,7 +15,14 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples, take
+from odocal_ros.data.samples import (
+    FixSamples,
+    HeadingSamples,
+    ImuSamples,
+    OdometerSamples,
+    ScalarSamples,
+    take,
+)
 from odocal_ros.nav.earth import radii
 from odocal_ros.nav.rotations import (
     matrix_from_rpy,
@@ -111,6 +118,25 @@ def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples
     stamp = options.start_ns + ns
     return HeadingSamples(stamp, stamp + round(TRANSPORT['heading'] * 1e9), q_nb,
                           np.full(len(t), sigma**2))
+
+
+def pressure(motion: Motion, options: SimOptions) -> ScalarSamples:
+    """
+    Return the air pressure, Pa; none without a sigma.
+
+    Weather, the wind of driving and the temperature of the air are drawn for each drive.
+    """
+    rate, scale_height, ground = 20.0, 8435.0, 101_325.0    # Hz, m, Pa: standard atmosphere
+    sigma = options.pressure_sigma
+    if sigma is None:
+        return ScalarSamples.none()
+    ns, t = stamps(motion.duration, rate, PHASE['pressure'])
+    state, draw = motion.at(t), stream(options.seed, 'pressure').standard_normal
+    weather, by_wind, warmer = draw(3) * [1e-3, 6e-3, 0.03]    # m/s, m per (m/s)^2, relative
+    height = (state.height + by_wind * state.speed**2 + weather * t) / (1 + warmer)
+    value = ground * np.exp(-(height + sigma * draw(len(t))) / scale_height)
+    stamp = options.start_ns + ns
+    return ScalarSamples(stamp, stamp, value, (value * sigma / scale_height)**2)
 
 
 def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> Floats:

@@ -18,11 +18,10 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import foresight
 from odocal_ros.forecast.forecast import as_keys, Forecast, Prospect
 from odocal_ros.forecast.foresight import Abandoned, DriveSoFar, forecast_of
-from odocal_ros.forecast.leg_so_far import faults_in_cells
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.forecast.leg_so_far import faults_in_cells, SmootherSoFar
 from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
 from odocal_ros.live import running_estimate as watch
-from odocal_ros.live.guidance import hint
+from odocal_ros.live.answers import hint
 from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
 from odocal_ros.live.session import Session, SessionView
 from odocal_ros.live.worker import Worker
@@ -386,11 +385,16 @@ def looked_at(made, t_stop, **settings):
     return forecast_of(cells.leg(start_ns), cells.fix_rate(), config, smoother=SmootherSoFar())
 
 
+@pytest.fixture(scope='module')
+def found(two):
+    """Return the estimates of the smoother; wheels is another word for it."""
+    return calibrate(two.leg(), with_settings(Config(), {
+        'method': 'smoother', 'imu.grade': 'tactical'})).methods['smoother'].estimates
+
+
 @pytest.mark.parametrize('method', ['smoother', 'auto', 'wheels'])
-def test_two_wheels_are_foreseen_as_they_come_out(two, method):
+def test_two_wheels_are_foreseen_as_they_come_out(two, found, method):
     whole = two.leg()
-    found = calibrate(whole, with_settings(Config(), {
-        'method': method, 'imu.grade': 'tactical'})).methods['smoother'].estimates
     forecast = looked_at(two, (whole.stop_ns - whole.start_ns) / SECOND, method=method)
     left, right, width = (found[name] for name in (
         'scale_factor_left', 'scale_factor_right', 'track_width'))

@@ -21,9 +21,9 @@ from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.warm_start import carried, steps_of
 from odocal_ros.forecast.forecast import Abandoned, as_keys, Forecast, Prospect
 from odocal_ros.forecast.foresight import forecast_of
+from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.forecast.smoother_forecast import look, with_running
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar
-from odocal_ros.live.guidance import hint
+from odocal_ros.live.answers import hint
 from odocal_ros.live.session import Session, SessionView
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code

@@ -21,13 +21,15 @@ PATIENCE = 60.0   # s, for one event; only a failing test waits so long
 
 class NodeProcess:
     """
-    The node as a process of its own; what it prints is kept.
+    The node as a process of its own; what it prints is kept. The calibrator draws no report.
 
     before : Python that runs before the node does.   module : of live/ that holds the node.
     """
 
     def __init__(self, *args: str, env: dict | None = None, before: str = '',
                  module: str = 'node') -> None:
+        if module == 'node' and args:
+            args = ('-p', 'output.formats:=[params]', *args)
         paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH')]))
         self.process = subprocess.Popen(
             [sys.executable, '-c', before + START.format(module),

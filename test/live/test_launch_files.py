@@ -19,7 +19,7 @@ CASES = [
     {}, {'rviz': 'true'}, {'method': 'two_point', 'use_sim_time': 'true'},
     {'namespace': 'truck', 'rviz': 'true', 'params_file': '/tmp/mine.yaml'},
     {name + '_topic': f'/a/{name}' for name in ('imu', 'odometer', 'odometer_right', 'fix',
-                                                'fix_velocity', 'heading')}]
+                                                'fix_velocity', 'heading', 'pressure')}]
 
 
 @pytest.mark.parametrize('given', CASES, ids=lambda given: ' '.join(given) or 'as is')

@@ -34,7 +34,8 @@ def sent():
 def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
         start, connect, sent, tmp_path, how, before):
     node = start('-p', 'alignment.heading_source:=fixed', '-p', 'alignment.heading:=0.7',
-                 '-p', 'method:=two_point', before=before)
+                 '-p', 'method:=two_point', '-p', 'output.formats:=[params, report]',
+                 before=before)
     client = connect()
     player = recording(client, sent, 40, 60, 30)
     player.play(part(sent[1], 60, 115), 30)

@@ -153,7 +153,8 @@ def test_the_command_it_tells_runs(data_dir, capsys, tmp_path):
     for name in ('comma2k19_rav4', 'husky_parking_lot'):
         told, _ = inspect(data_dir / name / 'bag', capsys)
         words = shlex.split(told['command'])[1:]
-        code = main([*words, '--output', str(tmp_path / name), '--quiet', '--json'])
+        code = main([*words, '--output', str(tmp_path / name), '--quiet', '--json', '--set',
+                     'output.formats=[params]'])
         result = json.loads(capsys.readouterr().out)
         assert code in (0, 1)
         assert result['result']['scale_factor']['value'] is not None

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Calibration, Estimate, Source, TrackCheck
-from odocal_ros.output.figures import beyond_one, length, time_span, with_sigma
-from odocal_ros.output.reason_lines import shared
+from odocal_ros.output.figures import beyond_one, length, shared, time_span, with_sigma
 from odocal_ros.output.summary import screen, sentence
 from odocal_ros.output.tables import overall
 from odocal_ros.reasons import Code, Reason

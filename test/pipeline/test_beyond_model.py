@@ -89,7 +89,7 @@ def test_one_method_says_it_once():
 SPUN, SLID = (Reason(Code.WHEEL_SLIP, f'the wheel {what}') for what in ('spun', 'slid'))
 REJECTED = (Reason(Code.NOT_CONVERGED, 'it did not'),)
 SPEED = {'scenario': 'town', 'odometer': 'speed', 'scale': 1.01, 'nominal_scale': 1.0,
-         'duration': 300.0, 'imu_grade': 'industrial', 'seed': 7}
+         'duration': 200.0, 'imu_grade': 'industrial', 'seed': 7}
 
 
 def run(name, odometer, reasons=()):

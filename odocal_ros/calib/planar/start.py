@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from odocal_ros.calib.planar.problem import Run
 from odocal_ros.data.arrays import Complexes, Floats, Ints
@@ -46,6 +45,8 @@ def first_values(run: Run, width: float = 0.0) -> First:
     by 450 deg look the same: of several minima that fit about equally well the one nearest to the
     configured width is taken, without one the largest, which has the smallest turns.
     """
+    # a node starts without it
+    from scipy.optimize import minimize
     z = run.position[:, 0] + 1j * run.position[:, 1]
     s = np.append(0.0, np.cumsum(run.wheels.path))[run.node]
     rough = _rough(z, s)

@@ -81,7 +81,7 @@ class PriorRows(Factor):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
-        self.level = not problem.leg.felt
+        self.own, self.level = problem.own, not problem.leg.felt
         self.shared = {name: where for name, where in SHARED.items()
                        if (problem.priors.constants[where] > NO_ERROR).any()}
 
@@ -154,12 +154,14 @@ class PriorRows(Factor):
         return out
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        """Yield the effects of the turn-on biases."""
+        """Yield the effects of the turn-on biases, and of constants of this leg alone."""
         first = self.with_wanted(marginals[0][None])[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
         drift = 2 * self.n + HEIGHT_DRIFT
         yield 'slow_fix_errors', first[:, [drift]] / self.priors.constants[HEIGHT_DRIFT]
+        for name, where in self.own.items():
+            yield name, first[:, 2 * self.n:][:, where] / self.priors.constants[where]
 
     def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
         """Yield names and effects, (3, k), of errors that all legs share."""

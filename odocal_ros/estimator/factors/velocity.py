@@ -48,7 +48,7 @@ from odocal_ros.settings.config import Config
 
 # m/s, to start from: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
 FIRST_SIGMA = 0.5
-STATED_SIGMA = 0.1      # m/s, initial if a receiver states none: physical, Doppler
+VELOCITY_SIGMA = 0.1      # m/s, initial if a receiver states none: physical, Doppler
 # of its stamps and its filter, s and s^2, 1 sigma: physical, receivers are late by up to 0.25 s
 # and smooth over as much
 TIME_SIGMA, LAG2_SIGMA = 0.25, 0.1
@@ -79,7 +79,7 @@ class VelocityRows(OutsideRows):
         some = thinned(t)
         t, variance = t[some], sent.variance_n[some, :2]
         known = np.isfinite(variance) & (variance > 0)
-        sigma = np.sqrt(np.where(known, variance, STATED_SIGMA**2))
+        sigma = np.sqrt(np.where(known, variance, VELOCITY_SIGMA**2))
         v_n = (from_place(inputs, t, origin) @ sent.velocity_n[some, :, None])[:, :2, 0]
         return Velocity(t, v_n, sigma)
 

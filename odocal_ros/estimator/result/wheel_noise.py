@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.optimize import minimize
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
@@ -63,6 +62,7 @@ class Line:
 
 def fit_line(seen: Increments) -> Line:
     """Return the line at the restricted maximum of the likelihood, far increments weighed less."""
+    from scipy.optimize import minimize
     spread = np.ones(len(seen.y))
     log_levels = np.zeros(len(seen.walk) + 1)
     for _ in range(TAIL_ROUNDS):
