@@ -128,7 +128,7 @@ setup(
             'odometry = odocal_ros.live.start:odometry',
         ],
         # ros2 odocal ...
-        'ros2cli.command': ['odocal = odocal_ros.offline.ros2_command:OdocalCommand'],
+        'ros2cli.command': ['odocal = odocal_ros.offline.cli:OdocalCommand'],
         # the header of two lines, which ament_copyright does not know
         'ament_copyright.license': ['odocal_spdx = odocal_ros.outside.licence:SPDX'],
     },

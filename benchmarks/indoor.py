@@ -7,7 +7,7 @@ Small robots indoors, without GNSS: does the sigma hold for each kind of positio
     python benchmarks/indoor.py [--drives 40] [--only KIND] [--jobs 1] [--file F]
 
 Differential robots with two counters on a level floor, 30 s to 3 min at 0.2 to 1.2 m/s with turns
-on the spot (odocal_ros/sim/indoor.py), references with their usual errors (sim/references.py).
+on the spot (odocal_ros/sim/routes.py), references with their usual errors (sim/references.py).
 IMUs are those of the zoo (docs/zoo.md) with their effects, by turns consumer and industrial; each
 wheel has a random slip of 1 mm/sqrt(s). Settings are the defaults, except for the grade of the
 IMU and the nominal scale. Drive k of kind e has seed 193_000_000 + 1_000_000 e + k, fixed before

@@ -39,7 +39,7 @@ def publish(rates, seconds) -> None:
     import rclpy
     from rclpy.qos import QoSProfile
 
-    from odocal_ros.live.definitions import message_class
+    from odocal_ros.live.messages import message_class
     from odocal_ros.sim.scenarios import SimOptions, simulate
     drive = simulate(SimOptions(scenario='town', duration=REST + seconds + 60.0, odometer='speed',
                                 **dict(zip(('imu_rate', 'odometer_rate', 'fix_rate'), rates,

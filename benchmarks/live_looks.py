@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from odocal_ros.data.samples import take  # noqa: E402
 from odocal_ros.errors import OdocalError  # noqa: E402
 from odocal_ros.forecast.foresight import forecast_of  # noqa: E402
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar  # noqa: E402
+from odocal_ros.forecast.leg_so_far import SmootherSoFar  # noqa: E402
 from odocal_ros.forecast.thinned_leg import ThinnedLeg  # noqa: E402
 from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, LOOK_SHARE  # noqa: E402
 from odocal_ros.pipeline.calibrate import calibrate  # noqa: E402
@@ -40,7 +40,7 @@ def look(leg, config, state, before_ns, now_ns):
     thinned, smoother = state
     begin = time.thread_time()
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         thinned.feed(slot, take(rows, (rows.stamp_ns > before_ns) & (rows.stamp_ns <= now_ns)))
     try:
         seen = forecast_of(thinned.leg(leg.start_ns), thinned.fix_rate(), config,

@@ -70,11 +70,10 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.data.leg import LegRecorder
     from odocal_ros.data.samples import take
     from odocal_ros.forecast.foresight import forecast_of
-    from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+    from odocal_ros.forecast.leg_so_far import SmootherSoFar
     from odocal_ros.forecast.thinned_leg import ThinnedLeg
-    from odocal_ros.live.jobs import compute
     import odocal_ros.live.node  # noqa: F401 all that a node holds
-    from odocal_ros.live.worker import give_back, hold_little
+    from odocal_ros.live.worker import compute, give_back, hold_little
     from odocal_ros.messages.decode import make_reader
     from odocal_ros.settings.config import Config
     hold_little()

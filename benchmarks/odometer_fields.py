@@ -14,7 +14,7 @@ import numpy as np
 
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.odometer import travel
-from odocal_ros.offline.fix_path import fix_path
+from odocal_ros.offline.survey import fix_path
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import simulate

@@ -91,8 +91,8 @@ def relay(args) -> None:
     from sensor_msgs.msg import Imu
     from std_msgs.msg import Int64
 
+    from odocal_ros.live.messages import WaitingMessages
     from odocal_ros.live.odometry import LOOK_S, NumbersPublisher, SERVE_S
-    from odocal_ros.live.waiting_messages import WaitingMessages
     rclpy.init()
     node = rclpy.create_node(args.role)
     publishers = [(NumbersPublisher(node, f'{args.role}/{name}', kind()), np.zeros(size))
@@ -145,7 +145,7 @@ def measure(args) -> None:
     from nav_msgs.msg import Odometry
     from rclpy.qos import QoSProfile
 
-    from odocal_ros.live.waiting_messages import Gate
+    from odocal_ros.live.messages import Gate
     drive = drive_of(args)
     truth = drive.truth
     with tempfile.NamedTemporaryFile('w', suffix='.yaml') as file:

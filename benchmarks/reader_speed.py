@@ -34,7 +34,7 @@ clock = time.perf_counter if sys.argv[2] == 'wall' else time.process_time
 BARE = TIMED + """
 from backports.zstd import ZstdDecompressor
 import numpy as np
-from odocal_ros.bagio.file_bytes import LET_GO
+from odocal_ros.bagio.channels import LET_GO
 from odocal_ros.bagio.mcap_records import CHUNK, CHUNK_HEAD, records_of
 np.empty(LET_GO, np.uint8)    # else most of it goes into memory that is made for each chunk
 began = clock()

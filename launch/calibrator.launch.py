@@ -26,6 +26,7 @@ ARGUMENTS = (
     ('heading_topic', 'heading',
      'sensor_msgs/Imu: ENU yaw of a dual antenna or the like, where alignment.heading_source '
      'allows it.'),
+    ('pressure_topic', 'pressure', 'sensor_msgs/FluidPressure: heights; optional.'),
     ('method', '', 'The setting method; empty: what params_file says.'),
     ('namespace', '', 'Namespace of the node and of relative topics.'),
     ('use_sim_time', 'false', 'Take time from /clock, as with a bag or a simulation.'),
@@ -34,7 +35,8 @@ ARGUMENTS = (
 REMAPPED = (
     ('imu/data', 'imu_topic'), ('odometer', 'odometer_topic'),
     ('odometer_right', 'odometer_right_topic'), ('fix', 'fix_topic'),
-    ('fix_velocity', 'fix_velocity_topic'), ('heading', 'heading_topic'))
+    ('fix_velocity', 'fix_velocity_topic'), ('heading', 'heading_topic'),
+    ('pressure', 'pressure_topic'))
 SIM_TIME = {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}
 
 

@@ -84,7 +84,7 @@ class Code(Enum):
                             'its own topic.')
     IMU_UNITS = REJECT, ('Publish m/s^2 and rad/s (REP-145), or set imu.accel_scale / '
                          'imu.gyro_scale.')
-    IMU_LOOKS_Z_DOWN = CAUTION, ('Set imu.mounting_rpy to [3.141592653589793, 0.0, 0.0] if the '
+    IMU_LOOKS_Z_DOWN = CAUTION, ('Set imu.mounting_rpy to [3.141592654, 0, 0] if the '
                                  'axes are forward-right-down.')
     IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up. If the '
                         'drive determines the IMU orientation, the values are given.')
@@ -102,7 +102,9 @@ class Code(Enum):
                          'driver.')
     GYRO_AXES = REJECT, ('Correct the axes of angular_velocity in the IMU driver. '
                          'imu.mounting_rpy cannot: it rotates gyro and accelerometer together.')
-    BAG_TRUNCATED = CAUTION, 'Stop recordings with Ctrl-C. All readable messages were used.'
+    BAG_TRUNCATED = CAUTION, ('All readable messages were used. Stop recordings with Ctrl-C. A '
+                              'damaged chunk is an error of storage or transfer: copy the file '
+                              'again.')
     STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg. Data up to the '
                                   'end of the recording was used.')
     FRAME_REPLACED = NOTE, ('Set frames.imu to the TF frame of the IMU, or correct frame_id in '

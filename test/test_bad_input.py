@@ -59,7 +59,7 @@ def sound(result, truth, sigmas=5.0):
 
 def spoilt(slot, **columns):
     """Return a function that changes columns of a topic of a leg."""
-    return lambda leg: replace(leg, **{slot: changed(getattr(leg, slot), **columns)})
+    return lambda leg: leg.with_rows(**{slot: changed(leg.rows(slot), **columns)})
 
 
 def sideways(a):
@@ -116,9 +116,9 @@ def test_an_unusable_leg_is_rejected_for_its_cause(made, leg, spoil, code, text,
 @pytest.mark.parametrize('keep', [1, 2, 3])
 @pytest.mark.parametrize('slot', ['imu', 'odometer', 'fix'])
 def test_a_handful_of_rows(made, leg, slot, keep):
-    few = take(getattr(leg, slot), slice(5000, 5000 + keep) if slot == 'imu' else
+    few = take(leg.rows(slot), slice(5000, 5000 + keep) if slot == 'imu' else
                slice(700, 700 + keep))
-    result, _ = run(replace(leg, **{slot: few}), settings(made))
+    result, _ = run(leg.with_rows(**{slot: few}), settings(made))
     assert rejecting(result)
 
 
@@ -295,7 +295,7 @@ def test_an_odometer_that_stops_counting_on_the_way(made, leg):
 def test_no_standstill_before_the_start(made, leg):
     t = seconds(leg, leg.imu)
     moving = shifted(leg, start=30.0)
-    cut = {slot: take(getattr(leg, slot), seconds(leg, getattr(leg, slot)) > 30.0)
+    cut = {slot: take(leg.rows(slot), seconds(leg, leg.rows(slot)) > 30.0)
            for slot in ('imu', 'odometer', 'fix')}
     assert (t > 30.0).any()
     result, said = run(replace(moving, **cut), settings(made))

@@ -23,7 +23,7 @@ ROS = {'rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_m
 # the rooms in the order of the data, and what each uses of those above it; all: errors, reasons
 ROOMS = {
     'outside': '', 'data': '',
-    'settings': 'outside',
+    'settings': 'data outside',
     'nav': 'data',
     'messages': 'data nav settings',
     'bagio': 'data messages outside',

@@ -16,7 +16,7 @@ import yaml
 from odocal_ros.bagio.encode import counter, fix, imu
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.offline import cli
-from odocal_ros.output.budget_table import source_label
+from odocal_ros.output.tables import source_label
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config_file import read_config_file
 

@@ -94,7 +94,8 @@ def test_the_mean_is_that_of_the_wheels_that_do_not_steer():
     rear = [wheel.s for wheel in inputs.travels[2:]]
     np.testing.assert_allclose(inputs.travel.s, (rear[0] + rear[1]) / 2, atol=1e-9)
     assert codes(found)[Code.WHEELS_STEERED] == (
-        'front_left and front_right are steered: the travel is more in turns. The scale factor is '
+        'front_left and front_right are steered: a steered wheel travels farther in turns. '
+        'The scale factor is '
         'that of the mean of rear_left and rear_right')
     fixed = made(front_steers=False)
     inputs, found = screen(fixed.leg(), config(fixed))

@@ -11,8 +11,8 @@ import pytest
 
 from odocal_ros.offline import cli
 from odocal_ros.reasons import Code
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import SETTINGS, settings_of
+from odocal_ros.settings.node_configs import ApplyConfig
 from tools import settings_page
 from tools.reasons_page import MEANINGS
 

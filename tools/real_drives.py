@@ -102,9 +102,8 @@ def _stated(reference: dict[str, float]) -> str:
 
 def gallery(data: Path, pictures: Path) -> str:
     """Return the page of all drives in a folder; write a map of each."""
-    from odocal_ros.library.export_map import map_figure
-    from odocal_ros.output.pictures import save_figure
-    from odocal_ros.output.plots_svg import look
+    from odocal_ros.library.export_pictures import map_figure
+    from odocal_ros.output.drawing import look, save_figure
     page = GALLERY_HEAD
     for folder in sorted(path.parent for path in data.glob('*/truth.yaml')):
         said = io.StringIO()

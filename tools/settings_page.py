@@ -13,9 +13,8 @@ from pathlib import Path
 import sys
 import textwrap
 
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import Config, SETTINGS, settings_of
-from odocal_ros.settings.pattern_config import PatternConfig
+from odocal_ros.settings.node_configs import ApplyConfig, PatternConfig
 from odocal_ros.settings.setting import Setting
 from tools.reasons_page import reasons_md
 

@@ -10,7 +10,7 @@ If the path cannot be continued, it restarts at its origin, with a note.
 import numpy as np
 
 from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
-from odocal_ros.apply.pose import Pose
+from odocal_ros.apply.errors import Pose
 from odocal_ros.apply.reckoning import ODOMETER_SILENCE, Reckoning
 from odocal_ros.apply.start import begin
 from odocal_ros.apply.stream import ImuStream
@@ -18,9 +18,9 @@ from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.leg import COUNTER
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import CLOCK_APART
+from odocal_ros.settings.node_configs import ApplyConfig
 
 BEGINS_ANEW = 'odometry restarts'      # so begins each sentence that says it
 

@@ -28,16 +28,24 @@ from odocal_ros.apply.attitude import (
     Vector,
     ZERO,
 )
-from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
-from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
+from odocal_ros.apply.errors import (
+    BA,
+    BG,
+    GRAVITY,
+    PHI,
+    Pose,
+    pose_covariance,
+    SHAKING,
+    twist_covariance,
+)
 from odocal_ros.apply.start import Start
 from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.standstill import REST_TURN
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.levels import FASTEST
+from odocal_ros.settings.node_configs import ApplyConfig
 
 # judgement, all in s: between corrections; that a speed is taken over; without odometer, after
 # which attitude continues alone; without IMU, that hide motion

@@ -16,8 +16,8 @@ from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.rotations import quat_from_matrix
 from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.grades import Grade
+from odocal_ros.settings.node_configs import ApplyConfig
 
 MOST_TILTING = 0.5         # rad/s; physical: no vehicle rolls or pitches so for START_SPAN
 START_SPAN = 2.0           # s; judgement: of samples that a start is taken from

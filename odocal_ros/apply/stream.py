@@ -10,7 +10,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import ImuSamples
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.screening.glitches import ROWS_BESIDE
-from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.node_configs import ApplyConfig
 
 INTERVAL_ROWS = 64      # judgement: rows that determine the usual interval
 HOLE_INTERVALS = 2.5      # judgement: usual intervals of the IMU, a longer one hides a turn

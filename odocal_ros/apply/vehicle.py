@@ -15,7 +15,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix
-from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.node_configs import ApplyConfig
 
 # rad, 1 sigma of what no calibration determined; judgement: 5 and 3 deg of a mounting by eye
 UNKNOWN_YAW, UNKNOWN_PITCH = 0.087, 0.05
@@ -76,11 +76,7 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     """
     Return the vehicle of a calibration's estimates.
 
-    Raises
-    ------
-    BadConfig
-        They hold no scale factor, or more than two wheels are configured.
-
+    Raises BadConfig: they hold no scale factor, or more than two wheels are configured.
     """
     def estimate_of(name: str, otherwise: float, sigma: float = 0.0) -> tuple[float, float]:
         e = estimates.get(name)
@@ -101,7 +97,7 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     nominal = config.imu.nominal_yaw
     yaw = estimate_of('yaw_mounting_angle', 0.0 if math.isnan(nominal) else nominal, UNKNOWN_YAW)
     pitch = estimate_of('pitch_mounting_angle', 0.0, UNKNOWN_PITCH)
-    guessed = tuple(f'{name} is not in the calibration: assumed {value:.4g} +- {sigma:.2g} rad'
+    guessed = tuple(f'{name} is not in the calibration: assumed {value:.4g} ± {sigma:.2g} rad'
                     for name, (value, sigma) in (('yaw_mounting_angle', yaw),
                                                  ('pitch_mounting_angle', pitch))
                     if name not in estimates or estimates[name].value is None)

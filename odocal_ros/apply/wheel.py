@@ -12,7 +12,7 @@ from bisect import bisect_left
 from collections import deque
 import math
 
-from odocal_ros.apply.rhythm import Rhythm
+from odocal_ros.apply.arrivals import Rhythm
 from odocal_ros.data.arrays import Floats, Values
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.levels import FASTEST

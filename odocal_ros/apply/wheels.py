@@ -11,7 +11,7 @@ from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheel import Wheel
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.standstill import REST_TRAVEL
-from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.node_configs import ApplyConfig
 
 STILL_COUNTS = 1.5    # physical: counts that a wheel at rest may still show
 SIDES = ('odometer', 'odometer_right')

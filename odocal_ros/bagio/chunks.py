@@ -110,11 +110,7 @@ def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chu
     """
     Write an mcap file, whole or not at all, safe on the disk when this returns.
 
-    Raises
-    ------
-    OSError
-        It cannot be written; nothing is left of it.
-
+    Raises OSError: it cannot be written; nothing is left of it.
     """
     with whole_file(path) as file:
         return _fill(file, channels, chunks)

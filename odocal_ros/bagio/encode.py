@@ -21,6 +21,7 @@ from odocal_ros.data.samples import (
     HeadingSamples,
     ImuSamples,
     OdometerSamples,
+    ScalarSamples,
     VelocitySamples,
 )
 
@@ -236,7 +237,7 @@ def _positions(name: str, kind: str, samples: FixSamples, position: Floats,
 
 
 def velocity(name: str, samples: VelocitySamples, frame: str = 'gnss') -> Topic:
-    """Return geometry_msgs/TwistWithCovarianceStamped of VelocitySamples: linear ones."""
+    """Return geometry_msgs/TwistWithCovarianceStamped of VelocitySamples; no angular rates."""
     layout = _Layout().header(frame).add('linear', VECTOR).add('angular', VECTOR).add(
         'cov', ('<f8', 36))
 
@@ -245,6 +246,17 @@ def velocity(name: str, samples: VelocitySamples, frame: str = 'gnss') -> Topic:
         out['linear'] = samples.velocity_n[rows]
         out['cov'][:, :15:7] = samples.variance_n[rows]
     return Topic(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples.received_ns,
+                 layout.packer(fill, len(samples.stamp_ns)))
+
+
+def pressure(name: str, samples: ScalarSamples, frame: str = 'imu') -> Topic:
+    """Return sensor_msgs/FluidPressure of ScalarSamples."""
+    layout = _Layout().header(frame).add('values', ('<f8', 2))
+
+    def fill(out: NDArray[Any], rows: slice) -> None:
+        _stamp(out, samples.stamp_ns[rows])
+        out['values'][:, 0], out['values'][:, 1] = samples.value[rows], samples.variance[rows]
+    return Topic(name, 'sensor_msgs/msg/FluidPressure', samples.received_ns,
                  layout.packer(fill, len(samples.stamp_ns)))
 
 

@@ -10,8 +10,7 @@ from pathlib import Path
 import struct
 import zlib
 
-from odocal_ros.bagio.channels import Batch, Channel, FORMATS, overlapping, Recording
-from odocal_ros.bagio.file_bytes import FileBytes
+from odocal_ros.bagio.channels import Batch, Channel, FileBytes, FORMATS, overlapping, Recording
 from odocal_ros.bagio.mcap_gather import batches
 from odocal_ros.bagio.mcap_records import (
     apart,

@@ -9,7 +9,7 @@ import struct
 from typing import NamedTuple
 import zlib
 
-from odocal_ros.bagio.file_bytes import FileBytes
+from odocal_ros.bagio.channels import FileBytes
 from odocal_ros.messages.raws import Bytes
 from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
 

@@ -85,6 +85,10 @@ class Bag:
             if span and part.count >= span.count:
                 found.append(f'{note}, but all {span.count} messages were read')
                 continue
+            if not part.count:
+                found.append(Reason(Code.BAG_TRUNCATED, f'{note}: none of its messages can be '
+                                    'read'))
+                continue
             span = span or (known.whole if after is None else None)
             end_ns = span.end_ns if span else after.start_ns if after else None
             seconds = (part.end_ns - part.start_ns) * 1e-9
@@ -107,11 +111,8 @@ class Bag:
         readers : topic -> reader of its messages.   feed : called with (slot, block) of samples,
         in order of bag time.   progress : called with the fraction done.
 
-        Raises
-        ------
-        BadUsage, BadData
-            A topic is not in the bag; none of a topic's messages can be used.
-
+        Raises BadUsage, BadData: a topic is not in the bag; none of a topic's messages can be
+        used.
         """
         for topic in readers.keys() - self.topics.keys():
             raise BadUsage(f'{self.name}: no topic {topic}; topics: {", ".join(self.topics)}')
@@ -190,11 +191,7 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
     """
     Open a bag: a folder or a file, of any kind that ``sources`` knows. Use it in ``with``.
 
-    Raises
-    ------
-    BadBag
-        Missing, unreadable, empty, or nothing usable left in it.
-
+    Raises BadBag: missing, unreadable, empty, or nothing usable left in it.
     """
     with ExitStack() as stack:
         try:

@@ -12,7 +12,7 @@ import sqlite3
 from typing import Any
 
 from odocal_ros.bagio.channels import possible
-from odocal_ros.bagio.numbered import JOURNAL, without_joined
+from odocal_ros.bagio.segments import JOURNAL, without_joined
 from odocal_ros.errors import BadBag
 from odocal_ros.outside.limits import (
     Allowance,
@@ -22,7 +22,7 @@ from odocal_ros.outside.limits import (
     read_text,
     zstd_module,
 )
-from odocal_ros.outside.yaml_tree import loader
+from odocal_ros.outside.yaml_files import loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}
@@ -68,11 +68,7 @@ def find(path: Path) -> Source:
     """
     Return the source that a path names: a folder, its metadata.yaml, or a file of a bag.
 
-    Raises
-    ------
-    BadBag
-        Nothing there, or nothing that is a bag.
-
+    Raises BadBag: nothing there, or nothing that is a bag.
     """
     path = Path(path)
     if not path.exists():

@@ -43,6 +43,8 @@ def drive_topics(drive: Any) -> list[Topic]:
         topics.append(encode.heading('/heading', drive.heading))
     if len(drive.velocity.stamp_ns):
         topics.append(encode.velocity('/fix_velocity', drive.velocity))
+    if len(drive.pressure.stamp_ns):
+        topics.append(encode.pressure('/pressure', drive.pressure))
     return topics
 
 
@@ -56,12 +58,8 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
     share written. The bag appears under its name only when it is complete; ``force`` replaces
     one that is there.
 
-    Raises
-    ------
-    BadUsage
-        The path exists and ``force`` is not set; its folder cannot be written; an unknown
-        storage or a compression the storage does not have.
-
+    Raises BadUsage: the path exists and ``force`` is not set; its folder cannot be written; an
+    unknown storage or a compression the storage does not have.
     """
     path = Path(path)
     check_target(path, storage, compression, force)

@@ -6,12 +6,12 @@ The error budget of the two-point method: every source as one-sigma effects on t
 
 A leg's end displacement D = M f (M: attitude summed over travel, f: scale times forward axis)
 is set equal to the chord between the reference positions. An error e of the chord against D, m,
-moves f by M^-1 e, and so ln K, yaw and pitch; each source is written as the e that one sigma of it
-makes. An attitude error phi(t) (computed = (I - [phi x]) true) makes e = sum of phi x dD, and a
-gyro error at time tau turns all that is still to come: r(tau) = D(end) - D(tau). Epochs may begin
-before the start mark, where the attitude was aligned: D is zero there and the gyros already err.
-The Earth's own turn, which carries an error of one axis to the others by 4 mrad a minute, is left
-out.
+changes f by M^-1 e, and so ln K, yaw and pitch; each source is given as the e that one sigma of it
+causes. An attitude error phi(t) (computed = (I - [phi x]) true) makes e = sum of phi x dD, and a
+gyro error at time tau rotates the remaining displacement: r(tau) = D(end) - D(tau). Epochs may
+begin before the start mark, at the alignment: D is zero there, gyro errors already accumulate.
+The Earth rotation, which turns an error of one axis into the others by 4 mrad a minute, is
+omitted.
 """
 
 from collections.abc import Iterable, Sequence
@@ -107,7 +107,7 @@ def _root(covariance: Floats) -> Floats:
 def _late_odometer(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,
                    end: MarkFix) -> Floats:
     """
-    Return the change of the chord by an odometer delay of 1 s, (3,) m.
+    Return the change of the chord by an odometer delay of 1 s, (3,) m/s.
 
     Travel is then put on attitudes that come after it: the integral of dC/dt f ds, less what the
     track has at one end and lacks at the other, v(end) - v(start).
@@ -140,14 +140,14 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     Return the sources of error of (ln K, yaw, pitch): docs/method.md (T9) to (T12).
 
     The fixes' own vertical errors are part of fix_start and fix_end; ``height`` is the error that
-    both ends share, which makes the Earth, and so the chord, larger. ``projection`` is there to
-    be seen to be zero: the chord is taken in space, not in a plane.
+    both ends share, which makes the Earth, and so the chord, larger. ``projection`` is listed
+    although it is zero: the chord is in space, not in a plane.
 
     f : (3,) solution, m per unit of travel, in b.   M : (3, 3) attitude summed over travel.
     start, end : reference positions.   t, D, q_nb : the track, as in drift_sources, from the
     alignment or the start mark to the end mark.   alignment : level, heading and gyro sigmas.
-    quantum : size of an odometer count, m.   fix_scale : (3,) factor on the stated fix sigmas that
-    the residuals ask for, east, north, up.   time_sigma : unknown latency of fixes, s.
+    quantum : size of an odometer count, m.   fix_scale : (3,) factor on the stated fix sigmas by
+    the residuals, east, north, up.   time_sigma : unknown latency of fixes, s.
     velocity_change : (3,) velocity at the end mark less that at the start, m/s; zero between
     standing marks.   lever_arm_sigma : m, each axis.   odometer_time_sigma : unknown latency of
     the odometer, s.
@@ -193,8 +193,8 @@ def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: f
     Return the second-order error of the scale: docs/method.md (T12).
 
     Half the distance-weighted variance of a drifting attitude, for a gyro bias
-    and noise of the size of their sigmas, and half the square of the tilt that height errors of
-    the fixes feign.
+    and noise of the size of their sigmas, and half the square of the false tilt due to
+    height errors of the fixes.
     """
     share = np.linalg.norm(np.diff(D, axis=0), axis=1)
     share = share / max(share.sum(), 1e-12)

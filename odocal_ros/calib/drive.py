@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the drive itself must be: long, fast and straight enough, and moving at all."""
+"""Checks of the drive: long, fast and straight enough, and in motion."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ FURTHEST_SLIDE = 100.0   # m, physical: no wheel slides and no fix deviates so f
 
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
-    """Return the reasons of a drive between the marks: path, by ``judge_way``, and turns."""
+    """Return path length, m, and the reasons against a drive between the marks."""
     distance, found = judge_way(track, t_stop, metres_per_unit, leg)
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
@@ -38,14 +38,14 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
 def judge_way(track: Track, t_stop: float, metres_per_unit: float,
               leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """
-    Judge how far and how fast was driven between the marks.
+    Return the path length between the marks, and reasons if it or the speed is too small.
 
     track : dead reckoned.   t_stop : the stop mark, s.   metres_per_unit : rough scale.   leg :
     limits.
 
     Returns
     -------
-    Distance driven, m, and what was found.
+    Path length, m, and reasons.
 
     """
     inside = (track.t >= 0) & (track.t <= t_stop)
@@ -137,7 +137,7 @@ def _without_counts(travel: Travel, t: Floats, fixes: Floats,
 
 def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
     """
-    Return the times in which a vehicle was carried, as by a ferry: (k, 2) s.
+    Return the intervals in which a vehicle was carried, as by a ferry: (k, 2) s.
 
     The fixes move without counts, and the odometer counts again after it.
     """

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A method that broke: its fault as data, for the door to write to a file."""
+"""An exception within a method as data; the command or the node writes it to a file."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -12,7 +12,7 @@ import numpy as np
 from odocal_ros.calib.result import LegResult, MethodResult
 from odocal_ros.reasons import Code, Reason
 
-TRACE = 'trace'      # of the details: what a developer needs
+TRACE = 'trace'      # key of the details: for a developer
 
 
 def raised_if_wild() -> np.errstate:
@@ -22,7 +22,7 @@ def raised_if_wild() -> np.errstate:
 
 def failed(unknown: Callable[[Reason], MethodResult], name: str,
            error: Exception) -> MethodResult:
-    """Return the result of a method that raised: what it gives where it refuses, and the trace."""
+    """Return the result of a method that raised: no values, the reason, and the trace."""
     where = traceback.extract_tb(error.__traceback__)[-1]
     said = ' '.join(str(error).split())[:200]
     reason = Reason(Code.METHOD_FAILED, f'method {name} failed with an internal error: '
@@ -32,7 +32,7 @@ def failed(unknown: Callable[[Reason], MethodResult], name: str,
 
 
 def traces(legs: Iterable[LegResult]) -> Iterator[tuple[str, str]]:
-    """Yield (method, trace) of each method that broke."""
+    """Yield (method, trace) of each method that raised."""
     for leg in legs:
         for name, method in leg.methods.items():
             if TRACE in method.details:

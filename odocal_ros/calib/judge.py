@@ -19,6 +19,7 @@ MISTAKEN = {
               np.pi / 30: 'rates in rpm'},
     'm/pulse': {0.25: 'a counter of the four edges of a pulse',
                 0.5: 'a counter of both edges of a pulse'}}
+PER_CENT_FROM = 0.01    # definition: relative figures from here on are shown in per cent
 
 
 def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
@@ -38,10 +39,12 @@ def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
     scale, yaw = estimates['scale_factor'], estimates['yaw_mounting_angle']
     if scale.value is not None:
         relative = 0.0 if scale.sigma is None else scale.sigma / scale.value
-        if relative > config.verdict.max_scale_sigma:
+        limit = config.verdict.max_scale_sigma
+        if relative > limit:
+            # in the unit of the uncertainty
+            shown = f'{100 * limit:.3g} %' if relative >= PER_CENT_FROM else share(limit)
             reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, 'scale uncertainty is '
-                                  f'{share(relative)}; the limit is '
-                                  f'{share(config.verdict.max_scale_sigma)}'))
+                                  f'{share(relative)}; the limit is {shown}'))
         reasons += far_from_nominal(scale.value, scale.unit, nominal_scale, config)
     if yaw.value is not None and yaw.sigma is not None \
             and yaw.sigma > config.verdict.max_yaw_sigma:
@@ -64,5 +67,5 @@ def far_from_nominal(scale: float, unit: str, nominal: float, config: Config) ->
 
 def share(relative: float, sign: str = '') -> str:
     """Return a relative figure as people say it: in ppm, or in per cent from one on."""
-    return f'{100 * relative:{sign}.1f} %' if abs(relative) >= 0.01 else (
+    return f'{100 * relative:{sign}.1f} %' if abs(relative) >= PER_CENT_FROM else (
         f'{1e6 * relative:{sign}.0f} ppm')

@@ -67,6 +67,6 @@ def check_worse(way: Floats, before: Floats, after: Floats, configured: bool) ->
             continue
         return [Reason(Code.CHECK_WORSE, f'in {length:g} m of path the calibrated track deviates '
                        f'{np.sqrt(now.mean()):.2g} m rms from the fixes, '
-                       + ('as configured' if configured else 'approximate scale')
+                       + ('as configured' if configured else 'uncalibrated')
                        + f' {np.sqrt(was.mean()):.2g} m')]
     return []

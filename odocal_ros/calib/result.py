@@ -124,7 +124,7 @@ class LegResult:
     C_bi: NDArray[np.float64] | None = None   # (3, 3) nominal rotation used, imu frame to b
     deciding: tuple[str, ...] = ()            # methods whose verdict counts, all where empty
     evidence: Evidence | None = None          # what a report draws, None where no track was fit
-    path_ratio: float | None = None     # path length by fixes over that of the odometer, raw
+    path_ratio: float | None = None     # median of distance between fixes by travel
     cut_from_ns: int | None = None            # start mark of the leg that it is a part of
 
     @property

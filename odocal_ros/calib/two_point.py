@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The two-point method: scale, yaw and pitch from where a leg ended, by track and by fix.
+The two-point method: scale, yaw and pitch from the end of a leg, dead reckoned and by fixes.
 
 Shi et al. 2015 takes the ratio of two chords in a plane and the angle between them,
 eq. (6)-(10). The same similarity is solved here in the Earth-fixed Cartesian frame n, where track
@@ -38,9 +38,9 @@ from odocal_ros.nav.projection import geodesic_chord, plane_chord
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
-# rad, prior sigma of the pitch where heights say nothing: physical, what holders and loads do
+# rad, prior sigma of the pitch without information from heights: physical, by holders and loads
 PITCH_PRIOR = 0.05
-# rad: a pitch beyond 15 deg is a height gone wrong, not a mounting. Physical, judgement
+# rad: a pitch above 15 deg is due to wrong heights, not to a mounting. Physical, judgement
 PITCH_LIMIT = 0.26
 
 
@@ -74,7 +74,7 @@ def solve(chord: Chord, up_scale: float = 1.0) -> tuple[Floats, bool]:
     Returns
     -------
     f : (3,) m per unit of travel, in b.
-    vertical_known : False where heights say nothing and the pitch was taken as zero.
+    vertical_known : False if heights contain no information and the pitch is taken as zero.
 
     """
     M = chord.M
@@ -144,7 +144,7 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
     sigma = np.sqrt(np.diag(covariance))
     K = float(np.linalg.norm(f))
     yaw, pitch = (float(a) for a in mounting_from_forward(f / K))
-    reasons = _judge_angles(chord.alignment, yaw, pitch, sources, vertical_known, config)
+    reasons = _judge_angles(chord.alignment, yaw, sources, vertical_known, config)
     separable = Code.YAW_NOT_SEPARABLE not in {r.code for r in reasons}
     estimates = {
         'scale_factor': Estimate(K, K * float(sigma[0]), scale_unit),
@@ -175,7 +175,7 @@ def _gyro_bias(alignment: Alignment) -> dict[str, Estimate]:
 def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_scale: Floats,
              config: Config) -> tuple[Source, ...]:
     track = chord.track
-    # the gyros err from the alignment on; but a fixed heading holds at the mark itself
+    # gyro errors accumulate from the alignment on, with a fixed heading from the mark on
     first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
     keep = epochs_between(track, min(first, chord.start.t), chord.end.t)
     t = track.t[keep]
@@ -215,8 +215,9 @@ def _blind_height(mark: MarkFix, sigma: float = 0.0) -> MarkFix:
     return replace(mark, covariance_n=covariance)
 
 
-def _judge_angles(alignment: Alignment, yaw: float, pitch: float, sources: tuple[Source, ...],
+def _judge_angles(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
                   vertical_known: bool, config: Config) -> tuple[Reason, ...]:
+    """Return the reasons about yaw (rad) and pitch, from heading and heights."""
     asked = config.verdict.max_yaw_sigma
     by_heading = next(s for s in sources if s.name == 'initial_heading')
     share = float(np.linalg.norm(by_heading.effects[1]))
@@ -242,7 +243,7 @@ def _judge_angles(alignment: Alignment, yaw: float, pitch: float, sources: tuple
                            f'{np.rad2deg(far):.1f} deg from its nominal value'),)
     if not vertical_known:
         reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the heights of the fixes are too '
-                           f'inaccurate for the pitch; 0 +- {np.rad2deg(PITCH_PRIOR):.1f} deg is '
+                           f'inaccurate for the pitch; 0 ± {np.rad2deg(PITCH_PRIOR):.1f} deg is '
                            'assumed'),)
     return reasons
 

@@ -13,12 +13,14 @@ class Input(NamedTuple):
     """
     One input; its slot is its name in code, bags, journals and options.
 
-    label : for people.   needed : columns without which a row is unusable.   clock : group of
-    settings that holds its ``time_offset``, or empty.   topic : the node subscribes to it; empty
-    for further wheels of one message.   queue : messages that the subscription keeps.
+    label : for people.   kind : name of the class of its samples (``data/samples.py``).   needed :
+    columns without which a row is unusable.   clock : group of settings that holds its
+    ``time_offset``, or empty.   topic : the node subscribes to it; empty for further wheels of one
+    message.   queue : messages that the subscription keeps.
     """
 
     label: str
+    kind: str
     needed: tuple[str, ...]
     clock: str = ''
     topic: str = ''
@@ -28,14 +30,20 @@ class Input(NamedTuple):
 # queues, physical: five seconds of the highest expected rate, 4 kHz, 1 kHz and 100 Hz: messages
 # that overrun a queue are lost
 INPUTS = {
-    'imu': Input('IMU', ('w_i', 'f_i'), 'imu', 'imu/data', 20_000),
-    'odometer': Input('odometer', ('value',), 'odometer', 'odometer', 5000),
-    'odometer_right': Input('right odometer', ('value',), 'odometer', 'odometer_right', 5000),
-    **{slot: Input(slot.replace('_', ' '), ('value',), 'odometer') for slot in WHEELS[2:]},
-    'fix': Input('fix', ('latitude', 'longitude'), 'gnss', 'fix', 500),
-    'heading': Input('heading', ('q_ni',), '', 'heading', 5000),
-    'fix_velocity': Input('GNSS velocity', ('velocity_n',), 'gnss', 'fix_velocity', 500),
+    'imu': Input('IMU', 'ImuSamples', ('w_i', 'f_i'), 'imu', 'imu/data', 20_000),
+    'odometer': Input('odometer', 'OdometerSamples', ('value',), 'odometer', 'odometer', 5000),
+    'odometer_right': Input('right odometer', 'OdometerSamples', ('value',), 'odometer',
+                            'odometer_right', 5000),
+    **{slot: Input(slot.replace('_', ' '), 'OdometerSamples', ('value',), 'odometer')
+       for slot in WHEELS[2:]},
+    'fix': Input('fix', 'FixSamples', ('latitude', 'longitude'), 'gnss', 'fix', 500),
+    'heading': Input('heading', 'HeadingSamples', ('q_ni',), '', 'heading', 5000),
+    'fix_velocity': Input('GNSS velocity', 'VelocitySamples', ('velocity_n',), 'gnss',
+                          'fix_velocity', 500),
+    'pressure': Input('air pressure', 'ScalarSamples', ('value',), '', 'pressure', 1000),
 }
+# the sensors besides IMU, odometer and fixes
+OUTSIDE = tuple(slot for slot in INPUTS if slot not in ('imu', *WHEELS, 'fix'))
 TOPICS = {slot: one.topic for slot, one in INPUTS.items() if one.topic}
 
 

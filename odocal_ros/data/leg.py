@@ -7,18 +7,18 @@ A leg: the samples between two marks, and the recorder that collects them.
 The recorder is used live and in replay.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, MISSING, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import numpy as np
 
+from odocal_ros.data import samples as kinds
 from odocal_ros.data.arrays import Ints
-from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.inputs import INPUTS, OUTSIDE, WHEELS
 from odocal_ros.data.pieces import by_row, runs
 from odocal_ros.data.samples import (
     FixSamples,
-    HeadingSamples,
     ImuSamples,
     OdometerForm,
     OdometerSamples,
@@ -26,12 +26,16 @@ from odocal_ros.data.samples import (
     Samples,
     SomeSamples,
     take,
-    VelocitySamples,
 )
 from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
 
 MOST_DAYS = 7          # judgement: of a leg
+# slot -> function that returns no rows
+EMPTY: dict[str, Callable[[], Samples]] = {
+    'imu_other': OtherImuSamples.none,
+    **{slot: getattr(kinds, one.kind).none for slot, one in INPUTS.items()}}
+SLOTS = tuple(EMPTY)
 COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
 
 
@@ -59,25 +63,29 @@ class Leg:
     odometer_7: OdometerSamples = field(default_factory=OdometerSamples.none)
     odometer_8: OdometerSamples = field(default_factory=OdometerSamples.none)
     fix: FixSamples = field(default_factory=FixSamples.none)
-    fix_velocity: VelocitySamples = field(default_factory=VelocitySamples.none)
-    heading: HeadingSamples = field(default_factory=HeadingSamples.none)
+    outside: Mapping[str, Samples] = field(default_factory=dict)     # of OUTSIDE, by slot
     form: OdometerForm = COUNTER
     form_right: OdometerForm | None = None
 
     @property
     def wheel_slots(self) -> tuple[str, ...]:
         """Return the slots of the wheels that sent messages, the first in any case."""
-        return (WHEELS[0], *(slot for slot in WHEELS[1:] if len(getattr(self, slot).stamp_ns)))
+        return (WHEELS[0], *(slot for slot in WHEELS[1:] if len(self.rows(slot).stamp_ns)))
+
+    def rows(self, slot: str) -> Any:
+        """Return the rows of a slot, as sent."""
+        rows = self.outside.get(slot) if slot in OUTSIDE else getattr(self, slot)
+        return EMPTY[slot]() if rows is None else rows
+
+    def with_rows(self, **rows: Samples) -> 'Leg':
+        """Return the leg with other rows of some slots."""
+        outside = {slot: rows.pop(slot) for slot in OUTSIDE if slot in rows}
+        changed: dict[str, Any] = {'outside': {**self.outside, **outside}, **rows}
+        return replace(self, **changed)
 
     def form_of(self, slot: str) -> OdometerForm:
         """Return the meaning of a wheel's values."""
         return self.form_right or self.form if slot == WHEELS[1] else self.form
-
-
-# slot -> function that returns no rows
-EMPTY = {one.name: one.default_factory for one in fields(Leg)
-         if one.default_factory is not MISSING}
-SLOTS = tuple(EMPTY)
 
 
 @final
@@ -139,11 +147,7 @@ class LegRecorder:
         Rows up to the first one after ``stop_ns`` are kept in each topic, so that values can be
         interpolated at the mark; later ones are not, however late the leg is closed.
 
-        Raises
-        ------
-        BadData
-            The marks are days apart: what is computed second by second would not end.
-
+        Raises BadData: the marks are days apart: what is computed second by second would not end.
         """
         days = (stop_ns - start_ns) / 86400e9
         if days > MOST_DAYS:
@@ -153,16 +157,16 @@ class LegRecorder:
         first_ns = start_ns - round(preroll * 1e9)
         rows = {slot: _cut(self.rows(slot), first_ns, stop_ns) for slot in SLOTS}
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=self.form,
-                   form_right=self.form_right, **rows)
+                   form_right=self.form_right).with_rows(**rows)
 
 
 def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
     """Return the part of a leg between two stamps; ``first_ns``: no IMU row before it."""
     lead_ns = 10**9    # of odometer and fixes, to interpolate at the first row of the IMU
-    rows = {slot: _cut(getattr(leg, slot), (first_ns or 0) - lead_ns, stop_ns) for slot in SLOTS}
+    rows = {slot: _cut(leg.rows(slot), (first_ns or 0) - lead_ns, stop_ns) for slot in SLOTS}
     imu = rows['imu']
     rows['imu'] = take(imu, (imu.stamp_ns >= (first_ns or 0)) & (imu.stamp_ns <= stop_ns))
-    return replace(leg, start_ns=start_ns, stop_ns=stop_ns, **rows)
+    return replace(leg, start_ns=start_ns, stop_ns=stop_ns).with_rows(**rows)
 
 
 def _key(samples: Samples) -> Ints:

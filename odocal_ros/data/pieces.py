@@ -98,10 +98,7 @@ def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Fl
     t : (n,) times of the rows, rising.   edges : (m + 1,) of the bins, in the same unit; a bin
     holds its upper edge.   vectors : (n, k) values of the rows.
 
-    Returns
-    -------
-    (m,) counts, (m, k) means; 0 in an empty bin.
-
+    Returns (m,) counts, (m, k) means; 0 in an empty bin.
     """
     first = np.searchsorted(t, edges, side='right')
     count = np.diff(first)

@@ -134,6 +134,14 @@ class VelocitySamples(Samples):
 
 
 @dataclass(frozen=True, eq=False)
+class ScalarSamples(Samples):
+    """A sensor of one number."""
+
+    value: Floats = column()       # in the unit of the message
+    variance: Floats = column()    # 0 unknown
+
+
+@dataclass(frozen=True, eq=False)
 class HeadingSamples(Samples):
     """External heading of the IMU's x axis, as ENU yaw."""
 

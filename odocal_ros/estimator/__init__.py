@@ -9,7 +9,8 @@ of screened samples, where ``too_little_of`` says no. ``bound`` is the covarianc
 """
 
 from odocal_ros.estimator.growing import GrowingFit, Running
-from odocal_ros.estimator.leg import smoother_leg, SmootherLeg
+from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.prepare import smoother_leg
 from odocal_ros.estimator.smoother import (
     bound,
     keyframe_times,

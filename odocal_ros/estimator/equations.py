@@ -18,7 +18,9 @@ from odocal_ros.estimator.factors.fixes import Fixes
 from odocal_ros.estimator.factors.heading import HeadingRows
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer_filter import as_rolled
+from odocal_ros.estimator.factors.outside_rows import OutsideRows
 from odocal_ros.estimator.factors.point_rows import PointRows
+from odocal_ros.estimator.factors.pressure import PressureRows
 from odocal_ros.estimator.factors.priors import PriorRows, SIZES
 from odocal_ros.estimator.factors.rests import Rests
 from odocal_ros.estimator.factors.slow_error import SlowError
@@ -32,8 +34,9 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, M, Priors, State, WITH_SLOW
 
 SomeFactor = TypeVar('SomeFactor', bound=Factor)
-FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, SpeedSteps,
-                                 TravelError, SlowError, Rests, PriorRows)
+FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, PressureRows,
+                                 SpeedSteps, TravelError, SlowError, Rests, PriorRows)
+OUTSIDE = tuple(part for part in FACTORS if issubclass(part, OutsideRows))
 
 
 def sums(problem: Problem, state: State) -> tuple[Intervals, dict[str, Points]]:

@@ -25,13 +25,13 @@ from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.factors.factor import WANTED
 from odocal_ros.estimator.fit import AGAIN_PASSES, Fit, fit, Trace, WarmStart
 from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.estimator.prepare import NO_ERROR, problem_of, SPACING
+from odocal_ros.estimator.prepare import problem_of, SPACING
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.outcome import outcome
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.several import combine_legs
 from odocal_ros.estimator.smoother import best_fit
-from odocal_ros.estimator.state import BY_TIME, CONSTANTS, LN_K, State
+from odocal_ros.estimator.state import BY_TIME, CONSTANTS, LN_K, NO_ERROR, State
 from odocal_ros.estimator.warm_start import carried, steps_of
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config

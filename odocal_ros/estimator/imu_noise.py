@@ -18,6 +18,7 @@ from odocal_ros.settings.grades import G, Grade
 # m/s^2/sqrt(Hz) minimum, and m/s^2/sqrt(s): accelerations of the vehicle, 1.5 m/s^2 for some
 # seconds, and slopes of a few per cent over a minute. Judgement
 UNFELT_NOISE, UNFELT_WALK = 5.0, 0.01
+CHI2_3_MEDIAN = 2.366       # statistical: median of chi2 with 3 degrees of freedom
 
 
 def sensor_noise(grade: Grade) -> dict[str, float]:
@@ -40,19 +41,15 @@ def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     inside = still[:-1] & still[1:]
     rest = np.flatnonzero(inside)
     runs = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
-    sums, freedom = np.zeros(2), 0
-    for run in runs:
-        if len(run) < 3:
-            continue
-        # second differences contain no bias and no drift; their variance is six times as large
-        for i, x in enumerate((turn, force)):
-            d = np.diff((x / T)[run], n=2, axis=0) * np.sqrt(T[run][1:-1] / 6)
-            sums[i] += (d**2).sum() / 3
-        freedom += len(run) - 2
-    if freedom < 15:        # of three axes each: a variance by fewer is good to 20 % at best
+    # second differences contain no bias and no drift; their variance is six times as large
+    squares = [[(np.diff((x / T)[run], n=2, axis=0)**2).sum(axis=1) * T[run][1:-1, 0] / 6
+                for x in (turn, force)] for run in runs if len(run) > 2]
+    both = np.concatenate([np.zeros((2, 0)), *squares], axis=1)
+    if both.shape[1] < 15:      # of three axes each: a variance by fewer is good to 30 % at best
         return {}
-    found = {name: max(float(total / freedom), LEAST.imu[name]**2)
-             for name, total in zip(('gyro', 'accel'), sums, strict=True)}
+    # the median: people get in and out, and a bus kneels
+    found = {name: max(float(np.median(x)) / CHI2_3_MEDIAN, LEAST.imu[name]**2)
+             for name, x in zip(('gyro', 'accel'), both, strict=True)}
     return found if leg.felt else {'gyro': found['gyro']}
 
 
@@ -74,5 +71,5 @@ def of_samples(leg: SmootherLeg, rows: slice | Bools) -> dict[str, float]:
 
     usual = float(np.median(np.diff(leg.t_imu[rows]), overwrite_input=True))
     return {name: float(np.sqrt(np.median(by_step(jumps, x[rows]), overwrite_input=True)
-                                / 2.366 / 2 * usual))      # 2.366: of chi2 with 3
+                                / CHI2_3_MEDIAN / 2 * usual))
             for name, x in (('gyro', leg.w_b), ('accel', leg.f_b))}

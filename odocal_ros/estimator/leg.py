@@ -3,18 +3,16 @@
 
 """The input of the estimator: one leg as screened arrays."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.estimator.outside import Heading, outside_heading, outside_velocity, Velocity
+from odocal_ros.estimator.outside import Outside
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.screening.inputs import Inputs
-from odocal_ros.settings.config import Config
-from odocal_ros.settings.nominal import nominal_scale
 
 Floats = NDArray[np.float64]
 # s: a standstill that ended longer before the start mark is another drive. Judgement
@@ -52,8 +50,7 @@ class SmootherLeg:
     antenna_arm: Floats = field(default_factory=lambda: np.zeros(3))
     doubt_t: Floats = _none()
     doubt_sigma: Floats = _none()        # scale units
-    velocity: Velocity = Velocity()
-    heading: Heading = Heading()
+    outside: Mapping[str, Outside] = field(default_factory=dict)     # by the name of its factor
     wheels: tuple[Travel, ...] = ()     # in the order of odometer.wheels
     felt: bool = True                   # False: no accelerometer, f_b is gravity, made up
 
@@ -85,32 +82,3 @@ def drift_time(leg: SmootherLeg, t: Floats) -> Floats:
     at_rest = 0.01      # of the time, judgement: a pose may change without motion
     out: Floats = np.maximum(T.sum() * path / max(path.sum(), 1e-12), at_rest * T)
     return out
-
-
-def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats, spans: Floats,
-                 rough_scale: float, t_stop: float | None = None) -> SmootherLeg:
-    """
-    Return the smoother's view of screened inputs.
-
-    inputs : of ``screen``.   config : lever arms, nominal scale.   origin, fixes_n : Origin, (k,
-    3) where n is fixed and the fixes in it, m; NaN up where a fix has no height.   spans : (s, 2)
-    standstills, s.   rough_scale : metres per unit of travel.   t_stop : end of what is used, s (a
-    held-out rest); the stop mark by default.
-    """
-    t_stop = inputs.t_stop if t_stop is None else t_stop
-    if not inputs.felt:         # the ground is taken as level, so heights have no say
-        fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
-    before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
-    t_begin = min(0.0, float(before[-1][0])) if before else 0.0
-    return SmootherLeg(
-        origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
-        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel, t_fix=inputs.t_fix,
-        fixes_n=fixes_n, covariance_n=inputs.covariance_n, standstills=np.asarray(spans),
-        rough_scale=float(rough_scale), nominal_scale=nominal_scale(config, inputs.scale_unit),
-        scale_unit=inputs.scale_unit, imu_arm=np.array(config.imu.lever_arm, float),
-        odometer_arm=np.array(config.odometer.lever_arm, float),
-        antenna_arm=np.array(config.gnss.lever_arm, float),
-        doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma,
-        velocity=outside_velocity(inputs, config, origin),
-        heading=outside_heading(inputs, config, origin), felt=inputs.felt,
-        wheels=inputs.travels)

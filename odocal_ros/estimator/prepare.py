@@ -1,22 +1,22 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Preparation of a leg for the estimator: keyframes, whitening, priors, initial levels."""
+"""Preparation of a leg for the estimator: its rows, keyframes, whitening, priors, levels."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.equations import FACTORS
+from odocal_ros.estimator.equations import FACTORS, OUTSIDE
 from odocal_ros.estimator.factors.axle import rates_at, WARM_TIME
 from odocal_ros.estimator.factors.fixes import whitener
-from odocal_ros.estimator.factors.outside_rows import used
+from odocal_ros.estimator.factors.priors import SHARED
 from odocal_ros.estimator.factors.slide import turned
 from odocal_ros.estimator.imu_noise import at_rest, shaken, unfelt
 from odocal_ros.estimator.imu_steps import ImuSteps
-from odocal_ros.estimator.leg import drift_time, SmootherLeg
-from odocal_ros.estimator.outside import velocity_sigmas
+from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, SmootherLeg
+from odocal_ros.estimator.outside import Outside
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.start import standing
 from odocal_ros.estimator.state import (
@@ -24,28 +24,58 @@ from odocal_ros.estimator.state import (
     FIX_TIME,
     GNSS_ARM,
     GNSS_DELAY,
-    HEADING,
     HEIGHT_DRIFT,
     IMPERFECT,
     KIND_SIZES,
     M,
+    NO_ERROR,
     ODO_ARM,
     ODO_DELAY,
     PITCH,
     Priors,
     SPEED_OFFSET,
-    VELOCITY,
     YAW,
 )
 from odocal_ros.nav.coarse_speed import CoarseSpeed
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_as_seen, turn_on_bias
+from odocal_ros.settings.nominal import nominal_scale
 
 # s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a
 # consumer IMU 6 % larger (docs/decisions/0005)
 SPACING = 1.0
 HEIGHT_TIME = 900.0     # s, physical: in which ionosphere and orbits change by their size
-NO_ERROR = 1e-12        # prior sigma of what there is none of, in any unit
+
+
+def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats, spans: Floats,
+                 rough_scale: float, t_stop: float | None = None) -> SmootherLeg:
+    """
+    Return the smoother's view of screened inputs.
+
+    inputs : of ``screen``.   config : lever arms, nominal scale.   origin, fixes_n : Origin, (k,
+    3) where n is fixed and the fixes in it, m; NaN up where a fix has no height.   spans : (s, 2)
+    standstills, s.   rough_scale : metres per unit of travel.   t_stop : end of what is used, s (a
+    held-out rest); the stop mark by default.
+    """
+    t_stop = inputs.t_stop if t_stop is None else t_stop
+    if not inputs.felt:         # the ground is taken as level, so heights have no say
+        fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
+    before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
+    t_begin = min(0.0, float(before[-1][0])) if before else 0.0
+    return SmootherLeg(
+        origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
+        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel, t_fix=inputs.t_fix,
+        fixes_n=fixes_n, covariance_n=inputs.covariance_n, standstills=np.asarray(spans),
+        rough_scale=float(rough_scale), nominal_scale=nominal_scale(config, inputs.scale_unit),
+        scale_unit=inputs.scale_unit, imu_arm=np.array(config.imu.lever_arm, float),
+        odometer_arm=np.array(config.odometer.lever_arm, float),
+        antenna_arm=np.array(config.gnss.lever_arm, float),
+        doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma,
+        outside={part.name: sent for part in OUTSIDE
+                 if (sent := part.prepared(inputs, config, origin)) is not None},
+        felt=inputs.felt, wheels=inputs.travels)
 
 
 def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:
@@ -58,7 +88,7 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     grade = grade if leg.felt else unfelt(grade)
     root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
     made = Problem(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
-               used(leg, t), turned(leg, imu), config.gnss.correlation_time,
+               _within(leg, t), _own(leg), turned(leg, imu), config.gnss.correlation_time,
                rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
                drift_time(leg, t))
     for part in FACTORS:
@@ -68,6 +98,18 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
             made.least |= least
     made.shaken = {k: max(v, made.first_levels[k]) for k, v in shaken(leg).items()}
     return made
+
+
+def _within(leg: SmootherLeg, t: Floats) -> dict[str, Outside]:
+    """Return the rows of the other sensors within the keyframes, where there are any."""
+    within = {name: sent.between(t[0], t[-1]) for name, sent in leg.outside.items()}
+    return {name: sent for name, sent in within.items() if len(sent.t)}
+
+
+def _own(leg: SmootherLeg) -> dict[str, slice]:
+    """Return the constants of sensors that no other leg shares, by the source of their errors."""
+    return {part.source: part.constants for part in OUTSIDE
+            if part.name in leg.outside and part.name not in SHARED}
 
 
 def imperfect_sigmas(grade: Grade) -> Floats:
@@ -111,7 +153,6 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     sigma[ODO_ARM] = sigma[GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
     sigma[ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
     sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
-    sigma[HEADING] = leg.heading.sigma
     sigma[IMPERFECT] = np.maximum(imperfect_sigmas(grade), NO_ERROR)
     # of IMUs as sold, also for a calibrated one: otherwise a bias would be estimated as an axis
     # error, and change the yaw of a tilted IMU
@@ -126,10 +167,12 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     # physical: receivers with an odometer trust it for 5 to 60 s
     centre[FIX_TIME], sigma[FIX_TIME] = np.log(20.0), 0.7
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
-    sigma[VELOCITY] = velocity_sigmas(config.gnss) if len(leg.velocity.t) else NO_ERROR
+    for part in OUTSIDE:
+        sent = leg.outside.get(part.name)
+        sigma[part.constants] = NO_ERROR if sent is None else part.prior_sigmas(sent, config)
     if not leg.felt:        # mounting and attitude are not separable: as configured
         sigma[ACCEL] = sigma[PITCH] = NO_ERROR
-        if not len(leg.heading.t):
+        if 'heading' not in leg.outside:
             centre[YAW], sigma[YAW] = nominal_yaw(config), NO_ERROR
     return Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, centre)
 

@@ -10,7 +10,7 @@ import numpy as np
 from odocal_ros.estimator.imu_steps import ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.outside import Heading, Velocity
+from odocal_ros.estimator.outside import Outside
 from odocal_ros.estimator.state import Priors
 from odocal_ros.settings.grades import Grade
 
@@ -27,7 +27,8 @@ class Problem:
     use: np.ndarray          # (k,) bool, of these the ones that are used
     root: np.ndarray         # (m, 3, 3) inverse roots of the stated covariances
     still: np.ndarray        # (N,) bool
-    outside: dict[str, Velocity | Heading]    # within the keyframes, where there are any
+    outside: dict[str, Outside]    # within the keyframes, where there are any
+    own: dict[str, slice]    # of their constants, by source: those that no other leg shares
     turned: float            # rad, in turns
     fix_time: float          # s, as gnss.correlation_time: 0 white, NaN to be judged
     rate_b: np.ndarray       # (N, 3) rad/s, measured at the keyframes

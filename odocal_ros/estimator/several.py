@@ -20,7 +20,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.estimator.factors.factor import WANTED
 from odocal_ros.estimator.factors.priors import SHARED, SIZE
 from odocal_ros.estimator.result.as_sent import as_sent_of
-from odocal_ros.estimator.result.outcome import determined, floored, in_words, SCALES
+from odocal_ros.estimator.result.outcome import determined, floored, not_observable, SCALES
 from odocal_ros.estimator.result.refusal import OPTIONAL
 from odocal_ros.estimator.result.remarks import beside, MODEL_FLOOR
 from odocal_ros.estimator.result.wheel_result import joined, wheel_details, wheel_estimates
@@ -81,8 +81,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
     if unsaid:
-        why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on these {len(legs)} '
-                          f'drives: {in_words(unsaid)}; the configured values are used'))
+        why.append(not_observable(f'these {len(legs)} drives', unsaid))
     sources = _sources(found.used[at] * found.factor, C)
     # by any leg with an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None

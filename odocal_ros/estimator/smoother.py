@@ -122,8 +122,10 @@ def too_little(fixes: int, seconds: float) -> Reason | None:
     fewest, shortest = 10, 20.0     # fixes, s: judgement, of less no start is found
     if fixes >= fewest and seconds >= shortest:
         return None
-    return Reason(Code.SCALE_NOT_DETERMINED, f'{fixes} fixes in {seconds:.0f} s; the smoother '
-                  f'needs at least {fewest} fixes in {shortest:.0f} s')
+    # rounded down: 19.97 s are less than 20
+    span = np.floor(10 * seconds) / 10
+    return Reason(Code.SCALE_NOT_DETERMINED, f'{fixes} fixes and {span:.1f} s of '
+                  f'data; the smoother needs at least {fewest} fixes and {shortest:.0f} s')
 
 
 def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,

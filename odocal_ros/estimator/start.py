@@ -117,7 +117,7 @@ def _level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     g = gravity(leg.origin.latitude, leg.origin.height)
     up = np.median(force, axis=0)
     up = up / np.linalg.norm(up)
-    lively = 1.0        # m/s^2 that an acceleration over 1 s may be of: physical, of a car
+    lively = 1.0        # m/s^2, 1 sigma of the acceleration of a car over 1 s: physical
     weight = np.sqrt(T) / lively
     change = np.zeros(3)
     for _ in range(3):
@@ -133,7 +133,13 @@ def _level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
 
 
 class _Track:
-    """The odometer's track in the level frame, x of b taken as forward, laid on the fixes."""
+    """
+    The odometer's track in the level frame, x of b taken as forward, fitted to the fixes.
+
+    X : (N,) travel units, complex.   K : m per unit.   chi : rad, rotation to the fixes at the
+    first keyframe.   slope : rad/s, its change, None without fixes.   place : (N,) m, east + i
+    north.   height : (N,) m.   spread : m, of the fixes about the track.
+    """
 
     def __init__(self, leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals) -> None:
         step = (C_Lk[:-1] @ sums.S)[:, :2, 0]
@@ -165,15 +171,15 @@ class _Track:
                 self.K = float(np.median(way[run > 0] / run[run > 0]))
         self.bend = 0.0 if self.slope is None else self.slope
         self.chi_at = self.chi + self.bend * (t - t[0])
-        self.place = self._place(t, t_fix, z, sums)
+        self.place = self._place(t, t_fix, z)
         self.height = _smooth(t, t_fix, np.where(np.isnan(fix[:, 2]), 0.0, fix[:, 2]))
         laid = np.interp(t_fix, t, self.place)
         self.spread = max(float(np.median(np.abs(laid - z))) / 1.18, 1e-3)
 
-    def _place(self, t: Floats, t_fix: Floats, z: Complexes, sums: Intervals) -> Complexes:
+    def _place(self, t: Floats, t_fix: Floats, z: Complexes) -> Complexes:
+        """Return the track plus the smoothed difference from the fixes: (N,) m, east + i north."""
         steps = np.diff(self.X) * np.exp(1j * (self.chi_at[:-1] + self.chi_at[1:]) / 2) * self.K
         path = np.concatenate([[0.0], np.cumsum(steps)])
-        self.path = path
         off = z - np.interp(t_fix, t, path)
         return path + _smooth(t, t_fix, off.real) + 1j * _smooth(t, t_fix, off.imag)
 
@@ -202,6 +208,7 @@ def _smooth(t: Floats, t_fix: Floats, y: Floats, window: float = 20.0) -> Floats
 
 
 def _speed(leg: SmootherLeg, t: Floats) -> Floats:
+    """Return the odometer speed, a mean over 2 SPEED_WINDOW: (N,) units per s."""
     s = leg.travel.at
     return (s(t + SPEED_WINDOW) - s(t - SPEED_WINDOW)) / (2 * SPEED_WINDOW)
 
@@ -209,7 +216,7 @@ def _speed(leg: SmootherLeg, t: Floats) -> Floats:
 def _heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
              track: _Track) -> tuple[float, float]:
     """
-    Return the rotation from the level frame to n that the accelerations ask for, and its sigma.
+    Return the rotation from the level frame to n from accelerations, rad, and its sigma.
 
     Change of velocity along the track = a times the integral of specific force in the level frame,
     plus a tilt (constant in the level frame) and an accelerometer bias (constant in b).

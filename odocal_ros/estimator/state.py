@@ -58,7 +58,8 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'sideslip', 'squat_by_jerk', 'sideslip_by_jerk', 'pitch_centre',
              'pitch_centre_of_bumps',
              'fix_motion_time', 'fix_height_drift', 'speed_offset', 'velocity_delay',
-             'velocity_lag_square', 'velocity_scale')
+             'velocity_lag_square', 'velocity_scale',
+             'pressure_offset', 'pressure_drift', 'pressure_by_speed_square', 'pressure_scale')
 
 
 def constants_from(first: str, last: str = '') -> slice:
@@ -114,7 +115,11 @@ SPEED_OFFSET = CONSTANTS.index('speed_offset')
 # smooths it, s^2, and by how much it is too large, relative
 VELOCITY = constants_from('velocity_delay', 'velocity_scale')
 VELOCITY_DELAY, VELOCITY_LAG2, VELOCITY_SCALE = range(VELOCITY.start, VELOCITY.stop)
+# of heights by air pressure: m, m/s of weather, m per (m/s)^2 by the wind of driving, relative
+# by the temperature of the air
+PRESSURE = constants_from('pressure_offset', 'pressure_scale')
 M = len(CONSTANTS)
+NO_ERROR = 1e-12    # definition: prior sigma of what there is none of, in any unit
 
 
 @dataclass(frozen=True, eq=False)

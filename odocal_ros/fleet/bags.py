@@ -42,11 +42,8 @@ def find_bags(names: list[str], vehicle_from: str | None) -> list[FleetBag]:
     one, names the vehicle; groups ``model`` and ``odometer_km`` likewise. None: the folder that
     the bag lies in.
 
-    Raises
-    ------
-    BadUsage
-        A manifest cannot be read, nothing is found, or the pattern does not fit a path.
-
+    Raises BadUsage: a manifest cannot be read, nothing is found, or the pattern does not fit a
+    path.
     """
     if len(names) == 1 and names[0].endswith(('.csv', '.parquet')):
         return _of_manifest(names[0])
@@ -175,11 +172,7 @@ def seen_as(url: str, settings: str) -> str:
     """
     Return a name for a bag by its place, size and date, and by settings.
 
-    Raises
-    ------
-    BadBag
-        It cannot be looked at.
-
+    Raises BadBag: it cannot be looked at.
     """
     try:
         fs, path = file_system(url)

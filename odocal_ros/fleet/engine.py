@@ -95,11 +95,7 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
 
     The scheduler is given some tasks for each worker, not all: its memory is bounded.
 
-    Raises
-    ------
-    EngineLost
-        The scheduler is gone.
-
+    Raises EngineLost: the scheduler is gone.
     """
     from distributed import as_completed, CancelledError
     ended, left, fewest = as_completed(), range(len(jobs)), 0

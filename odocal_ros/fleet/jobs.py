@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From the bags of a fleet and the options of the command to what workers are given."""
+"""The jobs of a fleet run: one for each bag, with the settings for its worker."""
 
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
@@ -26,11 +26,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
     args : as replay's options parse them (``add_calibration_arguments``).   config : settings
     that take precedence, in any form accepted by the library.
 
-    Raises
-    ------
-    BadUsage, BadConfig
-        A setting or a settings file is wrong.
-
+    Raises BadUsage, BadConfig: a setting or a settings file is wrong.
     """
     from odocal_ros.library.asked import config_of, legs_of
     from odocal_ros.offline.replay import asked_config, asked_topics
@@ -60,9 +56,9 @@ def _from_anywhere(bag: FleetBag) -> FleetBag:
 def computed_rows(client: Any, jobs: Sequence[BagJob],
                   again: bool = False) -> Iterator[tuple[int, Done]]:
     """
-    Yield (number of the job, what came of it) for each, as they end; rows are then there.
+    Yield (number of the job, outcome) of each job as it ends; its row is then stored.
 
-    again : those that failed before are tried once more.
+    again : retry jobs that failed before.
     """
     store = RowStore(jobs[0].folder)
     open_jobs = []
@@ -95,6 +91,7 @@ def _known(store: RowStore, job: BagJob) -> str | None:
 
 
 def _why(error: BaseException) -> str:
+    """Return the cause of a failed task, for people."""
     from distributed.scheduler import KilledWorker
     if isinstance(error, KilledWorker):
         return (f'its worker ended {error.allowed_failures + 1} times during the computation: '
@@ -106,11 +103,7 @@ def writable(folder: Path) -> None:
     """
     Make the output folder.
 
-    Raises
-    ------
-    BadUsage
-        It cannot be written.
-
+    Raises BadUsage: it cannot be written.
     """
     try:
         for part in ('rows', 'seen'):

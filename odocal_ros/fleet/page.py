@@ -14,19 +14,137 @@ from urllib.parse import quote
 import numpy as np
 
 from odocal_ros import __version__
-from odocal_ros.fleet.population import LEAST, Population, population
-from odocal_ros.fleet.second_stage import COMPARED, file_name
+from odocal_ros.fleet.second_stage import COMPARED, file_name, flagged
+from odocal_ros.fleet.statistics import LEAST, Population, population
 from odocal_ros.fleet.tables import LEGS
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.summary import DEG
 from odocal_ros.settings.levels import TYRE_SPREAD
+
+MOST_POINTS = 3000       # judgement: of a picture: more are thinned, but for those far off
+TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting angle',
+          'pitch_mounting_angle': 'Pitch mounting angle'}
+
+
+def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[str, str, str]]:
+    """Return (svg, title, what it shows) of what there is to draw."""
+    from odocal_ros.output.drawing import look
+    drawn = []
+    with look():
+        for name in COMPARED:
+            rows = [row for row in vehicles if row[name] is not None
+                    and row[f'{COMPARED[name]}_deviate'] is not None]
+            if rows:
+                drawn.append(_population(name, rows))
+        if chart := _control(vehicles, legs):
+            drawn.append(chart)
+    return drawn
+
+
+def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
+    """Draw each vehicle's value against its model's mean, one column a model."""
+    from odocal_ros.output.drawing import BLUE, evenly, RED, sheet, svg
+    models = sorted({row['model'] for row in rows})
+    figure, (ax,) = sheet(2.8)
+    scale, every = name == 'scale_factor', []
+    for k, model in enumerate(models):
+        some = [row for row in rows if row['model'] == model]
+        x, sigma = (np.array([row[key] for row in some], float)
+                    for key in (name, f'{name}_sigma'))
+        far = np.array([COMPARED[name] in row['outlier'].split() for row in some])
+        mean = np.median(x)
+        off, error = ((x / mean - 1) * 100, sigma / mean * 100) if scale else (
+            (x - mean) * DEG, sigma * DEG)
+        keep = np.union1d(evenly(len(x), MOST_POINTS // len(models)), np.flatnonzero(far))
+        at = k + 0.7 * (np.linspace(-0.5, 0.5, len(x)) if len(x) > 1 else np.zeros(1))
+        for which, colour in ((~far, BLUE), (far, RED)):
+            some_of = keep[which[keep]]
+            ax.errorbar(at[some_of], off[some_of], error[some_of], fmt='o', ms=3, lw=0.8,
+                        color=colour)
+        every += [(at[i], off[i]) for i in keep]
+    _within(ax, np.array(every))
+    ax.set_xticks(range(len(models)), [model or 'no model' for model in models])
+    ax.set_ylabel('deviation from the median, ' + ('%' if scale else 'deg'))
+    title = f'{TITLES[name]} by model.'
+    says = ('One point per vehicle with its sigma; red: outlier of its model; arrow: outside the '
+            'plot.')
+    return svg(figure, f'population-{COMPARED[name]}', f'{title} {says}'), title, says
+
+
+def _within(ax: Any, points: np.ndarray) -> None:
+    """Have the many fill the picture; those far beyond are arrows at its edge."""
+    from odocal_ros.output.drawing import RED
+    wide = 6.0    # medians of the distance that a picture shows
+    usual = wide * float(np.median(np.abs(points[:, 1])))
+    beyond = np.abs(points[:, 1]) > 2 * usual
+    if not beyond.any() or not usual:
+        return
+    most = 1.15 * max(usual, float(np.abs(points[~beyond, 1]).max()))
+    ax.set_ylim(-most, most)
+    for sign, mark in ((1, '^'), (-1, 'v')):
+        some = points[beyond & (sign * points[:, 1] > 0)]
+        ax.plot(some[:, 0], np.full(len(some), sign * 0.95 * most), mark, ms=6, color=RED)
+
+
+def _control(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, str] | None:
+    """Draw the scale of legs over dates, those that changed or drift highlighted."""
+    from odocal_ros.output.drawing import BLUE, GREEN, GREY, PINK, RED, sheet, svg
+    base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
+    most_lines = 6    # vehicles that are highlighted
+    named = [row['vehicle'] for row in vehicles if row['vehicle'] in base and any(
+        change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:most_lines]
+    named += [row['vehicle'] for row in vehicles if row['vehicle'] in base and flagged(row)
+             and row['vehicle'] not in named][:most_lines - len(named)]
+    found = _legs(legs, set(base), set(named))
+    if not found:
+        return None
+    figure, (ax,) = sheet(3.4)
+    rest = np.array([(day, value / base[vehicle]) for vehicle, day, value, _ in found
+                     if vehicle not in named]).reshape(-1, 2)
+    ax.plot(rest[:, 0].astype('datetime64[s]'), (rest[:, 1] - 1) * 100, '.', ms=2.5, color=GREY,
+            label='others')
+    styles = [(colour, mark) for mark in 'os' for colour in (BLUE, RED, GREEN, PINK)]
+    for vehicle, (colour, mark) in zip(named, styles, strict=False):
+        own = sorted((day, value, sigma) for name, day, value, sigma in found if name == vehicle)
+        day, value, sigma = np.array(own).T
+        ax.errorbar(day.astype('datetime64[s]'), (value / base[vehicle] - 1) * 100,
+                    sigma / base[vehicle] * 100, fmt=f'{mark}-', ms=3.5, lw=1.0, color=colour,
+                    label=vehicle[:18])
+    ax.set_ylabel('deviation from the current scale, %')
+    figure.autofmt_xdate(rotation=20, ha='right')
+    figure.subplots_adjust(bottom=0.2, top=0.82)
+    figure.legend(loc='upper center', borderaxespad=0.2, ncols=4, handlelength=1.4,
+                  columnspacing=1.0)
+    title = 'Scale over time.'
+    says = ('Legs relative to the current scale of their vehicle. Lines: vehicles that changed '
+            'or need inspection, the worst first.')
+    return svg(figure, 'control', f'{title} {says}'), title, says
+
+
+def _legs(path: Path, known: set[str], named: set[str]) -> list[tuple[str, float, float, float]]:
+    """Return (vehicle, seconds since 1970, scale, sigma) of legs, thinned for other vehicles."""
+    import pyarrow.parquet as pq
+    columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
+    with pq.ParquetFile(path) as file:
+        every = max(1, file.metadata.num_rows // MOST_POINTS)
+        found, k = [], 0
+        for batch in file.iter_batches(columns=columns, batch_size=10_000,
+                                       use_threads=False):
+            for row in batch.to_pylist():
+                k += 1
+                vehicle = row['vehicle']
+                if row['scale_factor'] is None or row['verdict'] == 'rejected' \
+                        or vehicle not in known or vehicle not in named and k % every:
+                    continue
+                found.append((vehicle, row['start_ns'] / 1e9, row['scale_factor'],
+                              row['scale_factor_sigma'] or 0.0))
+    return found
 
 
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
     """Return the page of a fleet whose rows stand in ``output``, the worst vehicle first."""
     from jinja2 import Environment, StrictUndefined
 
-    from odocal_ros.fleet.figures import fleet_figures
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
                            lstrip_blocks=True).from_string(
         (files('odocal_ros.fleet') / 'templates' / 'fleet.html').read_text(encoding='utf-8'))

@@ -159,11 +159,7 @@ def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
     """
     Yield the rows of files, one file after the other.
 
-    Raises
-    ------
-    BadData
-        A file is no row of a fleet.
-
+    Raises BadData: a file is no row of a fleet.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -17,7 +17,7 @@ import numpy as np
 
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.engine import results
-from odocal_ros.fleet.population import FAR, population
+from odocal_ros.fleet.statistics import FAR, population
 from odocal_ros.fleet.tables import (
     batches,
     in_batches,

@@ -53,7 +53,7 @@ class Prospect:
         sigma = None if self.sigma is None else three_digits(self.sigma * factor)
         known = name if sigma is None else f'{name} {sigma} {unit}'
         if self.now and sigma is not None:
-            known = f'{name} {self.now} +- {sigma} {unit}'
+            known = f'{name} {self.now} ± {sigma} {unit}'
         if self.lack:
             return f'{known} so far (limit {asked})' if self.now else (
                 f'{name} is not determined yet' + (f' ({sigma} {unit})' if sigma else ''))

@@ -27,7 +27,13 @@ from odocal_ros.forecast.forecast import (
     REST_FORESEEN_S,
     sources_of,
 )
-from odocal_ros.forecast.leg_so_far import count_size, fix_figures, profile_of, screened_in_cells
+from odocal_ros.forecast.leg_so_far import (
+    count_size,
+    fix_figures,
+    profile_of,
+    screened_in_cells,
+    SmootherSoFar,
+)
 from odocal_ros.forecast.planned_drive import inserted, PlannedDrive, REST_SPEED
 from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
 from odocal_ros.forecast.smoother_forecast import (
@@ -41,7 +47,6 @@ from odocal_ros.forecast.smoother_forecast import (
     without_force,
     YAW,
 )
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar
 from odocal_ros.screening.leg_kind import felt
 from odocal_ros.settings.config import Config
 
@@ -146,8 +151,9 @@ def _heading_found(leg: Leg, config: Config) -> Config:
     def before(stamp_ns: Ints) -> Ints:
         return np.flatnonzero(stamp_ns <= leg.start_ns + ORIENTATION_NS)[-ORIENTATION_ROWS:]
 
+    heading = leg.rows('heading')
     return with_heading(config, {
-        'heading_topic': stated_variance(take(leg.heading, before(leg.heading.stamp_ns))),
+        'heading_topic': stated_variance(take(heading, before(heading.stamp_ns))),
         'imu_orientation': stated_variance(take(leg.imu, before(leg.imu.stamp_ns)))})
 
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.estimator.factors.heading import GIVEN_NOISE, Heading
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.imu_steps import ImuSteps, keyframes
 from odocal_ros.estimator.leg import BEFORE_MARK, SmootherLeg
-from odocal_ros.estimator.outside import GIVEN_HEADING_NOISE, Heading, OUTSIDE_RATE
+from odocal_ros.estimator.outside import Outside, OUTSIDE_RATE
 from odocal_ros.estimator.state import M, State
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.forecast.predict import Sigmas
@@ -85,7 +86,7 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
         imu_arm=np.array(config.imu.lever_arm, float),
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
-        heading=_heading(drive, config, t_begin, spacing))
+        outside=_heading(drive, config, t_begin, spacing))
     key = keyframes(leg.t_imu, leg.t_begin, leg.t_stop, spacing)
     return Ideal(leg, ImuSteps.between(leg, key), _state(motion, key),
                  max(1.0, (drive.duration - t_begin) * sigmas.fix_rate / len(t_fix)))
@@ -114,17 +115,19 @@ def _times(begin: float, end: float, rate: float, spacing: float) -> Floats:
     return begin + (np.arange(count) + 0.5) * (end - begin) / count
 
 
-def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float) -> Heading:
+def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
+             ) -> dict[str, Outside]:
     """Return the external heading of the settings; none for a course or a gyrocompass."""
     asked, sigma = config.alignment.heading_source, config.alignment.heading_sigma
     if asked == 'fixed' or asked == 'auto' and not np.isnan(config.alignment.heading):
-        t, noise, asked = np.zeros(1), GIVEN_HEADING_NOISE, 'fixed'
+        t, noise, asked = np.zeros(1), GIVEN_NOISE, 'fixed'
     elif asked in SENT and sigma <= HEADING_LIMIT:
         t = _times(t_begin, drive.duration, OUTSIDE_RATE, spacing)
         noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * OUTSIDE_RATE))
     else:
-        return Heading()
-    return Heading(t, np.interp(t, drive.t, drive.yaw), np.full(len(t), noise), sigma, asked)
+        return {}
+    yaw = np.interp(t, drive.t, drive.yaw)
+    return {'heading': Heading(t, yaw, np.full(len(t), noise), sigma, asked)}
 
 
 def _state(motion: _Motion, key: Ints) -> State:

@@ -1,8 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The alignment that a planned drive will have: from the functions that align a recorded one."""
-
+"""Predicted alignment of a planned drive, by the functions that align a recorded one."""
 
 import numpy as np
 

@@ -87,7 +87,7 @@ class ThinnedLeg:
                            sides=form.sides)
         leading = cells.get('imu', cells.get('odometer'))
         stop_ns = start_ns if leading is None else int(leading.stamp_ns[-1])
-        return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form, **cells)
+        return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form).with_rows(**cells)
 
     def _newest(self, slot: str) -> OdometerSamples:
         """Return the cells of a counter with rows whose times are not final."""

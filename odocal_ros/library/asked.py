@@ -1,10 +1,10 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a caller asks for: settings in any of their forms, legs as text or seconds."""
+"""What a caller asks for (settings, legs), and the receivers of notes and progress it gives."""
 
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import datetime, UTC
 from decimal import Decimal, InvalidOperation
@@ -17,10 +17,40 @@ from odocal_ros.outside.limits import LATEST_NS
 from odocal_ros.outside.names import brief_line, said_by
 from odocal_ros.settings.config import Config, with_settings
 
+# called with the fraction done, 0 to 1 or None if unknown, and the current stage
+Progress = Callable[..., None]
 Settings = Config | Mapping[str, object] | str | Path | None
 Leg = str | tuple[float | None, float | None]
 EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
 EACH_STOP = 'each-stop'
+
+
+class Listener:
+    """Receive notes and phases of the work; this one ignores them."""
+
+    def note(self, text: str) -> None:
+        """Receive a note for the user."""
+
+    def phase(self, title: str) -> AbstractContextManager[Progress]:
+        """Return a context for a phase of the work; its value receives the fraction done."""
+        return nullcontext(lambda share, stage='': None)
+
+
+class Notes(Listener):
+    """Store the notes, and forward everything."""
+
+    def __init__(self, onward: Listener) -> None:
+        self.said: list[str] = []
+        self._onward = onward
+
+    def note(self, text: str) -> None:
+        """Store and forward a note."""
+        self.said.append(text)
+        self._onward.note(text)
+
+    def phase(self, title: str) -> AbstractContextManager[Progress]:
+        """Return the phase of the next listener."""
+        return self._onward.phase(title)
 
 
 @dataclass(frozen=True)
@@ -36,11 +66,7 @@ def paths_of(asked: Any) -> list[Path]:
     """
     Return the paths of one bag or several.
 
-    Raises
-    ------
-    BadUsage
-        There is none, or one that is no path at all.
-
+    Raises BadUsage: there is none, or one that is no path at all.
     """
     several = [asked] if isinstance(asked, (str, Path)) or not isinstance(asked, Iterable) \
         else list(asked)
@@ -74,11 +100,7 @@ def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> C
 
     asked : by dotted name, or a ROS parameter file; a Config is taken as it is.
 
-    Raises
-    ------
-    BadConfig, BadUsage
-        A setting is unknown or of a wrong value; the file cannot be read.
-
+    Raises BadConfig, BadUsage: a setting is unknown or of a wrong value; the file cannot be read.
     """
     if isinstance(asked, Config):
         return asked
@@ -100,11 +122,7 @@ def legs_of(asked: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
     asked : 'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates, 'each-stop',
         or (A, B), None for open; one or many.
 
-    Raises
-    ------
-    BadUsage
-        One is not of these forms.
-
+    Raises BadUsage: one is not of these forms.
     """
     if asked is None:
         return []
@@ -131,11 +149,7 @@ def parse_leg(text: str) -> LegSpan:
     """
     Return the leg of ``A:B`` (seconds) or ``A/B`` (ISO 8601); either side may be empty.
 
-    Raises
-    ------
-    BadUsage
-        Not of that form, or B not after A.
-
+    Raises BadUsage: not of that form, or B not after A.
     """
     separator = '/' if '/' in text else ':'
     parts = text.split(separator)

@@ -3,7 +3,7 @@
 
 """Bags to one calibration: what ``odocal replay`` does, for any program."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, UTC
 from pathlib import Path
@@ -11,14 +11,23 @@ from typing import Any
 
 from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadUsage, OdocalError
-from odocal_ros.library.asked import config_of, Leg, legs_of, paths_of, Settings, topics_of
+from odocal_ros.library.asked import (
+    config_of,
+    Leg,
+    legs_of,
+    Listener,
+    Notes,
+    paths_of,
+    Settings,
+    topics_of,
+)
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.legs import open_ended, OPEN_LEG
-from odocal_ros.library.listener import Listener, Notes
 from odocal_ros.library.read_bag import journal_notes, read_bag, readers_of, Recording
+from odocal_ros.outside.names import one_line
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Reason
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, flat
 
 NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm per m (a speed)'}
 
@@ -61,7 +70,6 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
         A bag cannot be read or used, or an argument is invalid.
 
     """
-    from odocal_ros.library.bags import look_at_all, unique_names, unique_paths
     from odocal_ros.output.ros_files import framed
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
@@ -113,7 +121,6 @@ class _BagLegs:
 
 def _each(paths: list[Path], asked: _Asked, received: Notes) -> list[_BagLegs]:
     """Return the stored data of each used bag."""
-    from odocal_ros.library.bags import about
     done: list[_BagLegs] = []
     dropped = None
     for path in paths:
@@ -146,7 +153,6 @@ def _one(path: Path, asked: _Asked, unit: str | None, received: Notes) -> _BagLe
 
 def _settings_of_all(done: list[_BagLegs], received: Notes) -> Config:
     """Return the settings of the last bag; a note lists the differences of the others."""
-    from odocal_ros.library.bags import unlike_settings
     if unlike := unlike_settings([one.config for one in done]):
         received.note(f'{", ".join(unlike)}: differ between the journals; each leg uses its own '
                    f'settings, limits and files use those of {done[-1].path.name}')
@@ -198,3 +204,68 @@ def _worth_keeping(results: list[LegResult], received: Notes) -> list[LegResult]
             received.note(f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
                        f'{reason.code.name}: {reason.text}')
     return [leg for leg, reason in zip(results, why, strict=True) if not reason]
+
+
+def unique_paths(paths: list[Path]) -> tuple[list[Path], list[Path]]:
+    """Return the bags, one given twice once, and those that were given again."""
+    first: dict[Path, Path] = {}
+    again = []
+    for path in paths:
+        if path.resolve() in first:
+            again.append(path)
+        first.setdefault(path.resolve(), path)
+    return list(first.values()), again
+
+
+def about(path: Path, error: Exception) -> str:
+    """Return the error of one of several bags, starting with the bag."""
+    text = str(error)
+    if text.startswith(str(path)):
+        return text
+    for name in (path.name, path.stem):      # some sentences begin with the bag's name
+        text = text.removeprefix(f'{name}: ')
+    return f'{path}: {text}'
+
+
+def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
+    """
+    Look at each of several bags, so that all errors are reported together, before the work.
+
+    Raises
+    ------
+    BadUsage
+        ``look`` raised for one bag or more.
+
+    """
+    troubles = []
+    for path in paths:
+        try:
+            look(path)
+        except OdocalError as error:
+            troubles.append(about(path, error))
+    if troubles:
+        raise BadUsage(f'{len(troubles)} of {len(paths)} bags cannot be used; nothing was '
+                       f'calibrated: {"; ".join(troubles)}')
+
+
+def unlike_settings(configs: list[Config]) -> list[str]:
+    """Return the names of the settings that differ between bags, as journals bring their own."""
+    first, *others = [flat(config) for config in configs]
+    # as text: an unset one is NaN, which is not equal to itself
+    return [name for name, value in first.items()
+            if any(repr(other[name]) != repr(value) for other in others)]
+
+
+def unique_names(paths: list[Path], legs: list[list[LegResult]],
+               inputs: list[dict[str, Any]]) -> tuple[list[LegResult], list[dict[str, Any]]]:
+    """
+    Return legs and inputs named so that no two bags have one name: by their paths if need be.
+
+    legs : of each bag.   inputs : what is written of each.
+    """
+    names = [entry['bag'] for entry in inputs]
+    if len(set(names)) == len(names):
+        return [leg for some in legs for leg in some], inputs
+    return ([replace(leg, bag=one_line(path)) for path, some in zip(paths, legs, strict=True)
+             for leg in some],
+            [entry | {'bag': one_line(path)} for path, entry in zip(paths, inputs, strict=True)])

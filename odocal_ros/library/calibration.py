@@ -13,8 +13,7 @@ from odocal_ros.calib import result
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.residuals import residuals
-from odocal_ros.library.series import Series, states, trajectory
+from odocal_ros.library.series import residuals, Series, states, trajectory
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
@@ -109,7 +108,7 @@ class Calibration:
     def plot_track(self, ax: Any, leg: int = 1) -> Any:
         """Draw a leg's track over its fixes on matplotlib axes; return these."""
         from odocal_ros.output.plots import draw_track
-        from odocal_ros.output.track_table import before_label
+        from odocal_ros.output.tables import before_label
         draw_track(ax, self._drawable(leg), before_label(self.result.legs))
         ax.legend()
         return ax

@@ -17,17 +17,52 @@ from odocal_ros.bagio.write import write_bag
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.export_map import draw_map
-from odocal_ros.library.export_rerun import INSTALL as RERUN, rrd
-from odocal_ros.library.export_speed import draw_scale_by_speed, scale_by_speed
-from odocal_ros.library.residuals import Left, left_in, residuals
-from odocal_ros.library.series import Series, stacked, states, trajectory
-from odocal_ros.output.pictures import PICTURES
+from odocal_ros.library.export_pictures import draw_map, draw_scale_by_speed, scale_by_speed
+from odocal_ros.library.series import Left, left_in, residuals, Series, stacked, states, trajectory
+from odocal_ros.output.drawing import PICTURES
 from odocal_ros.outside.whole import whole_file
 
+RERUN = 'pip install rerun-sdk'
 TABLES = 'pip install pandas pyarrow'
 IN_NAMES = {'m': 'm', 'rad/s': 'rad_per_s', 'm/s^2': 'm_per_s2'}     # units in names of joints
 KML = 'http://www.opengis.net/kml/2.2'
+
+
+def rrd(result: Calibration, path: Path) -> None:
+    """
+    Write drive.rrd.
+
+    leg_N/track LineStrips3D, m in the leg's n; leg_N/map GeoLineStrings; leg_N/vehicle Transform3D
+    over time; leg_N/states/NAME Scalars over time, names and units as in states.csv.
+    """
+    import rerun
+    recording = rerun.RecordingStream('odocal_ros')
+    memory = recording.memory_recording()
+    pose, state = trajectory(result), states(result)
+    for leg in np.unique(pose['leg']).tolist():
+        _log_leg(recording, f'leg_{leg}', *(
+            {name: column[one['leg'] == leg] for name, column in one.items()}
+            for one in (pose, state)))
+    with whole_file(path) as file:
+        file.write(memory.drain_as_bytes())
+
+
+def _log_leg(recording: Any, name: str, pose: Series, state: Series) -> None:
+    """Log one leg below its name."""
+    import rerun
+    track_n = np.stack([pose[f'{axis}_m'] for axis in ('east', 'north', 'up')], -1)
+    rotations = np.stack([pose[f'q{axis}'] for axis in 'xyzw'], -1)
+    places = np.stack([pose['latitude_deg'], pose['longitude_deg']], -1)
+    rerun.log(f'{name}/track', rerun.LineStrips3D([track_n]), static=True, recording=recording)
+    rerun.log(f'{name}/map', rerun.GeoLineStrings(lat_lon=[places]), static=True,
+              recording=recording)
+    times = [rerun.TimeColumn('time', timestamp=pose['stamp_ns'].astype('datetime64[ns]'))]
+    rerun.send_columns(f'{name}/vehicle', times, rerun.Transform3D.columns(
+        translation=track_n, quaternion=rotations), recording=recording)
+    for key, column in state.items():
+        if key not in ('leg', 'stamp_ns', 't_s'):
+            rerun.send_columns(f'{name}/states/{key}', times, rerun.Scalars.columns(
+                scalars=column), recording=recording)
 
 
 def tum(columns: Series) -> str:
@@ -167,11 +202,7 @@ def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
     """
     Write series as files; their names select series and format: ``KNOWN``.
 
-    Raises
-    ------
-    BadUsage
-        A name is another, a leg gives no such series, a file cannot be written.
-
+    Raises BadUsage: a name is another, a leg gives no such series, a file cannot be written.
     """
     paths = [Path(file) for file in files]
     check_names(paths)

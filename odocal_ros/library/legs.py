@@ -196,10 +196,7 @@ def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
 
     inputs : of all that its topics have in common, screened.   first : ns, where they begin.
 
-    Returns
-    -------
-    (k, 2) ns, and (k, 2) m driven before each with the total, None if unknown.
-
+    Returns (k, 2) ns, and (k, 2) m driven before each with the total, None if unknown.
     """
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         return np.empty((0, 2), np.int64), None

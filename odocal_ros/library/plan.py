@@ -3,24 +3,155 @@
 
 """How good a calibration will be, before it is driven, and what would help."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.errors import BadUsage
-from odocal_ros.forecast.planned_drive import PlannedDrive
-from odocal_ros.forecast.planned_methods import Plan, plan_methods
-from odocal_ros.forecast.predict import Sigmas
+from odocal_ros.forecast.planned_drive import (
+    left_and_right_turns,
+    PlannedDrive,
+    REST_SPEED,
+    stop_and_start,
+    town_driving,
+)
+from odocal_ros.forecast.planned_methods import Plan, plan_methods, spacing_for
+from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
 from odocal_ros.library.asked import config_of, Settings
-from odocal_ros.library.what_helps import Change, changes, SCALE, YAW
+from odocal_ros.output.figures import length, time_span
+from odocal_ros.pipeline.combination import together
 from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.settings.config import GRADES, with_settings
 
+SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
+RTK = 0.02                        # m, physical: of a fix, as receivers' data sheets have it
 PITCH = 'pitch_mounting_angle'
 PARAMETERS = (SCALE, YAW, PITCH)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change and the sigmas it leaves, relative and rad; None: not determined."""
+
+    text: str
+    scale: float | None
+    yaw: float | None
+
+    def gain(self, before: Plan, parameter: str) -> float:
+        """Return the ratio of the old to the new sigma; inf if there was none before."""
+        now, then = self.sigma(parameter), before.sigma(parameter)
+        if now is None:
+            return 1.0 if then is None else 0.0
+        return math.inf if then is None else then / now
+
+    def sigma(self, parameter: str) -> float | None:
+        """Return the sigma of a parameter."""
+        return self.scale if parameter == SCALE else self.yaw
+
+
+def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
+    """Return the possible changes, each with the resulting sigmas."""
+    # keyframes as far apart as they were: farther ones alone make a sigma larger
+    spacing = spacing_for(drive)
+    found = []
+    for text, other_drive, other_sigmas in (*_other_drives(drive, sigmas, before),
+                                            *_better_sensors(drive, sigmas, before)):
+        outcome = plan_methods(other_drive, other_sigmas, spacing)
+        found.append(Change(text, *(outcome.sigma(p) for p in (SCALE, YAW))))
+    return found + _second_leg(drive, sigmas, before)
+
+
+def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
+                  before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
+    """Yield longer drives, and such with more to see in them."""
+    yield (f'{length(drive.distance)} more, straight ahead', drive.lengthened(drive.distance),
+           sigmas)
+    least_rest = 60.0    # s
+    rest = max(least_rest, *before.two_point.standing)
+    yield (f'standing {time_span(rest)} longer at both marks', drive.standing_longer(rest),
+           sigmas)
+    yield 'one more stop and start', stop_and_start(drive), sigmas
+    yield 'one more left turn and right turn', left_and_right_turns(drive), sigmas
+    town_minutes = 5
+    yield (f'{town_minutes} min more, stop and go with turns', town_driving(drive, town_minutes),
+           sigmas)
+    farthest = _until_farthest(drive, sigmas)
+    if farthest is not None:
+        yield (f'end mark at the farthest point ({length(farthest.distance)})',
+               farthest, sigmas)
+
+
+def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
+                    before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
+    """Yield fixes, heading and IMU that are better than what there is."""
+    if sigmas.fix > 2 * RTK:
+        yield f'RTK fixes ({RTK:g} m)', drive, replace(sigmas, fix=RTK, fix_up=2 * RTK)
+    alignment = before.two_point.alignment
+    now = alignment.heading_sigma if alignment.heading_separable else math.inf
+    outside_heading = math.radians(0.1)    # of two antennas a metre or two apart
+    better = outside_heading if now > 2 * outside_heading else now / 2
+    config = with_settings(sigmas.config, {'alignment.heading_source': 'heading_topic',
+                                           'alignment.heading_sigma': better})
+    yield (f'a heading with {math.degrees(better):.2g} deg uncertainty', drive,
+           replace(sigmas, config=config))
+    grade = GRADES.index(sigmas.config.imu.grade)
+    if grade + 1 < len(GRADES):
+        finer = with_settings(sigmas.config, {'imu.grade': GRADES[grade + 1]})
+        yield f'an IMU of {GRADES[grade + 1]} grade', drive, replace(sigmas, config=finer)
+
+
+def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
+    """Return the drive up to where it is farthest from the start, None if that is the end."""
+    inside = drive.t >= 0
+    ds = np.gradient(drive.travel[inside])
+    place = np.cumsum(ds * np.exp(1j * drive.yaw[inside]))
+    k = int(np.argmax(np.abs(place - place[0])))
+    if abs(place[-1] - place[0]) > 0.9 * abs(place[k] - place[0]):
+        return None
+    rest = max((b - a for a, b in drive.standstills(sigmas.config.leg.standstill)
+                if a <= drive.t[inside][k] <= b), default=30.0)
+    moving = np.flatnonzero((np.abs(drive.speed) > REST_SPEED) & (drive.t <= drive.t[inside][k]))
+    return drive.until(float(drive.t[min(moving[-1] + 1, len(drive.t) - 1)]), rest)
+
+
+def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
+    """Return two legs combined, the second in reverse direction: each value by its method."""
+    if before.sigma(SCALE) is None:
+        return []
+    other = {'two_point': predict(drive.turned_around(), sigmas).method}
+    left: dict[str, float | None] = {}
+    for parameter in (SCALE, YAW):
+        name = before.by(parameter)
+        if not name:
+            left[parameter] = None
+            continue
+        one = before.methods[name]
+        # the smoother works in body axes: the direction of the drive does not matter
+        both = together(name, [_whole(one), _whole(other.get(name, one))],
+                        (0, round(drive.duration * 1e9)), sigmas.config)
+        left[parameter] = both.estimates[parameter].sigma
+    return [Change('a second leg in the other direction', left[SCALE], left[YAW])]
+
+
+def _whole(method: MethodResult) -> MethodResult:
+    """Return the method with a value for what it does not determine, so that legs combine."""
+    known = {name: e if e.value is not None else Estimate(0.0, 0.0, e.unit)
+             for name, e in method.estimates.items()}
+    return replace(method, estimates=known)
+
+
+def ranked(found: list[Change], before: Plan, parameter: str) -> list[Change]:
+    """Return the changes that help a parameter, best first."""
+    worth = 0.98    # of a sigma: what leaves more is no help
+    helpful = [c for c in found if c.gain(before, parameter) > 1 / worth]
+    return sorted(helpful, key=lambda c: (-c.gain(before, parameter), c.sigma(parameter)))
 
 
 @dataclass(frozen=True, eq=False)

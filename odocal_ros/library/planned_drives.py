@@ -74,12 +74,8 @@ def from_gpx(path: Path, speed: float | None = None) -> PlannedDrive:
     """
     Return the drive of a GPX track; of a route without times at ``speed`` m/s.
 
-    Raises
-    ------
-    BadUsage
-        The file cannot be read, is no GPX, has too few points, or lacks times and no speed is
-        given.
-
+    Raises BadUsage: the file cannot be read, is no GPX, has too few points, or lacks times and no
+    speed is given.
     """
     t, geodetic = _gpx_points(path)
     from odocal_ros.nav.dead_reckoning import Origin

@@ -3,29 +3,46 @@
 
 """A bag to samples: topics chosen, messages decoded, its marks, the notes of a journal."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from odocal_ros.bagio.numbered import JOURNAL
+import numpy as np
+
 from odocal_ros.bagio.read import Bag, bag_sha256, open_bag, TopicInfo
+from odocal_ros.bagio.segments import JOURNAL
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg, LegRecorder, SLOTS
 from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, LegSpan, Settings
-from odocal_ros.library.legs import dropped_legs, find_legs, marked_legs
-from odocal_ros.library.listener import Listener
-from odocal_ros.library.marks import check_still, marks_of
+from odocal_ros.library.asked import (
+    config_of,
+    Leg as AskedLeg,
+    legs_of,
+    LegSpan,
+    Listener,
+    Settings,
+)
+from odocal_ros.library.legs import dropped_legs, find_legs, leg_statuses, marked_legs
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.transforms import with_static
 from odocal_ros.outside.limits import is_file
 from odocal_ros.outside.names import one_line
-from odocal_ros.pipeline.floor_marks import mark_positions, with_marks
+from odocal_ros.pipeline.floor_marks import (
+    check_points,
+    FloorMark,
+    mark_positions,
+    marks_at,
+    with_marks,
+    WITHIN,
+)
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
 BLOCK = 'odocal_journal'
+STILL_SHARE = 0.05      # judgement: of the largest travel in a second: the robot moves
 
 
 @dataclass(frozen=True)
@@ -180,3 +197,52 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
             name, sha256, chosen, frame, bag.start_ns, bag.end_ns,
             tuple(marks), bool(journal and not marks and dropped_legs(bag)),
             tuple(note for note in bag.notes if not isinstance(note, str)), settings, recorder)
+
+
+def marks_of(config: Config, bag: Bag) -> list[FloorMark]:
+    """Return the marks of a bag in order of time, none without points."""
+    reference = config.reference
+    if reference.marks:
+        check_points(config)
+        return marks_at(config, [bag.start_ns + round(t * 1e9) for t in reference.marks])
+    return _stored_marks(bag, len(reference.points) // 2) if reference.points else []
+
+
+def _stored_marks(bag: Bag, points: int) -> list[FloorMark]:
+    """Return the marks in the status of a node."""
+    found = set[FloorMark]()
+    for values in leg_statuses(bag):
+        for word in filter(None, values.get('marks', '').split(',')):
+            with suppress(ValueError):      # of another program
+                found.add(FloorMark.of(word))
+    for mark in found:
+        if not 0 <= mark.point < points:
+            raise BadUsage(f'the bag has a mark of point {mark.point + 1}, reference.points has '
+                           f'{points}: use the points of the recording')
+    return sorted(found)
+
+
+def check_still(marks: Sequence[FloorMark], recorder: LegRecorder, start_ns: int) -> None:
+    """
+    Raise BadUsage for a mark at which the odometer counts, or that is outside the recording.
+
+    start_ns : of the first message of the bag.
+    """
+    rows = recorder.rows('odometer')
+    t, value = (rows.stamp_ns - start_ns) * 1e-9, np.asarray(rows.value, dtype=float)
+    if recorder.form.quantity != 'cumulative':
+        value = np.cumsum(value)
+
+    def moved(at: Floats) -> Floats:
+        out: Floats = np.abs(np.interp(at + WITHIN, t, value) - np.interp(at - WITHIN, t, value))
+        return out
+    times = np.array([(mark.stamp_ns - start_ns) * 1e-9 for mark in marks])
+    for time in times.tolist():
+        if not (len(t) and t[0] <= time - WITHIN and time + WITHIN <= t[-1]):
+            raise BadUsage(f'--mark {time:g}: the odometer has no data there; required: seconds '
+                           'from the first message of the bag')
+    top = float(moved(np.arange(t[0] + WITHIN, t[-1], WITHIN)).max())
+    for time, far in zip(times.tolist(), moved(times).tolist(), strict=True):
+        if far > STILL_SHARE * top:
+            raise BadUsage(f'--mark {time:g}: the wheels turn within {WITHIN:g} s of it; '
+                           'required: a time at which the robot stands on a point')

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import re
 
 from odocal_ros.bagio.read import TopicInfo
-from odocal_ros.data.inputs import INPUTS, topic_option
+from odocal_ros.data.inputs import INPUTS, OUTSIDE, topic_option
 from odocal_ros.errors import BadUsage
 from odocal_ros.messages.decode import full_type
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
@@ -135,8 +135,8 @@ def _optional(slot: str, config: Config, found: list[str]) -> bool:
     """Return True if a leg does not need a slot whose topic is missing or ambiguous."""
     if slot == 'imu':
         return not found and not config.odometer.needs_imu
-    return slot == 'fix_velocity' or (
-        slot == 'heading' and config.alignment.heading_source != 'heading_topic')
+    return slot in OUTSIDE and not (
+        slot == 'heading' and config.alignment.heading_source == 'heading_topic')
 
 
 def _of_receiver(name: str) -> bool:
@@ -189,8 +189,8 @@ def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: s
                 f'{topic_option(slot)}: {_described(topics, found)}{hint}')
     types = tuple(_types(slot, config))
     if slot == 'fix':
-        return (f'no {INPUTS[slot].label} in the bag: a topic of {" or ".join(types)}, or a '
-                f'{TRANSFORMS} or nav_msgs/msg/Odometry that is named with {topic_option(slot)}')
+        return (f'no {INPUTS[slot].label} (a topic of {", ".join(types[:-1])} or {types[-1]}) in '
+                f'the bag; name a {TRANSFORMS} or nav_msgs/msg/Odometry with {topic_option(slot)}')
     what = ' or '.join(types) if len(types) < 3 else 'an odometer type'
     beside = ' besides the IMU' if slot == 'heading' else ''
     return f'no {INPUTS[slot].label} (a topic of {what}{beside}) in the bag'

@@ -1,19 +1,30 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Answers of the services, each as one line."""
+"""Words for the operator: what to do next, and the answers of the services."""
 
 from collections.abc import Iterable, Sequence
 
+from odocal_ros.calib.choice import ABOUT, deciding
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
-from odocal_ros.live.session import Restored
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.forecast import quantities
+from odocal_ros.forecast.forecast import REST_FORESEEN_S
+from odocal_ros.forecast.progress import clocks_differ
+from odocal_ros.live.session import Restored, SessionView, State
 from odocal_ros.output.summary import sentence, values_in_words
 from odocal_ros.outside.names import said_by
-from odocal_ros.reasons import cautions, Verdict
+from odocal_ros.reasons import cautions, Reason, Verdict
 
 MOST_REASONS = 3     # judgement: in an answer
+KMH = 3.6    # definition: km/h in a m/s
+FORECAST_OLD_S = 15.0    # judgement: age from which what is foreseen is said to be old
+FEWEST_MARKS = 2         # judgement: marks after which the operator knows
+DRIVE = 'drive '
+STRAIGHT = 'drive straight at speed until left and right wheel are separable'
+TURNS = 'for the track width: turn by 90 deg in total or more'
+SPOT_TURNS = ('for the track width: turn on the spot in both directions, and drive straight for a '
+              'metre after each turn')
 
 
 def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: int = 0,
@@ -78,3 +89,167 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, OdocalError):
         return text
     return f'internal error, please report it: {type(error).__name__}: {text}'
+
+
+def hint(now: SessionView) -> str:
+    """Return the action: provide missing inputs, or the next step."""
+    session, state = now.session, now.session.state
+    if state is State.COMPUTING:
+        return f'computing: {now.computed.words() or "started"}; the result follows on ~/status'
+    if state is State.FAILED:
+        return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
+                if session.open_leg else 'call ~/reset')
+    if now.lost_cause:
+        return '; '.join([_fault(now), *now.missing[:1]])
+    if now.missing:
+        return now.missing[0]
+    if now.clocks:
+        return clocks_differ(now.clocks)
+    if state is State.RECORDING:
+        actions, facts = _while_recording(now)
+        return '; '.join([*facts, *actions])
+    if state is State.IDLE:
+        if now.config.leg.automatic and now.imu:
+            return 'start driving: a leg starts automatically'
+        return _before_start(now.still_s)
+    return after_result(now)
+
+
+def action_first(now: SessionView) -> str:
+    """Return the hint for a single line: in a leg the action comes before the estimate."""
+    fine = not (now.lost_cause or now.missing or now.clocks)
+    if now.session.state is State.RECORDING and fine:
+        actions, facts = _while_recording(now)
+        return '; '.join([*(actions or ['drive on']), *facts])
+    return hint(now)
+
+
+def quantities_ok(now: SessionView) -> dict[str, str]:
+    """Return the quantities that meet their limits: of the current leg, else of the result."""
+    session = now.session
+    if session.state is State.RECORDING:
+        return quantities.of_forecast(now.forecast, now.config, now.two_wheels, now.lost_cause)
+    if session.state is State.COMPUTING:
+        return quantities.nothing_known()
+    if session.calibration is not None:
+        return quantities.of_calibration(session.calibration, now.config, now.two_wheels)
+    if session.restored is not None:
+        return quantities.of_estimates(session.restored.estimates, now.config, now.two_wheels,
+                                       session.restored.valid)
+    return quantities.nothing_known()
+
+
+def metres_to_go(now: SessionView) -> float:
+    """Return the metres that the leg still lacks to leg.min_distance, 0 outside of one."""
+    if now.session.state is not State.RECORDING:
+        return 0.0
+    return max(0.0, now.leg.min_distance - now.distance_m)
+
+
+def seconds_to_stand(now: SessionView) -> float:
+    """Return the seconds of standstill still wanted: before the start, or at the end of a leg."""
+    if now.session.state is State.RECORDING or not now.session.busy:
+        return max(0.0, REST_FORESEEN_S - now.still_s)
+    return 0.0
+
+
+def manoeuvres(now: SessionView) -> list[str]:
+    """Return the missing manoeuvres of the leg, besides metres and standstill."""
+    if now.session.state is not State.RECORDING:
+        return []
+    wants, least = [], now.leg.min_speed
+    if now.max_speed < least:
+        wants.append(f'{DRIVE}faster than {least:.3g} m/s ({KMH * least:.0f} km/h)')
+    if now.config.reference.points and len(now.session.marks_of_leg()) < FEWEST_MARKS:
+        wants.append('call ~/mark at rest on each point')
+    if now.two_wheels and 'smoother' in deciding(now.session.config.method):
+        wants += _of_two_wheels(now)
+    return wants + (now.forecast.lacks if now.forecast else [])
+
+
+def _of_two_wheels(now: SessionView) -> list[str]:
+    """Return the manoeuvres for the wheels; before the first update only the general ones."""
+    config = now.session.config
+    wheels = None if now.forecast is None else now.forecast.wheels
+    asked = quantities.QUANTITIES['left_right'].limit(config)
+    wants = []
+    if wheels is not None and not (wheels.left_right is not None and wheels.left_right <= asked):
+        wants.append(STRAIGHT)
+    if not config.odometer.track_width and (wheels is None or wheels.track_width is None):
+        wants.append(TURNS if now.imu else SPOT_TURNS)
+    return wants
+
+
+def _before_start(still_s: float) -> str:
+    if still_s < REST_FORESEEN_S:
+        return f'stand still {REST_FORESEEN_S:.0f} s before ~/start_leg ({still_s:.0f} s so far)'
+    return 'call ~/start_leg'
+
+
+def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
+    """Return the hint: what to do, then what is known."""
+    metres, wants = metres_to_go(now), manoeuvres(now)
+    facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution, or a gap
+    slow = now.max_speed < now.leg.min_speed
+    if metres > 0 or slow:
+        if metres > 0:
+            wants = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in wants)]
+        end = _end(now) if now.session.by_itself else (
+            f'then stand still {REST_FORESEEN_S:.0f} s and call ~/stop_leg')
+        return [', '.join(wants), end], facts
+    if now.forecast is None:
+        return [*wants, _end(now)], facts
+    facts.append(now.forecast.words())
+    if now.forecast_age_s > FORECAST_OLD_S:
+        facts.append(f'estimate is {now.forecast_age_s:.0f} s old')
+    ends = now.forecast.complete or now.session.by_itself
+    return wants + ([_end(now)] if ends else []), facts
+
+
+def _fault(now: SessionView) -> str:
+    """Return the reason that would reject the leg, and its remedy."""
+    worst = now.faults[0]
+    if now.session.by_itself:
+        return (f'the leg will not be used: {worst.code.name}: {worst.text}. '
+                f'{worst.remedy.rstrip(".")}; the next leg starts automatically')
+    return (f'call ~/cancel_leg and start again: the leg would be rejected: {worst.code.name}: '
+            f'{worst.text}. {worst.remedy.rstrip(".")}')
+
+
+def _end(now: SessionView) -> str:
+    """Return the instruction that ends the leg."""
+    if now.session.by_itself:
+        left = now.session.config.leg.automatic_minutes - now.duration_s / 60
+        return (f'the leg ends automatically at a standstill, or within {max(1, round(left))} min')
+    if now.still_s < now.session.config.leg.standstill:
+        return f'stand still {REST_FORESEEN_S:.0f} s at the end point, then call ~/stop_leg'
+    left = seconds_to_stand(now)
+    return (f'stand still {left:.0f} s more, then ' if left >= 1 else '') + 'call ~/stop_leg'
+
+
+def after_result(now: SessionView) -> str:
+    """Return the advice after a result: the largest improvement, then the other quantities."""
+    reasons = now.session.calibration.reasons if now.session.calibration else ()
+    config = now.config
+    lacking = config.verdict.min_legs - len(now.session.legs)
+    if lacking > 0:
+        return f'drive {lacking} more leg{"s" * (lacking > 1)}'
+    if grave := cautions(reasons):
+        return grave[0].remedy
+    saved = config.output.autosave or now.saved
+    text = 'drive on: legs start and end automatically'
+    if not config.leg.automatic:
+        text = f'{"" if saved else "call ~/save, or "}drive another leg for a smaller sigma'
+    notes = _notes(reasons, quantities_ok(now))
+    return '; '.join([text, *notes])
+
+
+def _notes(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:
+    """Return the remedies of what is not OK and yet no reason against the result."""
+    wanted = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
+              if value == quantities.NO for part in quantities.QUANTITIES[name].estimates}
+    advice: dict[str, None] = {}
+    for r in reasons:
+        if ABOUT.get(r.code) in wanted:
+            advice[f'for the {wanted[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'] = None
+    return list(advice)

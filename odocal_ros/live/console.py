@@ -6,8 +6,7 @@
 import re
 from typing import Any
 
-from odocal_ros.live.session import State
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import SessionView, State
 from odocal_ros.outside.names import brief_line
 from odocal_ros.reasons import Code
 

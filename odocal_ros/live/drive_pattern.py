@@ -15,13 +15,12 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from odocal_ros import pattern
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
-from odocal_ros.live.definitions import message_class
+from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import run, SettledNode
-from odocal_ros.pattern.follow import command, moved, Pose, Progress, why_stop
-from odocal_ros.pattern.route import Piece, rectangle_of, route_of
-from odocal_ros.settings.pattern_config import PatternConfig
+from odocal_ros.settings.node_configs import PatternConfig
 
 PERIOD_S = 0.05       # judgement: base controllers stop after 0.2 s or more without a command
 ZEROS = 20            # judgement: commands of zero, since one may be lost
@@ -48,14 +47,15 @@ class DrivePattern(SettledNode):
         self.config: PatternConfig = params.declare(self, PatternConfig)
         if math.isnan(self.config.speed):
             raise BadConfig('speed is not set; required: the speed limit, m/s: -p speed:=0.2')
-        self._rectangle = rectangle_of(self.config)
-        route_of(self.config, self._rectangle[:2])      # refused at once, not at ~/start
-        self._pose: Pose | None = None
+        self._rectangle = pattern.rectangle_of(self.config)
+        pattern.route_of(self.config, self._rectangle[:2])      # refused at once, not at ~/start
+        self._pose: pattern.Pose | None = None
         self._pose_at = -math.inf       # all times: s, of the steady clock
         self._bumped = self._ending = False
-        self._route: tuple[Piece, ...] = ()     # empty: the robot is not driven
-        self._progress, self._begun, self._zeros = Progress(), 0.0, 0
-        self._moved: tuple[Pose, float] | None = None      # where and when the robot last moved
+        self._route: tuple[pattern.Piece, ...] = ()     # empty: the robot is not driven
+        self._progress, self._begun, self._zeros = pattern.Progress(), 0.0, 0
+        # where and when the robot last moved
+        self._moved: tuple[pattern.Pose, float] | None = None
         sensor = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.create_subscription(message_class(self.config.pose_type), 'pose', self._take_pose,
                                  sensor)
@@ -103,8 +103,8 @@ class DrivePattern(SettledNode):
     def _why_stop(self) -> str:
         now = time.monotonic()
         driven_s = now - self._begun if self._route else 0.0
-        return why_stop(self._pose, now - self._pose_at, self._rectangle, self._bumped,
-                        driven_s, self.config.timeout)
+        return pattern.why_stop(self._pose, now - self._pose_at, self._rectangle, self._bumped,
+                                driven_s, self.config.timeout)
 
     def _start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         why = 'the robot is driven already' if self._route else self._why_stop()
@@ -117,8 +117,8 @@ class DrivePattern(SettledNode):
             response.success, response.message = False, why
             return response
         assert self._pose is not None
-        self._route = route_of(self.config, self._pose[:2])
-        self._progress, self._begun, self._zeros = Progress(), time.monotonic(), 0
+        self._route = pattern.route_of(self.config, self._pose[:2])
+        self._progress, self._begun, self._zeros = pattern.Progress(), time.monotonic(), 0
         self._moved = None
         response.success = True
         response.message = (f'driving: {self.config.pattern}, '
@@ -151,8 +151,8 @@ class DrivePattern(SettledNode):
             self._halt(why)
             return
         assert self._pose is not None
-        speed, rate, self._progress = command(self._route, self._progress, self._pose,
-                                              time.monotonic(), self.config)
+        speed, rate, self._progress = pattern.command(self._route, self._progress, self._pose,
+                                                      time.monotonic(), self.config)
         if self._progress.piece == len(self._route):
             self._halt('the pattern is complete')
             return
@@ -166,7 +166,7 @@ class DrivePattern(SettledNode):
         """Return True if the robot has been asked to move for long and does not."""
         pose, now = self._pose, time.monotonic()
         assert pose is not None
-        if not asked or self._moved is None or moved(self._moved[0], pose):
+        if not asked or self._moved is None or pattern.moved(self._moved[0], pose):
             self._moved = pose, now
         return now - self._moved[1] > STUCK_S
 

@@ -15,15 +15,16 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 
 from odocal_ros import __version__
-from odocal_ros.live.definitions import message_class
 from odocal_ros.live.filing import output_root
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_writer import JournalWriter, Received
+from odocal_ros.live.messages import message_class
 from odocal_ros.live.recording import PREROLL_MARGIN_S
 from odocal_ros.live.session import Session
 from odocal_ros.live.topic_input import Input, StaticTransforms
+from odocal_ros.output.figures import iso
 from odocal_ros.outside.names import for_shell
-from odocal_ros.outside.yaml_text import parameters
+from odocal_ros.outside.yaml_files import parameters
 from odocal_ros.settings.config import Config, flat
 
 BATCH_NS = 800_000_000    # judgement: with the writing, a kill then costs about a second
@@ -123,8 +124,7 @@ class Journal:
         self._leg_id, self._ended, self._last_event = session.leg_id, False, ''
         self._writer.submit(self._writer.begin, Plan(
             session.leg_id, output_root(config, self._node) / 'journal',
-            f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
-            f'_leg_{session.leg_id}',
+            f'{iso(now_ns).replace(":", "-")}_leg_{session.leg_id}',
             journal_text(config, session.leg_id, session.start_ns, topics, self._node),
             config.journal.max_bytes))
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk, pack
-from odocal_ros.live.definitions import definition_of
 from odocal_ros.live.journal_leg import LegJournal, Plan
+from odocal_ros.live.messages import definition_of
 
 ALWAYS_NS = 1      # definition: stamp of messages that hold at all times
 PREROLL_BYTES = 256 * 2**20    # judgement: 1 kHz for 600 s are 55 MB

@@ -17,20 +17,18 @@ from odocal_ros.forecast.ability import Ability, ability
 from odocal_ros.forecast.leg_so_far import SILENT_TIME
 from odocal_ros.forecast.progress import clocks_differ
 from odocal_ros.forecast.quantities import words
-from odocal_ros.live import answers, jobs
-from odocal_ros.live.computing import Computing
+from odocal_ros.live import answers, worker
+from odocal_ros.live.answers import after_result, hint, quantities_ok
 from odocal_ros.live.console import Console
-from odocal_ros.live.filing import Filing, iso
-from odocal_ros.live.guidance import after_result, hint, quantities_ok
+from odocal_ros.live.filing import Filing
 from odocal_ros.live.journal import Journal, replay_command
 from odocal_ros.live.params import restored_from
 from odocal_ros.live.process import SettledNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.running_estimate import RunningEstimate
-from odocal_ros.live.session import Session, State
-from odocal_ros.live.session_view import SessionView
-from odocal_ros.live.worker import FILES_GRACE_S, JOB_GRACE_S, Worker
+from odocal_ros.live.session import Session, SessionView, State
+from odocal_ros.output.figures import iso
 from odocal_ros.outside.names import for_shell
 from odocal_ros.pipeline.floor_marks import with_marks
 from odocal_ros.settings.config import Config
@@ -52,10 +50,10 @@ class LegCompletion:
         self._recording, self._publishing, self._config = recording, publishing, config
         self._journal = journal
         self._log, self._clock = node.get_logger(), node.get_clock()
-        self._worker = Worker()
+        self._worker = worker.Worker()
         self._watch = RunningEstimate(self._worker, self._log)
         self._node_name = node.get_fully_qualified_name()
-        self._computing = Computing(self._worker, self._fail, self.show_status,
+        self._computing = worker.Computing(self._worker, self._fail, self.show_status,
                                     node.context.ok)
         self._ability: Ability | None = None  # of the leg last started
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
@@ -103,7 +101,8 @@ class LegCompletion:
     def close(self) -> bool:
         """Let the worker end; return True if it ended."""
         self._watch.end()
-        until = time.monotonic() + (FILES_GRACE_S if self._filing.busy else JOB_GRACE_S)
+        grace_s = worker.FILES_GRACE_S if self._filing.busy else worker.JOB_GRACE_S
+        until = time.monotonic() + grace_s
         done = self._worker.close(until - time.monotonic())
         return self._filing.close(max(0.0, until - time.monotonic())) and done
 
@@ -232,7 +231,7 @@ class LegCompletion:
         session = self.session
         kept = [leg.results for leg in session.legs]
         self._computing.submit(partial(
-            jobs.compute, samples, session.start_ns, session.stop_ns, kept, session.config,
+            worker.compute, samples, session.start_ns, session.stop_ns, kept, session.config,
             session.carried, session.by_itself, self._computing.report), self._take_leg)
 
     def _fail(self, trouble: str) -> None:
@@ -243,10 +242,10 @@ class LegCompletion:
                   'it') if self.session.open_leg else 'call ~/reset'
         self._computing.answer(False, f'failed: {trouble}; {remedy}')
 
-    def _take_leg(self, done: jobs.Computed | jobs.LeftOut) -> None:
+    def _take_leg(self, done: worker.Computed | worker.LeftOut) -> None:
         leg_id, self._snapshot, self._at_stop = self.session.leg_id, None, None
         self._distance_m = sum(one.distance for one in done.results)
-        if isinstance(done, jobs.LeftOut):
+        if isinstance(done, worker.LeftOut):
             self.session.leave_out(done.why)
             text = (f'leg {leg_id}, {self._distance_m:.0f} m, is not used: '
                     f'{done.why.code.name}: {done.why.text}')
@@ -259,7 +258,7 @@ class LegCompletion:
         if success and self._config().output.autosave:
             self._save(done.calibration)
 
-    def _take_result(self, calibration: Calibration, paths: jobs.Paths,
+    def _take_result(self, calibration: Calibration, paths: worker.Paths,
                      parts: Sequence[LegResult] = ()) -> tuple[bool, str]:
         """Publish a result and answer the waiting callers."""
         self._publishing.set_results(calibration)

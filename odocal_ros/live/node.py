@@ -35,8 +35,8 @@ usage: calibrator [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO
 Calibrates a vehicle's odometer against IMU and GNSS while it is driven (a ROS 2 node; the same
 over recorded bags is 'odocal replay').
 
-subscribes   imu/data, odometer, fix; fix_velocity and heading if published; if configured
-             odometer_right
+subscribes   imu/data, odometer, fix; if published fix_velocity, heading and pressure; if
+             configured odometer_right
              (another name: -r odometer:=/your/topic)
 services     ~/start_leg before a drive and ~/stop_leg after it, which answers with the result;
              ~/mark on each point of reference.points;

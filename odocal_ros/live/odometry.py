@@ -18,22 +18,22 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
+from odocal_ros.apply.errors import Pose
 from odocal_ros.apply.odometry import BEGINS_ANEW, Odometry
-from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.console import LossReport, SILENCE_FIRST_NS, SILENCE_SELDOM_NS
-from odocal_ros.live.definitions import message_class
 from odocal_ros.live.inputs import LOOK_AROUND_S
+from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
 from odocal_ros.messages.cdr import layout_of
 from odocal_ros.messages.sensor_types import types_of
 from odocal_ros.outside.names import said_by
-from odocal_ros.settings.apply_config import ApplyConfig, OdomFrames
+from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 
 # judgement, all in s: between looks at the odometer, which poses are late by; between turns of the
 # executor, which cost most; before a pose is due, when messages are looked at; between turns

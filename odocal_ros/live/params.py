@@ -87,11 +87,7 @@ def declare(node: Node, kind: type = Config) -> Any:
     """
     Declare every setting as a parameter and return the configuration they make, of a kind.
 
-    Raises
-    ------
-    BadConfig
-        An override has the wrong type or is out of range.
-
+    Raises BadConfig: an override has the wrong type or is out of range.
     """
     values, settings = {}, settings_of(kind)
     for name, setting in settings.items():
@@ -209,11 +205,7 @@ def restored_from(results: dict[str, Any],
     """
     Return the result that ``result.*`` hold, None where they hold none.
 
-    Raises
-    ------
-    BadConfig
-        No calibration gives such values: the checks are those of a calibration.json.
-
+    Raises BadConfig: no calibration gives such values: the checks are those of a calibration.json.
     """
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:

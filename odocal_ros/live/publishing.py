@@ -16,14 +16,15 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import Float64, String
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.live import jobs, params
-from odocal_ros.live.filing import iso
-from odocal_ros.live.guidance import action_first
+from odocal_ros.live import params
+from odocal_ros.live.answers import action_first
 from odocal_ros.live.recording import Recording
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import SessionView
 from odocal_ros.live.status import calibration_status, in_force, input_status
-from odocal_ros.live.status_listener import LATCHED
-from odocal_ros.outside.yaml_text import no_date
+from odocal_ros.live.watch import LATCHED
+from odocal_ros.live.worker import Paths
+from odocal_ros.output.figures import iso
+from odocal_ros.outside.yaml_files import no_date
 from odocal_ros.settings.config import Config
 
 PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle',
@@ -74,7 +75,7 @@ class Publishing:
         """Let go of a result that came with the start."""
         self._before = dict(params.RESULTS)
 
-    def show_paths(self, messages: jobs.Paths) -> None:
+    def show_paths(self, messages: Paths) -> None:
         """Publish dead reckoning and reference of a leg."""
         for publisher, message in zip(self._paths, messages, strict=True):
             publisher.publish(message)

@@ -12,9 +12,13 @@ from odocal_ros.data.leg import LegRecorder, SLOTS
 from odocal_ros.data.samples import join, OdometerForm, take
 from odocal_ros.forecast.forecast import Abandoned, better, Forecast
 from odocal_ros.forecast.foresight import forecast_of
-from odocal_ros.forecast.leg_so_far import faults_in_cells, ImuGaps, screened_in_cells
-from odocal_ros.forecast.planar_so_far import planar_forecast
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.forecast.leg_so_far import (
+    faults_in_cells,
+    ImuGaps,
+    screened_in_cells,
+    SmootherSoFar,
+)
+from odocal_ros.forecast.smoother_forecast import planar_forecast
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.live.answers import one_line
 from odocal_ros.live.console import PlainLog

@@ -1,11 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The commands calibrator, odometry, drive_pattern: start a node, or print what is missing."""
+"""Commands that start or watch a node; without ROS 2 they print what is missing."""
 
+from argparse import ArgumentParser, Namespace
 from functools import partial
 from importlib import import_module
 import sys
+
+from odocal_ros.errors import BadUsage
+
+NEEDS = {'rich': 'pip install rich (or apt install python3-rich)',
+         'rclpy': "source ROS 2 Jazzy, or install odocal_ros with the extra 'ros'"}
 
 
 def _run(command: str, module: str) -> int:
@@ -26,3 +32,31 @@ def _run(command: str, module: str) -> int:
 calibrator = partial(_run, 'calibrator', 'odocal_ros.live.node')
 odometry = partial(_run, 'odometry', 'odocal_ros.live.odometry')
 drive_pattern = partial(_run, 'drive_pattern', 'odocal_ros.live.drive_pattern')
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare what the command takes."""
+    parser.add_argument('node', nargs='?', default='/calibrator',
+                        help='full name of the node (default: /calibrator)')
+    parser.add_argument('--once', action='store_true',
+                        help='print the first status and exit')
+
+
+def run(args: Namespace) -> int:
+    """Show the panel until Ctrl-C."""
+    try:
+        from rich.live import Live
+
+        from odocal_ros.live.watch import panel, StatusListener
+    except ModuleNotFoundError as error:
+        name = (error.name or '').partition('.')[0]
+        raise BadUsage(f'odocal watch needs the package {name}: '
+                       f'{NEEDS.get(name, NEEDS["rclpy"])}') from None
+    waiting = panel(b'\x03', args.node, {'state': f'no status on {args.node}/status yet'},
+                    'start the node, or check its name (ros2 node list) and ROS_DOMAIN_ID')
+    with StatusListener(args.node) as listener, Live(waiting, auto_refresh=False) as shown:
+        for level, status, hint in listener:
+            shown.update(panel(level, args.node, status, hint), refresh=True)
+            if args.once:
+                break
+    return 0

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What ``~/status`` and ``/diagnostics`` say: keys for machines, a sentence for people."""
+"""Content of ``~/status`` and ``/diagnostics``: keys for machines, a sentence for people."""
 
 import math
 from typing import Any
@@ -11,17 +11,16 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from odocal_ros.calib.result import wheel_factors
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import as_keys
-from odocal_ros.live.console import losses_in_words
-from odocal_ros.live.guidance import (
+from odocal_ros.live.answers import (
     hint,
     manoeuvres,
     metres_to_go,
     quantities_ok,
     seconds_to_stand,
 )
+from odocal_ros.live.console import losses_in_words
 from odocal_ros.live.health import Health
-from odocal_ros.live.session import Session, State
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Verdict
 
@@ -118,7 +117,7 @@ def level(now: SessionView) -> Any:
 
 
 def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
-    """Return one sentence: what is, how good it is, and what to do next."""
+    """Return one sentence: the state, the accuracy, and the next action."""
     session = now.session
     legs = f'{len(session.legs)} leg{"s" * (len(session.legs) != 1)}'
     if session.carried:
@@ -145,7 +144,7 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
 
 
 def _computing(now: SessionView) -> dict[str, object]:
-    """Return the keys of how far the result of a leg is."""
+    """Return the keys of the progress of the computation of a leg."""
     stage = now.computed if now.session.state is State.COMPUTING else Stage()
     return {'computing_stage': stage.name, 'computing_passes': stage.passes,
             'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done}

@@ -17,12 +17,11 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from odocal_ros.data.inputs import INPUTS
+from odocal_ros.data.inputs import INPUTS, OUTSIDE
 from odocal_ros.errors import BadData, OdocalError
-from odocal_ros.live.definitions import message_class
 from odocal_ros.live.health import Health
 from odocal_ros.live.journal_writer import ALWAYS_NS
-from odocal_ros.live.waiting_messages import WaitingMessages
+from odocal_ros.live.messages import message_class, WaitingMessages
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES
 from odocal_ros.messages.sensor_types import Pairs, TRANSFORMS
@@ -151,8 +150,8 @@ class Input:
         kind = message_class(msgtype)
         reader = make_reader(self.slot, msgtype, config)
         self._frame_id = config.imu.frame_id
-        # increments want the QoS on offer; a heading is optional, an idle subscription is not free
-        if not self.publishers and (self.slot == 'heading' or self._counts_increments(reader)):
+        # increments want the QoS on offer; others are optional, an idle subscription is not free
+        if not self.publishers and (self.slot in OUTSIDE or self._counts_increments(reader)):
             return
         offered = {p.qos_profile.reliability for p in self.publishers}
         reliable = self._counts_increments(reader) and offered == {ReliabilityPolicy.RELIABLE}

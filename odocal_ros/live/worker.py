@@ -1,14 +1,38 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One thread for the heavy work, so that callbacks stay short; memory that it frees goes back."""
+"""The computations, the thread that runs one at a time, and callers that wait for its result."""
 
 from collections.abc import Callable
 import ctypes
+from dataclasses import dataclass
+import math
 import queue
 import threading
+import time
 from typing import Any, TypeAlias
 
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from nav_msgs.msg import Path as PathMessage
+import numpy as np
+from rclpy.task import Future
+from std_msgs.msg import Header
+
+from odocal_ros.calib.carried import Carried
+from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.live import answers
+from odocal_ros.live.session import LEGS_HELD
+from odocal_ros.output.stored import known_imu
+from odocal_ros.pipeline.automatic import fold, refusal
+from odocal_ros.pipeline.calibrate import calibrate_parts, combine
+from odocal_ros.pipeline.prepared import Stage
+from odocal_ros.reasons import Reason
+from odocal_ros.settings.config import Config
+
+MOST_POSES = 2000    # judgement: of a path shown
+Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, reference
 # judgement: s that a stopping node waits, for a computation and for files: launch asks again,
 # and harder, after 5 s
 JOB_GRACE_S, FILES_GRACE_S = 1.0, 4.0
@@ -20,6 +44,78 @@ Outcome: TypeAlias = tuple[Then, Any, Exception | None]
 # mallopt(3): arenas for all threads together, bytes from which a block is mapped separately
 OPTIONS = {-8: 2, -3: 2**22}
 _libc = ctypes.CDLL(None)
+# judgement: s that ~/stop_leg waits for the result. It answers within 5 s, of which one is for a
+# busy machine; the last samples take up to 1 s, the fit of a leg of ten minutes 1 to 2 s
+PATIENCE_S = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Computed:
+    """
+    Result of a leg.
+
+    results : one, or one of each part where the IMU had a gap.
+    carried, folded : information of earlier legs, and how many kept legs are in it.
+    """
+
+    results: tuple[LegResult, ...]
+    paths: Paths
+    calibration: Calibration
+    carried: Carried | None
+    folded: int
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Result of an unused automatic leg, and the cause."""
+
+    results: tuple[LegResult, ...]
+    why: Reason
+
+
+def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
+            kept: list[tuple[LegResult, ...]], config: Config, carried: Carried | None = None,
+            by_itself: bool = False, progress: Callable[[Stage], None] | None = None,
+            ) -> Computed | LeftOut:
+    """Return a leg's result, its combination with the legs kept, and the paths to show."""
+    leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
+    results = tuple(calibrate_parts(leg, config, progress=progress))
+    if by_itself and (why := refusal(results[0])):
+        return LeftOut(results, why)
+    paths = leg_paths(max(results, key=lambda one: one.distance), config)
+    folded = max(0, len(kept) + 1 - LEGS_HELD) if by_itself else 0
+    carried = fold([one for leg in kept[:folded] for one in leg], config, carried)
+    left = [one for leg in kept[folded:] for one in leg]
+    calibration = combine([*left, *results], config, carried, known_imu(config))
+    return Computed(results, paths, calibration, carried, folded)
+
+
+def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,
+              ) -> tuple[Calibration, Paths]:
+    """Return the combination of the legs left, and the paths of the last."""
+    return combine(kept, config, carried, known_imu(config)), leg_paths(kept[-1], config)
+
+
+def leg_paths(result: LegResult | None, config: Config) -> Paths:
+    """Return the two paths of a leg, empty ones without a leg."""
+    header = Header(frame_id=config.frames.local)
+    if result is None:
+        return PathMessage(header=header), PathMessage(header=header)
+    header.stamp.sec, header.stamp.nanosec = divmod(result.stop_ns, 10**9)
+    return _path(result.track_n, header), _path(result.reference_n, header)
+
+
+def _path(track_n: Floats | None, header: Header) -> PathMessage:
+    """Return a track, (m, 3) in n, as a Path of at most MOST_POSES, the last row included."""
+    if track_n is None or not len(track_n):
+        return PathMessage(header=header)
+    few = min(len(track_n), MOST_POSES)
+    rows = np.linspace(0, len(track_n) - 1, few).round().astype(int)
+    upright = Quaternion(w=1.0)
+    return PathMessage(header=header, poses=[
+        PoseStamped(header=header, pose=Pose(
+            position=Point(x=float(x), y=float(y), z=float(z)), orientation=upright))
+        for x, y, z in track_n[rows]])
 
 
 class Worker:
@@ -85,3 +181,71 @@ def give_back() -> None:
     """Give whole free pages back; nothing where the C library cannot."""
     if hasattr(_libc, 'malloc_trim'):
         _libc.malloc_trim(0)
+
+
+class Computing:
+    """
+    At most one active job; the result of a dropped one is ignored.
+
+    ``failed(trouble)`` is called for a job that raised, or whose result could not be taken;
+    ``done()`` is called after each that counted. ``alive()`` is false while the node is shut
+    down: what breaks then is no failure.
+    """
+
+    def __init__(self, worker: Worker, failed: Callable[[str], None],
+                 done: Callable[[], None], alive: Callable[[], bool]) -> None:
+        self._worker, self._failed, self._done, self._alive = worker, failed, done, alive
+        self._job: object | None = None
+        self._waiting: list[tuple[Future, float]] = []     # until when, s of the monotonic clock
+        self.at = Stage()
+
+    def report(self, stage: Stage) -> None:
+        """Store the progress of the job; called by the worker's thread."""
+        self.at = stage
+        give_back()      # what the pass before needed
+
+    def submit(self, job: Job, take: Callable[[Any], object]) -> None:
+        """Run a job in the worker and hand its result to ``take``."""
+        self._job = token = object()
+        self.at = Stage()
+
+        def then(result: Any, error: Exception | None) -> None:
+            if token is not self._job:
+                return
+            self._job = None
+            try:
+                if error is None:
+                    take(result)
+            except Exception as wrong:      # else nobody who waits would ever be answered
+                if not self._alive():
+                    raise
+                error = wrong
+            if error is not None:
+                self._failed(answers.one_line(error))
+            self._done()
+
+        self._worker.submit(job, then)
+
+    def drop(self) -> None:
+        """Drop the job: its result will be ignored."""
+        self._job = None
+
+    def promise(self, patience_s: float = math.inf) -> Future:
+        """Return a future that the next answer, or that of ``answer_late``, will be set on."""
+        future = Future()
+        self._waiting.append((future, time.monotonic() + patience_s))
+        return future
+
+    def answer(self, success: bool, text: str) -> None:
+        """Answer all waiting callers."""
+        waiting, self._waiting = self._waiting, []
+        for future, _ in waiting:
+            future.set_result((success, text))
+
+    def answer_late(self, text: Callable[[], str]) -> None:
+        """Answer callers whose waiting time is over; the job continues."""
+        now = time.monotonic()
+        late = [future for future, until in self._waiting if until <= now]
+        self._waiting = [one for one in self._waiting if one[1] > now]
+        for future in late:
+            future.set_result((True, text()))

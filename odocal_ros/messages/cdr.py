@@ -131,10 +131,8 @@ class Layout:
         """
         Return the values at some paths of messages of this layout, (n, size) bytes.
 
-        Returns
-        -------
-        (n, len(paths)) array of the first path's dtype; None where a path is not in the layout.
-
+        Returns (n, len(paths)) array of the first path's dtype; None where a path is not in the
+        layout.
         """
         runs = self._places(tuple(paths))
         if runs is None:

@@ -20,9 +20,8 @@ from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
 from odocal_ros.messages.fields import MessageView, View
-from odocal_ros.messages.frames import FrameFilter
 from odocal_ros.messages.odometer_types import OdometerPlan
-from odocal_ros.messages.raws import FEW_ROWS, Raws, Table, tables
+from odocal_ros.messages.raws import FEW_ROWS, FrameFilter, Raws, Table, tables
 from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan, TRANSFORMS
 from odocal_ros.settings.config import Config
 
@@ -84,15 +83,9 @@ class Reader:
         the stamp of messages that have none.   deserialize : turns one of them into an object with
         its fields; asked only where needed.
 
-        Returns
-        -------
-        (slot, block) pairs, one for each wheel of a message, none without a row.
+        Returns (slot, block) pairs, one for each wheel of a message, none without a row.
 
-        Raises
-        ------
-        BadData
-            The messages can never give what was asked: no such field, not a number.
-
+        Raises BadData: the messages can never give what was asked: no such field, not a number.
         """
         other, raws = None, raws if len(raws) <= FEW_ROWS else Raws.of(raws)
         if self.frames is not None and len(raws):
@@ -215,11 +208,8 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
     """
     Return the reader of a slot for messages of a type.
 
-    Raises
-    ------
-    BadData, BadConfig
-        The type cannot serve this slot, or not with these settings; the text says what would.
-
+    Raises BadData, BadConfig: the type cannot serve this slot, or not with these settings; the
+    text says what would.
     """
     msgtype = full_type(msgtype)
     if slot in WHEELS:

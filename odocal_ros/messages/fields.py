@@ -52,11 +52,7 @@ class MessageView:
         """
         Return the value at a dotted path, with [i] in a list or [name] by the list ``name``.
 
-        Raises
-        ------
-        AttributeError, LookupError
-            Not there.
-
+        Raises AttributeError, LookupError: not there.
         """
         here: Any = self.message
         owner = here

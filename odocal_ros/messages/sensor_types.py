@@ -19,6 +19,7 @@ from odocal_ros.data.samples import (
     OdometerForm,
     of_columns,
     Samples,
+    ScalarSamples,
     VelocitySamples,
 )
 from odocal_ros.errors import BadData
@@ -105,6 +106,10 @@ def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
     return VelocitySamples(stamps, received, velocity_n, np.where(known, variance, 0.0))
 
 
+def _scalar(stamps: Ints, received: Ints, sent: Floats) -> ScalarSamples:
+    return ScalarSamples(stamps, received, sent[:, 0], sent[:, 1])
+
+
 # format: of sensor_msgs/Imu, whose covariances are 3 x 3, row by row
 _ORIENTATION = (xyz('orientation', 'xyzw'), array('orientation_covariance', 0),
                 array('orientation_covariance', 8))
@@ -119,6 +124,8 @@ SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
     ('fix_velocity', 'geometry_msgs/msg/TwistStamped'): ((xyz('twist.linear'),), _velocity),
     ('fix_velocity', 'geometry_msgs/msg/TwistWithCovarianceStamped'): (
         (xyz('twist.twist.linear'), array('twist.covariance', 0, 7, 14)), _velocity),
+    ('pressure', 'sensor_msgs/msg/FluidPressure'): (
+        (fixed(np.float64, 'fluid_pressure', 'variance'),), _scalar),
 }
 
 

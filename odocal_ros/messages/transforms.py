@@ -25,11 +25,7 @@ def transforms_of(raw: bytes, deserialize: Callable[[bytes], Any]) -> list[Trans
     """
     Return the transforms of a TFMessage: x y z, m, and quaternion x y z w of child in parent.
 
-    Raises
-    ------
-    Exception
-        The message is damaged.
-
+    Raises an exception if the message is damaged.
     """
     if raw[:2] != b'\0\1':      # XCDR1, little endian
         return [(_name(one.child_frame_id), _name(one.header.frame_id),

@@ -13,6 +13,7 @@ from typing import NoReturn
 
 from odocal_ros import __version__
 from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.offline import cli
 from odocal_ros.offline.say import warn
 
 # name: (its module, or the package that has it as an entry point; what it does)
@@ -24,13 +25,31 @@ COMMANDS = {
                 'for a calibration'),
     'simulate': ('odocal_ros.offline.simulate', 'write a bag with known truth'),
     'plan': ('odocal_ros.offline.plan', 'predict the uncertainties of a planned drive'),
-    'watch': ('odocal_ros.live.watch_command', 'show the progress of a running node'),
+    'watch': ('odocal_ros.live.start', 'show the progress of a running node'),
     'doctor': ('odocal_ros.offline.doctor', 'show the installation, for bug reports'),
     'compare': ('odocal_ros.offline.compare', 'compare calibrations: changes in sigmas'),
     'paper': ('odocal_reproductions', 'reproduce tables 1-4 of the two-point paper'),
     'patent': ('odocal_reproductions', 'compute the embodiment of CN104359492A'),
 }
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130    # definition: exit codes
+
+
+class OdocalCommand:
+    """Calibrate a vehicle's odometer against IMU and GNSS, from recorded bags."""
+
+    NAME = 'odocal'
+    EXTENSION_POINT_VERSION = '0.1'
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Declare that all arguments after the command belong to odocal."""
+        parser.add_argument('argv', nargs=argparse.REMAINDER, metavar='COMMAND ...',
+                            help=f'a command of odocal and its options; {cli_name} COMMAND --help')
+        parser.epilog = 'commands:\n' + '\n'.join(
+            f'  {name:<10}{about}' for name, (_, about) in cli.COMMANDS.items())
+
+    def main(self, *, parser: argparse.ArgumentParser, args: argparse.Namespace) -> int:
+        """Run the command; return its exit code."""
+        return cli.main(args.argv)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -4,15 +4,12 @@
 """odocal compare: changes of the vehicle since earlier calibrations."""
 
 import argparse
-import json
-import sys
 from typing import TYPE_CHECKING
 
-from odocal_ros.offline.say import say
+from odocal_ros.offline.say import say, say_json
 
 if TYPE_CHECKING:
-    from odocal_ros.library.changes import Change, Difference
-    from odocal_ros.library.compare import Comparison
+    from odocal_ros.library.compare import Change, Comparison, Difference
     from odocal_ros.output.stored import Stored
 
 
@@ -34,8 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.offline.cli import OK, REJECTED
     found = compare(*args.files)
     if args.json:
-        json.dump(found.to_dict(), sys.stdout, indent=2, allow_nan=False)
-        say('')
+        say_json(found.to_dict())
     else:
         say('\n'.join(_screen(found)))
     return OK if found.changed is False else REJECTED
@@ -44,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 def _screen(found: 'Comparison') -> list[str]:
     from odocal_ros.library.compare import hints, label
     from odocal_ros.output.figures import columns, counted
-    from odocal_ros.output.worse import said as value_text
+    from odocal_ros.output.stored import said as value_text
     stored = found.stored
     width = max(len(s.name) for s in stored)
     lines = [f'{i:>3}  {s.name:<{width}}  {s.created}  {s.verdict.value}, '

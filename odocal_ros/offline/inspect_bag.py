@@ -7,20 +7,18 @@ import argparse
 from pathlib import Path
 
 from odocal_ros.offline.replay import add_input_arguments, asked_settings, asked_topics
-from odocal_ros.offline.say import say
+from odocal_ros.offline.say import say, say_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument('bag', metavar='BAG', help='bag folder or file')
     parser.add_argument('--json', action='store_true', help='print everything as JSON')
-    add_input_arguments(parser)
+    add_input_arguments(parser, 'the most likely one')
 
 
 def run(args: argparse.Namespace) -> int:
     """Inspect a bag and print what was found."""
-    import json
-
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.offline.inspection import inspect
     from odocal_ros.offline.inspection_text import text
@@ -28,5 +26,8 @@ def run(args: argparse.Namespace) -> int:
     config = with_settings(Config(), asked_settings(args))
     with open_bag(Path(args.bag)) as bag:
         found = inspect(bag, args.bag, config, asked_topics(args))
-    say(json.dumps(found, indent=2, allow_nan=False) if args.json else text(found))
+    if args.json:
+        say_json(found)
+    else:
+        say(text(found))
     return 0

@@ -5,7 +5,6 @@
 
 from collections.abc import Sequence
 from datetime import datetime, UTC
-import math
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.messages.transforms import with_static
 from odocal_ros.offline import survey
-from odocal_ros.offline.fix_path import fix_path, FixPath, Match
 from odocal_ros.offline.inspection_drive import lacking, look
 from odocal_ros.offline.odometer_search import (
     best_topic,
@@ -35,6 +33,7 @@ from odocal_ros.offline.odometer_search import (
     still,
 )
 from odocal_ros.offline.suggest import command, left_open, likely_mapping
+from odocal_ros.offline.survey import fix_path, FixPath, Match
 from odocal_ros.offline.wheel_survey import (
     alone,
     FIELDS as LISTS,
@@ -42,6 +41,7 @@ from odocal_ros.offline.wheel_survey import (
     suggested,
     Values,
 )
+from odocal_ros.output.files import plain
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond
 from odocal_ros.screening.leg_kind import settings_by_frame
@@ -131,17 +131,8 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         for reason in dict.fromkeys(findings)]
     found['open'] = left_open(bag.topics, own, overrides)
     found['command'] = command(path, bag.topics, own, overrides, mapping, extra)
-    plain: dict[str, Any] = _plain(found)
-    return plain
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON has it: what is no finite number is null."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    content: dict[str, Any] = plain(found)
+    return content
 
 
 def _taps(bag: Bag, config: Config,

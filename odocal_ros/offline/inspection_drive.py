@@ -21,7 +21,7 @@ from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.asked import EACH_STOP, LegSpan
 from odocal_ros.library.legs import find_legs, marked_legs, stops_of
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.offline.stretches import (
+from odocal_ros.offline.survey import (
     Drive,
     straight_stretches,
     survey_drive,

@@ -117,7 +117,7 @@ def _of_odometer(topic: dict[str, Any]) -> Iterator[str]:
     odometer = topic.get('odometer')
     if not odometer:
         return
-    what = {'cumulative': 'counts on', 'increment': 'counts since the previous message',
+    what = {'cumulative': 'running count', 'increment': 'counts since the previous message',
             'rate': 'speed'}[odometer['quantity']]
     unit = {'m/pulse': 'pulses', 'm/rad': 'rad', '1': 'm'}[odometer['scale_unit']]
     unit += '/s' * (odometer['quantity'] == 'rate')
@@ -126,7 +126,8 @@ def _of_odometer(topic: dict[str, Any]) -> Iterator[str]:
         return
     if odometer['quantity'] == 'rate' and odometer.get('still'):
         what = 'one component of a velocity, not the speed along the path of the fixes'
-    yield f'{what}: {odometer["least"]:.6g} to {odometer["most"]:.6g} {unit}'
+    form = '.5g' if odometer['quantity'] == 'rate' else '.12g'
+    yield f'{what}: {odometer["least"]:{form}} to {odometer["most"]:{form}} {unit}'
     if odometer['not_finite']:
         yield f'warning: {odometer["not_finite"]} messages hold NaN or Inf'
 
@@ -224,15 +225,22 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
         text = ('the IMU orientation cannot be estimated from gravity and driving; set '
                 'imu.mounting_rpy manually')
         return wrapped(f'axes: {text}')
-    rpy = ', '.join(f'{math.degrees(x):.0f}' for x in mounting['rpy'])
+    rpy = ', '.join(f'{x:.10g}' for x in mounting['rpy'])
+    degrees = ', '.join(f'{math.degrees(x):.0f}' for x in mounting['rpy'])
     if mounting['assumed_forward']:
         how = 'level from gravity; the drive does not determine forward, x is assumed'
     else:
-        sure = math.degrees(mounting['forward_sigma'])
-        how = (f'forward direction from accelerations and turns, uncertainty {sure:.0f} deg (1 '
+        sure = whole_degrees(mounting['forward_sigma'])
+        how = (f'forward direction from accelerations and turns, uncertainty {sure} deg (1 '
                f'sigma); remaining misalignment {math.degrees(mounting["off"]):.1f} deg')
     text = 'set imu.mounting_rpy to' if mounting['needed'] else 'imu.mounting_rpy is correct:'
-    return wrapped(f'axes: {text} [{rpy}] deg ({how})')
+    return wrapped(f'axes: {text} [{rpy}] rad (roll, pitch, yaw {degrees} deg; {how})')
+
+
+def whole_degrees(angle: float) -> str:
+    """Return an uncertainty, rad, in whole degrees, below half of one with one digit."""
+    degrees = math.degrees(angle)
+    return f'{degrees:.0f}' if degrees >= 0.5 else f'{degrees:.1g}'
 
 
 def _findings(found: dict[str, Any]) -> list[str]:
@@ -253,5 +261,5 @@ def _length_text(found: dict[str, Any]) -> list[str]:
     if found['open']:
         lines += wrapped(f'replay needs options: {found["open"]}', '')
     if found['command']:
-        lines += ['try', f'  {found["command"]}']
+        lines += ['suggested command', f'  {found["command"]}']
     return lines

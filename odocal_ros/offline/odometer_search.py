@@ -3,24 +3,196 @@
 
 """Search for the odometer of a bag: topics of unknown types, and topics that do not move."""
 
-from collections.abc import Collection, Mapping, Sequence
+from array import array
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import islice
+from numbers import Integral
 import re
 from typing import Any
 
+import numpy as np
+
 from odocal_ros.bagio.read import TopicInfo
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
+from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.library.topics import COMMANDS, FUSED, GNSS, NEVER
+from odocal_ros.messages.decode import Deserialize
+from odocal_ros.messages.fields import MessageView
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
-from odocal_ros.messages.sensor_types import IMU
+from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.nav.odometer import travel
-from odocal_ros.offline.field_survey import Fields, rank
-from odocal_ros.offline.fix_path import FixPath, Match
+from odocal_ros.offline.survey import FixPath, Match
+from odocal_ros.offline.wheel_survey import sides, suggested
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.config_file import parse_set
 
+# judgement: limits of the search in one topic; 0.4 million values take 1 s and 4 MB
+MOST_MESSAGES, MOST_FIELDS, MOST_VALUES = 10_000, 128, 400_000
+MOST_ELEMENTS = 16       # judgement: of an array
+MOST_BYTES = 2**14       # judgement: of a message; images and point clouds are longer
+# stamps, and positions: one axis of a straight drive grows with distance
+NO_TRAVEL = ('header', 'stamp', 'seq', 'pose', 'latitude', 'longitude', 'altitude')
+INCREMENTS = ('delta', 'diff', 'increment', 'since')
+# format: of counters of 8, 16 and 32 bits
+ROLLOVERS = (2**8, 2**16, 2**32)
 MOST_TOPICS = 20       # judgement: topics of unknown types that are searched
 RECEIVER = (*GNSS, 'navsat', 'nmea', 'ubx')
 STANDARD = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msgs', 'diagnostic_msgs')
+
+
+class Fields:
+    """Collects the numbers of messages of one topic, evenly taken from all of them."""
+
+    unreadable = 0       # as a reader of a bag: a topic that cannot be read is no error
+
+    def __init__(self, count: int) -> None:
+        self.count, self.trouble = count, ''
+        self.paths: list[str] = []
+        self.whole: list[bool] = []
+        self._every, self._seen, self._times, self._values = 1, 0, array('q'), array('d')
+        self._t_ns, self._travel = np.empty(0, np.int64), dict[str, Floats]()
+
+    def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
+             deserialize: Deserialize) -> Pairs:
+        """Take every n-th message."""
+        first, self._seen = -self._seen % self._every, self._seen + len(raws)
+        k = first
+        while k < len(raws) and not self.trouble:
+            self._take(raws[k], int(received_ns[k]), deserialize)
+            k += self._every
+        return []
+
+    def _take(self, raw: bytes, time_ns: int, deserialize: Deserialize) -> None:
+        try:
+            view = MessageView(deserialize(raw) if len(raw) <= MOST_BYTES else None)
+            if not self.paths:
+                self._learn(view.message)
+            values = [float(view.value(path)) for path in self.paths]
+        except OdocalError as error:
+            self.trouble = str(error)
+        except MemoryError:
+            raise
+        except Exception:    # a damaged message, or one with a shorter list
+            return
+        else:
+            self._times.append(time_ns)
+            self._values.extend(values)
+
+    def _learn(self, message: object) -> None:
+        """Find the numeric fields of the first message; raise BadData if there are none."""
+        found = list(islice(_numbers(message, ''), MOST_FIELDS))
+        if not found:
+            raise BadData('no numeric field')
+        self.paths = [path for path, _ in found]
+        self.whole = [isinstance(value, Integral) for _, value in found]
+        most = min(MOST_MESSAGES, MOST_VALUES // len(found))
+        self._every = max(1, -(-self.count // most))
+
+    def facts(self, path: FixPath) -> dict[str, Any]:
+        """Return the number of fields and those that follow the path of the fixes."""
+        t_ns = np.array(self._times, np.int64)
+        values = np.array(self._values).reshape(len(t_ns), len(self.paths))
+        keep = np.append(True, np.diff(t_ns) > 0)[:len(t_ns)] & np.isfinite(values).all(axis=1)
+        self._t_ns = t_ns[keep]
+        tried = [_best(name, whole, self._t_ns, value, path, self._every) for name, whole, value
+                 in zip(self.paths, self.whole, values[keep].T, strict=True)]
+        self._travel = {one[0].path: one[1] for one in tried if one}
+        found = sorted((asdict(one[0]) for one in tried if one), key=rank)
+        return {'tried': len(self.paths), 'found': [field | {
+            'settings': _settings(field, f'odometer.field={field["path"]}')} for field in found]}
+
+    def settings(self, found: Sequence[dict[str, Any]],
+                 turned: tuple[Ints, Floats] | None) -> list[str]:
+        """
+        Return the settings for left and right wheels, or for the best field.
+
+        found : fields of ``facts``.   turned : arrival times and turn rate to the left, rad/s;
+        None without an IMU.
+        """
+        best, t_ns = found[0], self._t_ns
+        alike = 0.3      # judgement: scales of the wheels of a vehicle differ less, relative
+        wheels = [field for field in found if all(
+            field[key] == best[key] for key in ('quantity', 'wrap', 'whole'))
+            and abs(field['scale'] / best['scale'] - 1) < alike]
+        if turned is not None and 1 < len(wheels) <= len(WHEELS):
+            s = np.stack([self._travel[field['path']] for field in wheels], -1)
+            named = sides((t_ns - t_ns[0]) * 1e-9, s, np.ones(len(wheels), bool),
+                          ((turned[0] - t_ns[0]) * 1e-9, turned[1]))
+            if options := suggested([{'key': field['path'], 'side': side}
+                                     for field, side in zip(wheels, named, strict=True)]):
+                return _settings(best, *options)
+        return list(best['settings'])
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field that follows the path of the fixes; scale in m per unit, or m/s for a rate."""
+
+    path: str
+    whole: bool
+    quantity: str
+    wrap: int
+    scale: float
+    explained: float
+
+
+def _settings(field: dict[str, Any], *names: str) -> list[str]:
+    """Return the settings that select a field, after those that name it."""
+    usual = 'cumulative' if field['whole'] else 'rate'
+    return [*names, *[f'odometer.quantity={field["quantity"]}'] * (field['quantity'] != usual),
+            *[f'odometer.wrap={field["wrap"]}'] * (field['wrap'] > 0),
+            *['odometer.reversed=true'] * (field['scale'] < 0)]
+
+
+def rank(field: dict[str, Any]) -> tuple[bool, float]:
+    """Return a sort key: counters before speeds, then the share of the variance explained."""
+    return field['quantity'] != 'cumulative', -round(field['explained'], 3)
+
+
+def _numbers(message: object, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Yield path and value of each number of a message."""
+    for name in getattr(type(message), '__dataclass_fields__', ()):
+        if not name.startswith('__') and name not in NO_TRAVEL:
+            yield from _numbers_of(getattr(message, name), prefix + name)
+
+
+def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, (bool, str, bytes)):
+        return
+    if isinstance(value, (int, float, np.number)):
+        yield path, value
+    elif isinstance(value, (list, np.ndarray)):
+        for k, one in enumerate(value[:MOST_ELEMENTS]):
+            yield from _numbers_of(one, f'{path}[{k}]')
+    else:
+        yield from _numbers(value, f'{path}.')
+
+
+def _best(path: str, whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
+          every: int) -> tuple[Field, Floats] | None:
+    """Return the meaning of a field that follows the path best, and its travel; None if none."""
+    per_message = any(word in path.lower() for word in INCREMENTS)
+    found = []
+    seconds: Floats = np.multiply(t_ns - t_ns[:1], 1e-9)
+    for quantity in ('cumulative', 'increment' if per_message else 'rate'):
+        counts = whole and quantity == 'cumulative'
+        wrap = _rollover(value) if counts else 0
+        s = travel(seconds, value.astype(np.int64) if counts else value,
+                   OdometerForm(quantity, wrap, ''))[0].s
+        s = s * every if per_message and quantity != 'cumulative' else s
+        match = fixes.match(t_ns, s)
+        if match.follows:
+            found.append((Field(path, whole, quantity, wrap, match.scale, match.explained), s))
+    return max(found, key=lambda one: one[0].explained, default=None)
+
+
+def _rollover(value: Floats) -> int:
+    """Return the modulus of a counter that rolls over, 0 if it does not."""
+    return next((modulus for modulus in ROLLOVERS if len(value) > 1 and np.ptp(value) < modulus
+                 and (np.abs(np.diff(value)) > modulus / 2).any()), 0)
 
 
 def searched(topics: Mapping[str, TopicInfo], known: Collection[str],

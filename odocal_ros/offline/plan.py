@@ -4,15 +4,13 @@
 """odocal plan: how good a calibration will be, before it is driven, and what would help."""
 
 import argparse
-import json
 import math
-from pathlib import Path
-import sys
 from typing import Any
 
 from odocal_ros.data.inputs import INPUTS, topic_option
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.say import say
+from odocal_ros.offline.replay import asked_settings
+from odocal_ros.offline.say import say, say_json
 
 SLOTS = ('imu', 'odometer', 'fix', 'heading')
 NOISE = {'white': 0.0, 'correlated': 60.0}
@@ -79,8 +77,7 @@ def run(args: argparse.Namespace) -> int:
     topics = {slot: topic for slot in SLOTS if (topic := getattr(args, f'{slot}_topic'))}
     planned = plan(**drive, topics=topics, config=_config(args), **_figures(args))
     if args.json:
-        json.dump(planned.to_dict(), sys.stdout, indent=2, allow_nan=False)
-        say('')
+        say_json(planned.to_dict())
     else:
         say(screen(planned))
     return 0
@@ -96,8 +93,7 @@ def _indoor(args: argparse.Namespace) -> int:
     runs = plan_indoor(args.indoor, imu=not args.no_imu, config=_config(args), **{
         name: value for name, value in asked.items() if value is not None})
     if args.json:
-        json.dump([one.to_dict() for one in runs], sys.stdout, indent=2, allow_nan=False)
-        say('')
+        say_json([one.to_dict() for one in runs])
     else:
         say(indoor_screen(runs))
     return 0
@@ -105,9 +101,7 @@ def _indoor(args: argparse.Namespace) -> int:
 
 def _config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings asked for: --config < --set < the options named for a plan."""
-    from odocal_ros.settings.config_file import parse_set, read_config_file
-    from_file = read_config_file(Path(args.config)) if args.config else {}
-    asked = dict(parse_set(text) for text in args.settings)
+    asked = asked_settings(args)
     if args.imu_grade:
         asked['imu.grade'] = args.imu_grade
     if args.heading_sigma_deg is not None:
@@ -120,12 +114,12 @@ def _config(args: argparse.Namespace) -> dict[str, Any]:
         asked['alignment.heading_source'] = args.heading_source
     if args.fix_noise:
         asked['gnss.correlation_time'] = NOISE[args.fix_noise]
-    return from_file | asked
+    return asked
 
 
 def _figures(args: argparse.Namespace) -> dict[str, Any]:
     """Return the requested error parameters."""
-    from odocal_ros.library.what_helps import RTK
+    from odocal_ros.library.plan import RTK
     if args.rtk and args.fix_sigma is not None:
         raise BadUsage('--rtk and --fix-sigma exclude each other')
     asked = {'fix': RTK if args.rtk else args.fix_sigma, 'fix_rate': args.fix_rate,

@@ -9,11 +9,10 @@ import textwrap
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE
 from odocal_ros.forecast.predict import Sigmas
-from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
+from odocal_ros.library.plan import Change, PARAMETERS, PITCH, Planned, ranked, SCALE, YAW
 from odocal_ros.library.plan_indoor import PlannedRun, SHOWN
-from odocal_ros.library.what_helps import Change, ranked, SCALE, YAW
-from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, share, table_row, time_span, wrapped
+from odocal_ros.output.tables import budget_lines
 
 WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 
@@ -63,15 +62,16 @@ def _head(before: Plan, sigmas: Sigmas) -> list[str]:
     tau = sigmas.correlation_time
     noise = f'correlation time {tau:g} s' if tau else 'white'
     lines = [f'{length(two_point.distance)} in {time_span(two_point.duration)}, {stands[0]} at '
-             f'the start mark, {stands[1]} at the end mark, {length(two_point.chord)} apart',
+             f'the start mark, {stands[1]} at the end mark; marks {length(two_point.chord)} apart',
              f'IMU grade {sigmas.config.imu.grade}, heading from {a.heading_source} '
              f'({math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:g} m at '
              f'{sigmas.fix_rate:.3g} Hz, {noise}']
     if 'smoother' in before.methods:
-        slip, road = 1000 * sigmas.slip, 1000 * sigmas.sway / math.sqrt(SWAY_RATE)
+        slip = 1000 * sigmas.slip
         own = ' needs no heading;' if a.heading_source in ('course', 'gyrocompass') else ''
         white = f'; fixes {100 * WHITE_SHARE:.0f} % white' if tau else ''
-        lines.append(f'smoother:{own} wheel slip {slip:.2g} mm/√s, sway {road:.2g} mm/√s{white}')
+        lines.append(f'smoother:{own} wheel slip {slip:.2g} mm/√s, sway {sigmas.sway:.2g} m/s '
+                     f'(white at {SWAY_RATE:g} Hz){white}')
     return lines
 
 

@@ -4,7 +4,6 @@
 """odocal replay: the node's pipeline over recorded bags."""
 
 import argparse
-import json
 import os
 from pathlib import Path
 from shutil import get_terminal_size
@@ -14,8 +13,8 @@ from typing import Any, TYPE_CHECKING
 
 from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.listener import Listener
-from odocal_ros.offline.say import Phase, say, warn
+from odocal_ros.library.asked import Listener
+from odocal_ros.offline.say import Phase, say, say_json, warn
 from odocal_ros.outside.names import one_line
 
 if TYPE_CHECKING:
@@ -43,20 +42,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
 
 
-def add_input_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options for settings and topics."""
+def add_input_arguments(parser: argparse.ArgumentParser,
+                        default: str = 'the only topic of a fitting type') -> None:
+    """Declare the options for settings and topics; ``default``: the topic without an option."""
     add = parser.add_argument
     add('--config', metavar='FILE', help='ROS parameter file, the same YAML as for the node')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
     for slot in TOPICS:
         add(topic_option(slot), metavar='TOPIC', dest=f'{slot}_topic',
-            help=f'topic of the {INPUTS[slot].label}; default: the only topic of a fitting type')
+            help=f'topic of the {INPUTS[slot].label}; default: {default}')
 
 
-def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
+def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) -> None:
     """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
-    add_input_arguments(parser)
+    add_input_arguments(parser, **topics)
     add = parser.add_argument
     add('--leg', action='append', default=[], metavar='A:B',
         help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
@@ -123,8 +123,8 @@ class _Screen(Listener):
 
 def asked_config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings asked for: --config < --set < --accept and --method, each checked."""
-    from odocal_ros.settings.accept_config import parse_accept
     from odocal_ros.settings.config import Config, with_settings
+    from odocal_ros.settings.config_groups import parse_accept
     asked = asked_settings(args)
     for text in args.accept:
         asked |= parse_accept(text)
@@ -163,7 +163,7 @@ def _size(stream: Any) -> tuple[int, int | None]:
 
 def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) -> int:
     from odocal_ros.output.files import Results
-    from odocal_ros.output.worse import replacing, stored_in
+    from odocal_ros.output.stored import replacing, stored_in
     screen = _Screen(args)
     old = stored_in(output)
     results = Results(calibration.result, calibration.config, output, list(calibration.inputs),
@@ -181,8 +181,7 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
         if trouble:
             screen.note(f'{results.report[0]}: could not be drawn: {trouble}')
         if args.json:
-            json.dump(calibration.to_dict(), sys.stdout, indent=2)
-            say('')
+            say_json(calibration.to_dict())
         elif not args.quiet:
             _show_files(calibration.result, output, written, results.report * (not trouble))
         return _exit_code(calibration.result, calibration.config, args)
@@ -191,7 +190,7 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
 def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespace) -> int:
     """Return 0 for a good result, after printing the decision on limits."""
     from odocal_ros.offline.cli import OK, REJECTED
-    from odocal_ros.output.acceptance import accept_line, accept_words
+    from odocal_ros.output.figures import accept_line, accept_words
     from odocal_ros.pipeline.acceptance import accept, Decision
     from odocal_ros.reasons import Verdict
     acceptance = accept(calibration, config)

@@ -3,9 +3,11 @@
 
 """What commands print: the one door to the terminal, which names from outside must not steer."""
 
+import json
 from shutil import get_terminal_size
 import sys
 import threading
+from typing import Any
 
 from odocal_ros.outside.names import brief_line, for_terminal
 
@@ -16,6 +18,11 @@ CLOCK = '{desc:<26} {elapsed}'
 def say(text: str, end: str = '\n') -> None:
     """Print lines on stdout."""
     print(for_terminal(text), end=end)
+
+
+def say_json(content: Any) -> None:
+    """Print plain dicts and lists as JSON on stdout."""
+    say(json.dumps(content, indent=2, allow_nan=False))
 
 
 def warn(text: str) -> None:

@@ -48,6 +48,7 @@ NUMBERS = {
     'fix_delay': ('S', 'delay of fix stamps, s'),
     'outliers': ('SHARE', 'fraction of outliers among the fixes, 0 to 0.5'),
     'outlier_size': ('M', 'size of outliers (default 20)'),
+    'pressure_sigma': ('M', 'publish the air pressure on /pressure; 1 sigma of its heights'),
     'velocity_sigma': ('M/S', 'publish the GNSS velocity on /fix_velocity; 1 sigma per axis'),
     'velocity_rate': ('HZ', 'rate of /fix_velocity (default 10)'),
     'velocity_correlation_time': ('S', 'correlation time of its errors (default 0: white)'),

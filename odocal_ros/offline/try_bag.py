@@ -5,7 +5,6 @@
 
 import argparse
 from dataclasses import dataclass
-import math
 import os
 from pathlib import Path
 import shlex
@@ -26,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options: the calibration options of replay, and --no-browser."""
     add = parser.add_argument
     add('bag', metavar='BAG', help='bag folder or file')
-    replay.add_calibration_arguments(parser)
+    replay.add_calibration_arguments(parser, default='selected, with the reason')
     add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
     add('--force', action='store_true', help='replace an existing calibration.json')
     add('--no-browser', action='store_true', help='do not open the report')
@@ -39,8 +38,10 @@ def run(args: argparse.Namespace) -> int:
     if not found['command']:
         from odocal_ros.offline.inspection_text import text
         say(text(found))
-        raise BadData(f'{args.bag}: {_missing(found)}; if a topic has another type, select it '
-                      'with its option, such as --odometer-topic TOPIC')
+        missing = _missing(found)
+        labels = ', '.join(INPUTS[slot].label for slot in missing)
+        raise BadData(f'{args.bag}: no topic was found for: {labels}; if one has another type, '
+                      f'select it with its option, such as {topic_option(missing[0])} TOPIC')
     options = [*_suggested(found['command'], bool(args.leg)), *_own_options(args)]
     say('\n'.join(_overview(found, choices, options)))
     parser = argparse.ArgumentParser()
@@ -122,10 +123,9 @@ def _asked(bag: 'Bag', choice: _Choice) -> _Choice:
         say(f'enter a number from 1 to {len(names)}')
 
 
-def _missing(found: dict[str, Any]) -> str:
-    missing = [INPUTS[slot].label for slot in ('imu', 'odometer', 'fix')
-               if slot not in found['mapping']]
-    return f'no topic was found for: {", ".join(missing)}'
+def _missing(found: dict[str, Any]) -> list[str]:
+    """Return the slots without a topic."""
+    return [slot for slot in ('imu', 'odometer', 'fix') if slot not in found['mapping']]
 
 
 def _suggested(command: str, without_legs: bool) -> list[str]:
@@ -169,12 +169,13 @@ def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str])
 
 def _why_mounting(mounting: dict[str, Any] | None) -> str:
     """Return the source of the IMU orientation; '' if it is not estimated."""
+    from odocal_ros.offline.inspection_text import whole_degrees
     if not mounting or not mounting['needed']:
         return ''
     if mounting['assumed_forward']:
         return 'up is measured from gravity; x is assumed to be forward'
     return ('up is measured from gravity, forward from accelerations and turns '
-            f'(1 sigma: {math.degrees(mounting["forward_sigma"]):.0f} deg)')
+            f'(1 sigma: {whole_degrees(mounting["forward_sigma"])} deg)')
 
 
 def _open(report: Path, never: bool) -> None:

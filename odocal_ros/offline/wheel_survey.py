@@ -13,7 +13,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import MOST_DAYS
 from odocal_ros.messages.odometer_types import JOINTS
 from odocal_ros.messages.raws import tables
-from odocal_ros.offline.fix_path import FixPath
+from odocal_ros.offline.survey import FixPath
 from odocal_ros.screening.glitches import beyond
 from odocal_ros.settings.config import SIDES
 
@@ -151,6 +151,6 @@ def in_words(facts: list[dict[str, Any]]) -> list[str]:
         side = f'; {f["side"]} side (matches gyro)' if f['side'] else ''
         grows = f', {f["scale"]:.3g} m/{f["unit"].rstrip("s")}' if f['scale'] else ''
         kind = f'a wheel{grows}{side}' if f['rolls'] else 'no wheel'
-        return (f'{f["key"]} travels {f["way"]:.6g} {f["unit"]} within a range of '
-                f'{f["span"]:.6g}: {kind}')
+        return (f'{f["key"]} travels {f["way"]:.5g} {f["unit"]} in all, range {f["span"]:.5g} '
+                f'{f["unit"]}: {kind}')
     return [one(f) for f in facts]

@@ -18,7 +18,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
 from odocal_ros.output.folder import ResultFolder
 from odocal_ros.output.report import NAME as REPORT, report_or_why
-from odocal_ros.output.track_table import in_pieces, overall
+from odocal_ros.output.tables import in_pieces, overall
 from odocal_ros.pipeline.acceptance import accept
 from odocal_ros.settings.config import Config, flat
 
@@ -37,10 +37,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
     calibration : the combination of all legs.   config : settings it was made with.   inputs : one
     a bag: its name, sha256 and topics.   created : ISO 8601 date and time.
 
-    Returns
-    -------
-    Plain dicts and lists, no NaN: a number that does not exist is None.
-
+    Returns plain dicts and lists, no NaN: a number that does not exist is None.
     """
     result: dict[str, Any] = {name: {'value': None, 'sigma': None, 'unit': unit, 'method': None}
                     for name, unit in ALWAYS.items()}
@@ -62,7 +59,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
             (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_keeps).as_dict()
         if config.leg.automatic:
             left['carried'] = calibration.carried.as_dict()
-    content: dict[str, Any] = _plain({
+    content: dict[str, Any] = plain({
         'schema': SCHEMA, 'software': f'odocal_ros {__version__}', 'created': created,
         'vehicle': config.vehicle,
         'verdict': calibration.verdict.value,
@@ -111,14 +108,14 @@ def _per_distance(legs: list[LegResult] | tuple[LegResult, ...]) -> list[dict[st
     return [{'length': x.length, 'before': x.before, 'after': x.after} for x in in_pieces(legs)]
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return a value as JSON knows it: no numpy, no tuples, None for what is not finite."""
     if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -132,13 +129,8 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
 
     ``tell`` receives a sentence if the report cannot be drawn.
 
-    Raises
-    ------
-    BadUsage
-        There is a calibration.json and no ``force``, or the folder cannot be written.
-    KeyboardInterrupt
-        Saying what was written, where something was.
-
+    Raises BadUsage: there is a calibration.json and no ``force``, or the folder cannot be written.
+    Raises KeyboardInterrupt: saying what was written, where something was.
     """
     results = Results(calibration, config, directory, inputs, created)
     with results.said_when_interrupted():

@@ -51,13 +51,7 @@ class ResultFolder:
         """
         Put a result there, or leave all as it was.
 
-        Raises
-        ------
-        BadUsage
-            There is one and no ``force``.
-        OSError
-            It cannot be written.
-
+        Raises BadUsage: there is one and no ``force``. Raises OSError: it cannot be written.
         """
         self.place.parent.mkdir(parents=True, exist_ok=True)
         try:

@@ -11,8 +11,7 @@ import numpy as np
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.output.plots_speed import by_speed, by_window
-from odocal_ros.output.plots_svg import (
+from odocal_ros.output.drawing import (
     BAND,
     BLUE,
     Drawing,
@@ -29,6 +28,7 @@ from odocal_ros.output.plots_svg import (
     svg,
     thinned,
 )
+from odocal_ros.output.plots_scale import by_speed, by_window
 
 PAUSE = {'no fix used': PINK, 'no IMU': RED, 'no odometer': GREEN}
 STATUS = {-1: ('no fix (-1)', 'x', GREY), 0: ('fix (0)', 'o', BLUE),
@@ -47,10 +47,8 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
     the correction rests on.   smoothed : details of the smoother: slips, and biases at its
     keyframes.
 
-    Returns
-    -------
-    (title, what it shows, svg element) of each figure; to be called under ``plots_svg.look``.
-
+    Returns (title, what it shows, svg element) of each figure; to be called under
+    ``drawing.look``.
     """
     if not len(found.t):
         return []

@@ -12,11 +12,10 @@ from typing import Any
 from odocal_ros.calib.choice import ABOUT, leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.output import report_tables as tables
-from odocal_ros.output.figures import counted, known, length, time_span
-from odocal_ros.output.plots_svg import Drawing
-from odocal_ros.output.reason_lines import shared
+from odocal_ros.output.drawing import Drawing
+from odocal_ros.output.figures import counted, known, length, shared, time_span
 from odocal_ros.output.summary import DEG, MEANING, sentence
-from odocal_ros.output.track_table import before_label, check_table
+from odocal_ros.output.tables import before_label, check_table
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
@@ -33,11 +32,7 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
     calibration : the combination of all legs; what a leg lacks (track, evidence) is left out.
     config : settings it was made with.   content : of calibration.json, for bags and software.
 
-    Raises
-    ------
-    ImportError
-        matplotlib or jinja2 is missing.
-
+    Raises ImportError: matplotlib or jinja2 is missing.
     """
     from jinja2 import Environment, StrictUndefined
     folder = files('odocal_ros.output') / 'templates'
@@ -142,9 +137,9 @@ def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing
 
     Of more legs than a page has room for, the newest have theirs.
     """
+    from odocal_ros.output.drawing import look
     from odocal_ros.output.plots import leg_figures
-    from odocal_ros.output.plots_compare import compared
-    from odocal_ros.output.plots_svg import look
+    from odocal_ros.output.plots_scale import compared
     numbered, size = list(enumerate(calibration.legs, 1)), 0
     figures: dict[int, list[Drawing]] = {}
     shown = [(number, leg, leg.evidence) for number, leg in numbered if leg.evidence is not None]

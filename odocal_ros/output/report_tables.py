@@ -18,7 +18,6 @@ from odocal_ros.calib.result import (
     MethodResult,
     wheel_factors,
 )
-from odocal_ros.output.budget_table import LABELS as SOURCES, largest_source
 from odocal_ros.output.figures import (
     beyond_one,
     COUNTS,
@@ -29,9 +28,14 @@ from odocal_ros.output.figures import (
     two_digits,
     with_sigma,
 )
-from odocal_ros.output.leg_table import shown_verdict
 from odocal_ros.output.summary import DEG, DEG_PER_HOUR
-from odocal_ros.output.track_table import before_label, in_pieces
+from odocal_ros.output.tables import (
+    before_label,
+    in_pieces,
+    LABELS as SOURCES,
+    largest_source,
+    shown_verdict,
+)
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 

@@ -12,11 +12,20 @@ import numpy as np
 
 from odocal_ros.calib.result import BESIDE, Calibration
 from odocal_ros.data.arrays import Floats
-from odocal_ros.output.controller_files import CONTROLLERS, controllers, DEVICES, devices
-from odocal_ros.output.file_head import about, head
+from odocal_ros.output.device_files import (
+    about,
+    CONTROLLERS,
+    controllers,
+    DEVICES,
+    devices,
+    head,
+    IMU_ERRORS,
+    imu_errors,
+    TWIST,
+    wheel_covariance,
+)
 from odocal_ros.output.geojson import geojson, TRACK
-from odocal_ros.output.leg_table import leg_table, LEGS
-from odocal_ros.output.noise_files import IMU_ERRORS, imu_errors, TWIST, wheel_covariance
+from odocal_ros.output.tables import leg_table, LEGS
 from odocal_ros.outside.names import (
     for_comment,
     for_launch,
@@ -25,7 +34,7 @@ from odocal_ros.outside.names import (
     is_frame,
     one_line,
 )
-from odocal_ros.outside.yaml_text import no_date, parameters
+from odocal_ros.outside.yaml_files import no_date, parameters
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config, with_settings
 

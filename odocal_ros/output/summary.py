@@ -16,10 +16,11 @@ from odocal_ros.calib.result import (
     Estimate,
     FACTOR,
     LegResult,
+    MethodResult,
     wheel_factors,
 )
-from odocal_ros.output.budget_table import budget_lines, largest_source, source_label
 from odocal_ros.output.figures import (
+    bag_lines,
     beyond_one,
     columns,
     counted,
@@ -27,15 +28,22 @@ from odocal_ros.output.figures import (
     inverse,
     known,
     length,
+    reason_lines,
     share,
     time_span,
     WIDTH,
     with_sigma,
     with_unit,
 )
-from odocal_ros.output.leg_table import leg_verdicts, search_lines, shown_verdict
-from odocal_ros.output.reason_lines import bag_lines, reason_lines
-from odocal_ros.output.track_table import track_lines
+from odocal_ros.output.tables import (
+    budget_lines,
+    largest_source,
+    leg_verdicts,
+    search_lines,
+    shown_verdict,
+    source_label,
+    track_lines,
+)
 from odocal_ros.reasons import Verdict
 
 DEG = math.degrees(1.0)    # definition
@@ -173,7 +181,7 @@ def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
 
 
 def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
-    """Return the plain ratio of path lengths beside the scale factor, '' where there is none."""
+    """Return the median ratio of fixes and odometer beside the scale factor, '' without one."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     way = sum(distance for _, distance in ratios)
     if not scale.value or not way:
@@ -181,8 +189,8 @@ def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
     ratio = sum(r * distance for r, distance in ratios) / way
     unit = '' if scale.unit == '1' else f' {scale.unit}'
     plain = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'  # 4 digits
-    return _line('  path ratio', f'{plain}{unit}   fixes / odometer, uncorrected '
-                 f'({100 * (ratio / scale.value - 1):+.1f} %)')
+    return _line('  path ratio', f'{plain}{unit}   fixes / odometer, '
+                 f'{100 * (ratio / scale.value - 1):+.1f} % from the scale factor')
 
 
 def _gyro_scale(calibration: Calibration) -> str:
@@ -259,8 +267,15 @@ def _method_table(calibration: Calibration) -> list[str]:
         scale, *angles = (known(method.estimates, n) for n in ('scale_factor', *ANGLES))
         rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
                      *('-' if a.value is None else with_sigma(a.value, a.sigma, DEG, signed=True)
-                       for a in angles), shown_verdict(method, calibration.legs)))
+                       for a in angles),
+                     shown_verdict(method, calibration.legs) + _refused(method)))
     return columns(rows)
+
+
+def _refused(method: MethodResult) -> str:
+    """Return the first code for which a method is rejected, '' if it is not."""
+    codes = [r.code.name for r in method.reasons if r.code.gravity is Verdict.REJECTED]
+    return f': {codes[0]}' if codes else ''
 
 
 def _leg_row(leg: LegResult) -> tuple[str, ...]:

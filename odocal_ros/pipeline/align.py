@@ -132,7 +132,7 @@ def _level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude
                             speed / np.maximum(inside, 1e-3), latitude, grade)
     found = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level estimated '
                    f'over {t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
-                   f'(+-{np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
+                   f'(± {np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
     return level, (found,)
 
 
@@ -212,8 +212,9 @@ def _imu_orientation(inputs: Inputs, level: Level, latitude: float, grade: Grade
 
 def _heading_topic(inputs: Inputs, level: Level, latitude: float, grade: Grade,
                    config: Config) -> Found:
-    return _from_quaternions(inputs.t_heading, inputs.q_heading, inputs.heading_variance, level,
-                             config, lambda C: C, config.alignment.heading_offset)
+    sent, t = inputs.outside['heading']
+    return _from_quaternions(t, sent.q_ni, sent.yaw_variance, level, config, lambda C: C,
+                             config.alignment.heading_offset)
 
 
 def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, config: Config,
@@ -235,7 +236,7 @@ def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, conf
     stated = float(np.median(variance[pick]))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:
-        return None, f'its covariance is +-{np.rad2deg(sigma):.3g} deg'
+        return None, f'its covariance is ± {np.rad2deg(sigma):.3g} deg'
     return (float(wrap(yaw)), float(sigma)), ''
 
 

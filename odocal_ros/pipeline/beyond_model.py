@@ -162,7 +162,7 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
             continue
         set_to = getattr(prepared.config, name).time_offset
         notes.append(Reason(
-            Code.DELAY_SEEN, f'{WHAT[name]} stamps are {abs(late):.3f} s (+-{sigma:.3f} s) '
+            Code.DELAY_SEEN, f'{WHAT[name]} stamps are {abs(late):.3f} s (± {sigma:.3f} s) '
             f'{"late" if late > 0 else "early"} relative to the other sensors, {metres:.2g} m at '
             f'{speed:.1f} m/s; accounted for. To remove the delay, set {name}.time_offset to '
             f'{set_to - late:.3f}'

@@ -18,7 +18,7 @@ from odocal_ros.calib.agreement import disagreements
 from odocal_ros.calib.choice import choose, deciding, passed_over
 from odocal_ros.calib.drive import way_and_chord
 from odocal_ros.calib.failed import failed, raised_if_wild
-from odocal_ros.calib.result import LegResult, MethodResult
+from odocal_ros.calib.result import AS_SENT, LegResult, MethodResult
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
@@ -158,9 +158,9 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
         return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
                           distance=prepared.distance, deciding=deciding(asked), path_ratio=plain)
     distance_sigma = 0.05    # relative sigma up to which a scale gives the distance
-    # truer than the rough scale
+    # more accurate than the rough scale; the travel is that of a speed as sent
     if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
-        prepared = judged_by(prepared, scale.value)
+        prepared = judged_by(prepared, estimates.get(AS_SENT, scale).value or scale.value)
     shown, said = tracks(prepared, paths)
     found += said
     for name, run in runs.items():

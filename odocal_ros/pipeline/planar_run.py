@@ -76,7 +76,7 @@ def _guarded(run: Run, inputs: Inputs, config: Config, progress: Callable[[Stage
         return refused([why], unit)
     try:
         with raised_if_wild():
-            found = fit(run, _known(run, inputs, config), lambda passes, change: progress(
+            found = fit(run, _known(run, config), lambda passes, change: progress(
                 Stage(PLANAR, passes=passes, change=change)))
             method = result_of(found, unit, nominal_scale(config, unit), config,
                                shortened_by_slopes(inputs))
@@ -169,7 +169,7 @@ def _gyro(inputs: Inputs, t: Floats) -> Floats:
     return out
 
 
-def _known(run: Run, inputs: Inputs, config: Config) -> Known:
+def _known(run: Run, config: Config) -> Known:
     """Return the priors of the constants by the settings."""
     antenna, odometer = config.gnss.lever_arm, config.odometer.lever_arm
     known: dict[str, Any] = {

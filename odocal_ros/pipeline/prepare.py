@@ -24,8 +24,8 @@ from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import axles_of
 from odocal_ros.screening.facing import axes_reasons, Facing, facing
-from odocal_ros.screening.gaps import imu_gap
 from odocal_ros.screening.inputs import Inputs, place, Placed
+from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config
 
 BY_SCALE = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # what is judged in metres

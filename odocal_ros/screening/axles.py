@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The axles of a vehicle: which ones count, and which ones steer."""
+"""The axles of a vehicle: which ones are used, and which ones steer."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -62,8 +62,9 @@ def judged_axles(wheels: Wheels, imu: Imu,
     found = [Reason(Code.WHEEL_LEFT_OUT, f'{reason.text}; {_listed(axle)} left out of the mean')
              for axle, why in zip(axles, faults, strict=True) for reason in why]
     if turning:
-        found.append(Reason(Code.WHEELS_STEERED, f'{_listed(turning)} steered: the travel is more '
-                            f'in turns. The scale factor is that of the mean of {_names(fixed)}'))
+        found.append(Reason(Code.WHEELS_STEERED, f'{_listed(turning)} steered: a '
+                            'steered wheel travels farther in turns. The scale factor is that of '
+                            f'the mean of {_names(fixed)}'))
     return wheels.only(whole), found
 
 
@@ -92,7 +93,7 @@ def _faults(axle: Axle, axles: list[Axle], imu: Imu,
 
 def _ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
            doubt_t: Floats) -> list[float]:
-    """Return by how much each axle is ahead of the one that steers least, scale units."""
+    """Return the distance of each axle ahead of the one that steers least, scale units."""
     first = mean_travel(axles[0])
     found = [(0.0, 0.0), *(_square(mean_travel(axle), first, imu, between, doubt_t)
                            for axle in axles[1:])]

@@ -40,12 +40,12 @@ def judge_clocks(leg: Leg, config: Config) -> list[Reason]:
     topics = [slot for slot in TOPICS if not (slot == 'fix' and config.reference.points)]
     offset = offsets(config)
     found = [r for slot in ('imu', *topics) for r in _was_set(
-        getattr(leg, slot), INPUTS[slot].label, leg.start_ns)]
+        leg.rows(slot), INPUTS[slot].label, leg.start_ns)]
     imu = _stamped(leg.imu)
     if len(imu.stamp_ns) < 2:
         return found
     for slot in topics:
-        samples = _stamped(getattr(leg, slot))
+        samples = _stamped(leg.rows(slot))
         if not len(samples.stamp_ns):
             continue
         ahead = median(_lag_at(samples.received_ns, imu) - _lag(samples))

@@ -138,7 +138,7 @@ def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]
     nominal = 0.0 if np.isnan(nominal_yaw) else nominal_yaw
     off = abs(float(wrap(found.yaw - nominal)))
     direction = WAYS[round(found.yaw / (np.pi / 2)) % 4]
-    seen = f'{np.rad2deg(found.yaw):+.0f} deg, +-{max(np.rad2deg(found.sigma), 1):.0f}'
+    seen = f'{np.rad2deg(found.yaw):+.0f} deg, ± {max(np.rad2deg(found.sigma), 1):.0f}'
     if nominal:
         seen += f', nominal {np.rad2deg(nominal):+.0f}'
     reversed_orientation = np.deg2rad(150.0)    # a reversed odometer looks the same

@@ -10,7 +10,6 @@ IMU predict, far better than elsewhere. The jump at the end is the sum of their 
 fixes contain no information on the scale.
 """
 
-from collections.abc import Callable
 
 import numpy as np
 
@@ -203,16 +202,15 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
                    f'velocity, rotated by {np.degrees(np.angle(z)):+.0f} deg'),)
 
 
-def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats, path: Floats,
-             turned: Callable[[Floats], Floats]) -> tuple[Bools, tuple[Reason, ...]]:
+def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats,
+             track: Complexes) -> tuple[Bools, tuple[Reason, ...]]:
     """
     Return a mask of fixes that a receiver has reckoned, and FIXES_DEAD_RECKONED.
 
-    t_fix : (k,) s.   fixes_n : (k, 3) m.   sigma : (k,) stated, of an axis, m.   path : (k,) path
-    length by the odometer, m, its scale good to 30 %.   turned : angle turned about the vertical
-    by (m,) times, rad: (m,).
+    t_fix : (k,) s.   fixes_n : (k, 3) m.   sigma : (k,) stated, of an axis, m.   track : (k,)
+    positions of the antenna by odometer and gyro, m, its scale good to 30 %, any first heading.
     """
-    spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, path, turned)
+    spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, track)
     found = np.zeros(len(t_fix), bool)
     for begin, end, _ in spans:
         found |= (t_fix >= begin) & (t_fix <= end)
@@ -225,29 +223,30 @@ def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats, path: Floats,
                           f'{int(found.sum())} of {len(t_fix)} fixes not used'),)
 
 
-def _spans(t: Floats, place: Complexes, sigma: Floats, path: Floats,
-           turned: Callable[[Floats], Floats]) -> list[tuple[float, float, float]]:
+def _spans(t: Floats, place: Complexes, sigma: Floats,
+           track: Complexes) -> list[tuple[float, float, float]]:
     """Return begin and end of each span, s, and the jump after it, m."""
     if len(t) <= SMOOTH_ROWS:
         return []
     step = max(1, round(COMPARED_EVERY / float(np.median(np.diff(t)))))
-    t, place, sigma, path = t[::step], place[::step], sigma[::step], path[::step]
-    dt, way, moved = np.diff(t), np.diff(path), np.diff(place)
+    t, place, sigma, track = t[::step], place[::step], sigma[::step], track[::step]
+    dt, way, moved = np.diff(t), np.diff(track), np.diff(place)
     whole = (np.abs(way) > MOVED_LEAST) & (dt < MISSING_INTERVALS * np.median(dt))
     both = np.flatnonzero(whole[1:] & whole[:-1])
     if len(both) <= SMOOTH_ROWS:
         return []
-    angle = np.diff(turned((t[1:] + t[:-1]) / 2))[both]
-    off = np.abs(moved[both + 1] - moved[both] * np.exp(1j * angle) * way[both + 1] / way[both])
+    off = np.abs(moved[both + 1] - moved[both] * way[both + 1] / way[both])
     usual = float(np.median(off))
     smooth = off < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
     spans: list[tuple[float, float, float]] = []
     # smaller ones than the stated error are of satellites that come and go
     least = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[both + 1])
     for k in np.flatnonzero(off > least):
-        begin = float(t[both[_begin(smooth[:k])]])
+        first = _begin(smooth[:k])
+        # fixes since the compared one before may be of the tunnel too
+        begin = float(t[max(both[first] - 1, 0)])
         # the row after a jump is as far off
-        if begin < t[both[k]] and (not spans or begin > spans[-1][1]):
+        if first < k and (not spans or begin > spans[-1][1]):
             spans.append((begin, float(t[both[k] + 1]), float(off[k])))
     return spans
 

@@ -3,8 +3,10 @@
 
 """A leg as the methods use it: screened rows, fixes in metres, metres per count."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,13 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
+
+
+class UsableRows(NamedTuple):
+    """The usable rows of a topic, as sent, and their times from the start mark: (n,) s."""
+
+    sent: Any
+    t: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +48,7 @@ class Inputs:
     t_fix: NDArray[np.float64]         # (k,)
     geodetic: NDArray[np.float64]      # (k, 3) latitude, longitude rad, height m (NaN: none)
     covariance_n: NDArray[np.float64]  # (k, 3, 3) m^2
-    t_heading: NDArray[np.float64]     # (h,)
-    q_heading: NDArray[np.float64]     # (h, 4)
-    heading_variance: NDArray[np.float64]  # (h,) rad^2
-    t_velocity: NDArray[np.float64]    # (v,)
-    velocity_n: NDArray[np.float64]    # (v, 3) m/s of the antenna, ENU where it is
-    velocity_variance: NDArray[np.float64]  # (v, 3) (m/s)^2, 0 or less: unknown
+    outside: Mapping[str, UsableRows]      # of the other sensors, by slot
     fixes_rejected: int
     scale_unit: str
     felt: bool = True                  # False: f_b is made up, no accelerometer is there

@@ -76,11 +76,11 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """
     if not is_local(leg.fix):
         return leg, ()
-    left_out = ['GNSS velocities'] * bool(len(leg.fix_velocity.stamp_ns))
-    leg = replace(leg, fix_velocity=VelocitySamples.none())
-    if config.alignment.heading_source == 'auto' and len(leg.heading.stamp_ns):
+    left_out = ['GNSS velocities'] * bool(len(leg.rows('fix_velocity').stamp_ns))
+    leg = leg.with_rows(fix_velocity=VelocitySamples.none())
+    if config.alignment.heading_source == 'auto' and len(leg.rows('heading').stamp_ns):
         left_out += ['external headings']
-        leg = replace(leg, heading=HeadingSamples.none())
+        leg = leg.with_rows(heading=HeadingSamples.none())
     latitude = math.radians(config.reference.latitude_deg)
     unknown = OMEGA if math.isnan(latitude) else OMEGA * math.cos(latitude)
     text = ('positions are in a local frame, so north is unknown: up to '

@@ -15,22 +15,22 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.inputs import INPUTS
+from odocal_ros.data.inputs import INPUTS, OUTSIDE
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.samples import FixSamples, ImuSamples, VelocitySamples
+from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
 from odocal_ros.screening.clocks import judge_clocks, offsets
 from odocal_ros.screening.fix_screen import contradicted, reckoned, usable_fixes
-from odocal_ros.screening.gaps import topic_gap
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
-from odocal_ros.screening.inputs import Inputs, place
+from odocal_ros.screening.inputs import Inputs, place, UsableRows
 from odocal_ros.screening.leg_kind import with_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
-from odocal_ros.screening.row_screen import usable_rows
+from odocal_ros.screening.row_screen import topic_gap, usable_rows
 from odocal_ros.screening.wheel_travel import Wheels, wheels
 from odocal_ros.settings.config import Config, ImuConfig, SIDES
 
@@ -71,7 +71,7 @@ def _missing(leg: Leg, found: list[Reason]) -> list[Reason]:
     known = {reason.code for reason in found}      # a frame_id that is not sent
     return [Reason(code, f'no {INPUTS[slot].label} message between the marks')
             for slot, code in codes.items()
-            if not len(getattr(leg, slot).stamp_ns) and code not in known]
+            if not len(leg.rows(slot).stamp_ns) and code not in known]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,63 +80,56 @@ class Usable:
 
     imu: ImuSamples
     t_imu: Floats
-    heading: Any
-    t_heading: Floats
-    velocity: VelocitySamples
-    t_velocity: Floats
     wheels: Wheels
     fix: FixSamples
     t_fix: Floats
+    outside: dict[str, UsableRows]
 
 
 def _usable(leg: Leg, config: Config, judged: bool, found: list[Reason]) -> Usable:
     """Return the usable rows of each topic; add the reasons for the others."""
     offset = offsets(config)
 
-    def rows(slot: str) -> tuple[Any, Floats]:
-        return usable_rows(slot, leg, config, offset[slot], found)
+    def rows(slot: str) -> UsableRows:
+        sent, t = usable_rows(slot, leg, config, offset[slot], found)
+        return UsableRows(oriented(sent) if judged and hasattr(sent, 'q_ni') else sent, t)
 
     imu, t_imu = rows('imu')
     t_imu = on_rhythm(t_imu, imu.w_i, imu.f_i)
-    heading, t_heading = rows('heading')
-    if judged:
-        imu, heading = oriented(imu), oriented(heading)
+    outside = {slot: rows(slot) for slot in OUTSIDE}
     let_go()
-    velocity, t_velocity = rows('fix_velocity')
     travelled = wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
               for form in (leg.form, leg.form_right) if form and form.chosen]
-    return Usable(imu, t_imu, heading, t_heading, velocity, t_velocity, travelled, *rows('fix'))
+    return Usable(imu, t_imu, travelled, *rows('fix'), outside)
 
 
 def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[str, Any]:
-    """Return fixes and velocity as fields of Inputs; add the reasons against others."""
-    fix, velocity, t_velocity = rows.fix, rows.velocity, rows.t_velocity
+    """Return fixes and other sensors as fields of Inputs; add the reasons against others."""
+    fix, outside, velocity = rows.fix, rows.outside, rows.outside['fix_velocity']
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
     found += why
     found += topic_gap('fix', rows.t_fix)       # of the stream: a rejected fix is no gap in it
     t_fix, covariance = rows.t_fix[use], covariance[use]
     geodetic = np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
-    unlike = contradicted(t_velocity, velocity.velocity_n, t_fix, geodetic, covariance) \
+    unlike = contradicted(velocity.t, velocity.sent.velocity_n, t_fix, geodetic, covariance) \
         if config.gnss.use_velocity else ()
     found += unlike
-    some = slice(0 if unlike else None)
+    if unlike:
+        outside = outside | {'fix_velocity': UsableRows(VelocitySamples.none(), np.empty(0))}
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
-            'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum()),
-            't_velocity': t_velocity[some], 'velocity_n': velocity.velocity_n[some],
-            'velocity_variance': velocity.variance_n[some]}
+            'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum()), 'outside': outside}
 
 
 def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:
     """Return the arrays of a leg, the IMU turned by its nominal mounting."""
-    imu, heading = rows.imu, rows.heading
+    imu = rows.imu
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     return Inputs(
         t_stop=(leg.stop_ns - leg.start_ns) * 1e-9, t_imu=rows.t_imu,
         w_b=_turned(imu.w_i, config.imu.gyro_scale, C_bi),
         f_b=_turned(imu.f_i, config.imu.accel_scale, C_bi),
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
-        t_heading=rows.t_heading, q_heading=heading.q_ni, heading_variance=heading.yaw_variance,
         scale_unit=leg.form.scale_unit, **_travel(leg, rows.wheels), **fixes)
 
 
@@ -177,10 +170,13 @@ def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> In
         return inputs
     rate = inputs.w_b @ inputs.up_b
     # straights, and turns to both sides: the median is the bias
-    angle = np.cumsum((rate[1:] - np.median(rate)) * np.diff(inputs.t_imu))
+    heading = np.exp(1j * running_integral(inputs.t_imu, rate - np.median(rate)))
+    x, y, _ = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
+    way = np.diff(inputs.travel.at(inputs.t_imu), prepend=0.0) * placed.rough
+    track = np.cumsum(heading * way) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
-    lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma, inputs.travel.at(inputs.t_fix)
-                         * placed.rough, lambda t: np.interp(t, inputs.t_imu[1:], angle))
+    lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma,
+                         np.interp(inputs.t_fix, inputs.t_imu, track))
     found += why
     return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],
                    covariance_n=inputs.covariance_n[~lost],

@@ -118,7 +118,7 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
     size = round(span.size) if np.issubdtype(samples.value.dtype, np.integer) else span.size
     value: NDArray[Any] = samples.value + size * np.cumsum(turns)
     times = len(span.rows)
-    about = f'about {span.size:.6g} (+-{span.sigma:.2g})' if span.sigma else NAMED_SPANS.get(
+    about = f'about {span.size:.6g} (± {span.sigma:.2g})' if span.sigma else NAMED_SPANS.get(
         span.size, f'{span.size:.0f}')
     found = Reason(Code.WHEEL_COUNTERS_DIFFER, f'the {side} wheel counter rolls over at {about}, '
                    f'not at the range of its message type: {times} jump{"s" * (times > 1)} of '

@@ -12,15 +12,17 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from odocal_ros.settings.accept_config import AcceptConfig
-from odocal_ros.settings.output_config import (
+from odocal_ros.data.inputs import TOPICS
+from odocal_ros.settings.config_groups import (
+    AcceptConfig,
     FramesConfig,
     JournalConfig,
     OutputConfig,
     PublishConfig,
+    ReferenceConfig,
     UpdaterConfig,
+    VerdictConfig,
 )
-from odocal_ros.settings.reference_config import ReferenceConfig
 from odocal_ros.settings.setting import (
     setting,
     settings_of as settings_of,  # for others too: they are its other half
@@ -114,6 +116,8 @@ class ImuConfig:
                          'settings below override single values.')
     frame_id: str = setting('', ro=True, about='Use only messages of the IMU topic with this '
                             "frame_id; '': the topic must carry one IMU.")
+    use_pressure: bool = setting(True, ro=True, about='Use the air pressure (pressure) as '
+                                 'height if it is published.')
     gyro_noise: float = _figure('rad/s/sqrt(Hz)', 1.0, 'White gyro noise')
     gyro_bias: float = _figure('rad/s', 1.0, 'Turn-on gyro bias, 1 sigma', TYPICAL)
     gyro_bias_walk: float = _figure('rad/s/sqrt(s)', 1.0, 'Random walk of the gyro bias')
@@ -231,18 +235,6 @@ class ProjectionConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerdictConfig:
-    max_scale_sigma: float = setting(0.001, '1', 0.0, 1.0, about='Required relative sigma of the '
-                                     'scale factor.')
-    max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Required sigma of the yaw '
-                                   'mounting angle.')
-    min_legs: int = setting(1, '', 1, 100, about='Fewer legs are a caution.')
-    scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='Random walk of '
-                                         'the scale factor between legs, relative, 1 sigma '
-                                         '(tyres).')
-
-
-@dataclass(frozen=True, kw_only=True)
 class Config:
     """All settings of the calibrator; see the module for how they are named."""
 
@@ -271,11 +263,11 @@ class Config:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Return the inputs that these settings use, with optional ones; see data/inputs.py."""
-        optional = {'odometer_right': self.odometer.own_topics,
-                    'fix_velocity': self.gnss.use_velocity,
-                    'heading': self.alignment.heading_source in ('auto', 'heading_topic')}
-        return 'imu', 'odometer', 'fix', *(slot for slot, used in optional.items() if used)
+        """Return the inputs that these settings use, with optional ones."""
+        used = {'odometer_right': self.odometer.own_topics, 'fix_velocity': self.gnss.use_velocity,
+                'pressure': self.imu.use_pressure,
+                'heading': self.alignment.heading_source in ('auto', 'heading_topic')}
+        return tuple(slot for slot in TOPICS if used.get(slot, True))
 
     def in_local_frame(self) -> 'Config':
         """Return the settings of a leg whose positions are in a local frame."""

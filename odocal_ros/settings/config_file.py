@@ -16,7 +16,7 @@ from typing import Any
 
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.outside.limits import read_text
-from odocal_ros.outside.yaml_tree import composed
+from odocal_ros.outside.yaml_files import composed
 from odocal_ros.settings.config import Config, SETTINGS
 from odocal_ros.settings.setting import with_settings
 
@@ -37,14 +37,9 @@ def read_config_file(path: Path) -> dict[str, object]:
     """
     Return the settings of a ROS parameter file by dotted name, each checked.
 
-    Raises
-    ------
-    BadUsage
-        The file cannot be read.
-    BadConfig
-        It is no parameter file, has no block for the calibrator, or holds an unknown setting or
-        a wrong value; the text names file and line.
-
+    Raises BadUsage: the file cannot be read. Raises BadConfig: it is no parameter file, has no
+    block for the calibrator, or holds an unknown setting or a wrong value; the text names file and
+    line.
     """
     return _settings(Path(path), _root(Path(path)))
 
@@ -87,13 +82,8 @@ def parse_set(text: str) -> tuple[str, object]:
     """
     Return (name, value) of ``key=value``; the value is YAML, checked against its setting.
 
-    Raises
-    ------
-    BadUsage
-        There is no ``=``, or the value is no YAML.
-    BadConfig
-        The setting is unknown or the value wrong.
-
+    Raises BadUsage: there is no ``=``, or the value is no YAML. Raises BadConfig: the setting is
+    unknown or the value wrong.
     """
     name, equals, value = text.partition('=')
     name = name.strip()

@@ -126,11 +126,7 @@ def with_settings(config: AnyConfig, changes: Mapping[str, Any]) -> AnyConfig:
     """
     Return config with settings changed by dotted name, each checked.
 
-    Raises
-    ------
-    BadConfig
-        Unknown name (the text names similar ones), wrong type, out of range.
-
+    Raises BadConfig: Unknown name (the text names similar ones), wrong type, out of range.
     """
     groups: dict[str, dict[str, Any]] = {}
     settings = settings_of(type(config))

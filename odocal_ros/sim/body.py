@@ -13,45 +13,66 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.motion import inertial_v, Motion, State
-from odocal_ros.sim.profile import hermite, Profile
+from odocal_ros.sim.profile import hermite, Hills, Profile
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.road import Hills
 from odocal_ros.sim.zoo import G
 
 # physical: natural frequency of a car's body on its springs, damped by shock absorbers
 FREQUENCY = 2 * np.pi * 1.3   # rad/s
 DAMPING = 0.3
+STILL = 1e-9          # m/s, judgement: rounding
+KNEELING_TIME = 2.0   # s, judgement: in which a bus kneels, and rises
 
 
-def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
-          hills: Hills | None = None, wheelbase: float = 0.0) -> tuple[Profile, Profile]:
+def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = None,
+          lean: Profile | None = None) -> tuple[Profile, Profile]:
     """
     Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles.
 
-    The force that holds it on a slope acts like an acceleration. Both axles stand on the road: the
-    body lies along the chord of the wheelbase, the rear axle moves along the road below it.
+    lean : of the road, which the roll includes. The force that holds the body on a slope or a lean
+    acts like an acceleration. Both axles stand on the road: the body lies along the chord of the
+    wheelbase, the rear axle moves along the road below it.
     """
-    hills = hills or Hills()
+    hills, wheelbase = hills or Hills(), real.wheelbase
     # s; a cubic between is then good to (w h)^4 / 384 = 2e-6; a kerb is over within 0.2 s
     step = 0.005 if hills.kerbs else 0.02
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
     v, s = speed(t), speed.integral()(t)
     here, here_by, _ = hills(s)
     chord, chord_by = hills.chord(s, wheelbase) if wheelbase else (here, here_by)
-    forward, side = speed.derivative().mean(t) + G * here, v * yaw_rate(t)
+    forward = speed.derivative().mean(t) + G * here
     # nose up is a negative pitch; in a turn to the left the left side goes up
-    roll, roll_rate = sprung(body_roll * side, step)
-    pitch, pitch_rate = sprung(-squat * forward, step)
+    roll, roll_rate = sprung(real.body_roll * side_force(speed, yaw_rate, lean, t)
+                             + real.kneeling * kneels(speed, t), step)
+    pitch, pitch_rate = sprung(-real.squat * forward, step)
+    if lean:
+        roll, roll_rate = roll + lean(t), roll_rate + lean.derivative()(t)
     return hermite(t, roll, roll_rate), hermite(t, pitch - (chord - here),
                                                 pitch_rate - (chord_by - here_by) * v)
 
 
+def side_force(speed: Profile, yaw_rate: Profile, lean: Profile | None, t: Floats) -> Floats:
+    """Return the force of the tyres to the left over the mass at times t, m/s^2."""
+    return speed(t) * yaw_rate(t) + (G * np.sin(lean(t)) if lean else 0.0)
+
+
+def kneels(speed: Profile, t: Floats) -> Floats:
+    """Return the share by which a bus kneels at its stops, 0 to 1: (n,)."""
+    still = np.concatenate([[0], np.abs(speed(t)) < STILL, [0]]).astype(int)
+    begin, end = (np.flatnonzero(np.diff(still) == sign) for sign in (1, -1))
+    down = np.zeros(len(t))
+    for a, b in zip(t[begin[1:-1]], t[end[1:-1] - 1], strict=True):
+        down += np.clip(np.minimum(t - a, b - t) / KNEELING_TIME, 0.0, 1.0)
+    return down
+
+
 def leaning(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
-    """Return the lean of the road to the right by time, rad: cross slopes, banked curves."""
+    """Return the lean of the road to the right by time, rad."""
     step = 0.005 if real.kerbs else 0.02    # s, as above
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
     cross = Hills(real.cross_slope, real.cross_slope_length)
-    lean = cross(speed.integral()(t))[0] - real.banking * np.arctan(speed(t) * yaw_rate(t) / G)
+    lean = (real.crossfall + cross(speed.integral()(t))[0]
+            - real.banking * np.arctan(speed(t) * yaw_rate(t) / G))
     return hermite(t, lean, np.gradient(lean, step))
 
 
@@ -79,10 +100,10 @@ def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:
     return y, dy
 
 
-def drift(speed: Profile, yaw_rate: Profile, sideslip: float, t: Floats) -> Floats:
+def drift(speed: Profile, yaw_rate: Profile, sideslip: float, lean: Profile | None,
+          t: Floats) -> Floats:
     """Return the velocity to the left at times t, m/s: against the force of the tyres."""
-    v = speed(t)
-    return -sideslip * v * yaw_rate(t) * np.abs(v)
+    return -sideslip * side_force(speed, yaw_rate, lean, t) * np.abs(speed(t))
 
 
 def rotation(motion: Motion, t: Floats) -> Floats:

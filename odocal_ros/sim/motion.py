@@ -24,8 +24,7 @@ from odocal_ros.nav.earth import (
     transport_rate_n,
 )
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.sim.profile import Profile
-from odocal_ros.sim.road import Hills
+from odocal_ros.sim.profile import Hills, Profile
 
 STEADY = Profile([0.0, 1.0], [[0.0]])     # definition: no sway
 GAUSS = tuple(zip(*np.polynomial.legendre.leggauss(4), strict=True))     # definition: on -1 to 1
@@ -85,8 +84,10 @@ class Motion:
 
     @property
     def distance(self) -> float:
-        """Return the metres rolled over the whole drive."""
-        return float(self._travel(self.duration))
+        """Return the path length of the whole drive, m; reversing adds to it."""
+        step = 0.01     # s, definition: within it the direction of travel does not change
+        ends = np.linspace(0.0, self.duration, max(2, round(self.duration / step) + 1))
+        return float(np.abs(np.diff(self._travel(ends))).sum())
 
     def at(self, t: Floats) -> State:
         """Return the state at times t, (n,) s."""

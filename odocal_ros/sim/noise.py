@@ -10,7 +10,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints
 
 # s from the first IMU sample, so that no two topics sample together
-PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004}
+PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004, 'pressure': 0.005}
 TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measuring to arriving
 
 

@@ -92,6 +92,8 @@ class SimOptions:
     heading_sigma: float | None = None     # rad; None: no heading topic
     heading_rate: float = 10.0             # Hz
 
+    pressure_sigma: float | None = None    # m, of heights by air pressure; None: no sensor
+
     velocity_sigma: float | None = None    # m/s, each axis; None: no GNSS velocity
     velocity_rate: float = 10.0            # Hz
     velocity_correlation_time: float = 0.0  # s; 0: white
@@ -133,9 +135,9 @@ POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'velocity_r
             'nominal_scale', 'track_width', 'wheelbase', 'fix_correlation_time', 'duration')
 NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise', 'slip_walk',
                 'slip_events', 'slip_size', 'start_slip', 'start_slip_time', 'sway', 'outliers',
-                'outlier_size', 'seed', 'velocity_sigma', 'velocity_correlation_time',
-                'velocity_lag', 'velocity_outliers', 'reference_drift', 'drift_length',
-                'closure_time')
+                'outlier_size', 'seed', 'pressure_sigma', 'velocity_sigma',
+                'velocity_correlation_time', 'velocity_lag', 'velocity_outliers',
+                'reference_drift', 'drift_length', 'closure_time')
 # largest absolute values; angles are rad in the options and degrees on the command line
 LIMITS = {'outliers': 0.5, 'start_slip': 0.5, 'sway': 1.0, 'wheel_difference': 0.5,
           'gyro_scale_error': 0.5, 'accel_scale_error': 0.5, 'odometer_delay': 10.0,

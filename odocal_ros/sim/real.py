@@ -21,8 +21,8 @@ WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_slope',
           'accel_slope', 'warm_rise', 'rectification', 'speed_law', 'warming', 'imu_arm_error',
           'odometer_arm_error', 'antenna_arm_error', 'receiver_odometer', 'sideslip',
-          'squat', 'body_roll', 'tunnel_odometer', 'tunnel_heading', 'odometer_clock_rate',
-          'fix_clock_rate')
+          'squat', 'body_roll', 'crossfall', 'kneeling', 'tunnel_odometer', 'tunnel_heading',
+          'odometer_clock_rate', 'fix_clock_rate')
 PAIRS = {'slow_errors': 'sigma and correlation time, such as ((1.2,60),(0.9,900))',
          'tunnels': 'begin and length, such as ((200,60),(400,30))'}
 POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_factor',
@@ -75,6 +75,8 @@ class Real:
     wheelbase: float = 0.0           # m, on whose chord the body lies over a crest; 0: as the road
     body_roll: float = 0.0           # rad per m/s^2, outwards
     banking: float = 0.0             # share of a curve's force that its bank takes
+    crossfall: float = 0.0           # rad, the whole road leans to the right by
+    kneeling: float = 0.0            # rad, a bus leans to the right by at a stop
     kerbs: float = 0.0               # m up and down by turns
     kerb_distance: float = 15.0      # m, mean, between them
     cross_slope: float = 0.0         # rad, largest, to either side by turns
@@ -94,6 +96,7 @@ class Real:
     burst_size: float = 12.0         # m, median
     burst_time: float = 8.0          # s, median
     burst_onset: float = 2.0         # s, mean, in which one comes and goes
+    burst_spread: float = 0.9        # of the logarithm of size and length, 1 sigma
     # (begin, length) s each, in which the receiver dead-reckons by an odometer and a gyro
     tunnels: tuple[tuple[float, float], ...] = ()
     tunnel_odometer: float = 0.0     # relative scale error of this odometer

@@ -17,6 +17,7 @@ from odocal_ros.data.samples import (
     ImuSamples,
     OdometerForm,
     OdometerSamples,
+    ScalarSamples,
     VelocitySamples,
 )
 from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
@@ -28,11 +29,9 @@ from odocal_ros.sim import body, sensors
 from odocal_ros.sim.motion import attitude, Motion, Start, STEADY
 from odocal_ros.sim.noise import stamps, stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
-from odocal_ros.sim.profile import hermite, Profile
-from odocal_ros.sim.real_fixes import velocity
-from odocal_ros.sim.real_imu import own_angles
+from odocal_ros.sim.profile import hermite, Hills, Profile
+from odocal_ros.sim.real_sensors import own_angles, velocity
 from odocal_ros.sim.references import Reference, REFERENCES
-from odocal_ros.sim.road import Hills
 from odocal_ros.sim.routes import Route, ROUTES, with_sideways_moves
 from odocal_ros.sim.wheels import leg_factor, wheels_of
 
@@ -61,7 +60,7 @@ class Truth:
     yaw: float                   # rad, mounting
     pitch: float                 # rad, mounting
     heading: float               # rad from north, clockwise, of b's x axis at the start mark
-    distance: float              # m rolled at the odometer's point
+    distance: float              # path length of the odometer's point, m
     start_ns: int                # start mark: the last IMU sample before the vehicle first moves
     stop_ns: int                 # stop mark: the last IMU sample
     gyro_bias: np.ndarray        # (3,) rad/s at turn-on, frame i
@@ -83,6 +82,7 @@ class Drive:
     fix: FixSamples
     heading: HeadingSamples
     velocity: VelocitySamples
+    pressure: ScalarSamples
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -112,7 +112,9 @@ class Drive:
             fix = local_fixes(np.nan)(fix.stamp_ns, fix.received_ns, self.positions(), *stated)
         wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
         return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
-                   fix=fix, heading=self.heading, fix_velocity=self.velocity,
+                   fix=fix,
+                   outside={'heading': self.heading, 'fix_velocity': self.velocity,
+                            'pressure': self.pressure},
                    form=self.form, **wheels)
 
     def positions(self) -> Floats:
@@ -137,18 +139,15 @@ def motion_of(options: SimOptions) -> Motion:
     more: dict[str, Any] = {}
     hills = Hills(options.slope, kerbs=_kerbs(route, options))
     lean = (body.leaning(route.speed, route.yaw_rate, real)
-            if real.cross_slope or real.banking else None)
+            if real.cross_slope or real.banking or real.crossfall else None)
     if lean:
         more['lean'] = lean
     if route.side is not None:
         more['sway'] = route.side, STEADY
     elif options.sway or real.sideslip or lean:
         more['sway'] = _sway(route, options, lean)
-    if real.squat or real.body_roll or real.wheelbase or lean:
-        roll, pitch = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll, hills,
-                                 real.wheelbase)
-        roll = roll if lean is None else Profile(roll.breaks, roll.powers + lean.powers)
-        more['tilt'] = roll, pitch
+    if real.squat or real.body_roll or real.wheelbase or real.kneeling or lean:
+        more['tilt'] = body.tilts(route.speed, route.yaw_rate, real, hills, lean)
     return Motion(route.speed, route.yaw_rate, start, hills, **more)
 
 
@@ -175,7 +174,7 @@ def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Prof
     draws = size * stream(options.seed, 'sway').standard_normal((2, len(breaks)))
     side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / step], -1)) for x in draws)
     if options.real.sideslip:
-        v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, breaks)
+        v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, lean, breaks)
         side = _with(side, v)
     if lean:
         phi, rate = lean(breaks), lean.derivative()(breaks) * options.odometer_lever_arm[2]
@@ -207,7 +206,8 @@ def simulate(options: SimOptions | None = None) -> Drive:
         fix=sensors.fixes(motion, options),
         heading=(HeadingSamples.none() if options.heading_sigma is None
                  else sensors.heading(motion, options, options.heading_sigma)),
-        velocity=velocity(motion, options))
+        velocity=velocity(motion, options),
+        pressure=sensors.pressure(motion, options))
 
 
 def _truth(motion: Motion, options: SimOptions, imu: ImuSamples) -> Truth:

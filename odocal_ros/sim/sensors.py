@@ -15,7 +15,14 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples, take
+from odocal_ros.data.samples import (
+    FixSamples,
+    HeadingSamples,
+    ImuSamples,
+    OdometerSamples,
+    ScalarSamples,
+    take,
+)
 from odocal_ros.nav.earth import radii
 from odocal_ros.nav.rotations import (
     matrix_from_rpy,
@@ -24,7 +31,7 @@ from odocal_ros.nav.rotations import (
     quat_multiply,
 )
 from odocal_ros.settings.config import DIFFERENTIAL, HOLONOMIC
-from odocal_ros.sim import body, real_fixes, real_imu
+from odocal_ros.sim import body, real_sensors
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State
 from odocal_ros.sim.noise import gauss_markov, PHASE, random_walk, stamps, stream, TRANSPORT, white
 from odocal_ros.sim.options import SIM_GRADES, SimOptions
@@ -82,10 +89,10 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
     state = motion.at(t)
     C_vi = imu_rotation(options)
     w_v, f_v = body.felt(motion, state, options.imu_lever_arm)
-    w_i, f_i = real_imu.crooked(w_v @ C_vi * (1 + options.gyro_scale_error),
+    w_i, f_i = real_sensors.crooked(w_v @ C_vi * (1 + options.gyro_scale_error),
                                 f_v @ C_vi * (1 + options.accel_scale_error), options.real)
     gyro, accel = imu_errors(options, len(t))
-    gyro_drift, accel_drift = real_imu.drifts(t, state.speed, options)
+    gyro_drift, accel_drift = real_sensors.drifts(t, state.speed, options)
     q_ni = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     variance = np.full(len(t), np.nan)
     if options.orientation_sigma is not None:
@@ -100,7 +107,7 @@ def _imu_stamps(ns: Ints, options: SimOptions) -> Ints:
     real = options.real
     if not (real.imu_latency or real.imu_jitter or real.imu_batch > 1):
         return ns
-    return real_imu.stamped(ns, stream(options.seed, 'real imu stamps'), real.imu_latency,
+    return real_sensors.stamped(ns, stream(options.seed, 'real imu stamps'), real.imu_latency,
                             real.imu_jitter, real.imu_batch)
 
 
@@ -111,6 +118,25 @@ def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples
     stamp = options.start_ns + ns
     return HeadingSamples(stamp, stamp + round(TRANSPORT['heading'] * 1e9), q_nb,
                           np.full(len(t), sigma**2))
+
+
+def pressure(motion: Motion, options: SimOptions) -> ScalarSamples:
+    """
+    Return the air pressure, Pa; none without a sigma.
+
+    Weather, the wind of driving and the temperature of the air are drawn for each drive.
+    """
+    rate, scale_height, ground = 20.0, 8435.0, 101_325.0    # Hz, m, Pa: standard atmosphere
+    sigma = options.pressure_sigma
+    if sigma is None:
+        return ScalarSamples.none()
+    ns, t = stamps(motion.duration, rate, PHASE['pressure'])
+    state, draw = motion.at(t), stream(options.seed, 'pressure').standard_normal
+    weather, by_wind, warmer = draw(3) * [1e-3, 6e-3, 0.03]    # m/s, m per (m/s)^2, relative
+    height = (state.height + by_wind * state.speed**2 + weather * t) / (1 + warmer)
+    value = ground * np.exp(-(height + sigma * draw(len(t))) / scale_height)
+    stamp = options.start_ns + ns
+    return ScalarSamples(stamp, stamp, value, (value * sigma / scale_height)**2)
 
 
 def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> Floats:
@@ -138,7 +164,7 @@ def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
     if not jitter:
         late: Ints = ns + round(delay * 1e9)
         return late
-    return real_imu.stamped(ns, stream(options.seed, f'real {name} stamps'), delay, jitter)
+    return real_sensors.stamped(ns, stream(options.seed, f'real {name} stamps'), delay, jitter)
 
 
 def _reading(state: State, options: SimOptions, wheel: SimWheel,
@@ -203,19 +229,19 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     """Return GNSS fixes of the antenna, without those in an outage."""
     ns, t = stamps(motion.duration, options.fix_rate, PHASE['fix'])
     real = options.real
-    latitude, longitude, height = real_fixes.places(motion, t, options)
-    error = fix_errors(t, options) + real_fixes.errors(t, options)
+    latitude, longitude, height = real_sensors.places(motion, t, options)
+    error = fix_errors(t, options) + real_sensors.errors(t, options)
     error = error + drift(t, motion.at(t).travel, options)
-    error = real_fixes.fused(t, error, options)
+    error = real_sensors.fused(t, error, options)
     meridian, normal = radii(latitude)
     by_rad = np.stack([(normal + height) * np.cos(latitude), meridian + height], -1)
     # from the first fix: metres per radian change along the path
     off = np.stack([longitude - longitude[:1], latitude - latitude[:1]], -1)
     place = np.column_stack([by_rad * off, height])
-    error = real_fixes.reckoned(t, error, place, options)
+    error = real_sensors.reckoned(t, error, place, options)
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
-    variance = real_fixes.true_variance(
+    variance = real_sensors.true_variance(
         _axes(options) ** 2 * _power(options) + stationary_sigma(options)**2, options)
     variance = np.maximum(variance * real.stated_factor**2, SIGMA_FLOOR**2)
     if REFERENCES[options.reference].planar:

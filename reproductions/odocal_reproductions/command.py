@@ -7,7 +7,6 @@ import argparse
 from pathlib import Path
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.output.pictures import PICTURES
 
 
 def add_outputs(parser: argparse.ArgumentParser, drawn: str) -> None:
@@ -20,6 +19,7 @@ def picture_of(args: argparse.Namespace) -> Path | None:
     """Return the file to draw into, None without --plot; check that it can be drawn."""
     if args.plot is None:
         return None
+    from odocal_ros.output.drawing import PICTURES  # it imports numpy: not for help
     path = Path(args.plot)
     if path.suffix.lower() not in PICTURES:
         raise BadUsage(f'--plot {path}: required: a name that ends in {", ".join(PICTURES)}')

@@ -18,8 +18,8 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.data.samples import ImuSamples, OdometerSamples, take
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import matrix_from_quat
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import with_settings
+from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.scenarios import SimOptions, simulate
 

@@ -16,8 +16,8 @@ from odocal_ros.nav.rotations import (
     quat_from_rotvec,
     quat_multiply,
 )
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import with_settings
+from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.sensors import imu_rotation
 

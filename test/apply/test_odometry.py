@@ -17,8 +17,8 @@ from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.screening.screen import screen
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import with_settings
+from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow

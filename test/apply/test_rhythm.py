@@ -9,12 +9,12 @@ from faulty_streams import calibration
 import numpy as np
 import pytest
 
+from odocal_ros.apply.arrivals import Rhythm
 from odocal_ros.apply.odometry import Odometry
-from odocal_ros.apply.rhythm import Rhythm
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.samples import take
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import with_settings
+from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 RATE, COUNT = 50.0, 0.02      # Hz, m

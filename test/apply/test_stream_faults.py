@@ -13,8 +13,8 @@ from odocal_ros.apply.spikes import SpikeScreen
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.apply.wheel import Wheel
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import with_settings
+from odocal_ros.settings.node_configs import ApplyConfig
 
 pytestmark = pytest.mark.slow
 STREAMS = 6       # of any number: benchmarks/stream_faults.py

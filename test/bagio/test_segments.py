@@ -16,9 +16,8 @@ from rosbags import rosbag2
 from odocal_ros.bagio import chunks, segments
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import pack, read_chunks, write_file
-from odocal_ros.bagio.numbered import JOURNAL, part_name, whole_name
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.bagio.segments import SegmentedBag
+from odocal_ros.bagio.segments import JOURNAL, part_name, SegmentedBag, whole_name
 from odocal_ros.errors import BadBag
 from odocal_ros.outside.whole import PART
 

@@ -3,7 +3,6 @@
 
 """Simulated legs as the smoother sees them, and their truth at its keyframes."""
 
-from dataclasses import replace
 
 from drives import cached, settings
 import numpy as np
@@ -53,7 +52,7 @@ def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
     v = motion.velocity_n(state) + np.einsum('kij,kj->ki', motion.attitude(state), swing)
     v = v + errors(np.random.default_rng(7).standard_normal(v.shape))
     stamp = o.start_ns + ns
-    return replace(drive.leg(), fix_velocity=VelocitySamples(
+    return drive.leg().with_rows(fix_velocity=VelocitySamples(
         stamp, stamp, v, np.full(v.shape, stated)))
 
 

@@ -36,7 +36,7 @@ def test_the_rate_is_stated(drifting):
     name, _, result = drifting
     text, = (r.text for r in result.reasons if r.code is Code.CLOCKS_DRIFT)
     ppm = int(text.split('clock is ')[1].split(' ppm')[0])
-    sigma = int(text.split('(+-')[1].split(')')[0])
+    sigma = int(text.split('(± ')[1].split(')')[0])
     assert text.startswith(f'{name} stamps')
     assert 'fast' in text
     assert abs(ppm - 1e6 * FAST) <= 3 * sigma + 1    # rounded to whole ppm

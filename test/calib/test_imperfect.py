@@ -150,6 +150,19 @@ def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, text, d
     assert ('easure' in reason.do) != ('larger' in text)
 
 
+def test_a_lever_arm_that_is_off_is_not_called_unobservable_too():
+    _, config, leg = made(scenario='town', duration=300.0, imu_grade='consumer', seed=4,
+                          antenna_lever_arm=(1.5, 0.0, 1.0))
+    config = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0),
+                                    'gnss.lever_arm_sigma': 0.1})
+    found = smooth(replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0])), config)
+    said = {r.code: r.text for r in found.reasons}
+    assert 'gnss.lever_arm x: set to +0.00 m, found +1.' in said[Code.LEVER_ARM_OFF]
+    # the sigma of this axis is no smaller than its prior; the other two are as configured
+    assert found.details['posterior_to_prior']['antenna_lever_arm_x'] > 0.5
+    assert 'the antenna lever arm (left, up)' in said[Code.PARAMETER_NOT_DETERMINED]
+
+
 def test_what_a_vehicle_shows_beside_its_values_is_said():
     real = Real(receiver_lag=0.8, speed_law=0.006, stated_factor=0.5)
     drive, config, leg = made(scenario='town', duration=250.0, imu_grade='industrial', seed=4,

@@ -61,7 +61,7 @@ def test_samples_that_vary_more_in_motion_are_vibration():
 
 def test_samples_that_vary_alike_are_the_noise_of_the_sensor():
     text = noise_remedy(noisy(1e-2, 8e-3), {'gyro': 1e-2, 'accel': 1.0}, ['gyro'])
-    assert 'If this is its normal noise, set imu.gyro_noise to 0.01.' in text
+    assert 'If this is its normal noise, set imu.gyro_noise to 0.01 (rad/s/sqrt(Hz)).' in text
     assert 'cause is vibration' not in text
 
 

@@ -15,7 +15,6 @@ from odocal_ros.estimator import bound, smooth
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.point_rows import alike
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.outside import Heading
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import YAW
 from odocal_ros.reasons import Code
@@ -65,7 +64,7 @@ def test_a_velocity_helps_and_its_size_is_found():
     assert off(drive, said) < 3.3
     assert sigma_of(said) < 0.9 * sigma_of(without)
     unasked = with_settings(config, {'gnss.use_velocity': False})
-    assert not len(leg_of(with_velocity(drive, lambda e: SIGMA * e), unasked).velocity.t)
+    assert not leg_of(with_velocity(drive, lambda e: SIGMA * e), unasked).outside
     # 1.5 thousand draws of each: 2 % of a sigma
     assert said.details['noise']['velocity'] == pytest.approx(1.0, abs=0.08)
     assert silent.details['noise']['velocity'] == pytest.approx(0.5, abs=0.04)
@@ -135,8 +134,8 @@ def test_no_velocity_is_used_without_an_accelerometer():
     drive, config, _ = made(**SHORT, velocity_sigma=SIGMA)
     leg = drive.leg()
     silent = replace(leg, imu=changed(leg.imu, f_i=lambda f: f.fill(0.0)))
-    assert len(leg_of(leg, config).velocity.t)
-    assert not len(leg_of(silent, config).velocity.t)
+    assert 'velocity' in leg_of(leg, config).outside
+    assert 'velocity' not in leg_of(silent, config).outside
 
 
 def test_white_errors_are_not_alike():
@@ -160,7 +159,7 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
     method = fitted(drive.leg(), config, **ask)
     # without it, at the noise levels that this fit found: a fit of its own would find others
     levels = Levels.of_roots(method.details['noise'])
-    alone = math.sqrt(bound(replace(leg, heading=Heading()), config,
+    alone = math.sqrt(bound(replace(leg, outside={}), config,
                             truth(drive, config, leg), levels)[YAW, YAW])
     # two independent sources; linearised at the estimate or at the truth: 3 %. A heading that the
     # drive gainsays, by 1.5 of its sigmas here, is believed less: up to 15 %
@@ -174,7 +173,7 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
 
 def test_the_orientation_of_an_imu_is_used_only_when_asked_for():
     drive, config, leg = made(**STRAIGHT, orientation_sigma=1e-3)
-    assert not len(leg.heading.t)
+    assert 'heading' not in leg.outside
 
 
 def test_a_wrong_heading_is_said_and_gives_way():
@@ -190,11 +189,12 @@ def test_a_wrong_heading_is_said_and_gives_way():
 def test_a_velocity_is_screened():
     drive, config, _ = made(**SHORT)
     leg = with_velocity(drive, lambda e: 0 * e)
+    sent = leg.rows('fix_velocity')
 
     def spoil(v):
         v[5:8, 0] = np.nan
 
-    inputs, found = screen(replace(leg, fix_velocity=changed(leg.fix_velocity, velocity_n=spoil)),
+    inputs, found = screen(leg.with_rows(fix_velocity=changed(sent, velocity_n=spoil)),
                            config)
-    assert len(inputs.t_velocity) == len(leg.fix_velocity.stamp_ns) - 3
+    assert len(inputs.outside['fix_velocity'].t) == len(sent.stamp_ns) - 3
     assert any('3 of' in r.text and 'GNSS velocity messages' in r.text for r in found)

@@ -70,7 +70,7 @@ def spun(options, at, length, size):
 def said(made, **wheels):
     """Return what screening says of a leg whose counters are changed."""
     leg = made.leg()
-    leg = replace(leg, **{slot: changed(getattr(leg, slot), value=change)
+    leg = leg.with_rows(**{slot: changed(leg.rows(slot), value=change)
                           for slot, change in wheels.items()})
     return {r.code: r.text for r in screen(leg, settings(made))[1]}
 
@@ -225,7 +225,7 @@ def test_a_wheel_that_slips_on_and_on_is_said(side):
         return s + np.floor(0.01 * np.maximum(s - s[np.searchsorted(t, 150.0)], 0.0))
     (reason,), slips = faults(options, **{side: slips_on})
     assert reason.code is Code.WHEEL_SLIP
-    assert '% (+-' in reason.text
+    assert '% (± ' in reason.text
     assert ('more' if side == 'right' else 'less') in reason.text
     assert not len(slips.t)
 

@@ -306,8 +306,8 @@ def test_the_range_is_widened_where_the_minimum_lies_on_its_edge():
                   right_n=leg.right_n @ turned(-60.0))
     found = search(far, RANGES)
     widened = next(r for r in found.reasons if r.code is Code.SEARCH_WIDENED)
-    assert 'left +-5 % to +-40 %' in widened.text
-    assert 'heading +-10 deg to +-80 deg' in widened.text
+    assert 'left ± 5 % to ± 40 %' in widened.text
+    assert 'heading ± 10 deg to ± 80 deg' in widened.text
     assert_allclose(found.refined_set - [0.0, 0.0, np.deg2rad(60.0)], TRUE, atol=0.01)
 
 

@@ -6,8 +6,7 @@
 import numpy as np
 import pytest
 
-from odocal_ros.fleet.changes import covariance, history
-from odocal_ros.fleet.population import FAR, population
+from odocal_ros.fleet.statistics import covariance, FAR, history, population
 
 pytestmark = pytest.mark.slow
 N = 10

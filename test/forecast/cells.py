@@ -14,7 +14,7 @@ def thinned(leg, stop_s=float('inf'), begin_s=float('-inf'), into=None):
     """Return the cells of a leg between times after its start mark, s, added to ``into``."""
     cells = into or ThinnedLeg(leg.form)
     for slot in SLOTS:
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         t = (rows.stamp_ns - leg.start_ns) / SECOND
         cells.feed(slot, take(rows, (t > begin_s) & (t <= stop_s)))
     return cells

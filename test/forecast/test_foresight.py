@@ -18,14 +18,12 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import foresight
 from odocal_ros.forecast.forecast import as_keys, Forecast, Prospect
 from odocal_ros.forecast.foresight import Abandoned, DriveSoFar, forecast_of
-from odocal_ros.forecast.leg_so_far import faults_in_cells
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar
+from odocal_ros.forecast.leg_so_far import faults_in_cells, SmootherSoFar
 from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
 from odocal_ros.live import running_estimate as watch
-from odocal_ros.live.guidance import hint
+from odocal_ros.live.answers import hint
 from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
-from odocal_ros.live.session import Session
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView
 from odocal_ros.live.worker import Worker
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
@@ -279,11 +277,11 @@ def watched(drive, config, worker, log):
     recorder.form = leg.form
     half = leg.start_ns + 150 * SECOND
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         recorder.feed(slot, take(rows, rows.stamp_ns <= leg.start_ns))
     look.begin(recorder, leg.start_ns, config)
     for slot in ('imu', 'odometer', 'fix'):
-        rows = getattr(leg, slot)
+        rows = leg.rows(slot)
         for first_ns in range(leg.start_ns, half, 10 * SECOND):
             look.feed(slot, take(rows, (rows.stamp_ns > first_ns)
                                  & (rows.stamp_ns <= first_ns + 10 * SECOND)))
@@ -444,7 +442,7 @@ NO_YAW = Prospect(None, 0.0087, None, (), 'limited by the heading uncertainty (1
 
 def test_a_coarse_scale_is_said_in_per_cent():
     assert Prospect(0.138, 1e-3, 2108.0, now='1.02').words('scale', 'ppm', 1e6) == (
-        'scale 1.02 +- 13.8 % so far; drive 2200 m more for the limit of 0.1 %')
+        'scale 1.02 ± 13.8 % so far; drive 2200 m more for the limit of 0.1 %')
     assert Prospect(0.0099, 1e-3, 0.0).words('scale', 'ppm', 1e6) == (
         'OK: scale 9900 ppm (limit 1000)')
 

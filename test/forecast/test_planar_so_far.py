@@ -8,7 +8,7 @@ import pytest
 
 from odocal_ros.errors import BadData
 from odocal_ros.forecast.forecast import Abandoned
-from odocal_ros.forecast.planar_so_far import planar_forecast
+from odocal_ros.forecast.smoother_forecast import planar_forecast
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate

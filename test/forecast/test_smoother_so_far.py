@@ -21,11 +21,10 @@ from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.warm_start import carried, steps_of
 from odocal_ros.forecast.forecast import Abandoned, as_keys, Forecast, Prospect
 from odocal_ros.forecast.foresight import forecast_of
+from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.forecast.smoother_forecast import look, with_running
-from odocal_ros.forecast.smoother_so_far import SmootherSoFar
-from odocal_ros.live.guidance import hint
-from odocal_ros.live.session import Session
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.answers import hint
+from odocal_ros.live.session import Session, SessionView
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
@@ -257,12 +256,13 @@ def test_an_imu_that_faces_down_is_read_as_such(config, looks):
 
 
 @pytest.mark.parametrize(('changed', 'words'), [
-    ({'fix': slice(0, 5)}, '^5 fixes in [0-9]+ s; the smoother needs at least 10 fixes in 20 s'),
+    ({'fix': slice(0, 5)},
+     '^5 fixes and [0-9.]+ s of data; the smoother needs at least 10 fixes and 20 s'),
     ({'imu': slice(0, 0)}, 'needs IMU'), ({'imu': slice(0, 2)}, 'needs IMU'),
     ({'odometer': slice(0, 1)}, 'and odometer')])
 def test_too_little_is_said_and_no_look_is_lost_by_it(config, looks, changed, words):
     leg, so_far = looks[0].leg, SmootherSoFar()
-    less = replace(leg, **{slot: take(getattr(leg, slot), rows) for slot, rows in changed.items()})
+    less = leg.with_rows(**{slot: take(leg.rows(slot), rows) for slot, rows in changed.items()})
     with pytest.raises(OdocalError, match=words):
         so_far.look(less, config)
     assert so_far.look(leg, config).distance > 50.0
@@ -351,7 +351,7 @@ def test_the_yaw_asks_for_stops_and_starts_until_it_is_there(looks):
     assert found.yaw.lack == 'for the yaw: stop and start 12 times, or make as many turns'
     assert found.yaw.metres == pytest.approx(1500.0)
     assert found.yaw.words('yaw', 'deg', math.degrees(1)).endswith(
-        ' +- 1.15 deg so far (limit 0.573)')
+        ' ± 1.15 deg so far (limit 0.573)')
     assert not found.complete
     assert of_sigmas(looks[-1], yaw=0.0105).yaw.lack.startswith('for the yaw: stop and start 1 ')
     assert of_sigmas(looks[-1], yaw=0.2).yaw.lack.startswith('for the yaw: stop and start often,')
@@ -370,7 +370,7 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     far = of_sigmas(looks[-1], scale=2e-3, yaw=0.02)
     said = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
     # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
-    assert ' m/pulse +- 2000 ppm so far; drive 660 m more for the limit of 1000 ppm; yaw ' in said
+    assert ' m/pulse ± 2000 ppm so far; drive 660 m more for the limit of 1000 ppm; yaw ' in said
     assert said.endswith('; for the yaw: stop and start 12 times, or make as many turns')
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=40.0, **known))
     assert '; estimate is 40 s old; ' in told

@@ -22,7 +22,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast.progress import Progress
-from odocal_ros.live import jobs
+from odocal_ros.live import worker
 from odocal_ros.live.health import Health
 from odocal_ros.live.running_estimate import RunningEstimate
 from odocal_ros.messages.decode import make_reader
@@ -225,7 +225,7 @@ def leg(seed, number):
         warnings.simplefilter('error', RuntimeWarning)
         try:
             recorder, start_ns, stop_ns, raised = received(drive, rows, config)
-            computed = jobs.compute(recorder, start_ns, stop_ns, [], config)
+            computed = worker.compute(recorder, start_ns, stop_ns, [], config)
         except OdocalError as error:
             return Outcome(number, tuple(done), 'refused', 0.0, '', (str(error),), '')
         except Exception as error:      # that none comes is what is tested

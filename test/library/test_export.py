@@ -16,7 +16,7 @@ import shown
 
 from odocal_ros import OdocalError
 from odocal_ros.library.export import KNOWN
-from odocal_ros.library.export_map import map_figure
+from odocal_ros.library.export_pictures import map_figure
 from odocal_ros.offline.cli import main
 from odocal_ros.output.geojson import features
 

@@ -8,8 +8,7 @@ from types import SimpleNamespace
 from bench import wait_for
 
 from odocal_ros.live.console import Console
-from odocal_ros.live.session import Session
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 

@@ -14,10 +14,10 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
-from odocal_ros.live import answers, jobs, operation
+from odocal_ros.live import answers, operation, worker
+from odocal_ros.live.messages import WaitingMessages
 from odocal_ros.live.node import AWAITED_TURN_S, TURN_S
 from odocal_ros.live.topic_input import Input
-from odocal_ros.live.waiting_messages import WaitingMessages
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 
@@ -130,7 +130,7 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
 
     def explode(*_):
         raise MemoryError('not enough for this leg')
-    monkeypatch.setattr(operation.jobs, 'compute', explode)
+    monkeypatch.setattr(worker, 'compute', explode)
     stopping = client.ask('stop_leg')
     player.play(part(messages, 80, 82), 30)
     status = client.until(state='failed')
@@ -142,7 +142,7 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
     assert 'not enough for this leg' in status['message']
     assert not client.call('start_leg').success
     monkeypatch.undo()
-    assert operation.jobs.compute is jobs.compute
+    assert operation.worker.compute is worker.compute
     # a fault after the numbers are there is an answer, too, and the node lives
     monkeypatch.setattr(answers, 'outcome', explode)
     assert 'MemoryError: not enough for this leg' in client.result(

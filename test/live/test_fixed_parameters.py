@@ -8,8 +8,8 @@ import math
 from rclpy.parameter import Parameter
 
 from odocal_ros.live.params import fixed, refused, RESULTS
-from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.node_configs import ApplyConfig
 
 
 def of(**values):

@@ -12,10 +12,9 @@ import pytest
 from odocal_ros.bagio import segments
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import pack
-from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.live.journal_leg import LegJournal, Plan
-from odocal_ros.live.journal_space import clear_empty
+from odocal_ros.bagio.segments import JOURNAL
+from odocal_ros.live.journal_leg import clear_empty, LegJournal, Plan
 
 SECOND = 10**9
 NAME = '2026-01-02T03-04-05Z_leg_1'

@@ -15,16 +15,15 @@ import ros_messages as make
 from odocal_ros.bagio import segments
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import pack
-from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.read import open_bag
+from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.errors import BadConfig
 from odocal_ros.library.read_bag import journal_notes
 from odocal_ros.live import journal_leg, journal_writer
-from odocal_ros.live.definitions import _in_msg, definition_of, message_class
 from odocal_ros.live.journal import journal_text
-from odocal_ros.live.journal_leg import LegJournal, Plan
-from odocal_ros.live.journal_space import claim, journals, make_room, size_of
+from odocal_ros.live.journal_leg import claim, journals, LegJournal, make_room, Plan, size_of
 from odocal_ros.live.journal_writer import PreRoll
+from odocal_ros.live.messages import _in_msg, definition_of, message_class
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config import Config, flat, with_settings
 

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from odocal_ros.live import result_folders as module
-from odocal_ros.live.result_folders import ResultFolders
+from odocal_ros.live import filing as module
+from odocal_ros.live.filing import ResultFolders
 
 pytestmark = pytest.mark.core
 

@@ -19,7 +19,7 @@ CASES = [
     {}, {'rviz': 'true'}, {'method': 'two_point', 'use_sim_time': 'true'},
     {'namespace': 'truck', 'rviz': 'true', 'params_file': '/tmp/mine.yaml'},
     {name + '_topic': f'/a/{name}' for name in ('imu', 'odometer', 'odometer_right', 'fix',
-                                                'fix_velocity', 'heading')}]
+                                                'fix_velocity', 'heading', 'pressure')}]
 
 
 @pytest.mark.parametrize('given', CASES, ids=lambda given: ' '.join(given) or 'as is')
@@ -62,7 +62,7 @@ def test_an_empty_method_leaves_the_one_of_the_file():
 @pytest.mark.parametrize(('read', 'path'), [(of_python, PYTHON), (of_xml, XML)],
                          ids=['python', 'xml'])
 def test_the_node_started_so_listens_where_it_is_told(start, connect, tmp_path, read, path):
-    from odocal_ros.live.definitions import message_class
+    from odocal_ros.live.messages import message_class
     mine = tmp_path / 'mine.yaml'
     mine.write_text(yaml.safe_dump({'/**/calibrator': {'ros__parameters': {
         'odometer': {'type': 'std_msgs/msg/Int64', 'right': 'topic'},

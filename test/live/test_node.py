@@ -275,7 +275,7 @@ def test_while_it_records_the_running_estimate_is_told(session, drive):
     assert (metres == 0.0) == (scale_ppm <= 1000)
     assert float(status['predicted_yaw_sigma_deg']) > 0.0
     assert 0.0 <= float(status['estimate_age_s']) <= 55.0            # the leg is no longer
-    assert re.search(r'scale 1\.0\d* \+- [\d.]+ ppm', status['hint'])
+    assert re.search(r'scale 1\.0\d* ± [\d.]+ ppm', status['hint'])
     assert status['largest_error_source_scale']
     assert session.idle['estimate_scale_factor'] == session.waiting['estimate_age_s'] == 'nan'
     assert session.calibrated['estimate_scale_factor'] == 'nan'

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs by poses, by a robot with skid steering and by four wheels; journals replay to the bit."""
+"""Legs by poses, skid steering, four wheels with air pressure; journals replay to the bit."""
 
 from types import SimpleNamespace
 
@@ -70,12 +70,14 @@ def bare(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def four(tmp_path_factory):
-    """Drive some minutes of town with four wheels, the front ones of which steer."""
+    """Drive some minutes of town with four wheels, two of which steer, and air pressure."""
     return driven(tmp_path_factory.mktemp('four'), {
         'scenario': 'town', 'duration': 240.0, 'imu_rate': 50.0, 'odometer_rate': 25.0,
-        'fix_noise': 'rtk', 'imu_grade': 'tactical', 'wheels': 4, 'heading': 0.7, 'seed': 4},
-        lambda drive: {'odometer': encode.joints('odometer', {
-            'steering': drive.odometer, **joints(drive)})},
+        'fix_noise': 'rtk', 'imu_grade': 'tactical', 'wheels': 4, 'heading': 0.7, 'seed': 4,
+        'pressure_sigma': 0.15},
+        lambda drive: {'pressure': encode.pressure('pressure', drive.pressure),
+                       'odometer': encode.joints('odometer', {
+                           'steering': drive.odometer, **joints(drive)})},
         lambda drive: {'method': 'smoother', 'imu.grade': 'tactical',
                        'odometer.wheels': f'[{", ".join(drive.joints)}]'},
         rest_s=30.0, leg_s=160.0)
@@ -126,6 +128,8 @@ def test_status_and_answer_have_each_of_four_wheels_by_its_name(four):
         assert four.live['result'][f'scale_factor_{name}']['value'] == value
     assert four.status['left_right_ok'] == 'unknown'
     assert 'WHEELS_STEERED' in four.status['reasons']
+    seen = four.live['legs'][0]['methods']['smoother']['outside']['pressure']
+    assert seen['messages'] > 150       # means of a second
 
 
 def test_an_imu_is_required_if_it_is_published(start, connect):

@@ -43,13 +43,14 @@ def seen(client, kind, node='calibrator'):
 
 def test_the_policy_is_the_graph_of_a_node_that_is_asked_for_everything(start, connect):
     from geometry_msgs.msg import TwistStamped
-    from sensor_msgs.msg import Imu, NavSatFix
+    from sensor_msgs.msg import FluidPressure, Imu, NavSatFix
     from std_msgs.msg import Int64
     start(*ALL)
     client = connect()
     for kind, name in ((Imu, 'heading'), (NavSatFix, 'fix'), (Int64, 'odometer'),
                        (Int64, 'odometer_right'),
-                       (TwistStamped, 'fix_velocity')):     # found by their publishers
+                       (TwistStamped, 'fix_velocity'), (FluidPressure, 'pressure')):
+        # found by their publishers
         client.node.create_publisher(kind, name, 10)
     client.until(state='waiting')
     wanted = allowed('/calibrator')

@@ -13,9 +13,8 @@ from player import messages_of, part, playing_to
 import pytest
 
 from odocal_ros.live import answers
-from odocal_ros.live.computing import PATIENCE_S
-from odocal_ros.live.session import Session
-from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.session import Session, SessionView
+from odocal_ros.live.worker import PATIENCE_S
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -27,8 +26,8 @@ MOST_S = 5.0                         # of an answer, as docs/node.md promises
 # until a file is there, the first leg's fit makes three passes and the next leg's none
 HELD = """
 import os, time
-from odocal_ros.live import jobs
-compute = jobs.compute
+from odocal_ros.live import worker
+compute = worker.compute
 def wait():
     while not os.path.exists({!r}):
         time.sleep(0.01)
@@ -41,7 +40,7 @@ def held(*args):
     if args[3]:      # the legs kept
         wait()
     return compute(*samples, told)
-jobs.compute = held
+worker.compute = held
 """
 
 

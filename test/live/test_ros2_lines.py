@@ -16,7 +16,7 @@ import pytest
 from test_shown_names import has_field, INPUT_TYPES
 import yaml
 
-from odocal_ros.live.definitions import message_class
+from odocal_ros.live.messages import message_class
 from odocal_ros.offline import cli
 
 LINES = [(page, shlex.split(line)) for page, line in all_commands('ros2')]

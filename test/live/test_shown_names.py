@@ -10,7 +10,7 @@ import pytest
 from rclpy._rclpy_pybind11 import NodeNameNonExistentError
 import shown
 
-from odocal_ros.live.definitions import message_class
+from odocal_ros.live.messages import message_class
 
 INPUT_TYPES = {'/imu/data': 'sensor_msgs/msg/Imu', '/fix': 'sensor_msgs/msg/NavSatFix',
                '/odometer': 'std_msgs/msg/Int64'}       # as a pulse counter

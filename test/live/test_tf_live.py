@@ -14,7 +14,7 @@ import pytest
 import ros_messages as make
 
 from odocal_ros.errors import BadConfig
-from odocal_ros.live.definitions import message_class
+from odocal_ros.live.messages import message_class
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 TF = 'tf2_msgs/msg/TFMessage'

@@ -11,7 +11,7 @@ from player import messages_of, part, playing_to
 import pytest
 
 from odocal_ros.bagio import encode
-from odocal_ros.live.guidance import TURNS
+from odocal_ros.live.answers import TURNS
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 30.0

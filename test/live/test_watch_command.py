@@ -15,8 +15,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import pytest
 from std_msgs.msg import Float64, String
 
-from odocal_ros.live.status_listener import LATCHED, StatusListener
-from odocal_ros.live.watch_command import NEEDS
+from odocal_ros.live.start import NEEDS
+from odocal_ros.live.watch import LATCHED, StatusListener
 
 ODOCAL = [sys.executable, '-m', 'odocal_ros.offline.cli', 'watch', '--once']
 
@@ -55,13 +55,13 @@ def test_the_panel_shows_a_running_node(start, connect):
     ended = subprocess.run(ODOCAL, capture_output=True, text=True, timeout=PATIENCE, check=False,
                            env=os.environ | {'PYTHONPATH': paths, 'COLUMNS': '120'})
     assert ended.returncode == 0, ended.stderr
-    for words in ('/calibrator', 'waiting', 'no IMU on /imu/data', 'path', 'limit 1000 ppm'):
+    for words in ('/calibrator', 'waiting', 'no IMU on /imu/data', 'standstill', 'limit 1000 ppm'):
         assert words in ended.stdout
 
 
 def test_while_a_leg_is_computed_the_panel_shows_its_running_estimate():
     rich = pytest.importorskip('rich.console')
-    from odocal_ros.live.panel import panel
+    from odocal_ros.live.watch import panel
     status = {'state': 'computing', 'scale_factor': '0.03', 'scale_factor_sigma': '0.0001',
               'estimate_scale_factor': '0.02', 'estimate_scale_factor_sigma': '0.0001'}
 
@@ -78,7 +78,7 @@ def test_while_a_leg_is_computed_the_panel_shows_its_running_estimate():
 
 def test_the_bars_are_shares_of_what_is_asked():
     pytest.importorskip('rich')
-    from odocal_ros.live.panel import shares
+    from odocal_ros.live.watch import shares
     found = shares({'distance_m': '75.0', 'metres_to_least': '25.0', 'seconds_to_stand': '4.0',
                     'asked_scale_sigma_ppm': '1000.0', 'predicted_scale_sigma_ppm': '4000.0',
                     'asked_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
@@ -92,6 +92,8 @@ def test_the_bars_are_shares_of_what_is_asked():
     assert shares(done)['yaw'] == (1.0, '0.25 deg, limit 0.5 deg')
     assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, limit 1000 ppm')
     assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {}
+    # without a leg no metres are missing, and '0 m to go' would be wrong
+    assert 'path' not in shares({'state': 'waiting', 'metres_to_least': '0.0'})
 
 
 def test_what_anybody_publishes_does_not_reach_the_terminal():

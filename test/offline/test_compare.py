@@ -188,7 +188,7 @@ def test_a_zero_or_unknown_sigma_is_no_judgement(compare):
 
 
 def test_every_compared_name_has_a_cause():
-    from odocal_ros.library.changes import NOT_COMPARED
+    from odocal_ros.library.compare import NOT_COMPARED
     names = ['scale_factor', 'scale_factor_left', 'scale_factor_right', 'track_width',
              'yaw_mounting_angle', 'pitch_mounting_angle', 'odometer_delay', 'gnss_delay',
              *(f'{what}_lever_arm_{a}' for what in ('odometer', 'antenna') for a in 'xyz')]

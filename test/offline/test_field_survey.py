@@ -19,8 +19,7 @@ from odocal_ros.bagio.encode import counter, fix, imu, velocity
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.offline import inspection_text
 from odocal_ros.offline.cli import main
-from odocal_ros.offline.field_survey import Fields
-from odocal_ros.offline.odometer_search import only_near_best
+from odocal_ros.offline.odometer_search import Fields, only_near_best
 
 pytestmark = pytest.mark.slow
 MOTOR = 'float32 rpm\nfloat64 angle\n'

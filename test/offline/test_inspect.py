@@ -115,7 +115,7 @@ def test_comma(data_dir, capsys):
     assert (pulses['odometer']['quantity'], pulses['rate_hz']) == (
         'cumulative', pytest.approx(82.9, abs=0.1))
     for line in ('looks z-down', 'no header: arrival time', 'arrival jitter', 'never at rest',
-                 'no covariance', '3 topics can be the odometer', '[180, 0, 0] deg'):
+                 'no covariance', '3 topics can be the odometer', '[3.141592654, 0, 0] rad'):
         assert line in text
 
 
@@ -193,7 +193,7 @@ def test_a_good_drive_lacks_only_a_heading(tmp_path, capsys):
     assert told['mounting'] == told['mounting'] | {'rpy': [0, 0, 0], 'needed': False}
     assert told['command'] == f'odocal replay {tmp_path / "bag"}'
     assert told['open'] == ''
-    assert 'imu.mounting_rpy is correct: [0, 0, 0] deg' in text
+    assert 'imu.mounting_rpy is correct: [0, 0, 0] rad' in text
 
 
 @pytest.mark.parametrize('rpy', [

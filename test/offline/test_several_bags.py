@@ -8,7 +8,7 @@ import shutil
 
 import pytest
 
-from odocal_ros.bagio.numbered import JOURNAL
+from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.offline.cli import main
 from odocal_ros.sim.scenarios import SimOptions, simulate

@@ -5,7 +5,7 @@
 
 import pytest
 
-from odocal_ros.output.budget_table import budget_lines
+from odocal_ros.output.tables import budget_lines
 
 TABLE = {'fix_end': {'scale_factor': 4e-5, 'yaw_mounting_angle': 3e-3, 'shared': False},
          'initial_heading': {'scale_factor': 0.0, 'yaw_mounting_angle': 4e-3, 'shared': True},

@@ -19,11 +19,11 @@ from odocal_ros.calib.evidence import Evidence
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, Source
 from odocal_ros.calib.sections import Sections
 from odocal_ros.calib.speed_scale import SpeedScale
-from odocal_ros.output import plots_compare, report
+from odocal_ros.output import plots_scale, report
+from odocal_ros.output.drawing import look
 from odocal_ros.output.files import as_json, write_results
 from odocal_ros.output.plots import _biases, leg_figures
-from odocal_ros.output.plots_speed import by_speed, by_window
-from odocal_ros.output.plots_svg import look
+from odocal_ros.output.plots_scale import by_speed, by_window
 from odocal_ros.output.report import report_html, report_or_why
 from odocal_ros.settings.config import Config, with_settings
 
@@ -255,9 +255,9 @@ def test_many_legs_stay_within_the_size(good, monkeypatch):
 
 
 def test_of_many_legs_the_newest_are_side_by_side(good, monkeypatch):
-    monkeypatch.setattr(plots_compare, 'MOST_LEGS', 2)
+    monkeypatch.setattr(plots_scale, 'MOST_LEGS', 2)
     with look():
-        (_, says, drawing), = plots_compare.compared(replace(good, legs=good.legs[:1] * 3), 'all')
+        (_, says, drawing), = plots_scale.compared(replace(good, legs=good.legs[:1] * 3), 'all')
     assert 'Of 3 legs, the newest 2.' in says
     assert [f'leg {k}, two' in drawing for k in (1, 2, 3)] == [False, True, True]
 

@@ -14,7 +14,7 @@ import yaml
 from odocal_ros.calib.result import Estimate
 from odocal_ros.output import ros_files
 from odocal_ros.output.files import as_json
-from odocal_ros.outside.yaml_text import number
+from odocal_ros.outside.yaml_files import number
 from odocal_ros.settings.config import Config, with_settings
 
 CREATED = '2026-01-02T03:04:05+00:00'

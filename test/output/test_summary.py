@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Calibration, Estimate, Source, TrackCheck
-from odocal_ros.output.figures import beyond_one, length, time_span, with_sigma
-from odocal_ros.output.reason_lines import shared
+from odocal_ros.output.figures import beyond_one, length, shared, time_span, with_sigma
 from odocal_ros.output.summary import screen, sentence
-from odocal_ros.output.track_table import overall
+from odocal_ros.output.tables import overall
 from odocal_ros.reasons import Code, Reason
 
 pytestmark = pytest.mark.core
@@ -223,4 +222,4 @@ def test_the_plain_ratio_of_path_lengths_stands_beside_the_scale(good):
                  for ratio, distance in ((0.0505, 1000.0), (0.0508, 2000.0)))
     line = next(x for x in screen(replace(good, legs=legs)).splitlines() if 'path ratio' in x)
     assert line.split()[2:4] == ['0.05070', 'm/pulse']
-    assert line.endswith('fixes / odometer, uncorrected (+1.4 %)')
+    assert line.endswith('fixes / odometer, +1.4 % from the scale factor')

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 
 from odocal_ros.output import report_tables
+from odocal_ros.output.figures import shared
 from odocal_ros.output.files import as_json
-from odocal_ros.output.leg_table import leg_verdicts, shown_verdict
-from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.report import report_html
 from odocal_ros.output.summary import screen
+from odocal_ros.output.tables import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 

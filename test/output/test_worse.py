@@ -9,8 +9,7 @@ import pytest
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.output.files import write_results
-from odocal_ros.output.stored import read_stored
-from odocal_ros.output.worse import is_worse, replacing, stored_in
+from odocal_ros.output.stored import is_worse, read_stored, replacing, stored_in
 from odocal_ros.settings.config import Config
 
 CREATED = '2026-01-02T03:04:05+00:00'

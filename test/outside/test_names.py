@@ -16,10 +16,10 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.errors import BadConfig
 from odocal_ros.output import ros_files
 from odocal_ros.output.files import as_json
-from odocal_ros.output.leg_table import leg_table, LEGS
 from odocal_ros.output.ros_files import framed
+from odocal_ros.output.tables import leg_table, LEGS
 from odocal_ros.outside import names as outside
-from odocal_ros.outside.yaml_text import parameters, value_text
+from odocal_ros.outside.yaml_files import parameters, value_text
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 

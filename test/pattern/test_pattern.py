@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadConfig
-from odocal_ros.pattern.follow import command, Progress, why_stop
-from odocal_ros.pattern.route import rectangle_of, route_of
-from odocal_ros.settings.pattern_config import PatternConfig
+from odocal_ros.pattern import command, Progress, rectangle_of, route_of, why_stop
+from odocal_ros.settings.node_configs import PatternConfig
 
 pytestmark = pytest.mark.core
 DT = 0.05

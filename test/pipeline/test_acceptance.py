@@ -13,8 +13,8 @@ from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.pipeline.acceptance import accept, decide, Decision
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.accept_config import parse_accept
 from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.config_groups import parse_accept
 
 pytestmark = pytest.mark.core
 LIMITS = {'accept.scale_ratio_min': 0.995, 'accept.scale_ratio_max': 1.005}

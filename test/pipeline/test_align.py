@@ -9,6 +9,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from odocal_ros.data.samples import HeadingSamples
 from odocal_ros.nav.angles import heading_from_yaw, wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en
@@ -24,6 +25,7 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.align import align, choose_standstill, with_seen_walk
 from odocal_ros.pipeline.prepared import attitude_of
 from odocal_ros.reasons import Code
+from odocal_ros.screening.inputs import UsableRows
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import GRADES
@@ -51,8 +53,8 @@ class Case:
         start_ns = leg.start_ns + round(later * 1e9)
         if forget:     # no pre-roll: the recording begins at the mark
             from odocal_ros.data.samples import take
-            leg = replace(leg, **{slot: take(getattr(leg, slot),
-                                             getattr(leg, slot).stamp_ns >= start_ns)
+            leg = leg.with_rows(**{slot: take(leg.rows(slot),
+                                             leg.rows(slot).stamp_ns >= start_ns)
                                   for slot in ('imu', 'odometer', 'fix', 'heading')})
         self.leg = replace(leg, start_ns=start_ns)
         self.mark = (start_ns - self.drive.options.start_ns) * 1e-9     # s of the motion
@@ -246,7 +248,9 @@ def orientations(case, yaw, variance):
 
 def heading_rows(yaw, variance, t):
     q = quat_from_rotvec(np.outer(np.broadcast_to(yaw, np.shape(t)), [0, 0, 1]))
-    return {'t_heading': t, 'q_heading': q, 'heading_variance': np.full(len(t), variance)}
+    stamp_ns = np.round(t * 1e9)
+    sent = HeadingSamples(stamp_ns, stamp_ns, q, np.full(len(t), variance))
+    return {'outside': {'heading': UsableRows(sent, t)}}
 
 
 def yaw_of(alignment):
@@ -290,8 +294,8 @@ def test_heading_topic_with_its_offset(plain):
 
 def test_in_motion_the_nearest_heading_that_says_something_is_taken(plain):
     case = asked(plain, alignment__heading_source='heading_topic')
-    rows = heading_rows(np.array([9.0, 1.0, 2.0, 9.0]), 1e-4, np.array([0.0, 0.1, 0.3, 0.6]))
-    rows['heading_variance'][0] = np.nan
+    rows = heading_rows(np.array([9.0, 1.0, 2.0, 9.0]), np.array([np.nan, 1e-4, 1e-4, 1e-4]),
+                        np.array([0.0, 0.1, 0.3, 0.6]))
     a, _ = case.align(spans=np.empty((0, 2)), **rows)
     assert yaw_of(a) == pytest.approx(1.0, abs=PLACE)
 
@@ -305,7 +309,7 @@ def test_in_motion_a_heading_of_long_ago_is_none(plain):
 
 
 @pytest.mark.parametrize('source', ['imu_orientation', 'heading_topic'])
-@pytest.mark.parametrize(('variance', 'says'), [(np.nan, 'covariance[0] = -1'), (10.0, '+-181')])
+@pytest.mark.parametrize(('variance', 'says'), [(np.nan, 'covariance[0] = -1'), (10.0, '± 181')])
 def test_an_orientation_not_sent_or_worthless_is_refused(plain, source, variance, says):
     case = asked(plain, alignment__heading_source=source)
     rows = orientations(plain, 1.0, variance) if source == 'imu_orientation' else \

@@ -23,7 +23,7 @@ from odocal_ros.settings.config import Config
 
 pytestmark = pytest.mark.slow
 ROUTE = {'scenario': 'town', 'duration': 180.0, 'seed': 6, 'two_wheels': True}
-SAID = re.compile(r'(\w+) stamps are ([\d.]+) s \(\+-([\d.]+) s\) (late|early).*? '
+SAID = re.compile(r'(\w+) stamps are ([\d.]+) s \(± ([\d.]+) s\) (late|early).*? '
                   r'set (gnss|odometer)\.time_offset to (-?[\d.]+)')
 
 

@@ -55,7 +55,7 @@ def test_a_recorded_leg_gives_what_the_whole_drive_gives(made):
     """Pre-roll cut, topics raced, closed late: no digit changes."""
     recorder = LegRecorder()
     for slot in ('fix', 'odometer', 'imu'):
-        block = getattr(made.leg(), slot)
+        block = made.leg().rows(slot)
         for first in range(0, len(block.stamp_ns), 997):
             recorder.feed(slot, take(block, slice(first, first + 997)))
     leg = recorder.close(made.truth.start_ns, made.truth.stop_ns)
@@ -193,7 +193,7 @@ class Corruption:
     def leg(self, leg):
         for _ in range(self.rng.integers(1, 4)):
             slot = str(self.rng.choice(list(self.COLUMNS)))
-            leg = replace(leg, **{slot: self._one(slot, getattr(leg, slot))})
+            leg = leg.with_rows(**{slot: self._one(slot, leg.rows(slot))})
         return leg
 
     def _one(self, slot, samples):

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.estimator import prepare
-from odocal_ros.estimator.leg import smoother_leg
+from odocal_ros.estimator import prepare, smoother_leg
 from odocal_ros.estimator.prepare import _priors
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, OMEGA, PartlyKnownRate, rate_without_north
@@ -126,8 +125,8 @@ def test_what_refers_to_north_is_not_used_and_said():
     made = drive(**CAR, heading_sigma=0.001, velocity_sigma=0.05)
     leg, config = posed(made), settings(made, **SMOOTHER)
     inputs, found = screen(leg, config)
-    assert not len(inputs.t_heading)
-    assert not len(inputs.t_velocity)
+    assert not len(inputs.outside['heading'].t)
+    assert not len(inputs.outside['fix_velocity'].t)
     said = {r.code: r.text for r in found}
     assert Code.VELOCITY_UNUSABLE not in said
     assert said[Code.LOCAL_FRAME] == (
@@ -136,7 +135,7 @@ def test_what_refers_to_north_is_not_used_and_said():
     assert Code.LOCAL_FRAME not in {r.code for r in screen(made.leg(), config)[1]}
     # who asks for a heading topic has one in the frame of the positions
     asked = settings(made, **SMOOTHER, alignment__heading_source='heading_topic')
-    assert len(screen(leg, asked)[0].t_heading)
+    assert len(screen(leg, asked)[0].outside['heading'].t)
     text = {r.text for r in screen(leg, settings(made, reference__latitude_deg=40.0))[1]
             if r.code is Code.LOCAL_FRAME}
     assert f'up to {15.041 * math.cos(math.radians(40.0)):.1f} deg/h' in text.pop()

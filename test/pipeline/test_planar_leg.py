@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
-from odocal_ros.output.controller_files import controllers
+from odocal_ros.output.device_files import controllers
 from odocal_ros.pipeline import planar_run
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.pipeline.planar_run import shortened_by_slopes

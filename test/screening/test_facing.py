@@ -63,7 +63,7 @@ def test_what_is_far_off_is_said_by_its_side_and_size():
         assert axes_reasons(Facing(yaw * DEG, 1 * DEG), np.nan) == ()
     left, = axes_reasons(Facing(-90 * DEG, 1 * DEG), np.nan)
     assert left.code is Code.IMU_AXES
-    assert 'to the left in the IMU frame (yaw mounting -90 deg, +-1)' in left.text
+    assert 'to the left in the IMU frame (yaw mounting -90 deg, ± 1)' in left.text
     right, = axes_reasons(Facing(90 * DEG, 1 * DEG), np.nan)
     assert 'to the right' in right.text
     back, = axes_reasons(Facing(-179 * DEG, 1 * DEG), np.nan)
@@ -72,7 +72,7 @@ def test_what_is_far_off_is_said_by_its_side_and_size():
     # said as it is seen, whatever the nominal
     ahead, = axes_reasons(Facing(0.0, 1 * DEG), np.pi)
     assert ahead.code is Code.ODOMETER_REVERSED
-    assert 'forwards in the IMU frame (yaw mounting +0 deg, +-1, nominal +180)' in ahead.text
+    assert 'forwards in the IMU frame (yaw mounting +0 deg, ± 1, nominal +180)' in ahead.text
     ahead, = axes_reasons(Facing(0.0, 1 * DEG), 90 * DEG)
     assert ahead.code is Code.IMU_AXES
     assert 'accelerations point forwards' in ahead.text

@@ -47,8 +47,8 @@ def test_a_clean_leg_is_used_to_the_last_row(leg):
     ('imu', 'w_i', 'IMU'), ('imu', 'f_i', 'IMU'), ('fix', 'latitude', 'fix')])
 @pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf, 1e200])
 def test_rows_that_hold_no_number_are_dropped_and_counted(leg, slot, column, label, value):
-    bad = changed(getattr(leg, slot), **{column: lambda a: a.__setitem__(slice(40, 43), value)})
-    inputs, _, texts = said(replace(leg, **{slot: bad}))
+    bad = changed(leg.rows(slot), **{column: lambda a: a.__setitem__(slice(40, 43), value)})
+    inputs, _, texts = said(leg.with_rows(**{slot: bad}))
     t = seconds(leg, bad)[40]
     if slot == 'fix' and value == 1e200:
         assert texts == [f'3 of {len(bad.stamp_ns)} fixes are not used: 3 at an invalid position']
@@ -114,7 +114,7 @@ def test_messages_that_queue_and_arrive_at_once_are_no_clock_that_differs(leg):
         t = seconds(leg, samples)
         late = np.where(t % 10 < 8, t - t % 10 + 8, t)
         return replace(samples, received_ns=leg.start_ns + np.round(late * 1e9).astype(np.int64))
-    slots = {slot: queued(getattr(leg, slot)) for slot in ('imu', 'odometer', 'fix')}
+    slots = {slot: queued(leg.rows(slot)) for slot in ('imu', 'odometer', 'fix')}
     assert Code.CLOCKS_DIFFER not in said(replace(leg, **slots))[1]
     slots['fix'] = replace(slots['fix'], stamp_ns=slots['fix'].stamp_ns + 700_000_000)
     assert 'fix stamps are +0.7' in said(replace(leg, **slots))[1][Code.CLOCKS_DIFFER]
@@ -124,8 +124,8 @@ def test_messages_that_queue_and_arrive_at_once_are_no_clock_that_differs(leg):
                                                ('fix', 'gnss.time_offset')])
 @pytest.mark.parametrize('late', [0.8, -0.8])
 def test_clocks_that_differ_refuse_the_leg_until_an_offset_is_set(leg, slot, setting, late):
-    other = changed(getattr(leg, slot), stamp_ns=lambda a: a + round(late * 1e9))
-    moved = replace(leg, **{slot: other})
+    other = changed(leg.rows(slot), stamp_ns=lambda a: a + round(late * 1e9))
+    moved = leg.with_rows(**{slot: other})
     _, codes, _ = said(moved)
     seen = float(codes[Code.CLOCKS_DIFFER].split('are ')[1].split(' s')[0])
     assert abs(seen - late) < 0.055       # fixes take 0.05 s to arrive, which looks the same
@@ -136,7 +136,7 @@ def test_clocks_that_differ_refuse_the_leg_until_an_offset_is_set(leg, slot, set
     inputs, codes, _ = said(moved, with_settings(Config(), {setting: -late}))
     assert Code.CLOCKS_DIFFER not in codes
     t = inputs.travel.t if slot == 'odometer' else inputs.t_fix
-    np.testing.assert_allclose(t, seconds(leg, getattr(leg, slot)), atol=1e-9)
+    np.testing.assert_allclose(t, seconds(leg, leg.rows(slot)), atol=1e-9)
 
 
 def test_a_clock_an_hour_off_names_no_offset_that_cannot_be_set(leg):
@@ -241,9 +241,9 @@ def test_poor_fixes_are_left_out_by_the_limit_and_zero_takes_it_off(leg):
 
 @pytest.mark.parametrize(('slot', 'label'), [('odometer', 'odometer'), ('fix', 'fix')])
 def test_a_gap_far_beyond_a_topics_own_rhythm_is_a_note(leg, slot, label):
-    t = seconds(leg, getattr(leg, slot))
+    t = seconds(leg, leg.rows(slot))
     keep = (t < 30) | (t > 42)
-    _, codes, _ = said(replace(leg, **{slot: take(getattr(leg, slot), keep)}))
+    _, codes, _ = said(leg.with_rows(**{slot: take(leg.rows(slot), keep)}))
     assert set(codes) == {Code.TOPIC_GAP}
     assert codes[Code.TOPIC_GAP].startswith(f'{label} gap of 12.')
     assert Code.TOPIC_GAP.gravity.value == 'accepted'

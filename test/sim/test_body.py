@@ -10,9 +10,8 @@ import pytest
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import attitude, Motion, Start, velocity_n
 from odocal_ros.sim.options import resolved, SimOptions
-from odocal_ros.sim.profile import chain, hermite, hold, ramp, turn
+from odocal_ros.sim.profile import chain, hermite, Hills, hold, ramp, turn
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.road import Hills
 from odocal_ros.sim.scenarios import motion_of, simulate
 from odocal_ros.sim.zoo import G
 
@@ -121,7 +120,7 @@ def bends():
     speed = chain(hold(1) + ramp(4, 10, 1.0) + hold(8) + ramp(4, -10, 1.0) + hold(1)).integral()
     rate = chain(hold(6) + turn(5, 0.8, 1.5) + hold(7))
     return Motion(speed, rate, Start(0.7, 0.2, 0.0, 0.3),
-                  tilt=body.tilts(speed, rate, SQUAT, ROLL))
+                  tilt=body.tilts(speed, rate, Real(squat=SQUAT, body_roll=ROLL)))
 
 
 def test_the_nose_rises_and_the_body_leans_outwards():
@@ -172,3 +171,32 @@ def test_a_rear_axle_drifts_outwards_by_what_pushes_it():
     assert (state.sway[:, 1] == 0).all()
     assert_allclose(state.travel, motion_of(resolved(SimOptions(
         scenario='town', duration=200.0))).at(state.t).travel, atol=1e-9)
+
+
+def test_on_a_crossfall_the_body_leans_and_the_axle_drifts_downhill():
+    fall, straight = 0.025, {'scenario': 'straight', 'duration': 190.0}
+    real = Real(crossfall=fall, body_roll=ROLL, sideslip=0.004)
+    motion = motion_of(resolved(SimOptions(**straight, odometer_lever_arm=(0.0, 0.0, 0.0),
+                                           real=real)))
+    t = np.arange(0.0, 190.0, 0.1)
+    state, R = motion.at(t), body.rotation(motion, t)
+    force = G * np.sin(fall)
+    assert_allclose(np.arctan2(R[:, 2, 1], R[:, 2, 2]), fall + ROLL * force, atol=1e-12)
+    assert_allclose(state.sway[:, 0], -0.004 * force * state.speed, atol=1e-12)
+
+
+def test_a_bus_kneels_at_its_stops_on_the_way_only():
+    down = np.radians(2.0)
+    options = SimOptions(scenario='town', duration=300.0, real=Real(kneeling=down))
+    motion = motion_of(resolved(options))
+    t = np.arange(0.0, 300.0, 0.02)
+    still = np.abs(motion.speed(t)) < 1e-9
+    roll = motion.tilt[0](t)
+    begin, end = (np.flatnonzero(np.diff(np.r_[0, still, 0]) == sign) for sign in (1, -1))
+    assert len(begin) > 3
+    assert roll[begin[0]:end[0]].max() < 1e-12
+    assert np.abs(roll[begin[-1] + 100:]).max() < 1e-3      # of the last swing
+    for a, b in zip(begin[1:-1], end[1:-1], strict=True):
+        most = min((b - a) * 0.01 / body.KNEELING_TIME, 1.0)
+        # springs overshoot by exp(-pi z / sqrt(1 - z^2)) of a step, of a ramp by far less
+        assert roll[a:b].max() == pytest.approx(most * down, rel=0.1)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.sim import motion, real_fixes, sensors
+from odocal_ros.sim import motion, real_sensors, sensors
 from odocal_ros.sim.motion import point
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
@@ -22,7 +22,7 @@ PAPER = SimOptions(scenario='paper', duration=600.0, imu_rate=20.0, heading=0.0)
 def north(drive, times):
     """Return how far north of the start a receiver without noise tells the antenna, m."""
     options = resolved(drive)
-    latitude, _, _ = real_fixes.places(motion_of(options), np.asarray(times), options)
+    latitude, _, _ = real_sensors.places(motion_of(options), np.asarray(times), options)
     return (latitude - options.latitude) * 6.36e6
 
 
@@ -58,11 +58,11 @@ def test_an_odometer_in_the_receiver_adds_its_share_of_the_last_motion():
 def test_errors_of_satellites_are_smoothed_by_an_odometer_in_the_receiver():
     t, options = np.arange(0.0, 4000.0), replace(PAPER, real=Real(receiver_odometer=0.01))
     white = np.random.default_rng(1).standard_normal((len(t), 3))
-    left = real_fixes.fused(t, white, options)
+    left = real_sensors.fused(t, white, options)
     a = np.exp(-1 / 20)
     # 4000 / 40 independent draws an axis
     assert left[200:].var() == pytest.approx((1 - a) / (1 + a), rel=5 * np.sqrt(2 / 300))
-    assert real_fixes.fused(t, white, PAPER) is white
+    assert real_sensors.fused(t, white, PAPER) is white
 
 
 def test_slow_errors_have_their_size_and_the_covariance_knows():
@@ -73,7 +73,7 @@ def test_slow_errors_have_their_size_and_the_covariance_knows():
     want = 0.3**2 + 1.2**2 + 0.9**2
     assert_allclose(drive.fix.covariance_n[0],
                     0.25 * np.diag([want, want, 4 * want]), rtol=1e-12)
-    made = np.array([real_fixes.errors(np.arange(0.0, 600, 1.0), replace(
+    made = np.array([real_sensors.errors(np.arange(0.0, 600, 1.0), replace(
         resolved(options), seed=s)) for s in range(60)])
     # 60 drives of 600 s hold 60 * 600 / (2 * 20) independent draws of the slower one, each axis
     n = 60 * 600 / 40
@@ -85,19 +85,19 @@ def test_slow_errors_have_their_size_and_the_covariance_knows():
 def test_bursts_come_and_go_smoothly():
     t = np.arange(0.0, 3600.0, 0.2)
     options = replace(resolved(PAPER), real=Real(bursts=10.0, burst_size=10.0))
-    error = real_fixes.burst_errors(t, options)
+    error = real_sensors.burst_errors(t, options)
     size = np.hypot(error[:, 0], error[:, 1])
     assert size.max() > 5
     assert (size == 0).mean() > 0.8
     # 3 x^2 - 2 x^3 rises by at most 1.5 of the size in an onset of a second
-    assert np.abs(np.diff(size)).max() <= 1.5 * size.max() * 0.2 / real_fixes.ONSET[0]
+    assert np.abs(np.diff(size)).max() <= 1.5 * size.max() * 0.2 / real_sensors.ONSET[0]
 
 
 def test_the_antenna_leans_with_the_body():
     options = resolved(SimOptions(scenario='town', duration=200.0, antenna_lever_arm=(0, 0, 2.0),
                                   real=Real(body_roll=0.01)))
     motion, t = motion_of(options), np.arange(20.0, 190.0, 0.5)
-    leaning = real_fixes.places(motion, t, options)
+    leaning = real_sensors.places(motion, t, options)
     stiff = point(motion.at(t), options.antenna_lever_arm)
     aside = np.hypot(leaning[0] - stiff[0],
                      (leaning[1] - stiff[1]) * np.cos(options.latitude)) * 6.37e6

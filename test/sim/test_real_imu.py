@@ -10,11 +10,11 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix
-from odocal_ros.sim import real_imu
+from odocal_ros.sim import real_sensors
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.real_imu import angles, own_angles, turn_and_push
+from odocal_ros.sim.real_sensors import angles, own_angles, turn_and_push
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.core
@@ -30,7 +30,7 @@ def test_the_imu_reads_by_its_model():
     rng = stream(1, 'test')
     w, f = rng.standard_normal((2, 7, 3))
     gyro, accel, G = rng.normal(0, 0.01, (3, 3, 3))
-    w_m, f_m = real_imu.crooked(w, f, Real(gyro_matrix=tuple(gyro.ravel()),
+    w_m, f_m = real_sensors.crooked(w, f, Real(gyro_matrix=tuple(gyro.ravel()),
                                            accel_matrix=tuple(accel.ravel()),
                                            g_sensitivity=tuple(G.ravel())))
     for k in range(7):
@@ -52,7 +52,7 @@ def test_a_bias_given_is_the_bias_and_warms_along_its_curve():
 
 def test_the_wander_begins_at_the_bias_and_grows_as_a_markov_process():
     t = np.arange(0.0, 100.0, 0.05)
-    ends = [real_imu.drifts(t, np.zeros(len(t)), replace(options(
+    ends = [real_sensors.drifts(t, np.zeros(len(t)), replace(options(
         gyro_wander=0.01, wander_time=200.0), seed=seed))[0] for seed in range(300)]
     assert all((one[0] == 0).all() for one in ends)
     # variance of x(T) - x(0): 2 s^2 (1 - exp(-T / tau)); 900 draws, 5 sigma
@@ -63,7 +63,7 @@ def test_the_wander_begins_at_the_bias_and_grows_as_a_markov_process():
 
 @pytest.mark.parametrize('rate', [50.0, 200.0])
 def test_vibration_shakes_as_said_and_goes_nowhere(rate):
-    x = real_imu.vibration(stream(2, 'test'), 0.5, rate, MANY)
+    x = real_sensors.vibration(stream(2, 'test'), 0.5, rate, MANY)
     # resonances 6 Hz wide: some 2 * 6 Hz draws a second
     assert x.var() / 0.25 == pytest.approx(1, rel=5 * np.sqrt(2 / (3 * MANY / rate * 12)))
     power = np.abs(np.fft.rfft(x, axis=0))**2
@@ -75,24 +75,24 @@ def test_vibration_shakes_as_said_and_goes_nowhere(rate):
 def test_vibration_comes_with_speed_and_moves_the_bias_by_its_square():
     t, speed = np.arange(MANY) / 20.0, np.full(MANY, 5.0)       # half of it at 5 m/s
     shaken = options(vibration=0.8, rectification=0.01)
-    _, accel = real_imu.drifts(t, speed, shaken)
+    _, accel = real_sensors.drifts(t, speed, shaken)
     assert accel.mean(axis=0) == pytest.approx(0.01 * 0.4**2, rel=1e-6)
-    _, still = real_imu.drifts(t, 0 * speed, shaken)
+    _, still = real_sensors.drifts(t, 0 * speed, shaken)
     assert (still == 0).all()
 
 
 def test_stamps_are_late_in_order_and_in_batches():
     ns = np.arange(MANY) * 10_000_000
-    late = (real_imu.stamped(ns, stream(3, 'test'), 0.02, 0.003) - ns) * 1e-9
+    late = (real_sensors.stamped(ns, stream(3, 'test'), 0.02, 0.003) - ns) * 1e-9
     # stamps so far apart seldom cross: mean within 5 sigma, spread as said
     assert late.mean() == pytest.approx(0.02, abs=5 * 0.003 / MANY**0.5)
     assert late.std() == pytest.approx(0.003, rel=5 / np.sqrt(2 * MANY))
-    wild = real_imu.stamped(ns, stream(3, 'test'), 0.02, 0.02)
-    assert (np.diff(wild) >= real_imu.APART_NS).all()
+    wild = real_sensors.stamped(ns, stream(3, 'test'), 0.02, 0.02)
+    assert (np.diff(wild) >= real_sensors.APART_NS).all()
     assert (wild >= ns).all()
-    batch = real_imu.stamped(ns, stream(3, 'test'), 0.002, 0.0, 4)
-    assert set(np.diff(batch).tolist()) == {real_imu.APART_NS,
-                                            40_000_000 - 3 * real_imu.APART_NS}
+    batch = real_sensors.stamped(ns, stream(3, 'test'), 0.002, 0.0, 4)
+    assert set(np.diff(batch).tolist()) == {real_sensors.APART_NS,
+                                            40_000_000 - 3 * real_sensors.APART_NS}
     assert (batch[:4] - ns[3] >= 2_000_000).all()
 
 

@@ -182,7 +182,7 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
                             f'{good} (condition number {free.condition:.2g}, correlation '
                             f'{free.correlation[0, 1]:+.6f}): the search moved both together'))
     if refined.widened:
-        grown = [f'{name} +-{_amount(k, a)} to +-{_amount(k, b)}' for k, (name, a, b) in enumerate(
+        grown = [f'{name} ± {_amount(k, a)} to ± {_amount(k, b)}' for k, (name, a, b) in enumerate(
             zip(NAMES, ranges.half, refined.half, strict=True)) if b > a]
         found.append(Reason(Code.SEARCH_WIDENED, 'the minimum was on the edge of the search '
                             f'range, which was widened: {", ".join(grown)}'))

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Faults of two wheels by the gyro: swapped, one slipping, different counters.
+Faults of two wheels, detected with the gyro: swapped, one slipping, different counters.
 
-The paths of the two wheels differ by the track width times the turn. What is left of the
-difference is rounding and gyro noise, millimetres over seconds; a wheel that spins or slides on
-its own stands out of it by centimetres, where the IMU's acceleration alone sees half a metre.
+The paths of the two wheels differ by the track width times the turn. The remaining difference is
+rounding and gyro noise, millimetres over seconds; a wheel that spins or slides alone exceeds it by
+centimetres. With the acceleration of the IMU alone the limit is half a metre.
 """
 
 from collections.abc import Sequence
@@ -43,8 +43,8 @@ Event = tuple[float, float, float]      # begin, end, s, and size, m
 # steps between the ends of windows: slips of up to 1, 3, 8, 20, 50 s, those between are seen too.
 # Judgement
 SLIP_SPANS = (10, 30, 80, 200, 500)
-# 1 sigma of what two wheels on real ground part by without a slip. Physical, judgement: m in any
-# window (stones, tyres); of the track width times the turn (scrub, camber, the gyro's scale)
+# 1 sigma of the difference of two wheels on real ground without a slip. Physical, judgement: m in
+# any window (stones, tyres); of the track width times the turn (scrub, camber, the gyro's scale)
 TYRE_BLUR, TURN_DOUBT = 0.005, 0.01
 
 
@@ -60,8 +60,8 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.   between : (2,) the marks, s.   track : dead
     reckoned with their mean: attitude.   latitude : rad.   metres_per_unit : rough scale of the
     mean of both.   track_width : m, 0 unknown.   doubt_t : (d,) s, where travel is uncertain for
-    other reasons (gaps, resets).   max_deviation : ratio of the counts less one, from which on it
-    is said.   count : of the wheels in the mean.
+    other reasons (gaps, resets).   max_deviation : ratio of the counts minus one above which it is
+    reported.   count : of the wheels in the mean.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     events, lasting = _events(two, apart, quantum_m, width)
     found, change = changed(_without(two, events), signals, metres_per_unit, count)
     reasons += found
-    # what seemed a change and is none is a slip; beside one only what is twice as steep is
+    # a slow event that is no change of the ratio is a slip; if the ratio changes, twice as steep
     events = sorted(events + lasting)
     if change:
         steep = 2 * abs(change) * metres_per_unit
@@ -130,8 +130,8 @@ def _events(two: Pair, apart: Floats, quantum_m: float,
     """
     Return (begin, end, size) of the jumps of the difference: s, s, m, in order.
 
-    apart : m, what turn and ratio leave of the difference; the ratio as most of the path has it is
-    taken off here. Those that are over, and those that may be a change of the ratio.
+    First those that end, then those that may be a change of the ratio.   apart : m, difference of
+    the wheels less turn and ratio; the slope of most of the path is removed here.
     """
     apart = _level(two, apart, quantum_m)
     total = np.append(0.0, np.cumsum(apart))
@@ -230,8 +230,8 @@ def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: T
     """
     Return the wheel that slipped: -1, +1, or 0 where acceleration does not show it.
 
-    A slip of the right wheel by x takes the mean ahead of the IMU by x / 2, one of the left by -x
-    back by as much: the odds of the two come from how far mean and IMU part elsewhere.
+    A slip of the right wheel by x moves the mean ahead of the IMU by x / 2, one of the left by -x
+    back by as much. Their odds are from the difference of mean and IMU elsewhere.
     """
     begin, end, size = event
     grid = np.arange(max(track.t[0], two.t[0]), min(track.t[-1], two.t[-1]), SPIN_GRID)
@@ -248,7 +248,7 @@ def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: T
         return 0
     sigma = robust_sigma(excess[straight]) + 1e-3
     log_odds = excess[at] * size / sigma**2
-    # once in 150 the other wheel; parts mean and IMU by less than a quarter of the half, the slip
-    # begins or ends elsewhere
+    # once in 150 the other wheel; if mean and IMU differ by less than a quarter of the half, the
+    # slip begins or ends elsewhere
     clear = abs(log_odds) > 5.0 and abs(excess[at]) > abs(size) / 8
     return int(np.sign(log_odds)) if clear else 0

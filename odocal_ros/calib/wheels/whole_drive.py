@@ -65,16 +65,16 @@ def swapped(two: Pair, width: float, sigma: float, track_width: float) -> tuple[
     if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least,
                                                        track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
-                       f'would be {width:.3f} m, +-{sigma:.2g} m. Likely cause: one counter is '
+                       f'would be {width:.3f} m, ± {sigma:.2g} m. Likely cause: one counter is '
                        'sent twice'),)
     if width - WHOLE_DRIVE_SIGMAS * sigma <= 0 < width + WHOLE_DRIVE_SIGMAS * sigma:
         return (Reason(Code.ODOMETER_CHOSEN, 'too few turns to test whether left and right wheel '
-                       f'are swapped (track width from turns {width:.2f} +- {sigma:.2g} m): the '
+                       f'are swapped (track width from turns {width:.2f} ± {sigma:.2g} m): the '
                        'configured sides are used'),)
     if width > -TRACK_WIDTH.least:
         return ()
     return (Reason(Code.WHEELS_SWAPPED, f'the {two.names[0]} wheel travels farther in left turns '
-                   f'(track width {width:.2f} m, +-{sigma:.2g} m)'),)
+                   f'(track width {width:.2f} m, ± {sigma:.2g} m)'),)
 
 
 def changed(two: Pair, signals: Floats, metres_per_unit: float,
@@ -109,7 +109,7 @@ def changed(two: Pair, signals: Floats, metres_per_unit: float,
     left, right = two.names
     return (Reason(Code.WHEEL_SLIP, f'from t = {two.t[at]:.0f} s on, after about '
                    f'{100 * share:.0f} % of the path, the {right} wheel counts '
-                   f'{100 * abs(change):.2f} % (+-{100 * abs(change) / odds:.2f}) '
+                   f'{100 * abs(change):.2f} % (± {100 * abs(change) / odds:.2f}) '
                    f'{"more" if change > 0 else "less"} relative to the {left} wheel and the '
                    'gyro. Likely cause: continuous slip or a tyre that loses pressure. Which '
                    'section is correct cannot be decided from the data: '

@@ -1,18 +1,50 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A heading from outside, docs/method.md (S19): yaw of the IMU's x axis, one error for the leg."""
+"""
+A heading from outside as rows, docs/method.md (S19): yaw of the IMU's x axis.
+
+It has one error for the whole leg (a mounting, a declination, a compass), which no number of
+messages averages out, and white noise; a heading configured at the start mark is one such
+message.
+"""
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
-from odocal_ros.estimator.outside import Heading
+from odocal_ros.estimator.outside import convergence, Outside, thinned
 from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, BG, GYRO_SCALE, HEADING, M, PHI, State
-from odocal_ros.nav.angles import arctan2, wrap
+from odocal_ros.nav.alignment import HEADING_LIMIT
+from odocal_ros.nav.angles import arctan2, wrap, yaw_from_heading
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.rotations import matrix_from_quat, transpose
+from odocal_ros.screening.inputs import Inputs
+from odocal_ros.settings.config import Config
+
+# rad, of a heading given at the mark, beside its error. Judgement: next to none
+GIVEN_NOISE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Heading(Outside):
+    """
+    Yaw of the IMU's x axis in n: (m,) rad.
+
+    noise : (m,) rad.   sigma : rad, of the error that is the same through the leg.
+    """
+
+    yaw: Floats
+    noise: Floats
+    sigma: float
+    said_by: str        # the heading source, as in the settings
 
 
 class HeadingRows(OutsideRows):
@@ -20,6 +52,35 @@ class HeadingRows(OutsideRows):
 
     name, source = 'heading', 'heading_noise'
     levels_of = {'heading': slice(0, 1)}
+    constants = slice(HEADING, HEADING + 1)
+
+    @classmethod
+    def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Heading | None:
+        """Return the configured heading, else that of the heading topic."""
+        asked, alignment = config.alignment.heading_source, config.alignment
+        if not np.isnan(alignment.heading) and asked in ('auto', 'fixed'):
+            yaw = yaw_from_heading(alignment.heading) + convergence(inputs, np.zeros(1), origin)
+            return Heading(np.zeros(1), wrap(yaw), np.full(1, GIVEN_NOISE),
+                           alignment.heading_sigma, 'fixed')
+        if asked in ('auto', 'heading_topic'):
+            sent, t = inputs.outside['heading']
+            return _sent(inputs, t, sent.q_ni, sent.yaw_variance, alignment.heading_offset,
+                         config, origin, np.eye(3), 'heading_topic')
+        if asked == 'imu_orientation':
+            return _sent(inputs, inputs.t_imu, inputs.q_ni, inputs.yaw_variance, 0.0, config,
+                         origin, transpose(inputs.C_bi), 'imu_orientation')
+        return None
+
+    @staticmethod
+    def prior_sigmas(sent: Heading, config: Config) -> float:
+        """Return the prior sigma of its error."""
+        return sent.sigma
+
+    @classmethod
+    def details(cls, sent: Heading, constants: Floats, sigma: Floats) -> dict[str, Any]:
+        """Return its source, the stated sigma and the error that was found."""
+        return {'source': sent.said_by, 'sigma_stated': sent.sigma,
+                'error': float(constants[HEADING]), 'error_sigma': float(sigma[HEADING])}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
         """Return the rows."""
@@ -31,6 +92,24 @@ class HeadingRows(OutsideRows):
     def least(sent: Heading) -> dict[str, float]:
         """Return the least level."""
         return {'heading': (LEAST.heading / float(np.median(sent.noise)))**2}
+
+
+def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float, config: Config,
+          origin: Origin, C_ib: Floats, said_by: str) -> Heading | None:
+    """Return the heading of orientations q (m, 4) that an IMU or a topic publishes."""
+    good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
+    t, q, variance = t[good], q[good], variance[good]
+    if len(t) < 2 or not len(inputs.t_fix):
+        return None
+    some = thinned(t)
+    t, q, variance = t[some], q[some], variance[some]
+    stated = float(np.median(variance))
+    sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
+    if sigma > HEADING_LIMIT:
+        return None
+    C = matrix_from_quat(q) @ C_ib
+    yaw = arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + convergence(inputs, t, origin)
+    return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), said_by)
 
 
 def _heading(sent: Heading, state: State, points: Points) -> Rows:

@@ -18,6 +18,7 @@ class LeastNoise:
     fix: float = 0.005          # m, east or north or up, of white and of slow errors each
     velocity: float = 0.005     # m/s, of one from outside
     heading: float = 5e-4       # rad, of one from outside
+    height: float = 0.02        # m, by air pressure
     travel: float = 1e-3        # m, of a reading of the odometer
     road: float = 2e-4          # m/sqrt(s) along: grain of a road under a tyre
     # gyro rad/s/sqrt(Hz), accelerometer m/s^2/sqrt(Hz), their walks rad/s/sqrt(s), m/s^2/sqrt(s)

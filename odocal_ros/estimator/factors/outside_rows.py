@@ -1,20 +1,26 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What velocity and heading from outside have in common: rows with a sigma for each component."""
+"""
+The base of the sensors besides IMU, odometer and fixes: rows with a sigma for each component.
+
+A subclass in ``equations.FACTORS`` is all that the estimator knows of such a sensor.
+"""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import PointRows
-from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.estimator.outside import Heading, Velocity
+from odocal_ros.estimator.outside import Outside
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BARE
+from odocal_ros.estimator.state import BARE, CONSTANTS
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.screening.inputs import Inputs
+from odocal_ros.settings.config import Config
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +35,30 @@ class Rows:
 
 
 class OutsideRows(PointRows):
-    """Rows of one of ``problem.outside``."""
+    """Rows of one of ``problem.outside``, its own constants and their prior sigmas."""
+
+    constants: ClassVar[slice]      # of state.CONSTANTS
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self._rows = self.rows(problem, point)
         self.k, self.raw = self._rows.k, self._rows.raw
         self.per_effective = problem.per_effective.get(self.name, 1.0)
+
+    @classmethod
+    def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Outside | None:
+        """Return the rows of screened inputs in frame n; None without any, or unused."""
+        raise NotImplementedError
+
+    @staticmethod
+    def prior_sigmas(sent: Any, config: Config) -> Floats | float:
+        """Return the prior sigmas of its constants."""
+        raise NotImplementedError
+
+    @classmethod
+    def details(cls, sent: Any, constants: Floats, sigma: Floats) -> dict[str, Any]:
+        """Return details of a result: its constants by name, and their sigmas."""
+        return {CONSTANTS[i]: {'value': float(constants[i]), 'sigma': float(sigma[i])}
+                for i in range(cls.constants.start, cls.constants.stop)}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
         """Return the rows at a state."""
@@ -69,11 +93,3 @@ class OutsideRows(PointRows):
         """Return rows (m, d, c) in the sigmas that the sensor states."""
         out: Floats = rows * self._rows.root[:, :, None]
         return out
-
-
-def used(leg: SmootherLeg, t: Floats) -> dict[str, Velocity | Heading]:
-    """Return velocity and heading within the keyframes, those that there are."""
-    found: dict[str, Velocity | Heading] = {
-        'velocity': leg.velocity.between(t[0], t[-1]),
-        'heading': leg.heading.between(t[0], t[-1])}
-    return {name: x for name, x in found.items() if len(x.t)}

@@ -29,6 +29,7 @@ from odocal_ros.estimator.state import (
     KIND_OF,
     KIND_SIZES,
     M,
+    NO_ERROR,
     ODO_ARM,
     ODO_CLOCK,
     ODO_DELAY,
@@ -80,11 +81,9 @@ class PriorRows(Factor):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
-        absent = {'heading', 'velocity'} - {*problem.outside}
-        coarse = problem.leg.travel.coarse
-        absent |= set() if coarse and coarse.truncation else {'speed_truncation'}
-        self.level = not problem.leg.felt
-        self.shared = {name: where for name, where in SHARED.items() if name not in absent}
+        self.own, self.level = problem.own, not problem.leg.felt
+        self.shared = {name: where for name, where in SHARED.items()
+                       if (problem.priors.constants[where] > NO_ERROR).any()}
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
@@ -155,12 +154,14 @@ class PriorRows(Factor):
         return out
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        """Yield the effects of the turn-on biases."""
+        """Yield the effects of the turn-on biases, and of constants of this leg alone."""
         first = self.with_wanted(marginals[0][None])[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
         drift = 2 * self.n + HEIGHT_DRIFT
         yield 'slow_fix_errors', first[:, [drift]] / self.priors.constants[HEIGHT_DRIFT]
+        for name, where in self.own.items():
+            yield name, first[:, 2 * self.n:][:, where] / self.priors.constants[where]
 
     def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
         """Yield names and effects, (3, k), of errors that all legs share."""

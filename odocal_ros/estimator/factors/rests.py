@@ -9,6 +9,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import Normal
 from odocal_ros.estimator.factors.factor import add_prior, add_process, Factor, LinearisationPoint
 from odocal_ros.estimator.factors.motion import rotvec
+from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import PHI, V
 from odocal_ros.nav.rotations import transpose
@@ -27,7 +28,9 @@ class Rests(Factor):
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.still = point.state, problem.still
         self.pair = self.still[:-1] & self.still[1:]
-        self.turn_variance = STILL_TURN**2 * point.intervals.T[:, None]
+        variance = STILL_TURN**2 * point.intervals.T[:, None]
+        z2 = (self.turned()**2 / variance).mean(axis=1, keepdims=True)
+        self.turn_variance = variance * np.maximum(z2 / TAIL_SIGMAS**2, 1.0)
 
     def turned(self) -> Floats:
         """Return the turn within each interval, rad: (K, 3)."""

@@ -8,6 +8,8 @@ Derivatives by constants go by means of the interval. Those by samples hold vibr
 delay and axes look certain, and a lever arm short.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
@@ -16,7 +18,7 @@ from odocal_ros.estimator.factors.fixes import antenna
 from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
-from odocal_ros.estimator.outside import Velocity
+from odocal_ros.estimator.outside import from_place, Outside, thinned
 from odocal_ros.estimator.preintegrate import Points, turn
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
@@ -32,16 +34,32 @@ from odocal_ros.estimator.state import (
     PHI,
     PITCH,
     V,
+    VELOCITY,
     VELOCITY_DELAY,
     VELOCITY_LAG2,
     VELOCITY_SCALE,
     YAW,
 )
+from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.receiver_filter import smoothing
 from odocal_ros.nav.rotations import skew, transpose
+from odocal_ros.screening.inputs import Inputs
+from odocal_ros.settings.config import Config
 
 # m/s, to start from: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
 FIRST_SIGMA = 0.5
+VELOCITY_SIGMA = 0.1      # m/s, initial if a receiver states none: physical, Doppler
+# of its stamps and its filter, s and s^2, 1 sigma: physical, receivers are late by up to 0.25 s
+# and smooth over as much
+TIME_SIGMA, LAG2_SIGMA = 0.25, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Velocity(Outside):
+    """Horizontal velocity of the antenna, in n: (m, 2) m/s."""
+
+    velocity_n: Floats
+    sigma: Floats
 
 
 class VelocityRows(OutsideRows):
@@ -49,6 +67,28 @@ class VelocityRows(OutsideRows):
 
     name, source = 'velocity', 'fix_velocity'
     levels_of = {'velocity': slice(0, 2)}
+    constants = VELOCITY
+
+    @classmethod
+    def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Velocity | None:
+        """Return the velocity of the antenna, in n."""
+        sent, t = inputs.outside[cls.source]
+        # without an accelerometer its change between keyframes is unknown
+        if not (config.gnss.use_velocity and len(t) and inputs.felt):
+            return None
+        some = thinned(t)
+        t, variance = t[some], sent.variance_n[some, :2]
+        known = np.isfinite(variance) & (variance > 0)
+        sigma = np.sqrt(np.where(known, variance, VELOCITY_SIGMA**2))
+        v_n = (from_place(inputs, t, origin) @ sent.velocity_n[some, :, None])[:, :2, 0]
+        return Velocity(t, v_n, sigma)
+
+    @staticmethod
+    def prior_sigmas(sent: Velocity, config: Config) -> Floats:
+        """Return the prior sigmas of delay, square of the lag, and scale: (3,)."""
+        gnss = config.gnss
+        return np.array([np.hypot(TIME_SIGMA, gnss.time_sigma), LAG2_SIGMA,
+                         max(gnss.velocity_scale_sigma, 1e-6)])
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
         """Return the rows."""
@@ -64,7 +104,9 @@ class VelocityRows(OutsideRows):
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         """Return the first level, of residuals before the delay is known, and the least."""
         first, least = super().first_levels(problem)
-        sigma = float(np.median(problem.outside[cls.name].sigma))
+        sent = problem.outside[cls.name]
+        assert isinstance(sent, Velocity)
+        sigma = float(np.median(sent.sigma))
         return {name: max(x, (FIRST_SIGMA / sigma)**2) for name, x in first.items()}, least
 
     @staticmethod

@@ -9,8 +9,7 @@ from odocal_ros.calib.border import Border
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.priors import PriorRows, SIZES
 from odocal_ros.estimator.fit import Fit
-from odocal_ros.estimator.prepare import NO_ERROR
-from odocal_ros.estimator.state import CONSTANTS, HEIGHT_DRIFT
+from odocal_ros.estimator.state import CONSTANTS, HEIGHT_DRIFT, NO_ERROR
 
 
 def border_of(fit: Fit, configured: Floats) -> Border:

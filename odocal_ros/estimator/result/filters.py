@@ -26,7 +26,7 @@ def odometer_reasons(share: float, sigma: float, log_time: float) -> tuple[Reaso
     if abs(share) <= max(FAULT_SIGMAS * sigma, worth):
         return ()
     return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes contain an odometer with a scale error '
-                   f'of {100 * share:+.2f} % +- {100 * sigma:.2f} % (time constant '
+                   f'of {100 * share:+.2f} % ± {100 * sigma:.2f} % (time constant '
                    f'{np.exp(log_time):.0f} s), as positions fused with a wheel speed do; '
                    'accounted for'),)
 
@@ -45,6 +45,6 @@ def clock_reasons(name: str, rate: float, sigma: float, duration: float) -> tupl
     worth = 0.01        # s: two samples of most odometers are further apart
     if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= worth:
         return ()
-    return (Reason(Code.CLOCKS_DRIFT, f'{name} stamps: the clock is {1e6 * abs(rate):.0f} ppm (+-'
+    return (Reason(Code.CLOCKS_DRIFT, f'{name} stamps: the clock is {1e6 * abs(rate):.0f} ppm (± '
                    f'{1e6 * sigma:.0f}) {"fast" if rate > 0 else "slow"} relative to the IMU, '
                    f'{abs(rate) * duration:.3f} s in this leg; accounted for'),)

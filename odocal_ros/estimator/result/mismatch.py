@@ -7,9 +7,10 @@ import numpy as np
 
 from odocal_ros.estimator.factors.factor import WANTED
 from odocal_ros.estimator.factors.fixes import Fixes
+from odocal_ros.estimator.factors.heading import Heading
 from odocal_ros.estimator.fit import CONVERGENCE, Fit
 from odocal_ros.estimator.imu_noise import sensor_noise
-from odocal_ros.estimator.outside import Heading
+from odocal_ros.estimator.outside import Outside
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.noise_cause import noise_remedy
 from odocal_ros.estimator.result.slip import SLIP_VARIANCE
@@ -66,7 +67,7 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     if max(level['side'], level['side_turn']) > 0.2:       # m/sqrt(s): no vehicle on wheels
         odd.append(f'sideslip at the odometer is {max(level["side"], level["side_turn"]):.2f} '
                    'm/√s')
-    reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
+    reasons += _heading(problem.outside.get('heading'), float(fit.state.constants[HEADING]))
     if odd:
         known = 'See IMU_WORSE_THAN_GRADE.' if worse else remedy
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd), known if odd == noisy else ''))
@@ -81,10 +82,10 @@ def moving(fit: Fit) -> float:
     return float(np.abs(step[:WANTED]).max())
 
 
-def _heading(heading: Heading, error: float) -> list[Reason]:
+def _heading(heading: Outside | None, error: float) -> list[Reason]:
     """Report an external heading that differs from that of the drive by more than its sigma."""
-    if not len(heading.t) or abs(error) < REMARK_SIGMAS * heading.sigma:
+    if not isinstance(heading, Heading) or abs(error) < REMARK_SIGMAS * heading.sigma:
         return []
-    return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source}) differs by '
+    return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.said_by}) differs by '
                    f'{np.rad2deg(error):+.2f} deg, {abs(error) / heading.sigma:.1f} sigma, from '
                    'the heading estimated on this drive; it was down-weighted')]

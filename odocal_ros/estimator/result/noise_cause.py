@@ -19,6 +19,7 @@ EXPLAINED = 0.4         # judgement: share of the noise variance that quantisati
 VIBRATION = 3.0
 FEWEST_ROWS = 100       # judgement: samples at rest, of which a median is good to 15 %
 NAMES = {'gyro': 'gyro', 'accel': 'accelerometer'}
+UNITS = {'gyro': 'rad/s/sqrt(Hz)', 'accel': 'm/s^2/sqrt(Hz)'}    # of white noise
 
 
 def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) -> str:
@@ -72,7 +73,7 @@ def at_rest_and_moving(problem: Problem) -> tuple[dict[str, float], dict[str, fl
 
 
 def _setting(name: str, level: dict[str, float]) -> str:
-    return f'set imu.{name}_noise to {level[name]:.2g}.'
+    return f'set imu.{name}_noise to {level[name]:.2g} ({UNITS[name]}).'
 
 
 def _steps_in_words(steps: dict[str, float]) -> str:

@@ -16,6 +16,7 @@ from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.slip import missing_reasons, without_braking
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals
+from odocal_ros.estimator.equations import OUTSIDE
 from odocal_ros.estimator.factors.fixes import Fixes
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.slide import assumed
@@ -29,7 +30,13 @@ from odocal_ros.estimator.result.filters import filter_reasons
 from odocal_ros.estimator.result.left_over import bias_sigmas, correlation, left_over, normalised
 from odocal_ros.estimator.result.mismatch import mismatch
 from odocal_ros.estimator.result.refusal import OPTIONAL, UNITS, unknown
-from odocal_ros.estimator.result.remarks import beside, level_pitch, MODEL_FLOOR, remarks
+from odocal_ros.estimator.result.remarks import (
+    beside,
+    contradicted_settings,
+    level_pitch,
+    MODEL_FLOOR,
+    remarks,
+)
 from odocal_ros.estimator.result.shares import shares
 from odocal_ros.estimator.result.slip import (
     along,
@@ -46,7 +53,6 @@ from odocal_ros.estimator.state import (
     CONSTANTS,
     GNSS_ARM,
     GYRO,
-    HEADING,
     LN_K,
     M,
     ODO_ARM,
@@ -97,10 +103,12 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
         ratio[name] = float(bias_sigma[i] / fit.first.gyro_bias[i])
         if ratio[name] < INFORMED_SHARE:
             found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
-    unsaid = [name for name in ratio if name in found and found[name].value is None]
+    # of what the drive contradicts the fit does not use the setting, and another reason says so
+    contradicted = {CONSTANTS[i] for i in contradicted_settings(c, sigma)}
+    unsaid = [name for name in ratio if name in found and found[name].value is None
+              and name not in contradicted]
     if unsaid:
-        reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: '
-                              f'{in_words(unsaid)}; the configured values are used'))
+        reasons.append(not_observable('this drive', unsaid))
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
     sources = [*(_widened(s, widen) for s in shares(fit, near)),
@@ -175,6 +183,15 @@ def configured(leg: SmootherLeg) -> Floats:
     return value
 
 
+def not_observable(drives: str, names: list[str]) -> Reason:
+    """Return the reason that constants keep their configured values; names: of estimates."""
+    heights = all(name.endswith('_z') for name in names)
+    return Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on {drives}: '
+                  f'{in_words(names)}; the configured values are used',
+                  'Measure these heights and set them: turns, stops and starts hardly determine '
+                  'them.' if heights else '')
+
+
 def in_words(names: Iterable[str]) -> str:
     """Return names of estimates as people say them, axes of one thing together."""
     words: dict[str, list[str]] = {}
@@ -238,7 +255,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'f': K * state.forward,
         'noise': fit.levels.roots(),
         'iterations': fit.iterations, 'widened': float(widen),
-        'outside': _outside(leg, problem, fit, sigma),
+        'outside': _outside(problem, fit, sigma),
         'posterior_to_prior': ratio,
         **{CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
            for i in SCALES},
@@ -257,19 +274,9 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
     }
 
 
-def _outside(leg: SmootherLeg, problem: Problem, fit: Fit,
-             sigma: Floats) -> dict[str, dict[str, Any]]:
-    """Return details of GNSS velocity and external heading."""
-    out: dict[str, dict[str, Any]] = {}
-    for name, sent in problem.outside.items():
-        out[name] = {'messages': len(sent.t),
-                     'alike': problem.per_effective.get(name, 1.0)}
-    if 'velocity' in out:
-        out['velocity'] |= {CONSTANTS[i]: {'value': float(fit.state.constants[i]),
-                                           'sigma': float(sigma[i])}
-                            for i in range(VELOCITY.start, VELOCITY.stop)}
-    if 'heading' in out:
-        out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,
-                           'error': float(fit.state.constants[HEADING]),
-                           'error_sigma': float(sigma[HEADING])}
-    return out
+def _outside(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, dict[str, Any]]:
+    """Return details of the sensors besides IMU, odometer and fixes."""
+    return {part.name: {'messages': len(sent.t),
+                        'alike': problem.per_effective.get(part.name, 1.0),
+                        **part.details(sent, fit.state.constants, sigma)}
+            for part in OUTSIDE if (sent := problem.outside.get(part.name)) is not None}

@@ -25,10 +25,12 @@ from odocal_ros.estimator.state import (
     FIX_TIME,
     GNSS_ARM,
     GNSS_CLOCK,
+    GNSS_DELAY,
     IMPERFECT,
     LN_K,
     ODO_ARM,
     ODO_CLOCK,
+    ODO_DELAY,
     PITCH,
     YAW,
 )
@@ -147,9 +149,9 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
     said = []
     for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from low to high speed'),
                           (BY_TIME, motion.from_mean[:, 1], 'from start to end')):
-        change = c[i] * np.ptp(span)
-        if abs(c[i]) > REMARK_SIGMAS * sigma[i] and abs(change) > 3e-4:     # worth a word
-            said.append(f'{100 * change:+.2f} % {what}')
+        change, doubt = np.array([c[i], sigma[i]]) * np.ptp(span)
+        if abs(change) > max(REMARK_SIGMAS * doubt, 3e-4):     # worth a word
+            said.append(f'{100 * change:+.2f} ± {100 * doubt:.2f} % {what}')
     if not said:
         return []
     less = said[0].startswith('-') and 'speed' in said[0]
@@ -157,15 +159,23 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
                    'value is the mean over this leg', FALLS_WITH_SPEED if less else '')]
 
 
+def contradicted_settings(c: Floats, sigma: Floats) -> set[int]:
+    """Return the lever arms and delays that the drive puts far from their setting, by index."""
+    least = dict.fromkeys((*range(ODO_ARM.start, ODO_ARM.stop - 1),      # not z of the odometer
+                           *range(GNSS_ARM.start, GNSS_ARM.stop)), 0.3)    # m, worth a word
+    least |= {ODO_DELAY: 0.0, GNSS_DELAY: 0.0}
+    return {i for i, most in least.items() if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], most)}
+
+
 def _arms(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
     """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
     said, do = [], []
-    for name, arm, where, axes in (
-            ('odometer.lever_arm', config.odometer.lever_arm, ODO_ARM, 'xy'),
-            ('gnss.lever_arm', config.gnss.lever_arm, GNSS_ARM, 'xyz')):
-        for i, axis, value, most in zip(range(where.start, where.stop), axes, arm, VEHICLE,
-                                        strict=False):
-            if abs(c[i]) <= max(REMARK_SIGMAS * sigma[i], 0.3):     # m
+    off = contradicted_settings(c, sigma)
+    for name, arm, where in (('odometer.lever_arm', config.odometer.lever_arm, ODO_ARM),
+                             ('gnss.lever_arm', config.gnss.lever_arm, GNSS_ARM)):
+        for i, axis, value, most in zip(range(where.start, where.stop), 'xyz', arm, VEHICLE,
+                                        strict=True):
+            if i not in off:
                 continue
             found = value + c[i]
             text = f'{found:+.2f} ± {sigma[i]:.2f} m'

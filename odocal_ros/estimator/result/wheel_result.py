@@ -120,7 +120,7 @@ def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, lis
     if given and abs(width - given) > REMARK_SIGMAS * np.hypot(
             TRACK_WIDTH.taped_share * given, sigma):
         return Estimate(width, sigma, 'm'), [Reason(
-            Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.4f} +- '
+            Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.4f} ± '
             f'{sigma:.4f} m; odometer.track_width is {given:.4g} m')]
     return Estimate(width, sigma, 'm'), []
 

@@ -1,0 +1,106 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Heights by air pressure as rows, docs/method.md (S19a).
+
+A pressure sensor measures height differences to a decimetre. Its zero, the weather, the dynamic
+pressure and the air temperature are constants of the leg.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.factors.factor import LinearisationPoint
+from odocal_ros.estimator.factors.least import LEAST
+from odocal_ros.estimator.factors.motion import gravity_n
+from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
+from odocal_ros.estimator.outside import Outside
+from odocal_ros.estimator.preintegrate import turn
+from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.state import BA, BARE, BG, M, P, PHI, PRESSURE, V
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.rotations import skew
+from odocal_ros.screening.inputs import Inputs
+from odocal_ros.settings.config import Config
+
+# physical, of the standard atmosphere at the ground: R T / g, m
+SCALE_HEIGHT = 8435.0
+# physical: m of zero; m/s of weather, 1 hPa/h; m per (m/s)^2, a pressure coefficient of 0.3;
+# relative, 15 K
+PRIOR_SIGMAS = 1e4, 8.4 / 3600, 0.015, 0.05
+EARTH_RADIUS = 6.371e6      # m, physical: of the curvature, mean
+HEIGHT_SIGMA = 0.15     # m, to start from where a sensor does not say: physical
+RATE = 1.0              # Hz: judgement, heights of a vehicle change no faster
+
+
+@dataclass(frozen=True, eq=False)
+class Pressure(Outside):
+    """Heights above an unknown zero, m, and their stated sigmas: (m,)."""
+
+    height: Floats
+    sigma: Floats
+
+
+class PressureRows(OutsideRows):
+    """Residuals of heights (by pressure less predicted) and their derivatives at one state."""
+
+    name, source = 'pressure', 'air_pressure'
+    levels_of = {'pressure': slice(0, 1)}
+    constants = PRESSURE
+
+    @classmethod
+    def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Pressure | None:
+        """Return heights as means over seconds."""
+        sent, t = inputs.outside['pressure']
+        pressure, variance = sent.value, sent.variance
+        good = (pressure > 1e4) & (pressure < 2e5)      # Pa
+        if good.sum() < 2 or not (config.imu.use_pressure and inputs.felt):
+            return None
+        t, pressure, variance = t[good], pressure[good], variance[good]
+        cell = np.floor(t * RATE)
+        first = np.r_[0, np.flatnonzero(np.diff(cell)) + 1]
+        count = np.diff(np.r_[first, len(t)])
+        t_mean, p_mean, v_mean = (np.add.reduceat(x, first) / count
+                                  for x in (t, pressure, variance))
+        per_pa = SCALE_HEIGHT / p_mean
+        stated = np.sqrt(np.maximum(v_mean, 0.0) / count) * per_pa
+        sigma = np.where(stated > 0, stated, HEIGHT_SIGMA / np.sqrt(count))
+        return Pressure(t_mean, -SCALE_HEIGHT * np.log(p_mean / p_mean[0]), sigma)
+
+    @staticmethod
+    def prior_sigmas(sent: Pressure, config: Config) -> Floats:
+        """Return the prior sigmas of zero, weather, wind of driving, temperature: (4,)."""
+        return np.array(PRIOR_SIGMAS)
+
+    @staticmethod
+    def least(sent: Pressure) -> dict[str, float]:
+        """Return the least level."""
+        return {'pressure': (LEAST.height / float(np.median(sent.sigma)))**2}
+
+    def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
+        """Return the rows."""
+        leg, state, points = problem.leg, point.state, point.points['pressure']
+        sent, k, tau = problem.outside['pressure'], points.interval, points.tau
+        assert isinstance(sent, Pressure)
+        C, g = state.C_nb[k], gravity_n(state.p_n[k], leg.origin)
+        dp = turn(C, points.dp)
+        dv = turn(C, points.dv)
+        velocity_n = state.v_n[k] + dv + g * tau[:, None]
+        by_velocity = (2 * state.constants[PRESSURE][2] * velocity_n)[:, None]
+        by_constants = np.stack([np.ones(len(k)), sent.t, (velocity_n**2).sum(axis=1),
+                                 sent.height - sent.height.mean()], -1)
+        p_n = state.p_n[k] + state.v_n[k] * tau[:, None] + dp + g * (tau**2 / 2)[:, None]
+        height = p_n[:, 2] + (p_n[:, :2]**2).sum(axis=1) / (2 * EARTH_RADIUS)
+        raw = sent.height - height - by_constants @ state.constants[PRESSURE]
+        J, c = np.zeros((len(k), 1, BARE)), np.zeros((len(k), 1, M))
+        up = np.concatenate([p_n[:, :2] / EARTH_RADIUS, np.ones((len(k), 1))], axis=1)[:, None]
+        t = tau[:, None, None]
+        J[:, :, P], J[:, :, V] = -up, -up * t - by_velocity
+        J[:, :, PHI] = up @ skew(dp) + by_velocity @ skew(dv)
+        J[:, :, BA] = up @ C @ points.AA + by_velocity @ C * t
+        J[:, :, BG] = -(up @ skew(dp) / 3 + by_velocity @ skew(dv) / 2) @ C * t
+        c[:, 0, PRESSURE] = -by_constants
+        return Rows(k, raw[:, None], J, c, 1 / sent.sigma[:, None])

@@ -1,0 +1,190 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Values of a vehicle over its legs, and the vehicles of a model beside each other.
+
+When a vehicle changed: steps in a value over its legs (tyres, pressure, a moved IMU), and drift.
+The legs' values are one level, steps, a slope and errors of known covariance: what is each leg's
+own, what legs share, and the walk that a scale is known for. Of the slope, all steps and all
+single odd legs the one that explains most is taken as long as it is beyond chance; then what has
+lost its meaning beside the others is dropped (backward after forward: a pair is not kept for what
+one of it explains).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.statistics import NORMAL_MEDIAN
+
+Floats = NDArray[np.float64]
+FAR = 4.0            # statistical: sigmas of a vehicle from its model: by chance one in 16,000
+LEAST = 3            # judgement: vehicles needed for a spread
+
+
+@dataclass(frozen=True)
+class Change:
+    """A step: from leg ``leg`` on, by ``size`` of the value, with its sigma."""
+
+    leg: int
+    size: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class History:
+    """
+    What a value did.
+
+    changes : in order.   odd : legs that stand alone.   slope, slope_sigma : per unit of ``t``;
+    None if not determined.
+    """
+
+    changes: tuple[Change, ...] = ()
+    odd: tuple[int, ...] = ()
+    slope: float | None = None
+    slope_sigma: float | None = None
+
+
+def covariance(own: Floats, shared: Sequence[Floats] = (), days: Floats | None = None,
+               walk: float = 0.0) -> Floats:
+    """
+    Return the covariance of the values of n legs.
+
+    own : (n,) variance of what is each leg's alone.   shared : (n, k) one-sigma effects of errors
+    that legs have in common.   walk : sigma of a random walk per square root of a day.
+    """
+    ridge = 1e-18    # smallest variance of a leg: the inverse exists
+    V = np.diag(np.maximum(own, ridge)) + sum((g @ g.T for g in shared), np.zeros(()))
+    return V if days is None else V + walk**2 * np.minimum.outer(days, days)
+
+
+def chance(n: int) -> float:
+    """Return the deviate that no step, odd leg or slope of n legs comes to by chance."""
+    from scipy.special import ndtri
+    false = 1e-3    # chance that a vehicle without any is said to have a change
+    return float(-ndtri(false / (2 * max(1, 2 * n - 2))))
+
+
+def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
+    """
+    Return the changes of n values in order, y (n,), of covariance V, and their slope over t.
+
+    A last leg that is odd is a change: nothing after it says otherwise.
+    """
+    n = len(y)
+    if n < 2:
+        return History()
+    L = np.linalg.cholesky(V)
+    # all that may be: a step from leg k on, 1 to n - 1; leg k alone, 1 to n - 2; and the slope
+    drifts = t is not None and np.ptp(t) > 0 and n > 2
+    white = np.linalg.solve(L, np.column_stack([
+        y, np.tril(np.ones((n, n))), np.eye(n)[:, 1:n - 1],
+        *([t - t[0]] if t is not None and drifts else [])]))
+    z, level, W = white[:, 0], white[:, 1], white[:, 2:]
+    slope = W.shape[1] - 1 if drifts else -1
+    found = sorted(_selected(z, level[:, None], W, chance(n)))
+    known = [k for k in found if k != slope]
+    size, sigma = _fit(z, np.column_stack([level, W[:, found]]))
+    ratio = {k: (float(size[i]), float(sigma[i])) for i, k in enumerate(found, 1)}
+    if drifts and slope not in ratio and n > len(found) + 2:
+        X = np.column_stack([level, W[:, found], W[:, slope]])
+        if np.linalg.matrix_rank(X) == X.shape[1]:
+            size, sigma = _fit(z, X)
+            ratio[slope] = float(size[-1]), float(sigma[-1])
+    return History(tuple(Change(k + 1, *ratio[k]) for k in known if k < n - 1),
+                   tuple(k - n + 2 for k in known if k >= n - 1),
+                   *ratio.get(slope, (None, None)))
+
+
+def _selected(z: Floats, level: Floats, W: Floats, least: float) -> list[int]:
+    """Return the columns of W that explain z significantly, in addition to the level."""
+    found: list[int] = []
+    while len(found) < (len(z) - 1) // 2 or not found:
+        rest, left = _without(np.column_stack([level, W[:, found]]), z, W)
+        size = np.linalg.norm(left, axis=0)
+        ratio = np.where(size > 1e-6 * np.linalg.norm(W, axis=0), left.T @ rest
+                        / np.maximum(size, 1e-300), 0.0)
+        best = int(np.argmax(np.abs(ratio)))
+        if abs(ratio[best]) <= least:
+            break
+        found.append(best)
+    while found:
+        size, sigma = _fit(z, np.column_stack([level, W[:, found]]))
+        ratio = np.abs(size[1:] / sigma[1:])
+        if ratio.min() > least:
+            break
+        del found[int(ratio.argmin())]
+    return found
+
+
+def _without(X: Floats, z: Floats, W: Floats) -> tuple[Floats, Floats]:
+    """Return z and the columns of W with all that X explains taken out."""
+    Q, _ = np.linalg.qr(X)
+    return z - Q @ (Q.T @ z), W - Q @ (Q.T @ W)
+
+
+def _fit(z: Floats, X: Floats) -> tuple[Floats, Floats]:
+    """Return the factors of the columns of X, and their sigmas, where z has unit variance."""
+    C = np.linalg.inv(X.T @ X)
+    return C @ (X.T @ z), np.sqrt(np.diag(C))
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """
+    Values of one model's vehicles.
+
+    mean, sigma : robust, and how well it is known.   spread : between vehicles, beyond their
+    sigmas, 1 sigma.   deviates : (n,) of each vehicle, in sigmas of spread and its own together;
+    nan of too few vehicles.
+    """
+
+    mean: float
+    sigma: float
+    spread: float
+    deviates: Floats
+
+    @property
+    def outliers(self) -> NDArray[np.intp]:
+        """Return the numbers of those who lie outside."""
+        return np.flatnonzero(np.abs(self.deviates) > FAR)
+
+
+def population(values: Floats, sigmas: Floats) -> Population:
+    """
+    Return the population of vehicles, values (n,) with their sigmas.
+
+    The spread is that with which half of all lie as near to the mean as the normal law says; the
+    mean is Huber's, so that a vehicle far off moves neither.
+    """
+    x, s = np.asarray(values, float), np.asarray(sigmas, float)
+    mean, spread = float(np.median(x)), 0.0
+    if len(x) < LEAST:
+        return Population(mean, float(s.max()), 0.0, np.full(len(x), np.nan))
+    huber = 1.5    # sigmas from which a vehicle counts for less
+    passes = 50
+    for _ in range(passes):
+        before = mean
+        spread = _spread(np.abs(x - mean), s)
+        total = np.hypot(s, max(spread, 1e-300))
+        weight = np.minimum(1.0, huber * total / np.maximum(np.abs(x - mean), 1e-300)) / total**2
+        mean = float(weight @ x / weight.sum())
+        if abs(mean - before) <= 1e-12 * max(float(total.min()), 1e-300):
+            break
+    return Population(mean, float(weight.sum()**-0.5), spread, (x - mean) / total)
+
+
+def _spread(off: Floats, s: Floats) -> float:
+    """Return the spread at which the median of off / sigma is that of the normal law."""
+    if np.median(off / np.maximum(s, 1e-300)) <= NORMAL_MEDIAN:
+        return 0.0
+    low, high = 0.0, float(off.max()) / NORMAL_MEDIAN
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if np.median(off / np.hypot(s, middle)) > NORMAL_MEDIAN else (
+            low, middle)
+    return high

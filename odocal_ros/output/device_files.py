@@ -1,0 +1,267 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Files for drivers, controllers and filters: the wheel, its noise, errors of the IMU."""
+
+from collections.abc import Mapping
+import math
+import textwrap
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from odocal_ros.calib.result import Calibration
+from odocal_ros.output.figures import counted, inverse, known, with_sigma
+from odocal_ros.output.summary import sentence
+from odocal_ros.outside.names import for_comment, one_line
+from odocal_ros.outside.yaml_files import parameters
+from odocal_ros.settings.config import Config, DIFFERENTIAL, HOLONOMIC, MECANUM, OMNI, SKID
+from odocal_ros.settings.levels import INFORMED_SHARE
+from odocal_ros.settings.nominal import nominal_scale
+
+if TYPE_CHECKING:
+    from odocal_ros.estimator.result.twist_noise import TwistNoise
+
+CONTROLLERS = 'ros2_controllers.yaml'
+# controllers that take the radius itself, and their parameter for it
+RADIUS = {'ackermann_steering_controller': 'traction_wheels_radius',
+          'tricycle_steering_controller': 'traction_wheels_radius',
+          'bicycle_steering_controller': 'traction_wheel_radius',
+          'tricycle_controller': 'wheel_radius'}
+# their parameters for radius and rotation lever
+HOLONOMIC_KEYS = {
+    MECANUM: ('wheels_radius', 'sum_of_robot_center_projection_on_X_Y_axis'),
+    OMNI: ('wheel_radius', 'robot_radius')}
+DEVICES = 'wheel_input.txt'
+MICRO = 1e6    # definition: millionths in 1
+TWIST, IMU_ERRORS = 'wheel_odometry_covariance.yaml', 'imu_errors.yaml'
+UNKNOWN = 1e6      # definition: variance of what wheels do not measure, as ROS drivers have it
+
+
+def controllers(calibration: Calibration, config: Config,
+                content: dict[str, Any]) -> dict[str, str]:
+    """Return the file by name, nothing when no value of it was determined."""
+    blocks = _blocks(calibration, config)
+    if not blocks:
+        return {}
+    lines = [head(calibration, content).rstrip(),
+             '# for ros2_controllers: copy the block of your controller into its parameter file,',
+             '# under the name of your controller; the calibrated wheel must be one',
+             '# that the controller drives. The multipliers are relative to '
+             'odometer.nominal_scale:',
+             '# if other multipliers were active during the drive, multiply them by these.',
+             '# Older releases call the radius rear_wheels_radius or rear_wheel_radius.']
+    text = '\n'.join(lines) + '\n'
+    return {CONTROLLERS: text + ''.join(parameters(v, name) for name, v in blocks.items())}
+
+
+def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any]]:
+    """Return the parameters by controller, of those that fit the drive."""
+    radius = wheel_radius(calibration, config)
+    if config.odometer.drive in HOLONOMIC:
+        lever = known(calibration.estimates, 'rotation_lever').value
+        keys = HOLONOMIC_KEYS[config.odometer.drive]
+        own = {key: value for key, value in zip(keys, (radius, lever), strict=True)
+               if value is not None}
+        if not own:
+            return {}
+        if config.odometer.drive == MECANUM:
+            return {'mecanum_drive_controller': {'kinematics': own}}
+        return {'omni_wheel_drive_controller': {
+            'wheel_offset': config.odometer.wheel_offset, **own}}
+    multipliers = _multipliers(calibration, config)
+    blocks: dict[str, dict[str, Any]] = (
+        {'diff_drive_controller': multipliers} if multipliers else {})
+    if radius is not None and config.odometer.drive == DIFFERENTIAL:
+        blocks |= {name: {key: radius} for name, key in RADIUS.items()}
+    return blocks
+
+
+def _multipliers(calibration: Calibration, config: Config) -> dict[str, float]:
+    """Return those of diff_drive_controller: each wheel's own factor where there is one."""
+    estimates = calibration.estimates
+    common = known(estimates, 'scale_ratio').value
+    left, right = (known(estimates, f'scale_factor_{side}') for side in ('left', 'right'))
+    nominal = nominal_scale(config, left.unit or known(estimates, 'scale_factor').unit)
+    out = {}
+    if nominal and left.value is not None and right.value is not None:
+        out = {'left_wheel_radius_multiplier': left.value / nominal,
+               'right_wheel_radius_multiplier': right.value / nominal}
+    elif common is not None:
+        out = {f'{name}_wheel_radius_multiplier': common for name in ('left', 'right')}
+    width = known(estimates, 'track_width')
+    if width.value is not None and width.sigma and config.odometer.track_width:
+        out['wheel_separation_multiplier'] = width.value / config.odometer.track_width
+    elif width.value is not None and config.odometer.drive == SKID:
+        out['wheel_separation'] = width.value       # in place of the distance of the wheels
+    return out
+
+
+def wheel_radius(calibration: Calibration, config: Config) -> float | None:
+    """Return the effective radius of the wheel, m; None where its pulses per turn are unknown."""
+    scale = known(calibration.estimates, 'scale_factor')
+    wheels = config.wheels
+    if scale.value is None:
+        return None
+    if scale.unit == 'm/rad':
+        return scale.value
+    if scale.unit == 'm/pulse' and wheels.pulses_per_revolution:
+        return scale.value * wheels.pulses_per_revolution / math.tau
+    if scale.unit == '1' and wheels.radius:     # a speed made with that radius
+        return scale.value * wheels.radius
+    return None
+
+
+def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
+    """Return the file by name; nothing without a scale factor in metres per pulse."""
+    scale = known(calibration.estimates, 'scale_factor')
+    if scale.value is None or scale.unit != 'm/pulse':
+        return {}
+    micrometres = with_sigma(scale.value, scale.sigma, MICRO)
+    lines = [head(calibration, content).rstrip(),
+             '# for receivers and inertial systems that count the wheel themselves; the pulse is '
+             'that of the',
+             '# counter calibrated: a device that counts other edges needs a multiple',
+             f'# one pulse: {micrometres} um; {inverse(scale)}']
+    for where, setting in _device_settings(scale.value, config.wheels.pulses_per_revolution):
+        lines += ['', *textwrap.wrap(where, 98, initial_indent='# ', subsequent_indent='# ')]
+        lines += [setting] if setting else []
+    return {DEVICES: '\n'.join(lines) + '\n'}
+
+
+def _device_settings(scale: float, pulses: float) -> list[tuple[str, str]]:
+    """Return (where it goes, the line) for each system; a line is empty where it lacks a fact."""
+    per_metre = f'{1 / scale:.9g}'
+    wheel, radius = '', ''
+    if pulses and pulses == round(pulses):
+        wheel = f'SETWHEELPARAMETERS {pulses:.0f} {pulses * scale:.9g} {scale:.9g}'
+        radius = f'WENC_RADIUS {pulses * scale / math.tau:.7g}'
+    needed = 'Needs a whole number in wheels.pulses_per_revolution.'
+    return [
+        ('u-blox F9 dead reckoning (UBX-CFG-VALSET, key 0x40070007, U4): whole um per tick, '
+         f'rounded by up to {0.5 / scale:.2g} ppm',
+         f'CFG-SFODO-FACTOR = {scale * MICRO:.0f}'),
+        ('SBG Systems, sbg_ros2_driver with device configuration by ROS parameters: group odom; '
+         'with the sbgECom library: member gain of SbgEComOdoConf, sent by '
+         'sbgEComCmdOdoSetConf: pulses per metre',
+         f'gain: {per_metre}' if '.' in per_metre else f'gain: {per_metre}.0'),
+        ('OxTS, NAVconfig, advanced tools, tab Wheel speed input: pulses per metre',
+         f'Pulses per metre = {per_metre}'),
+        ('NovAtel SPAN, firmware up to 7.06: ticks per revolution, circumference m, spacing of '
+         'ticks m. Later firmware (DMICONFIG) takes no size; it estimates it.'
+         + ('' if wheel else f' {needed}'), wheel),
+        ('ArduPilot rover: wheel radius m, '
+         + (f'for WENC_CPR {pulses:.0f}' if radius else f'for WENC_CPR. {needed}'), radius)]
+
+
+def wheel_covariance(calibration: Calibration, config: Config,
+                     content: dict[str, Any]) -> dict[str, str]:
+    """Return the file by name; nothing without a scale factor of the smoother."""
+    from odocal_ros.estimator.result.twist_noise import twist_noise
+    noise = twist_noise(calibration)
+    if noise is None:
+        return {}
+    usual = noise.variances(noise.speed, noise.turn_rate)
+    density = math.sqrt(usual[0] * noise.period)
+    lines = [
+        head(calibration, content).rstrip(),
+        f'# Covariance of the twist of the calibrated wheels in {config.frames.base}, for one '
+        'message per',
+        f'# {noise.period:.4g} s of the odometer. Estimated from this calibration: reading '
+        'error, wheel noise,',
+        '# scale, track width and their sigmas. Not included: an odometer delay, later tyre '
+        'changes.',
+        '# Velocity (m/s)^2, turn rate (rad/s)^2; order x, y, z, about x, y, z. '
+        f'{UNKNOWN:g}: not measured.',
+        '# robot_localization reads it from the messages: copy the diagonal into elements 0, 7, '
+        '14, 21,',
+        '# 28, 35 of twist.covariance of your driver, or its table below if the driver knows the '
+        'speed.',
+        '# ros2_controllers: copy the line under the name of your controller.',
+        *([] if noise.has_turn_rate else [
+            '# Without a left and a right wheel the turn rate is not measured: use a gyro.']),
+        '# VIO with wheels (VINS-Fusion forks), m/s per sqrt(Hz):',
+        f'#   wheel_velocity_noise_sigma: {density:.3g}']
+    diagonal = {'twist_covariance_diagonal': _diagonal(usual)}
+    text = '\n'.join(lines) + '\n'
+    return {TWIST: text + parameters(diagonal, 'diff_drive_controller') + _table(noise)}
+
+
+def _diagonal(variances: np.ndarray[Any, Any]) -> list[float]:
+    """Return the diagonal of a twist covariance from variances forward, left, up, turn rate."""
+    forward, left, up, turn = (float(f'{x:.3g}') for x in np.nan_to_num(variances, nan=UNKNOWN))
+    return [forward, left, up, UNKNOWN, UNKNOWN, turn]
+
+
+def _table(noise: 'TwistNoise') -> str:
+    """Return the variances by speed and turn rate, as parameters of a node of one's own."""
+    speeds = np.linspace(0.0, noise.fastest[0], 6)
+    rates = np.linspace(0.0, noise.fastest[1], 4)
+    rows = {f'turn_rate_{k}': {
+        'rad_per_s': float(f'{rate:.3g}')} | {
+        name: [float(f'{noise.variances(v, rate)[column]:.3g}') for v in speeds]
+        for name, column in (('x', 0), ('y', 1), ('yaw', 3)) if column < 3 or noise.has_turn_rate}
+        for k, rate in enumerate(rates)}
+    return parameters({'period': float(f'{noise.period:.4g}'),
+                       'speed': [float(f'{v:.3g}') for v in speeds], **rows},
+                      'wheel_odometry_covariance')
+
+
+def imu_errors(calibration: Calibration, config: Config,
+               content: dict[str, Any]) -> dict[str, str]:
+    """Return the file by name; nothing if no error of the IMU is known better than its prior."""
+    found: dict[str, dict[str, float]] = {}
+    for leg in calibration.legs:
+        method = leg.methods.get('smoother')
+        if method is None or leg.verdict.value == 'rejected':
+            continue
+        for name, entry in _known(method.details).items():
+            if name not in found or entry['sigma'] < found[name]['sigma']:
+                found[name] = entry
+    for axis in 'xyz':
+        bias = calibration.estimates.get(f'gyro_bias_{axis}')
+        if bias is not None and bias.value is not None and bias.sigma is not None:
+            found[f'gyro_bias_{axis}'] = {'value': bias.value, 'sigma': bias.sigma}
+    if not found:
+        return {}
+    lines = [
+        head(calibration, content).rstrip(),
+        '# Errors of the IMU that this calibration determined better than the prior; of several '
+        'legs the',
+        '# value with the smallest sigma. Axes: the IMU turned by imu.mounting_rpy (none: its '
+        'own), after',
+        '# imu.gyro_scale and imu.accel_scale. True value = reading - bias - scale * reading, and '
+        'for axis_ab',
+        '# - axis_ab * reading b in axis a. rad/s, m/s^2, rad; scale without a unit. Biases are '
+        'those at the',
+        '# start of the leg: they change with temperature and at every start.']
+    text = '\n'.join(lines) + '\n'
+    return {IMU_ERRORS: text + parameters(dict(sorted(found.items())), 'imu_errors')}
+
+
+def _known(details: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Return the errors of the IMU that a leg determined, by name."""
+    from odocal_ros.estimator.state import CONSTANTS
+    ratio = details.get('posterior_to_prior', {})
+    found = {name: {key: details[name][key] for key in ('value', 'sigma')} for name in CONSTANTS
+             if name.startswith(('gyro_', 'accelerometer_')) and name in details
+             and ratio.get(name, 1.0) < INFORMED_SHARE}
+    biases = details.get('accelerometer_bias', {})
+    return found | {f'accelerometer_bias_{axis}': {key: one[key] for key in ('value', 'sigma')}
+                    for axis, one in biases.items() if one['ratio'] < INFORMED_SHARE}
+
+
+def head(calibration: Calibration, content: dict[str, Any]) -> str:
+    """Return ``about`` as comment lines."""
+    return for_comment(about(calibration, content))
+
+
+def about(calibration: Calibration, content: dict[str, Any]) -> str:
+    """Return two lines: what made the file, when, of what, and with which result."""
+    inputs = content['inputs']
+    bags = ', '.join(str(i['bag']) for i in inputs if i.get('bag')) or 'live'
+    bags += ''.join(f', node {i["node"]}' for i in inputs if i.get('node'))
+    bags += f', vehicle {content["vehicle"]}' if content.get('vehicle') else ''
+    return (f'{content["software"]}, {content["created"]}, '
+            f'{counted(len(calibration.legs), "leg")}, from: {one_line(bags)}\n'
+            f'{sentence(calibration)}')

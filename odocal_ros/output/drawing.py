@@ -1,0 +1,153 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Figures of one look: as SVG parts of a page, or as files of their own."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import io
+import os
+from pathlib import Path
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.errors import BadUsage
+
+# Okabe and Ito's colours, distinguishable with colour blindness, by shapes in grey
+BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
+GREY, BAND = '0.45', '0.90'
+Drawing = tuple[str, str, str]      # title, what it says, SVG
+MOST_POINTS = 1200   # judgement: of a line
+MOST_MARKS = 400     # judgement: of single marks
+LOOK: dict[Any, Any] = {
+    'svg.fonttype': 'none', 'svg.hashsalt': 'odocal', 'font.family': ['DejaVu Sans'],
+    'font.size': 9.0, 'axes.labelsize': 9.0, 'legend.fontsize': 8.5, 'axes.axisbelow': True,
+    'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'axes.spines.top': False,
+    'axes.spines.right': False, 'axes.unicode_minus': True, 'path.simplify': True,
+    'legend.frameon': False, 'lines.linewidth': 1.4, 'mathtext.default': 'regular'}
+PICTURES = ('.png', '.svg', '.pdf')
+
+
+@contextmanager
+def look() -> Iterator[None]:
+    """Hold the look while figures are made and written; nothing of it stays."""
+    from matplotlib import rc_context
+    with rc_context(LOOK):
+        yield
+
+
+def sheet(height: float, rows: int = 1, sharex: bool = True,
+          heights: list[float] | None = None) -> tuple[Any, NDArray[Any]]:
+    """
+    Return a figure of ``height`` inch and its axes, one above the other, as an array.
+
+    heights : of the axes, in any unit; None: all equal.
+    """
+    from matplotlib.figure import Figure
+    width = 5.6    # inch
+    figure = Figure(figsize=(width, height))
+    axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False, height_ratios=heights)[:, 0]
+    figure.subplots_adjust(left=0.135, right=0.975, top=1 - 0.32 / height,
+                           bottom=0.48 / height, hspace=0.16)
+    grid = {'color': '0.90', 'linewidth': 0.6}
+    for ax in axes:
+        ax.grid(**grid)
+    return figure, axes
+
+
+def key(figure: Any, axes: Any) -> None:
+    """Put the legend above the axes, where it hides nothing."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc='upper center', ncols=3, borderpad=0.1,
+                      handlelength=2.2, columnspacing=1.4, borderaxespad=0.2)
+
+
+def svg(figure: Any, name: str, says: str) -> str:
+    """
+    Return a figure as an svg element.
+
+    figure : made under ``look``.   name : put before each id in it: a page holds many figures.
+    says : for those who cannot see it.
+    """
+    from html import escape
+
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    out = io.StringIO()
+    FigureCanvasSVG(figure).print_svg(out, metadata={
+        'Creator': None, 'Date': None, 'Format': None, 'Type': None})
+    text = out.getvalue()
+    text = text[text.index('<svg'):].strip()
+    text = re.sub(r'<defs>\s*<style.*?</style>\s*</defs>\s*', '', text, count=1, flags=re.DOTALL)
+    text = re.sub(r'<!--.*?-->\s*', '', text, flags=re.DOTALL)
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r'((?:xlink:)?href="|url\()#', rf'\1#{name}-', text)
+    head, _, rest = text.partition('>')
+    box = re.findall(r'viewBox="[^"]*"', head)[0]
+    return f'<svg {box} role="img" aria-label="{escape(says, quote=True)}">{rest}'
+
+
+def thinned(y: Floats) -> Ints:
+    """
+    Return rows of a line that keep its peaks, and both its ends: (m,) int.
+
+    Of each piece of equally many rows the least and the greatest y are kept (of all columns).
+    """
+    y = np.asarray(y, float)
+    n = len(y)
+    if n <= MOST_POINTS:
+        return np.arange(n)
+    columns = np.nan_to_num(y.reshape(n, -1).T)
+    edges = np.linspace(0, n, MOST_POINTS // (2 * len(columns)) + 1).astype(int)
+    keep = {0, n - 1}
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        for column in columns[:, a:b]:
+            keep |= {a + int(column.argmin()), a + int(column.argmax())}
+    return np.array(sorted(keep))
+
+
+def evenly(n: int, most: int = MOST_MARKS) -> Ints:
+    """Return at most ``most`` row numbers of n, both ends included: (m,) int."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)) if n else \
+        np.empty(0, int)
+
+
+def lengths(metres: float) -> tuple[float, str]:
+    """Return the factor and the unit for lengths up to so many metres."""
+    return (1e-3, 'km') if metres > 3000 else (1.0, 'm')
+
+
+def relative(most: float) -> tuple[float, str]:
+    """Return the factor and the unit for relative figures up to so much."""
+    return (100.0, '%') if most > 0.005 else (1e6, 'ppm')
+
+
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty figure, inches, that no window will show."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    figure = Figure(figsize=(width, height), layout='constrained')
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """
+    Write a figure.
+
+    Raises BadUsage: the file cannot be written.
+    """
+    part = path.with_name(f'.{path.name}.part')
+    try:
+        ending = path.suffix[1:].lower()
+        # without a date, the same result gives the same file
+        figure.savefig(part, format=ending, dpi=150,
+                       metadata={'Date': None} if ending == 'svg' else None)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise BadUsage(f'--plot {path}: cannot write it ({error.strerror})') from None

@@ -1,0 +1,243 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tables of legs, error budget and tracks, for terminal, report and spreadsheet."""
+
+import csv
+import io
+import math
+import textwrap
+from typing import Any
+
+from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.calib.result import (
+    Calibration,
+    Estimate,
+    LegResult,
+    MethodResult,
+    PerDistance,
+    TrackCheck,
+    wheel_factors,
+)
+from odocal_ros.output.figures import iso, known, length, table_row, two_digits
+from odocal_ros.outside.names import for_table
+from odocal_ros.pipeline.combination import driven_twice
+from odocal_ros.reasons import Verdict, verdict_of
+from odocal_ros.settings.config import Config
+
+LEGS = 'legs.csv'
+SHOWN = {'scale_factor': '', 'scale_ratio': '1'}
+ANGLES = {'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad'}
+COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
+LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
+          'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion'}
+HEAD = ('error budget', 'scale, ppm', 'yaw, deg', 'pitch, deg')
+WIDTHS = 24, 13, 15, 15      # judgement: with 'shared' within 80 columns
+SIDES = 'before', 'after'
+LABEL, CELL = 22, 9      # judgement: columns
+
+
+def leg_table(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
+    """Return the file by name, nothing without legs."""
+    if not calibration.legs:
+        return {}
+    rows = [_row(n, leg, calibration) for n, leg in enumerate(calibration.legs, 1)]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(rows)
+    return {LEGS: text.getvalue()}
+
+
+def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any]:
+    """Return a row; what a leg does not know is an empty cell."""
+    giving = {e.method for e in calibration.estimates.values() if e.value is not None}
+    reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
+                               if m.name in giving or not giving)]
+    row = {'leg': number, 'bag': for_table(leg.bag), 'start [UTC]': iso(leg.start_ns),
+           'start [ns]': leg.start_ns, 'stop [ns]': leg.stop_ns,
+           'duration [s]': leg.duration, 'distance [m]': leg.distance,
+           'imu_samples': leg.imu_samples, 'pulses': leg.pulses, 'fixes': leg.fixes,
+           'rejected_fixes': leg.rejected_fixes, 'verdict': leg.verdict.value,
+           'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
+    wheels = dict.fromkeys(wheel_factors(calibration.estimates), '') | {
+        name: 'm' for name in calibration.estimates if name.startswith('track_width')}
+    for name, unit in (SHOWN | wheels | ANGLES).items():
+        if name in calibration.estimates:
+            unit = unit or calibration.estimates[name].unit
+            found = _estimate(leg, calibration, name)
+            row |= {f'{name} [{unit}]': found.value, f'{name}_sigma [{unit}]': found.sigma}
+    for name in ('before', 'after'):
+        check = getattr(leg, name)
+        row |= {f'{name}_{part} [m]': None if check is None else getattr(check, part)
+                for part in ('rms', 'mean', 'max', 'end')}
+    return row
+
+
+def _estimate(leg: LegResult, calibration: Calibration, name: str) -> Estimate:
+    """Return a leg's value by the method whose value the calibration gives, else by its own."""
+    method = leg.methods.get(calibration.estimates[name].method)
+    return known(leg_estimates(leg) if method is None else method.estimates, name)
+
+
+def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
+    """Return a table of each leg's search, empty where there was none."""
+    lines = []
+    for k, leg in enumerate(legs, 1):
+        found = next((m.details['search'] for m in leg.methods.values()
+                      if m.details.get('search')), None)
+        if not found:
+            continue
+        best, after = found['best_row'], found['after']
+        rows = ((f'best of {found["array"]["rows"]} ({found["array"]["name"]})', best, best),
+                ('response surface', found['response_surface'], after),
+                ('least squares', found['least_squares'], None))
+        lines += ['search by positions alone (CN104359492A), without sigmas'
+                  + (f', leg {k}' if len(legs) > 1 else ''),
+                  f'  {"":24}  {"left":>10}  {"right":>10}  turn, deg  mean, m   max, m']
+        for name, values, fit in rows:
+            how = '' if fit is None else f'  {fit["mean"]:7.3f}  {fit["max"]:7.3f}'
+            lines.append(f'  {name:24}  {values["scale_left"]:10.6g}  '
+                         f'{values["scale_right"]:10.6g}  {values["heading_deg"]:+9.4f}{how}')
+        if found['left_and_right_held_together']:
+            lines.append('  the fixes do not separate left and right: their ratio is kept')
+    return lines
+
+
+def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
+    """
+    Return the verdict of a method's figures, '(leg)' behind it where it is that of the leg.
+
+    What is wrong with a leg's data is no method's reason, but touches each of them: a method that
+    found nothing to say of a dead wheel is no way round it.
+
+    legs : those the figures rest on; of several that are good in part, the good ones count.
+    """
+    twice = driven_twice([leg for leg in legs if verdict_of(leg.reasons) is not Verdict.REJECTED])
+    of_data = [verdict_of(leg.reasons) for leg in legs if leg not in twice]
+    used = [v for v in of_data if v is not Verdict.REJECTED] or of_data
+    worst = Verdict.worst([method.verdict, *used])
+    if worst is method.verdict:
+        return worst.value
+    return f'{worst.value} (leg{"s" * (len(legs) > 1)})'
+
+
+def leg_verdicts(legs: tuple[LegResult, ...]) -> list[str]:
+    """Return the verdict of each leg, 'not used' where it is good and an earlier one is used."""
+    twice = driven_twice([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
+    return ['not used' if leg in twice else leg.verdict.value for leg in legs]
+
+
+def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
+    """Return the largest source of an estimate's error, and its share of the variance; '' none."""
+    if method is None or name not in method.parameters:
+        return '', 0.0
+    row = method.parameters.index(name)
+    parts = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
+    largest, whole = max(parts, key=lambda source: parts[source], default=''), sum(parts.values())
+    return (largest, parts[largest] / whole) if whole else ('', 0.0)
+
+
+def source_label(name: str) -> str:
+    """Return the printed name of an error source."""
+    return LABELS.get(name, name.replace('_', ' '))
+
+
+def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: float,
+                 hidden: list[str] | set[str] | tuple[Any, ...] = (), width: int = 98,
+                 small_too: bool = True) -> list[str]:
+    """
+    Return the lines of a budget, none without one.
+
+    table : source to one-sigma share of each parameter, as calibration.json has it.   scale :
+    scale factor that its scale column belongs to.   shown : share of the variance below which a
+    source is but named.   hidden : parameters that are not determined: their column stays empty.
+    width : columns of the screen.   small_too : name the small ones.
+    """
+    if not table:
+        return []
+    factor = {COLUMNS[0]: 1e6 / scale}
+    wholes = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in COLUMNS]
+    lines = [table_row(HEAD, WIDTHS)]
+    small = []
+    shared = '   shared by all legs' if width > 90 else '  shared'
+    for name, row in table.items():
+        shares = [row.get(p, 0.0)**2 / whole if whole and p not in hidden else 0.0
+                  for p, whole in zip(COLUMNS, wholes, strict=True)]
+        if max(shares) < shown:
+            small.append(source_label(name))
+            continue
+        cells = ['-' if share < shown else
+                 f'{two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
+                 for p, share in zip(COLUMNS, shares, strict=True)]
+        lines.append(table_row([source_label(name), *cells], WIDTHS)
+                     + (shared if row.get('shared') else ''))
+    if not (small and small_too):
+        return lines
+    rest = f'under {shown:.1%}: '.replace('.0%', '%').replace('%', ' %') + ', '.join(small)
+    return lines + textwrap.wrap(rest, width, initial_indent='  ',
+                                 subsequent_indent='    ')
+
+
+def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
+    """
+    Return one check for many legs, each (check, fixes), None if there is none.
+
+    rms and mean are pooled over fixes; max, end and percent are those of the worst leg.
+    """
+    have = [(check, n) for check, n in checks if check is not None and n]
+    if not have:
+        return None
+    total = sum(n for _, n in have)
+    return TrackCheck(
+        rms=math.sqrt(sum(n * check.rms**2 for check, n in have) / total),
+        mean=sum(n * check.mean for check, n in have) / total,
+        **{name: max(getattr(check, name) for check, _ in have)
+           for name in ('max', 'end', 'percent_of_distance')})
+
+
+def in_pieces(legs: list[LegResult] | tuple[LegResult, ...]) -> list[PerDistance]:
+    """Return the error per distance driven of all legs, pooled over pieces."""
+    found: dict[float, list[PerDistance]] = {}
+    for one in (x for leg in legs for x in leg.per_distance):
+        found.setdefault(one.length, []).append(one)
+    return [_pooled(length, parts) for length, parts in sorted(found.items())]
+
+
+def _pooled(length: float, parts: list[PerDistance]) -> PerDistance:
+    whole = sum(x.pieces for x in parts)
+    return PerDistance(length, math.sqrt(sum(x.pieces * x.before**2 for x in parts) / whole),
+                       math.sqrt(sum(x.pieces * x.after**2 for x in parts) / whole), whole)
+
+
+def before_label(legs: list[LegResult] | tuple[LegResult, ...]) -> str:
+    """Return the label of the track before calibration."""
+    configured = any('scale_ratio' in m.estimates and m.estimates['scale_ratio'].value is not None
+                     for leg in legs for m in leg.methods.values())
+    return 'as configured' if configured else 'uncalibrated'
+
+
+def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Return heads and rows (label, cells) of dead reckoning against the fixes, none without."""
+    pieces = in_pieces(legs)
+    rows = []
+    for label, name in zip((before_label(legs), 'as calibrated'), SIDES, strict=True):
+        check = overall([(getattr(leg, name), leg.fixes) for leg in legs])
+        if check is not None:
+            rows.append((label, [
+                *(length(getattr(x, name)) for x in pieces), length(check.rms),
+                length(check.max), length(check.mean), length(check.end),
+                f'{check.percent_of_distance:.3f} %']))
+    heads = [f'in {x.length:g} m' if x.length < 1000 else f'in {x.length / 1000:g} km'
+             for x in pieces]
+    return [*heads, 'rms', 'max', 'mean', 'at end', 'of path'], rows
+
+
+def track_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
+    """Return the table of dead reckoning against the fixes, as wide as there is room."""
+    heads, rows = check_table(legs)
+    if not rows:
+        return []
+    most = (width - LABEL) // CELL
+    return [table_row([label, *cells[:most]], [LABEL - 2, *[CELL] * len(cells[:most])])
+            for label, cells in (('track against fixes', heads), *rows)]

@@ -1,0 +1,213 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Patterns inside a rectangle: routes of straights and quarter circles, how to follow one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+
+from odocal_ros.errors import BadConfig
+from odocal_ros.settings.node_configs import PatternConfig
+
+HALF_TURN = 3.0       # rad. Judgement: from here the robot may turn to either side
+LEAST_SIDE = 0.5      # m of the pattern. Judgement: below, a robot of 0.3 m turns more than drives
+Point = tuple[float, float]
+Rectangle = tuple[float, float, float, float]      # x and y, least and largest
+# m within which an error of the path is corrected. Judgement: at 0.5 m/s with commands that are
+# 0.1 and 0.2 s late, robots leave the pattern by 0.9 and 2.5 cm with any value from 0.2 to 0.8
+REACH = 0.4
+TURN_FROM, TURN_TO = 0.2, 0.02      # rad off the path: turn on the spot; aligned. Judgement
+SLOWEST, SLOWEST_TURN = 0.03, 0.1   # m/s, rad/s. Judgement: slower, many wheels stick
+MOVED, MOVED_TURN = 0.01, 0.02      # m, rad. Judgement: at the slowest within a second
+POSE_LOST_S = 0.5                   # judgement: without a pose
+Pose = tuple[float, float, float]   # x, y, m, and heading, rad
+
+
+@dataclass(frozen=True)
+class Piece:
+    """
+    A line or an arc of less than half a circle.
+
+    heading : at its start, rad from the x axis, counter-clockwise.   curvature : 1/m, positive to
+    the left.   rests : the robot stops at its end.   side : of a half turn before it, 1: left.
+    """
+
+    x: float
+    y: float
+    heading: float
+    length: float
+    curvature: float = 0.0
+    rests: bool = True
+    side: int = 1
+
+    def located(self, x: float, y: float) -> tuple[float, float]:
+        """Return the distance along the piece, m, and the distance to the left of it, m."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        along, left = c * (x - self.x) + s * (y - self.y), c * (y - self.y) - s * (x - self.x)
+        if not self.curvature:
+            return along, left
+        radius, side = 1 / abs(self.curvature), math.copysign(1.0, self.curvature)
+        inwards = radius - side * left       # from the centre outwards
+        return radius * math.atan2(along, inwards), side * (radius - math.hypot(along, inwards))
+
+
+def rectangle_of(config: PatternConfig) -> Rectangle:
+    """Return the free area, or raise BadConfig."""
+    if len(config.rectangle) != 4:
+        raise BadConfig(f'rectangle has {len(config.rectangle)} values; required: x and y of one '
+                        'corner, x and y of the opposite one, m')
+    x, y, other_x, other_y = config.rectangle
+    return min(x, other_x), min(y, other_y), max(x, other_x), max(y, other_y)
+
+
+def route_of(config: PatternConfig, start: Point) -> tuple[Piece, ...]:
+    """
+    Return the straight to a pattern, and the pattern.
+
+    start : position of the robot inside the rectangle, m.
+
+    Raises BadConfig: the rectangle is too small.
+    """
+    left, low, right, high = rectangle_of(config)
+    inner = left + config.margin, low + config.margin, right - config.margin, high - config.margin
+    side = min(inner[2] - inner[0], inner[3] - inner[1])
+    if side < LEAST_SIDE:
+        raise BadConfig(f'rectangle: the pattern has {max(side, 0):.2f} m, required: '
+                        f'{LEAST_SIDE:g} m; enlarge the rectangle or lower margin')
+    once = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight}[
+        config.pattern](inner)
+    first = (once[0].x, once[0].y)
+    return tuple(_alternating([*_lines([start, first]), *(once * config.rounds)]))
+
+
+def _alternating(pieces: list[Piece]) -> list[Piece]:
+    """Return pieces with half turns to the left and right by turns, as the track width needs."""
+    found, side = pieces[:1], 1
+    for before, piece in zip(pieces, pieces[1:], strict=False):
+        turn = piece.heading - before.heading - before.curvature * before.length
+        found.append(replace(piece, side=side))
+        if abs(math.remainder(turn, 2 * math.pi)) > HALF_TURN:
+            side = -side
+    return found
+
+
+def _lines(points: Sequence[Point]) -> list[Piece]:
+    """Return the straights from point to point."""
+    return [Piece(*a, math.atan2(b[1] - a[1], b[0] - a[0]), math.dist(a, b))
+            for a, b in zip(points, points[1:], strict=False) if a != b]
+
+
+def _straight(inner: Rectangle) -> list[Piece]:
+    x, y, right, high = inner
+    if right - x >= high - y:
+        a, b = (x, (y + high) / 2), (right, (y + high) / 2)
+    else:
+        a, b = ((x + right) / 2, y), ((x + right) / 2, high)
+    return _lines([a, b, a])
+
+
+def _square(inner: Rectangle) -> list[Piece]:
+    x, y, right, high = inner
+    side = min(right - x, high - y)
+    corners = [(x, y), (x + side, y), (x + side, y + side), (x, y + side), (x, y)]
+    return _lines(corners) + _lines(corners[::-1])
+
+
+def _figure_eight(inner: Rectangle) -> list[Piece]:
+    """Return two circles side by side along the longer side; it begins between them."""
+    x, y, right, high = inner
+    wide, tall = right - x, high - y
+    radius = min(max(wide, tall) / 4, min(wide, tall) / 2)
+    heading = math.pi / 2 if wide >= tall else 0.0      # across the longer side
+    centre = (x + right) / 2, (y + high) / 2
+    pieces = []
+    for side in (1, -1):
+        for quarter in range(4):
+            turned = heading + side * quarter * math.pi / 2
+            # from the middle to the centre of the circle, and from there to the start
+            pieces.append(Piece(
+                centre[0] + side * radius * (math.sin(turned) - math.sin(heading)),
+                centre[1] + side * radius * (math.cos(heading) - math.cos(turned)),
+                turned, radius * math.pi / 2, side / radius, rests=side < 0 and quarter == 3))
+    return pieces
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress on a route: piece, turning on the spot, end of the rest, last command."""
+
+    piece: int = 0
+    turning: bool = True
+    rest_until: float = -math.inf
+    t: float = math.nan
+    speed: float = 0.0
+
+
+def command(route: Sequence[Piece], now: Progress, pose: Pose, t: float,
+            config: PatternConfig) -> tuple[float, float, Progress]:
+    """
+    Return speed, m/s, turn rate, rad/s, and the progress after it.
+
+    t : s.   The route is driven when ``piece`` of the progress is its length.
+    """
+    step = 0.0 if math.isnan(now.t) else max(t - now.t, 0.0)
+    now = replace(now, t=t)
+    if now.piece == len(route) or t < now.rest_until:
+        return 0.0, 0.0, replace(now, speed=0.0)
+    piece = route[now.piece]
+    along, left = piece.located(*pose[:2])
+    off = _angle(pose[2] - piece.heading - piece.curvature * along)
+    if abs(off) > HALF_TURN:
+        off = math.copysign(off, -piece.side)
+    if now.turning and abs(off) > TURN_TO:
+        rate = max(min(1.5 * abs(off), config.turn_rate), SLOWEST_TURN)
+        return 0.0, -math.copysign(rate, off), replace(now, speed=0.0)
+    to_go = piece.length - along
+    if to_go <= 0:
+        rests = piece.rests
+        after = replace(
+            now, piece=now.piece + 1, turning=rests, speed=0.0 if rests else now.speed,
+            rest_until=t + config.rest if rests else now.rest_until)
+        return command(route, after, pose, t, config)
+    if abs(off) > TURN_FROM:
+        return 0.0, 0.0, replace(now, turning=True, speed=0.0)
+    limit = min(config.speed, config.turn_rate / abs(piece.curvature or 1e-9) / 1.5,
+                now.speed + config.acceleration * step)
+    if piece.rests:
+        limit = min(limit, math.sqrt(2 * config.acceleration * to_go))
+    speed = min(max(limit, SLOWEST), config.speed)
+    # across'' = -across / REACH^2 - 2 across' / REACH, by distance: critically damped
+    bend = piece.curvature - left / REACH**2 - 2 * off / REACH
+    rate = max(-config.turn_rate, min(speed * bend, config.turn_rate))
+    return speed, rate, replace(now, turning=False, speed=speed)
+
+
+def moved(before: Pose, after: Pose) -> bool:
+    """Return True if a robot surely moves between two poses."""
+    return (math.dist(before[:2], after[:2]) > MOVED
+            or abs(_angle(after[2] - before[2])) > MOVED_TURN)
+
+
+def why_stop(pose: Pose | None, age_s: float, rectangle: Rectangle, bumped: bool,
+             driven_s: float, timeout_s: float) -> str:
+    """
+    Return the cause to stop at once, empty without one.
+
+    pose : the newest, and its age.   driven_s : time since the start.
+    """
+    if bumped:
+        return 'the bumper is pressed'
+    if pose is None or not age_s <= POSE_LOST_S:
+        return f'no pose for {POSE_LOST_S:g} s'
+    x, y, _ = pose
+    if not (rectangle[0] <= x <= rectangle[2] and rectangle[1] <= y <= rectangle[3]):
+        return f'the robot is outside the rectangle, at x {x:.2f} m, y {y:.2f} m'
+    if not math.isfinite(pose[2]):
+        return 'the pose has no heading'
+    return f'timeout of {timeout_s:g} s' if driven_s > timeout_s else ''
+
+
+def _angle(angle: float) -> float:
+    """Return an angle within half a turn."""
+    return math.remainder(angle, 2 * math.pi)

@@ -1,0 +1,257 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a real IMU and a real receiver add: triads, vibration, filters, multipath, wrong sigmas."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.samples import VelocitySamples
+from odocal_ros.nav.earth import radii
+from odocal_ros.sim import body
+from odocal_ros.sim.motion import Motion, point
+from odocal_ros.sim.noise import gauss_markov, PHASE, stamps, stream, TRANSPORT
+from odocal_ros.sim.options import SimOptions
+from odocal_ros.sim.real import Real
+
+# physical: Hz, width, share: wheel hop, engine
+RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
+APART_NS = 50_000    # judgement: between the stamps of one batch
+# definition: ages, in time constants, and weights of a first-order filter: Gauss-Legendre rule on
+# pieces, fine enough for the kinks of a route
+EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
+                        np.arange(20.0, 41.0, 4.0)])
+NODES = (EDGES[:-1, None] + np.diff(EDGES)[:, None] * (0.5 + np.array([-1, 1]) / 12**0.5)).ravel()
+AVERAGING = np.exp(-NODES) * np.repeat(np.diff(EDGES) / 2, 2)
+AVERAGING /= AVERAGING.sum()
+# definition: of a second-order filter of position and velocity, damped by sqrt(1/2)
+TRACKING = np.exp(-NODES / 2**0.5) * np.cos(NODES / 2**0.5) * np.repeat(np.diff(EDGES) / 2, 2)
+TRACKING /= TRACKING.sum()
+UP = 2.0             # judgement: errors of the height over those of east and north
+ONSET = (0.5, 1.5)   # judgement: of the mean time in which a burst comes and goes
+HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e-4 m/s
+OUTLIER = 5.0           # m/s, judgement: a wrong Doppler in a street
+
+
+def angles(d_b: Floats) -> tuple[float, float]:
+    """Return yaw and pitch mounting angle of the forward axis in b, rad."""
+    d = np.asarray(d_b, dtype=float)
+    return float(-np.arcsin(d[1])), float(np.arctan2(d[2], d[0]))
+
+
+def turn_and_push(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
+    """
+    Return the rotation that takes the turn-and-push frame to that of the matrices, (3, 3).
+
+    The triads measure ``I + M`` times a vector. To first order the rotation is ``I + [theta x]``
+    with theta = (M_g,yz, -M_g,xz, -M_a,yx).
+    """
+    gyro, accel = np.eye(3) + gyro_matrix, np.eye(3) + accel_matrix
+    z = np.linalg.solve(gyro, [0.0, 0.0, 1.0])
+    z /= np.linalg.norm(z)
+    x = np.cross(accel[1], z)      # not measured by the y accelerometer, perpendicular to z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], -1)
+
+
+def own_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
+               accel_matrix: Floats) -> tuple[float, float, float, float]:
+    """Return yaw and pitch by the IMU's own axes, then by its housing, rad; matrices in i."""
+    d = np.asarray(C_vb)[0]
+    R = turn_and_push(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
+    return *angles(R.T @ d), *angles(d)
+
+
+def crooked(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:
+    """Return turn rate and specific force with the errors of the triads: (n, 3) each."""
+    gyro, accel, G = (real.matrix(n) for n in ('gyro_matrix', 'accel_matrix', 'g_sensitivity'))
+    w_m = w_i + w_i @ gyro.T if gyro.any() else w_i
+    if G.any():
+        w_m = w_m + f_i @ G.T
+    return w_m, f_i + f_i @ accel.T if accel.any() else f_i
+
+
+def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float]:
+    """Return gyro and accelerometer errors by temperature, drift and vibration: (n, 3) or 0.0."""
+    real = options.real
+    warmth = real.warm_rise * -np.expm1(-t / real.warm_time)[:, None]
+    added = []
+    for name, shake in (('gyro', real.gyro_vibration), ('accel', real.vibration)):
+        slope, wander = getattr(real, f'{name}_slope'), getattr(real, f'{name}_wander')
+        total = warmth * np.array(slope) if real.warm_rise and any(slope) else 0.0
+        if wander:
+            total = total + _wander(stream(options.seed, f'real {name} wander'), wander,
+                                    real.wander_time, t)
+        if shake:
+            level = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + 5.0)    # half at 5 m/s
+            total = total + level * vibration(stream(options.seed, f'real {name} vibration'),
+                                              shake, options.imu_rate, len(t))
+            if name == 'accel' and real.rectification:
+                total = total + real.rectification * (shake * level)**2
+        added.append(total)
+    return added
+
+
+def _wander(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
+    """Return a Gauss-Markov process that starts at 0, linear between draws."""
+    knots = np.arange(0.0, t[-1] + 2.0, 1.0)    # s
+    x = gauss_markov(rng, sigma, tau, knots)
+    return np.stack([np.interp(t, knots, column) for column in (x - x[0]).T], -1)
+
+
+def vibration(rng: np.random.Generator, rms: float, rate: float, n: int) -> Floats:
+    """
+    Return accelerations of a vibrating body, (n, 3): around its resonances, zero at 0 Hz.
+
+    Below them the power falls as f^4, as for a bounded displacement.
+    """
+    f = np.fft.rfftfreq(n, 1 / rate)
+    power = np.zeros_like(f)
+    for middle, width, share in RESONANCES:
+        at = min(middle, 0.4 * rate)
+        power += share * np.minimum(f / at, 1.0)**4 / (1 + ((f - at) / width)**2)
+    shape = np.sqrt(power)[:, None]
+    x = np.fft.irfft(np.fft.rfft(rng.standard_normal((n, 3)), axis=0) * shape, n, axis=0)
+    # both halves of the spectrum: the mean square of the shape is that of the samples
+    weight = np.full(len(f), 2.0)
+    weight[0] = 1.0
+    weight[-1] = 1.0 if n % 2 == 0 else 2.0
+    shaking: Floats = rms * x / np.sqrt((weight * power).sum() / n)
+    return shaking
+
+
+def stamped(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
+            batch: int = 1) -> Ints:
+    """
+    Return stamps (ns) of samples measured at ``ns``: late, in order, and in batches.
+
+    The jitter has zero mean, but no stamp is before its sample.
+    """
+    late = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
+    stamp = ns + np.rint(late * 1e9).astype(np.int64)
+    apart = APART_NS * np.arange(len(ns))
+    if batch > 1:
+        last = np.minimum(np.arange(len(ns)) // batch * batch + batch - 1, len(ns) - 1)
+        stamp = stamp[last]
+    return np.maximum.accumulate(stamp - apart) + apart
+
+
+def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
+    """Return latitude, longitude (rad), height (m) of a receiver without noise at t."""
+    real, true = options.real, _antenna(motion, t, options)
+    out = true
+    for weights, time in ((AVERAGING, real.receiver_lag), (TRACKING, real.receiver_tracking)):
+        if time:
+            out = _filtered(motion, t, options, weights, time)
+    if real.receiver_odometer:
+        mean = _filtered(motion, t, options, AVERAGING, real.receiver_odometer_time)
+        share = real.receiver_odometer
+        latitude, longitude, height = (x + share * (now - past) for x, now, past in zip(
+            out, true, mean, strict=True))
+        return latitude, longitude, height
+    return out
+
+
+def _filtered(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
+              time: float) -> tuple[Floats, Floats, Floats]:
+    """Return positions weighted by age; before the first sample the vehicle is at rest."""
+    return tuple(sum(w * x for w, x in zip(weights, row, strict=True)) for row in zip(
+        *(_antenna(motion, np.maximum(t - time * node, 0.0), options) for node in NODES),
+        strict=True))
+
+
+def fused(t: Floats, errors: Floats, options: SimOptions) -> Floats:
+    """Return (n, 3) satellite errors after fusion with the odometer of the receiver."""
+    if not options.real.receiver_odometer:
+        return errors
+    left = np.exp(-np.diff(t) / options.real.receiver_odometer_time)
+    out = errors.copy()
+    for k, a in enumerate(left, 1):
+        out[k] = a * out[k - 1] + (1 - a) * errors[k]
+    return out
+
+
+def _antenna(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
+    tilt = body.rotation(motion, t) if motion.tilt else None
+    return point(motion.at(t), options.antenna_lever_arm, tilt)
+
+
+def errors(t: Floats, options: SimOptions) -> Floats | float:
+    """Return slow errors and bursts at (n,) times, ENU, m: (n, 3), or 0.0."""
+    real = options.real
+    total: Floats | float = 0.0
+    for k, (sigma, tau) in enumerate(real.slow_errors):
+        slow = gauss_markov(stream(options.seed, f'real slow {k}'), sigma, tau, t)
+        total = total + slow * [1.0, 1.0, UP]
+    return total + burst_errors(t, options) if real.bursts else total
+
+
+def burst_errors(t: Floats, options: SimOptions) -> Floats:
+    """Return errors by multipath: bursts to any side, of smooth onset: (n, 3)."""
+    real, rng = options.real, stream(options.seed, 'real bursts')
+    total, hours = np.zeros((len(t), 3)), t[-1] / 3600
+    for _ in range(rng.poisson(real.bursts * hours)):
+        begin, side = rng.uniform(0.0, t[-1]), rng.uniform(0, 2 * np.pi)
+        size, length = (median * np.exp(real.burst_spread * rng.standard_normal())
+                        for median in (real.burst_size, real.burst_time))
+        onset, up = real.burst_onset * rng.uniform(*ONSET), rng.normal()
+        x = np.clip(np.minimum(t - begin, begin + length + onset - t) / onset, 0.0, 1.0)
+        shape = size * x**2 * (3 - 2 * x)
+        total += shape[:, None] * [np.cos(side), np.sin(side), up]
+    return total
+
+
+def reckoned(t: Floats, error: Floats, place: Floats, options: SimOptions) -> Floats:
+    """
+    Return errors of a receiver that dead-reckons in tunnels, without effect after them.
+
+    error, place : (n, 3) m, ENU; the error at the entry is kept in the tunnel.
+    """
+    real, out = options.real, error.copy()
+    for begin, length in real.tunnels:
+        inside = np.flatnonzero((t >= begin) & (t < begin + length))
+        if len(inside) < 2:
+            continue
+        steps = np.diff(place[inside], axis=0, prepend=place[inside[:1]])
+        turned = real.tunnel_heading * (t[inside, None] - begin) / 60
+        sideways = np.stack([-steps[:, 1], steps[:, 0], 0 * steps[:, 2]], -1)
+        out[inside] = error[inside[0]] + np.cumsum(
+            real.tunnel_odometer * steps + turned * sideways, axis=0)
+    return out
+
+
+def true_variance(white: Floats, options: SimOptions) -> Floats:
+    """Return the variance of the errors without bursts, ENU: (3,) m^2. white: of the noise."""
+    slow = sum(sigma**2 for sigma, _ in options.real.slow_errors)
+    return white + slow * np.array([1.0, 1.0, UP**2])
+
+
+def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
+    """Return the published velocity of the antenna; none without a sigma."""
+    sigma = options.velocity_sigma
+    if sigma is None:
+        return VelocitySamples.none()
+    ns, t = stamps(motion.duration, options.velocity_rate, PHASE['fix'])
+    smoothed = replace(options, real=replace(options.real, receiver_lag=options.velocity_lag))
+    before, after = (np.stack(places(motion, np.maximum(t + by, 0.0), smoothed), -1)
+                     for by in (-HALF_STEP, HALF_STEP))
+    latitude, _, height = after.T
+    meridian, normal = radii(latitude)
+    north, east, up = ((after - before) / (2 * HALF_STEP)).T
+    true = np.stack([east * (normal + height) * np.cos(latitude), north * (meridian + height), up],
+                    -1)
+    sent = true * (1 + options.velocity_scale_error) + _velocity_errors(t, options, sigma)
+    stamp = options.start_ns + ns + round(options.velocity_delay * 1e9)
+    return VelocitySamples(stamp, stamp + round(TRANSPORT['fix'] * 1e9), sent,
+                           np.full(sent.shape, sigma**2))
+
+
+def _velocity_errors(t: Floats, options: SimOptions, sigma: float) -> Floats:
+    time, rng = options.velocity_correlation_time, stream(options.seed, 'velocity')
+    error = (gauss_markov(rng, sigma, time, t) if time
+             else sigma * rng.standard_normal((len(t), 3)))
+    far = rng.uniform(size=(len(t), 1)) < options.velocity_outliers
+    out: Floats = error + far * OUTLIER * rng.standard_normal((len(t), 3))
+    return out
