@@ -213,10 +213,10 @@ def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats,
     spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, track)
     found = np.zeros(len(t_fix), bool)
     for begin, end, _ in spans:
-        found |= (t_fix >= begin) & (t_fix <= end)
+        found |= (t_fix >= begin) & (t_fix < end)
     if not spans:
         return found, ()
-    said = ', '.join(f't = {begin:.0f} to {end:.0f} s (jump of {jump:.1f} m)'
+    said = ', '.join(f't = {begin:.0f} to {t_fix[t_fix < end][-1]:.0f} s (jump of {jump:.1f} m)'
                      for begin, end, jump in spans[:SPANS_SAID])
     more = f' and {len(spans) - SPANS_SAID} more' * (len(spans) > SPANS_SAID)
     return found, (Reason(Code.FIXES_DEAD_RECKONED, f'the receiver dead-reckoned at {said}{more}: '
@@ -225,7 +225,7 @@ def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats,
 
 def _spans(t: Floats, place: Complexes, sigma: Floats,
            track: Complexes) -> list[tuple[float, float, float]]:
-    """Return begin and end of each span, s, and the jump after it, m."""
+    """Return of each span its first fix and the first after it, s, and the jump there, m."""
     if len(t) <= SMOOTH_ROWS:
         return []
     step = max(1, round(COMPARED_EVERY / float(np.median(np.diff(t)))))
@@ -247,7 +247,7 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
         begin = float(t[max(both[first] - 1, 0)])
         # the row after a jump is as far off
         if first < k and (not spans or begin > spans[-1][1]):
-            spans.append((begin, float(t[both[k] + 1]), float(off[k])))
+            spans.append((begin, float(t[both[k] + 2]), float(off[k])))
     return spans
 
 

@@ -79,7 +79,7 @@ def test_a_rejected_result_keeps_its_values(rejected):
 
 
 def test_numpy_arrays_in_inputs_and_details_become_lists():
-    assert files._plain({'a': np.arange(2), 'b': (np.float64(1.5), np.int64(2), np.inf)}) == {
+    assert files.plain({'a': np.arange(2), 'b': (np.float64(1.5), np.int64(2), np.inf)}) == {
         'a': [0, 1], 'b': [1.5, 2, None]}
 
 
