@@ -8,9 +8,9 @@ Results are drawn about true values at places against the limits, with the sigma
 python benchmarks/acceptance.py --draws 20000
 """
 
-import argparse
 from math import erf, sqrt
 
+from harness import parsed
 import numpy as np
 
 from odocal_ros.calib.result import Calibration, Estimate
@@ -49,10 +49,7 @@ def decisions(truth, sigma, draws, config, rng):
 
 def main():
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--draws', type=int, default=20_000)
-    parser.add_argument('--seed', type=int, default=1)
-    args = parser.parse_args()
+    args = parsed(__doc__, draws=20_000, seed=1)
     config = with_settings(Config(), {'accept.scale_ratio_min': LOW, 'accept.scale_ratio_max':
                                       HIGH})
     rng = np.random.default_rng(args.seed)

@@ -16,7 +16,6 @@ Printed by code: the fault; in how many drives with it the code is said, in how 
 what else is said of the fault's drives, but for what is never false (zoo_table.NEVER_FALSE).
 """
 
-import argparse
 from collections import Counter
 from dataclasses import replace
 import os
@@ -25,9 +24,9 @@ from pathlib import Path
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+from harness import configured, parsed, read_rows, run_missing
 import numpy as np
-from resumed import read_rows, run_missing
-from zoo import configured, GRADES, KINDS
+from zoo import GRADES, KINDS
 from zoo_table import BY_KIND, NEVER_FALSE
 
 FIRST_SEED, SEEDS_A_RUN = 80_000_000, 1_000_000
@@ -168,13 +167,10 @@ def table(rows):
 
 def main():
     """Run what the file does not hold yet, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=20, help='with each fault')
-    parser.add_argument('--only', choices=RUNS, action='append', default=[], metavar='CODE')
-    parser.add_argument('--duration', type=float, default=300.0, help='s of a drive')
-    parser.add_argument('--jobs', type=int, default=1, help='processes')
-    parser.add_argument('--file', type=Path, default=Path('/tmp/alarms.jsonl'))
-    args = parser.parse_args()
+    args = parsed(__doc__, drives=(20, 'with each fault'),
+                  only={'choices': RUNS, 'action': 'append', 'default': [], 'metavar': 'CODE'},
+                  duration=(300.0, 's of a drive'), jobs=(1, 'processes'),
+                  file=Path('/tmp/alarms.jsonl'))
     have = {seed: row for seed, row in read_rows(args.file).items()
             if row['asked'] == args.duration}
     # by turns, so that what is there after an interruption is of all codes

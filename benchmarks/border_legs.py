@@ -20,20 +20,15 @@ constants scatter between them.
 Rows are kept in the file: an interrupted run continues where it stopped.
 """
 
-import argparse
-import json
 import os
 from pathlib import Path
-import sys
 import time
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
-sys.path.insert(0, str(Path(__file__).parents[1] / 'test' / 'calib'))
 
+from harness import parsed, read_rows, run_missing
 import numpy as np
-from resumed import read_rows
 from smoother_cells import simulated
 
 FIRST_SEED, APART = 61_000_000, 15 * 60 * 10**9       # ns
@@ -115,24 +110,10 @@ def table(rows):
 
 def main():
     """Run what the file does not hold yet, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--vehicles', type=int, default=4)
-    parser.add_argument('--legs', type=int, default=6)
-    parser.add_argument('--grade', default='consumer')
-    parser.add_argument('--fixes', default='correlated')
-    parser.add_argument('--file', type=Path)
-    args = parser.parse_args()
+    args = parsed(__doc__, vehicles=4, legs=6, grade='consumer', fixes='correlated', file=Path)
     path = args.file or Path(f'/tmp/border_{args.grade}_{args.fixes}_{args.legs}.jsonl')
-    have = read_rows(path)
-    with path.open('a') as out:
-        for vehicle in range(args.vehicles):
-            if vehicle not in have:
-                have[vehicle] = run_vehicle(vehicle, args.legs, args.grade, args.fixes)
-                out.write(json.dumps(have[vehicle]) + '\n')
-                out.flush()
-                print(f'vehicle {vehicle}: {have[vehicle]["seconds"]:.0f} s', file=sys.stderr,
-                      flush=True)
-    table([have[k] for k in range(args.vehicles)])
+    table(run_missing(run_vehicle, range(args.vehicles), read_rows(path), path, 1, args.legs,
+                      args.grade, args.fixes))
 
 
 if __name__ == '__main__':

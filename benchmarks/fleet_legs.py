@@ -9,13 +9,13 @@ python benchmarks/fleet_legs.py --legs 100000            50 legs a vehicle, a we
 The rows of a vehicle lie in one file; a fleet's lie in one a bag.
 """
 
-import argparse
 from dataclasses import asdict
 import json
 from pathlib import Path
 import tempfile
 import time
 
+from harness import parsed
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -79,13 +79,7 @@ def used():
 
 def main():
     """Make the legs, time the stage."""
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--legs', type=int, default=100_000)
-    parser.add_argument('--workers', type=int, default=2)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--scratch', default=None)
-    args = parser.parse_args()
+    args = parsed(__doc__, legs=100_000, workers=2, seed=1, scratch=str)
     n = args.legs // EACH
     with tempfile.TemporaryDirectory(prefix='fleet_legs_', dir=args.scratch) as name:
         folder = Path(name)

@@ -10,16 +10,14 @@ Town, 600 s, industrial and consumer IMU in turn. Cells: front wheels that steer
 (skid steering), and front wheels that steer on vehicles with all effects of docs/zoo.md.
 """
 
-import argparse
 import math
 
+from harness import configured, parsed
 import numpy as np
 
 from odocal_ros.pipeline.calibrate import calibrate
-from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.draw import drawn, EFFECTS, ODOMETER_EFFECTS
 from odocal_ros.sim.scenarios import simulate
-from odocal_ros.sim.truth import settings
 from odocal_ros.sim.wheels import wheels_of
 
 FIRST_SEED = 92_000_000
@@ -34,9 +32,7 @@ def errors_of(seed, cell):
     effects = [name for name in EFFECTS if name not in ODOMETER_EFFECTS] * cell['all']
     made = simulate(drawn(seed, 'town', GRADES[seed % 2], effects, duration=600.0, wheels=4,
                           odometer='angle', front_steers=cell['front_steers'])[0])
-    config = with_settings(Config(), {
-        f'{group}.{key}': tuple(value) if isinstance(value, list) else value
-        for group, keys in settings(made).items() for key, value in keys.items()})
+    config = configured(made)
     leg = calibrate(made.leg(), config)
     method = leg.methods['smoother']
     scale = method.estimates['scale_factor']
@@ -63,10 +59,7 @@ def errors_of(seed, cell):
 
 def main():
     """Run the drives, print a row for each quantity."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=10, help='drives a cell')
-    parser.add_argument('--cell', default='', help='cells whose name holds it')
-    args = parser.parse_args()
+    args = parsed(__doc__, drives=(10, 'drives a cell'), cell=('', 'cells whose name holds it'))
     for number, (name, cell) in enumerate(CELLS.items()):
         if args.cell not in name:
             continue

@@ -11,9 +11,9 @@ wheels, on flat ground and on hills of 4.5 % (a sine; 3.2 % rms), with three gyr
 rate alone. Printed: error of the scale, its stated sigma, error / sigma, all rms over the drives.
 """
 
-import argparse
 from dataclasses import replace
 
+from harness import parsed
 import numpy as np
 
 from odocal_ros.pipeline.calibrate import calibrate, combine
@@ -42,9 +42,7 @@ def drive(seed, planar=False, **options):
 
 def main():
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--drives', type=int, default=30)
-    args = parser.parse_args()
+    args = parsed(__doc__, drives=30)
     print(f'{args.drives} drives each{"":22}error, ppm  sigma, ppm  error/sigma')
     for name, options in CELLS.items():
         rows = np.array([drive(seed, **options) for seed in range(1, args.drives + 1)])

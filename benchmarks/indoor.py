@@ -32,8 +32,7 @@ import os
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-from resumed import run_by_name
-from zoo import configured
+from harness import configured, run_by_name
 from zoo_table import print_errors
 
 FIRST_SEED, SEEDS_A_KIND = 193_000_000, 1_000_000

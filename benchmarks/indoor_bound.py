@@ -11,12 +11,11 @@ run: it is the Cramer-Rao bound of the estimator's model. Printed by kind for ea
 rms of error over forecast, the median of stated and of forecast sigma.
 """
 
-import argparse
 from pathlib import Path
 
+from harness import parsed, read_rows
 import indoor
 import numpy as np
-from resumed import read_rows
 
 PPM, DEG = 1e6, 180 / np.pi
 VALUES = {'scale': 'scale_factor', 'width': 'track_width', 'lever': 'rotation_lever',
@@ -41,9 +40,8 @@ def forecast(seed):
 
 def main():
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--file', type=Path, default=Path('/tmp/indoor.jsonl'))
-    rows = list(read_rows(parser.parse_args().file).values())
+    args = parsed(__doc__, file=Path('/tmp/indoor.jsonl'))
+    rows = list(read_rows(args.file).values())
     bounds = {row['seed']: forecast(row['seed']) for row in rows}
     for kind in indoor.KINDS:
         print(kind)

@@ -12,27 +12,18 @@ the leg by its start mark. With ``--stage stop`` or ``save`` it is killed after 
 ~/save instead, and its result folders are looked at: whole or none, and none wrong.
 """
 
-import argparse
 from pathlib import Path
-import sys
 import tempfile
 
+from harness import parsed
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
 
 
 def main() -> None:
     """Kill and count."""
     from kills import drive, killed, wrong
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--kills', type=int, default=50)
-    parser.add_argument('--seed', type=int, default=20260601)
-    parser.add_argument('--longest', type=float, default=9.0, help='s of leg at most')
-    parser.add_argument('--stage', choices=('record', 'stop', 'save'), default='record')
-    args = parser.parse_args()
+    args = parsed(__doc__, kills=50, seed=20260601, longest=(9.0, 's of leg at most'),
+                  stage={'choices': ('record', 'stop', 'save'), 'default': 'record'})
     if args.stage != 'record':
         kill_at_files(args)
         return

@@ -13,22 +13,15 @@ without DDS. Printed: legs whose accepted values are off by more than five sigma
 error or a warning; and how many legs are accepted, cautious, rejected and refused.
 """
 
-import argparse
 from collections import Counter
-from pathlib import Path
-import sys
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'fuzz'))
-from live_legs import leg, SIGMAS  # noqa: E402
+from harness import parsed
+from live_legs import leg, SIGMAS
 
 
 def main():
     """Run legs and print those that are wrong."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--legs', type=int, default=300)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--only', type=int)
-    args = parser.parse_args()
+    args = parsed(__doc__, legs=300, seed=1, only=int)
     found = []
     for number in range(args.legs) if args.only is None else [args.only]:
         one = leg(args.seed, number)

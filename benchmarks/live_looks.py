@@ -12,23 +12,20 @@ looks against that of the first EARLY_S, each by time, beside the goal, and how 
 estimate is from the result of the whole leg.
 """
 
-import argparse
 import math
-from pathlib import Path
-import sys
 import time
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from harness import parsed
 
-from odocal_ros.data.samples import take  # noqa: E402
-from odocal_ros.errors import OdocalError  # noqa: E402
-from odocal_ros.forecast.foresight import forecast_of  # noqa: E402
-from odocal_ros.forecast.leg_so_far import SmootherSoFar  # noqa: E402
-from odocal_ros.forecast.thinned_leg import ThinnedLeg  # noqa: E402
-from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, LOOK_SHARE  # noqa: E402
-from odocal_ros.pipeline.calibrate import calibrate  # noqa: E402
-from odocal_ros.settings.config import Config, with_settings  # noqa: E402
-from odocal_ros.sim.scenarios import SimOptions, simulate  # noqa: E402
+from odocal_ros.data.samples import take
+from odocal_ros.errors import OdocalError
+from odocal_ros.forecast.foresight import forecast_of
+from odocal_ros.forecast.leg_so_far import SmootherSoFar
+from odocal_ros.forecast.thinned_leg import ThinnedLeg
+from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, LOOK_SHARE
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.sim.scenarios import SimOptions, simulate
 
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 LINES = 40       # printed of a leg
@@ -80,14 +77,8 @@ def show(leg, config, seconds):
 
 def main() -> None:
     """Drive, look, compare."""
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--seconds', type=float, default=600.0)
-    parser.add_argument('--imu', type=float, default=100.0)
-    parser.add_argument('--grade', default='consumer')
-    parser.add_argument('--noise', default='white', help='of the fixes: white, correlated, rtk')
-    parser.add_argument('--seed', type=int, default=1)
-    args = parser.parse_args()
+    args = parsed(__doc__, seconds=600.0, imu=100.0, grade='consumer',
+                  noise=('white', 'of the fixes: white, correlated, rtk'), seed=1)
     config = with_settings(Config(), {'imu.grade': args.grade})
     leg = simulate(SimOptions(scenario='town', duration=args.seconds, imu_rate=args.imu,
                               imu_grade=args.grade, fix_noise=args.noise, seed=args.seed)).leg()

@@ -11,16 +11,11 @@ over DDS, as fast as it takes them. Printed: the time from the call of ~/stop_le
 beside the goal, and to the final result on ~/status; the CPU of the node meanwhile; both texts.
 """
 
-import argparse
-from pathlib import Path
-import sys
 import tempfile
 import time
 
+from harness import parsed
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
 
 BEFORE_S, AFTER_S = 15.0, 3.0      # s, sent before the start mark and after the stop mark
 BLOCK_S = 10.0                     # s of the drive sent at once
@@ -100,12 +95,7 @@ def main() -> None:
     from bench import Client, NodeProcess
 
     from odocal_ros.sim.scenarios import SimOptions, simulate
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--seconds', type=float, default=3600.0)
-    parser.add_argument('--imu', type=float, default=200.0)
-    parser.add_argument('--seed', type=int, default=1)
-    args = parser.parse_args()
+    args = parsed(__doc__, seconds=3600.0, imu=200.0, seed=1)
     drive = simulate(SimOptions(
         scenario='town', duration=args.seconds + AFTER_S, imu_rate=args.imu, odometer_rate=50.0,
         odometer='speed', seed=args.seed))

@@ -11,9 +11,9 @@ according to its sigmas. Output: error over sigma of the last pose, rms over the
 sigma), and the size of both. The pure core runs with the same input as in the node.
 """
 
-import argparse
 import math
 
+from harness import parsed
 import numpy as np
 
 from odocal_ros.apply.odometry import Odometry
@@ -76,12 +76,7 @@ def error_of(drive, poses):
 
 def main():
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--drives', type=int, default=50)
-    parser.add_argument('--scenario', default='town')
-    parser.add_argument('--minutes', type=float, default=10.0)
-    parser.add_argument('--grade', default='consumer')
-    args = parser.parse_args()
+    args = parsed(__doc__, drives=50, scenario='town', minutes=10.0, grade='consumer')
     errors, sigmas = [], []
     for seed in range(1, args.drives + 1):
         rng = np.random.default_rng(seed)

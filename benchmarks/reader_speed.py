@@ -15,7 +15,6 @@ the wanted topics, nothing decoded; neither counts its imports. ``auto`` is the 
 files and the report, less what the methods themselves take. --growth compares 10 min with 3 h.
 """
 
-import argparse
 import multiprocessing
 import os
 from pathlib import Path
@@ -23,6 +22,8 @@ import statistics
 import sys
 import tempfile
 import time
+
+from harness import parsed
 
 TIMED = """
 import sys, time
@@ -99,15 +100,10 @@ SHORT, LONG, GROWTH = 10.0, 180.0, 1.1      # min, min, times proportional
 
 def main() -> None:
     """Measure, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--minutes', type=float, default=60.0)
-    parser.add_argument('--repeat', type=int, default=5)
-    parser.add_argument('--camera', action='store_true', help='add 1 GB of camera messages')
-    parser.add_argument('--wall', action='store_true', help='time on the clock')
-    parser.add_argument('--growth', action='store_true', help='10 min beside 3 h')
-    parser.add_argument('--only', nargs='*', default=['mcap', 'zstd', 'sqlite3', 'help'])
-    parser.add_argument('--folder', type=Path, help='keep and reuse the bags here')
-    args = parser.parse_args()
+    args = parsed(__doc__, minutes=60.0, repeat=5, camera=(False, 'add 1 GB of camera messages'),
+                  wall=(False, 'time on the clock'), growth=(False, '10 min beside 3 h'),
+                  only={'nargs': '*', 'default': ['mcap', 'zstd', 'sqlite3', 'help']},
+                  folder=(Path, 'keep and reuse the bags here'))
     clock = 'wall' if args.wall else 'cpu'
     print(f'{"what":34} {"s":>7} {"beside":>8} {"s":>7} {"ratio":>7} {"goal":>7}')
     with tempfile.TemporaryDirectory() as scratch:

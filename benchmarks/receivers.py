@@ -28,10 +28,10 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from alarms import DEG, RTK
+from harness import configured, run_by_name
 import numpy as np
-from resumed import run_by_name
 from slip_alarms import SPEED, SPINS, spins_of
-from zoo import configured, outcome
+from zoo import outcome
 from zoo_table import BY_KIND, FIGURES, NEVER_FALSE, print_errors, WITHIN
 
 FIRST_SEED, SEEDS_A_RUN = 91_000_000, 1_000_000

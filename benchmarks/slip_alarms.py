@@ -20,7 +20,6 @@ largest size of scale error over sigma, the largest size in accepted drives, the
 the verdicts. Drives of spins without any spin are left out.
 """
 
-import argparse
 from collections import Counter
 from dataclasses import replace
 import os
@@ -30,9 +29,9 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from alarms import CHEAP, RTK, shifted
+from harness import configured, parsed, read_rows, run_missing
 import numpy as np
-from resumed import read_rows, run_missing
-from zoo import configured, KINDS, outcome
+from zoo import KINDS, outcome
 from zoo_table import BY_KIND, NEVER_FALSE
 
 FIRST_SEED, SEEDS_A_RUN = 83_000_000, 1_000_000
@@ -169,13 +168,10 @@ def errors(rows):
 
 def main():
     """Run what the file does not hold yet, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=15, help='of each run')
-    parser.add_argument('--only', choices=RUNS, action='append', default=[], metavar='RUN')
-    parser.add_argument('--duration', type=float, default=300.0, help='s of a drive')
-    parser.add_argument('--jobs', type=int, default=1, help='processes')
-    parser.add_argument('--file', type=Path, default=Path('/tmp/slip_alarms.jsonl'))
-    args = parser.parse_args()
+    args = parsed(__doc__, drives=(15, 'of each run'),
+                  only={'choices': RUNS, 'action': 'append', 'default': [], 'metavar': 'RUN'},
+                  duration=(300.0, 's of a drive'), jobs=(1, 'processes'),
+                  file=Path('/tmp/slip_alarms.jsonl'))
     have = {seed: row for seed, row in read_rows(args.file).items()
             if row['asked'] == args.duration}
     # by turns, so that what is there after an interruption is of all runs

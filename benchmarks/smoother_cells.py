@@ -28,24 +28,18 @@ least 87 % in each. Results go to the file line by line: an interrupted run cont
 stopped.
 """
 
-import argparse
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 from itertools import product
-import json
 import math
 import os
 from pathlib import Path
-import sys
 import time
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')     # two processes, two cores
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
-sys.path.insert(0, str(Path(__file__).parents[1] / 'test' / 'calib'))
 
+from harness import configured, parsed, read_rows, run_missing
 import numpy as np
-from resumed import read_rows
 
 GRADES, NOISES = ('consumer', 'industrial', 'tactical'), ('white', 'rtk')
 TOWN = {'scenario': 'town', 'duration': 600.0}
@@ -73,10 +67,9 @@ GOAL_STRESS = 87.0
 
 def simulated(seed, **options):
     """Return a drive with a heading drawn, and what an operator sets."""
-    from odocal_ros.settings.config import Config, with_settings
+    from odocal_ros.settings.config import with_settings
     from odocal_ros.sim.noise import stream
     from odocal_ros.sim.scenarios import SimOptions, simulate
-    from odocal_ros.sim.truth import settings
     rng = stream(seed, 'what differs from drive to drive')
     heading, side, when = rng.uniform(-np.pi, np.pi, 2).tolist() + [float(rng.uniform(30, 500))]
     if isinstance(options.get('outages'), float):
@@ -86,9 +79,7 @@ def simulated(seed, **options):
         arm = options['antenna_lever_arm']
         options['antenna_lever_arm'] = (arm * math.cos(side), arm * math.sin(side), 0.0)
     drive = simulate(SimOptions(seed=seed, heading=heading, **options))
-    config = with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
-                                      for group, keys in settings(drive).items()
-                                      for key, v in keys.items()})
+    config = configured(drive)
     if wrong:
         config = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 0.0)})
     return drive, config
@@ -141,12 +132,13 @@ def row_of(result, truth):
     return row
 
 
-def run_drive(name, seed):
+def run_drive(seed):
     """Drive, fit, and return a row."""
     from smoother_legs import leg_of
 
     from odocal_ros.estimator import smooth
-    drive, config = simulated(seed, **TOWN, **CELLS[name])
+    number = (seed - FIRST_SEED) // SEEDS_A_CELL
+    drive, config = simulated(seed, **TOWN, **list(CELLS.values())[number])
     leg = leg_of(drive.leg(), config)
     begin = time.process_time()
     try:
@@ -154,14 +146,9 @@ def run_drive(name, seed):
     except Exception as error:      # a defect, to be counted and not to end the run
         return {'seed': seed, 'codes': [f'{type(error).__name__}: {error}']}
     row = {'seed': seed, 'seconds': time.process_time() - begin, **row_of(result, drive.truth)}
-    if 'noise' in row and list(CELLS).index(name) < FIRST_STRESS:
+    if 'noise' in row and number < FIRST_STRESS:
         row |= bounds(drive, config, leg, result)
     return row
-
-
-def run_block(name, seeds):
-    """Drive some drives of a cell (in a process of its own)."""
-    return [run_drive(name, seed) for seed in seeds]
 
 
 def seeds_of(name, drives):
@@ -172,15 +159,13 @@ def seeds_of(name, drives):
 
 def main():
     """Run what the file does not hold yet, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, help='drives a cell (40; under stress 100)')
-    parser.add_argument('--jobs', type=int, default=2, help='processes')
-    parser.add_argument('--cells', nargs='*', default=[], help="a name, or a part of several, "
-                        "e.g. 'tactical rtk' or sway")
-    parser.add_argument('--stress', action='store_true', help='what the model may not hold')
-    parser.add_argument('--special', action='store_true', help='bounds of straight drives; starts')
-    parser.add_argument('--file', type=Path, default=Path('/tmp/smoother_cells.jsonl'))
-    args = parser.parse_args()
+    args = parsed(__doc__, drives=(int, 'drives a cell (40; under stress 100)'),
+                  jobs=(2, 'processes'),
+                  cells={'nargs': '*', 'default': [],
+                         'help': "a name, or a part of several, e.g. 'tactical rtk' or sway"},
+                  stress=(False, 'what the model may not hold'),
+                  special=(False, 'bounds of straight drives; starts'),
+                  file=Path('/tmp/smoother_cells.jsonl'))
     if args.special:
         from smoother_special import special
         special(simulated, true_levels, args.drives, args.cells)
@@ -189,35 +174,20 @@ def main():
     names = [n for n in names if not args.cells
              or any(text == n or text in n and text not in CELLS for text in args.cells)]
     drives = args.drives or (100 if args.stress else 40)
-    have = _run(names, drives, args.jobs, args.file)
+    seeds = [seed for name in names for seed in seeds_of(name, drives)]
+    have = {row['seed']: row for row in run_missing(
+        run_drive, seeds, read_rows(args.file), args.file, args.jobs, block=BLOCK)}
     print(f'{"cell":32}{"of":>4} {"":11}{"RMS":>9}{"/sigma":>8}{"/bound fit":>11}{"true":>7}'
           f'{"95 %":>8}')
     everything = {kind: [] for kind in ('bare', 'sway', 'stress')}
     for name in names:
-        rows = [have[seed] for seed in seeds_of(name, drives) if seed in have]
+        rows = [have[seed] for seed in seeds_of(name, drives)]
         kind = 'stress' if args.stress else 'sway' if name.endswith('sway') else 'bare'
         everything[kind] += rows
         _print_cell(name, rows, kind)
     for kind, rows in everything.items():
         if rows and kind != 'stress':
             _print_cell(f'all, {kind}', rows, kind, whole=True)
-
-
-def _run(names, drives, jobs, path):
-    have = read_rows(path)
-    with ProcessPoolExecutor(jobs) as pool, path.open('a') as out:
-        for name in names:
-            missing = [seed for seed in seeds_of(name, drives) if seed not in have]
-            blocks = [missing[i:i + BLOCK] for i in range(0, len(missing), BLOCK)]
-            begin = time.monotonic()
-            for rows in pool.map(run_block, [name] * len(blocks), blocks):
-                out.writelines(json.dumps(row) + '\n' for row in rows)
-                out.flush()
-                have |= {row['seed']: row for row in rows}
-            if blocks:
-                print(f'{name}: {len(missing)} drives in {time.monotonic() - begin:.0f} s',
-                      file=sys.stderr, flush=True)
-    return have
 
 
 def _print_cell(name, rows, kind, whole=False):

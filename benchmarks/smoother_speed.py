@@ -12,10 +12,11 @@ memory the process has held so far. Goals: ten minutes at 100 Hz under 3 s, an h
 200 Hz under 20 s and 1 GiB in all. Run it on an idle machine.
 """
 
-import argparse
 import os
 import resource
 import time
+
+from harness import configured, parsed
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -35,16 +36,12 @@ def run(name, options, seed):
     from odocal_ros.nav.standstill import standstills
     from odocal_ros.screening.inputs import place
     from odocal_ros.screening.screen import screen
-    from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.scenarios import SimOptions, simulate
-    from odocal_ros.sim.truth import settings
 
     t0 = time.perf_counter()
     drive = simulate(SimOptions(scenario='town', seed=seed, **options))
     t1 = time.perf_counter()
-    config = with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
-                                      for group, keys in settings(drive).items()
-                                      for key, v in keys.items()})
+    config = configured(drive)
     leg = drive.leg()
     inputs, _ = screen(leg, config)
     placed = place(inputs, config)
@@ -66,10 +63,8 @@ def run(name, options, seed):
 
 def main():
     """Run the cells."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument('--cells', nargs='*', default=list(CELLS), choices=list(CELLS))
-    parser.add_argument('--seed', type=int, default=1)
-    args = parser.parse_args()
+    args = parsed(__doc__, cells={'nargs': '*', 'default': list(CELLS), 'choices': list(CELLS)},
+                  seed=1)
     for name in args.cells:
         run(name, CELLS[name], args.seed)
 

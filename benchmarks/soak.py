@@ -16,7 +16,6 @@ quarter of the legs is held against the second one; the exit code is 1 if anythi
 was wrong.
 """
 
-import argparse
 import csv
 from dataclasses import asdict, dataclass, fields
 import os
@@ -27,9 +26,9 @@ import sys
 import tempfile
 import time
 
+from harness import parsed
+
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
 
 DRIVE_S, START_S, TICK_S, SIGMAS = 260.0, 20.0, 0.2, 5.0
 MOST_AHEAD = 50     # messages of a topic that the node may be behind
@@ -195,15 +194,9 @@ def main() -> int:
     from geometry_msgs.msg import TwistWithCovarianceStamped
 
     from odocal_ros.sim.scenarios import SimOptions, simulate
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--hours', type=float, default=24.0, help='simulated')
-    parser.add_argument('--legs', type=int, default=100)
-    parser.add_argument('--speedup', type=float, default=40.0,
-                        help='the node must keep up with it')
-    parser.add_argument('--rate', type=float, default=5.0, help='Hz of each topic')
-    parser.add_argument('--log', type=Path, help='CSV, a row for each leg')
-    args = parser.parse_args()
+    args = parsed(__doc__, hours=(24.0, 'simulated'), legs=100,
+                  speedup=(40.0, 'the node must keep up with it'), rate=(5.0, 'Hz of each topic'),
+                  log=(Path, 'CSV, a row for each leg'))
     drives = [simulate(SimOptions(
         scenario='out_and_back', duration=DRIVE_S, imu_rate=args.rate, odometer_rate=args.rate,
         fix_rate=args.rate, odometer='speed', seed=seed, scale=1.02, imu_grade='industrial'))

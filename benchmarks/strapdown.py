@@ -12,11 +12,11 @@ of the drive, scaled. Goals: an hour of 200 Hz well under 0.2 s, 300 times faste
 matrices sample by sample, error below 2e-5 rad an hour and 40 times less than two-sample.
 """
 
-import argparse
 import math
 import statistics
 import time
 
+from harness import parsed
 import numpy as np
 
 from odocal_ros.nav.earth import earth_rate_n
@@ -37,11 +37,7 @@ LOOPED = 20_000                           # samples that the loops are timed on
 
 def main() -> None:
     """Run all and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--hours', type=float, default=1.0)
-    parser.add_argument('--rate', type=float, default=200.0, help='Hz')
-    parser.add_argument('--repeat', type=int, default=5)
-    args = parser.parse_args()
+    args = parsed(__doc__, hours=1.0, rate=(200.0, 'Hz'), repeat=5)
     t = np.arange(round(args.hours * 3600 * args.rate) + 1) / args.rate
     truth, w_b = shaken_drive(t)
     every = max(1, round(args.rate / EPOCH_RATE))

@@ -13,26 +13,17 @@ all. A restart begins a new path: poses are judged against the first one after i
 run.
 """
 
-import argparse
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from pathlib import Path
-import sys
 
+from harness import parsed
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'apply'))
-from faulty_streams import SIGMAS, stream  # noqa: E402
 
 
 def main():
     """Run streams and print those that are wrong."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--streams', type=int, default=1000)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--jobs', type=int, default=1)
-    parser.add_argument('--only', type=int)
-    args = parser.parse_args()
+    from faulty_streams import SIGMAS, stream
+    args = parsed(__doc__, streams=1000, seed=1, jobs=1, only=int)
     numbers = range(args.streams) if args.only is None else [args.only]
     with ProcessPoolExecutor(args.jobs) as pool:
         found = list(pool.map(partial(stream, args.seed), numbers, chunksize=10))

@@ -19,19 +19,16 @@ The motion is computed once a cell and only the errors are redrawn, at low senso
 to the file line by line: an interrupted run continues where it stopped.
 """
 
-import argparse
-from concurrent.futures import ProcessPoolExecutor
 import dataclasses
 from itertools import product
-import json
 import math
 import os
 from pathlib import Path
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')     # two processes, two cores
 
+from harness import parsed, read_rows, run_missing
 import numpy as np
-from resumed import read_rows
 
 SCENARIOS, GRADES, NOISES = ('paper', 'straight', 'out_and_back'), ('navigation', 'tactical'), \
     ('white', 'correlated')
@@ -136,42 +133,30 @@ class Cell:
 _cells: dict[int, Cell] = {}
 
 
-def run_block(number: int, drives: range) -> list[dict]:
-    """Drive some drives of a cell (in a process of its own)."""
+def run_drive(seed: int) -> dict:
+    """Return the row of a drive; its cell is kept for the next ones of this process."""
+    number = (seed - FIRST_SEED) // SEEDS_A_CELL
     if number not in _cells:
         _cells.clear()
         _cells[number] = Cell(*CELLS[number])
-    first = FIRST_SEED + SEEDS_A_CELL * number
-    return [{'cell': number, **_cells[number].drive(first + k)} for k in drives]
+    return {'cell': number, **_cells[number].drive(seed)}
 
 
 def main() -> None:
     """Run what the file does not hold yet, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=2000, help='drives a cell')
-    parser.add_argument('--processes', type=int, default=2)
-    parser.add_argument('--only', default='', help="cells whose name holds this, e.g. 'paper'")
-    parser.add_argument('--file', type=Path, default=Path('/tmp/two_point_cells.jsonl'))
-    args = parser.parse_args()
+    args = parsed(__doc__, drives=(2000, 'drives a cell'), processes=2,
+                  only=('', "cells whose name holds this, e.g. 'paper'"),
+                  file=Path('/tmp/two_point_cells.jsonl'))
     wanted = [c for c in range(len(CELLS)) if args.only in ' '.join(CELLS[c])]
-    have = read_rows(args.file)
-    with ProcessPoolExecutor(args.processes) as pool, args.file.open('a') as out:
-        for number in wanted:
-            first = FIRST_SEED + SEEDS_A_CELL * number
-            missing = [k for k in range(args.drives) if first + k not in have]
-            blocks = [missing[i:i + BLOCK] for i in range(0, len(missing), BLOCK)]
-            for rows in pool.map(run_block, [number] * len(blocks), blocks):
-                out.writelines(json.dumps(row) + '\n' for row in rows)
-                out.flush()
-                have |= {row['seed']: row for row in rows}
-            if blocks:
-                print(f'{" ".join(CELLS[number])}: done', flush=True)
+    seeds = {number: [FIRST_SEED + SEEDS_A_CELL * number + k for k in range(args.drives)]
+             for number in wanted}
+    have = {row['seed']: row for row in run_missing(
+        run_drive, [seed for own in seeds.values() for seed in own], read_rows(args.file),
+        args.file, args.processes, block=BLOCK)}
     print(f'{"cell":34}{"of":>6} {"":15}{"mean error":>11}{"RMS":>10}{"RMS/sigma":>11}'
           f'{"within 95 %":>13}')
-    for number in wanted:
-        first = FIRST_SEED + SEEDS_A_CELL * number
-        _print_cell(' '.join(CELLS[number]),
-                    [have[first + k] for k in range(args.drives) if first + k in have])
+    for number, own in seeds.items():
+        _print_cell(' '.join(CELLS[number]), [have[seed] for seed in own])
 
 
 def _print_cell(name, rows):

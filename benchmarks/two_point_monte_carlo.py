@@ -14,9 +14,9 @@ seventh of their variance: the hardest to see. benchmarks/two_point_cells.py run
 drives over three routes with the motion computed once.
 """
 
-import argparse
 from time import perf_counter
 
+from harness import parsed
 import numpy as np
 
 from odocal_ros.pipeline.calibrate import calibrate
@@ -88,11 +88,8 @@ def run(name, drives, first_seed):
 
 def main():
     """Run the cases asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=100)
-    parser.add_argument('--first-seed', type=int, default=1000)
-    parser.add_argument('--only', default='', help='cases whose name holds this text')
-    args = parser.parse_args()
+    args = parsed(__doc__, drives=100, first_seed=1000,
+                  only=('', 'cases whose name holds this text'))
     for name in CASES:
         if args.only in name:
             run(name, args.drives, args.first_seed)

@@ -11,9 +11,9 @@ the search uses; ``set by set`` evaluates one set after another with the same pr
 ``from the pulses`` sums travel and heading up again for each set, as the patent's equations say.
 """
 
-import argparse
 import time
 
+from harness import parsed
 import numpy as np
 
 from odocal_ros.calib.wheel_search.criteria import score
@@ -65,10 +65,7 @@ def timed(run):
 
 def main():
     """Print the times."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--hours', type=float, default=1.0)
-    parser.add_argument('--sets', type=int, default=1000)
-    args = parser.parse_args()
+    args = parsed(__doc__, hours=1.0, sets=1000)
     *steps, leg = drive(args.hours)
     sets = leg.start + np.random.default_rng(2).uniform(-0.05, 0.05, (args.sets, 3))
     print(f'{args.hours:g} h: {len(steps[0])} epochs, {len(leg.t)} fixes, {args.sets} sets')

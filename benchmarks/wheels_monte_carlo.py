@@ -19,18 +19,14 @@ cell c has seed 40_000_000 + 100_000 c + k, fixed before the first run. Results 
 by line: an interrupted run continues where it stopped.
 """
 
-import argparse
-from concurrent.futures import ProcessPoolExecutor
-import json
 import math
 import os
 from pathlib import Path
-import sys
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+from harness import parsed, read_rows, run_missing
 import numpy as np
-from resumed import read_rows
 
 CELLS = {
     'town consumer white': {},
@@ -54,7 +50,7 @@ BLOCK = 20      # drives a process does before it reports
 GOAL_RATIO, GOAL_SHARE = (0.93, 1.07), (93.5, 96.5)
 
 
-def drive(number: int, k: int) -> dict:
+def drive(seed: int) -> dict:
     """Calibrate one drive; return errors and stated sigmas (scales: relative; rad; m)."""
     from odocal_ros.pipeline.calibrate import calibrate
     from odocal_ros.settings.config import Config, with_settings
@@ -62,10 +58,10 @@ def drive(number: int, k: int) -> dict:
     from odocal_ros.sim.noise import stream
     from odocal_ros.sim.options import DEFAULTS
     from odocal_ros.sim.scenarios import SimOptions, simulate
-    options = {'scenario': 'town', 'two_wheels': True} | CHEAP | list(CELLS.values())[number]
+    options = {'scenario': 'town', 'two_wheels': True} | CHEAP | list(CELLS.values())[
+        (seed - FIRST_SEED) // SEEDS_A_CELL]
     given = options.pop('given', False)
     grade = GRADES[options.get('imu_grade', DEFAULTS[options['scenario']]['imu_grade'])]
-    seed = FIRST_SEED + SEEDS_A_CELL * number + k
     draw = stream(seed, 'what the settings believe').standard_normal(7)
     made = simulate(SimOptions(
         seed=seed, fix_delay=float(LATENCY * draw[0]), odometer_delay=float(
@@ -96,42 +92,22 @@ def drive(number: int, k: int) -> dict:
     return row
 
 
-def run_block(number: int, drives: list[int]) -> list[dict]:
-    """Drive some drives of a cell (in a process of its own)."""
-    return [drive(number, k) for k in drives]
-
-
 def main() -> None:
     """Run what the file does not hold yet, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=200, help='drives a cell')
-    parser.add_argument('--processes', type=int, default=1)
-    parser.add_argument('--cell', default='', help="the cell of this name, else those "
-                        "whose name holds it, e.g. 'town'")
-    parser.add_argument('--file', type=Path, default=Path('/tmp/wheels_monte_carlo.jsonl'))
-    args = parser.parse_args()
-    have = read_rows(args.file)
+    args = parsed(__doc__, drives=(200, 'drives a cell'), processes=1,
+                  cell=('', "the cell of this name, else those whose name holds it, e.g. 'town'"),
+                  file=Path('/tmp/wheels_monte_carlo.jsonl'))
     wanted = [i for i, name in enumerate(CELLS) if args.cell == name] or [
         i for i, name in enumerate(CELLS) if args.cell in name]
-    with ProcessPoolExecutor(args.processes) as pool, args.file.open('a') as out:
-        for number in wanted:
-            name = list(CELLS)[number]
-            first = FIRST_SEED + SEEDS_A_CELL * number
-            missing = [k for k in range(args.drives) if first + k not in have]
-            blocks = [missing[i:i + BLOCK] for i in range(0, len(missing), BLOCK)]
-            for done, rows in enumerate(pool.map(run_block, [number] * len(blocks), blocks), 1):
-                out.writelines(json.dumps(row) + '\n' for row in rows)
-                out.flush()
-                have |= {row['seed']: row for row in rows}
-                print(f'\r{name}: {min(done * BLOCK, len(missing))} of {len(missing)}',
-                      end='', file=sys.stderr, flush=True)
-            print(file=sys.stderr)
+    seeds = {number: [FIRST_SEED + SEEDS_A_CELL * number + k for k in range(args.drives)]
+             for number in wanted}
+    have = {row['seed']: row for row in run_missing(
+        drive, [seed for own in seeds.values() for seed in own], read_rows(args.file), args.file,
+        args.processes, block=BLOCK)}
     print(f'{"cell":34}{"of":>6} {"":15}{"mean error":>11}{"RMS":>10}{"sigma":>10}'
           f'{"RMS/sigma":>11}{"within 95 %":>13}')
-    for number in wanted:
-        first = FIRST_SEED + SEEDS_A_CELL * number
-        print_cell(list(CELLS)[number],
-                   [have[first + k] for k in range(args.drives) if first + k in have])
+    for number, own in seeds.items():
+        print_cell(list(CELLS)[number], [have[seed] for seed in own])
 
 
 def print_cell(name, rows) -> None:

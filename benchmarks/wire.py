@@ -11,26 +11,19 @@ sizes, frames), with services called and parameters set between. The node has to
 answer, to say nothing negative or internal, and what it accepts has to be true.
 """
 
-import argparse
 from pathlib import Path
 import sys
 import tempfile
 import time
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
+from harness import parsed
 
 
 def main() -> int:
     """Run rounds; return 1 if anything was wrong."""
     from kills import drive
     from wire import Wire
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--rounds', type=int, default=20)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--speed', type=float, default=20.0, help='times real time')
-    args = parser.parse_args()
+    args = parsed(__doc__, rounds=20, seed=1, speed=(20.0, 'times real time'))
     bad, begin = 0, time.monotonic()
     with tempfile.TemporaryDirectory(prefix='odocal_wire_') as folder:
         wire = Wire(drive(), Path(folder), args.speed)

@@ -22,10 +22,7 @@ there explains; ``accepted``: with that verdict. ``false reasons``: drives with 
 nothing in them explains.
 """
 
-import argparse
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
-import json
 import math
 import os
 from pathlib import Path
@@ -35,7 +32,7 @@ import time
 os.environ.setdefault('OMP_NUM_THREADS', '1')     # two processes, two cores
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-from resumed import read_rows
+from harness import configured, parsed, read_rows, run_missing
 from zoo_table import print_tables
 
 from odocal_ros.sim.draw import drawn, EFFECTS, GRADES, KINDS, RARE
@@ -64,15 +61,6 @@ def kind_of(k):
 def grade_of(k):
     """Return the grade of a run's drive k: five kinds, three grades, each pair once in 15."""
     return GRADES[k % len(GRADES)]
-
-
-def configured(drive):
-    """Return the settings that the vehicle's operator has."""
-    from odocal_ros.settings.config import Config, with_settings
-    from odocal_ros.sim.truth import settings
-    return with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
-                                    for group, keys in settings(drive).items()
-                                    for key, v in keys.items()})
 
 
 def run_drive(seed, duration=None):
@@ -145,45 +133,23 @@ def against_housing(calibration, name, key, true):
     return row
 
 
-def run_block(seeds, duration):
-    """Drive some drives (in a process of its own)."""
-    return [run_drive(seed, duration) for seed in seeds]
-
-
-def _run(seeds, args):
-    have = {seed: row for seed, row in read_rows(args.file).items()
-            if row.get('asked') == args.duration}
-    missing = [seed for seed in seeds if seed not in have]
-    blocks = [missing[i:i + BLOCK] for i in range(0, len(missing), BLOCK)]
-    begin, done = time.monotonic(), 0
-    with ProcessPoolExecutor(args.jobs) as pool, args.file.open('a') as out:
-        for rows in pool.map(run_block, blocks, [args.duration] * len(blocks)):
-            out.writelines(json.dumps(row) + '\n' for row in rows)
-            out.flush()
-            have |= {row['seed']: row for row in rows}
-            done += len(rows)
-            print(f'{done} of {len(missing)} drives in {time.monotonic() - begin:.0f} s',
-                  file=sys.stderr, flush=True)
-    return [have[seed] for seed in seeds]
-
-
 def main():
     """Run what the file does not hold yet, print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=30, help='of each run')
-    parser.add_argument('--only', choices=RUNS[1:], action='append', default=[],
-                        metavar='EFFECT', help=f'one effect alone; repeatable: {", ".join(RUNS)}')
-    parser.add_argument('--kind', choices=KINDS)
-    parser.add_argument('--grade', choices=GRADES)
-    parser.add_argument('--duration', type=float, help='s of a drive (600; straight 720)')
-    parser.add_argument('--jobs', type=int, default=2, help='processes')
-    parser.add_argument('--file', type=Path, default=Path('/tmp/zoo.jsonl'))
-    args = parser.parse_args()
+    args = parsed(__doc__, drives=(30, 'of each run'),
+                  only={'choices': RUNS[1:], 'action': 'append', 'default': [],
+                        'metavar': 'EFFECT',
+                        'help': f'one effect alone; repeatable: {", ".join(RUNS)}'},
+                  kind={'choices': KINDS}, grade={'choices': GRADES},
+                  duration=(float, 's of a drive (600; straight 720)'), jobs=(2, 'processes'),
+                  file=Path('/tmp/zoo.jsonl'))
     if args.duration is not None and not math.isfinite(args.duration):
-        parser.error('--duration: required: a finite number')
+        sys.exit('--duration: required: a finite number')
     seeds = [seed for run in args.only or ['all']
              for seed in seeds_of(run, args.drives, args.kind, args.grade)]
-    print_tables(_run(seeds, args))
+    have = {seed: row for seed, row in read_rows(args.file).items()
+            if row.get('asked') == args.duration}
+    print_tables(run_missing(run_drive, seeds, have, args.file, args.jobs, args.duration,
+                             block=BLOCK))
 
 
 if __name__ == '__main__':

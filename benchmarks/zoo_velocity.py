@@ -12,8 +12,6 @@ and pitch, without and with velocity: share within 1.96 sigma, rms and maximum o
 the median ratio of the sigmas, with over without; and the ratio of CPU time.
 """
 
-import argparse
-import json
 import os
 from pathlib import Path
 import time
@@ -21,9 +19,9 @@ import time
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+from harness import configured, parsed, read_rows, run_missing
 import numpy as np
-from resumed import read_rows
-from zoo import configured, FIRST_SEED, grade_of, kind_of, outcome
+from zoo import FIRST_SEED, grade_of, kind_of, outcome
 
 SIGMA = 0.05        # m/s
 ERRORS = {
@@ -36,16 +34,22 @@ ERRORS = {
     'fused': {'velocity_scale_error': 0.02, 'velocity_correlation_time': 5.0}}
 
 
-def run_drive(k, error):
+def error_of(seed, kind):
+    """Return the type of velocity error of a drive: the one asked for, else by turns."""
+    return kind or list(ERRORS)[(seed - FIRST_SEED) % len(ERRORS)]
+
+
+def run_drive(seed, asked):
     """Return rows of a drive without and with the velocity."""
     from odocal_ros.pipeline.calibrate import calibrate, combine
     from odocal_ros.settings.config import with_settings
     from odocal_ros.sim.draw import drawn
     from odocal_ros.sim.scenarios import simulate
-    options, _ = drawn(FIRST_SEED + k, kind_of(k), grade_of(k), None, velocity_sigma=SIGMA,
+    k, error = seed - FIRST_SEED, error_of(seed, asked)
+    options, _ = drawn(seed, kind_of(k), grade_of(k), None, velocity_sigma=SIGMA,
                        **ERRORS[error])
     drive = simulate(options)
-    row = {'seed': FIRST_SEED + k, 'error': error, 'kind': kind_of(k), 'grade': grade_of(k)}
+    row = {'seed': seed, 'error': error, 'kind': kind_of(k), 'grade': grade_of(k)}
     for name, use in (('without', False), ('with', True)):
         config = with_settings(configured(drive), {'gnss.use_velocity': use})
         begin = time.process_time()
@@ -78,20 +82,12 @@ def print_table(name, rows):
 
 def main():
     """Run the drives that are missing in the file, print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
-    parser.add_argument('--drives', type=int, default=40)
-    parser.add_argument('--kind', choices=ERRORS)
-    parser.add_argument('--file', type=Path, default=Path('/tmp/zoo_velocity.jsonl'))
-    args = parser.parse_args()
-    have = read_rows(args.file)
-    for k in range(args.drives):
-        error = args.kind or list(ERRORS)[k % len(ERRORS)]
-        if have.get(FIRST_SEED + k, {}).get('error') == error:
-            continue
-        have[FIRST_SEED + k] = row = run_drive(k, error)
-        with args.file.open('a') as out:
-            out.write(json.dumps(row) + '\n')
-    rows = [have[FIRST_SEED + k] for k in range(args.drives)]
+    args = parsed(__doc__, drives=40, kind={'choices': ERRORS},
+                  file=Path('/tmp/zoo_velocity.jsonl'))
+    seeds = range(FIRST_SEED, FIRST_SEED + args.drives)
+    have = {seed: row for seed, row in read_rows(args.file).items()
+            if row['error'] == error_of(seed, args.kind)}
+    rows = run_missing(run_drive, seeds, have, args.file, 1, args.kind)
     for error in ERRORS:
         some = [row for row in rows if row['error'] == error]
         if some:

@@ -39,7 +39,7 @@ BEND, MOST_BENT = 3**0.5 / 2, 2.0
 GRAVITY = 9.81    # m/s^2; physical: its last digits tilt nothing
 # definition: in the numbers of a pose, diagonals of both covariances
 VARIANCES = np.r_[7:43:7, 49:85:7]
-EYE, POSITION = np.eye(3), np.arange(3)
+AXES, POSITION = np.eye(3), np.arange(3)
 
 
 class Errors:
@@ -219,7 +219,7 @@ def twist_covariance(vehicle: Vehicle, errors: Errors, speed: float, rate: Float
     beside that of scale and road.
     """
     B, grade = vehicle.twist_b, errors.grade
-    turn_b = errors.cov[BG, BG] + EYE * (grade.gyro_noise**2 / T)
+    turn_b = errors.cov[BG, BG] + AXES * (grade.gyro_noise**2 / T)
     off_b = rate @ vehicle.C_vb * grade.gyro_scale_error
     turn_b += off_b[:, None] * off_b
     cov: Floats = B @ turn_b @ B.T
