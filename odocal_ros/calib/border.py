@@ -3,7 +3,7 @@
 
 """The information of a leg's data on the constants of the vehicle, no prior in it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -56,15 +56,10 @@ class Border:
         sigmas : by name, of each constant's own error d, inf: the leg then says nothing of it.
         The data see x + d; d is taken out, docs/method.md (S34).
         """
-        D, at = self.information, [self.names.index(name) for name in sigmas]
-        size = np.array(list(sigmas.values()))
-        known, own = np.isfinite(size), np.diag(D)[at]
-        # a column of any length will do for what is not bounded
-        size = np.where(known, size, np.where(own > 0, 1 / np.sqrt(np.maximum(own, 1e-300)), 0.0))
-        A = np.eye(len(D))[:, at] * size
-        DA = D @ A
-        taken = DA @ np.linalg.pinv(np.diag(known * 1.0) + A.T @ DA)
-        return self._less(taken @ DA.T, taken @ (A.T @ self.pull))
+        at = [self.names.index(name) for name in sigmas]
+        (D,), (pull,) = loosened(self.information[None], self.pull[None], at,
+                                 np.array(list(sigmas.values())))
+        return replace(self, information=D, pull=pull)
 
     def doubted(self, effects: Floats) -> 'Border':
         """
@@ -76,11 +71,9 @@ class Border:
         G = (self.information + np.diag(weight)) @ effects
         taken = G @ np.linalg.inv(np.eye(G.shape[1]) + effects.T @ G)
         off = np.where(weight > 0, self.centre - self.value, 0.0)
-        return self._less(taken @ G.T, taken @ (effects.T @ (self.pull + weight * off)))
-
-    def _less(self, information: Floats, pull: Floats) -> 'Border':
-        left = self.information - information
-        return replace(self, information=(left + left.T) / 2, pull=self.pull - pull)
+        left = self.information - taken @ G.T
+        return replace(self, information=(left + left.T) / 2,
+                       pull=self.pull - taken @ (effects.T @ (self.pull + weight * off)))
 
     def only(self, names: Sequence[str]) -> 'Border':
         """Return the information on some constants, the others taken out with their priors."""
@@ -105,23 +98,36 @@ class Border:
 
         unit : (m,) prior sigmas, in which such information is 1.
         """
-        size, V = self._directions(unit, 1.0)
+        (size, V), = directions(self.information[None], unit, 1.0)
         V, W = V / unit[:, None], V * unit[:, None]
         return replace(self, information=V * size @ V.T, pull=V @ (W.T @ self.pull))
 
-    def rows(self, unit: Floats) -> tuple[Floats, Floats]:
-        """
-        Return the data as rows of unit variance: (r, m), and what they should be: (r,).
 
-        unit : (m,) of the constants. Directions in which there is but rounding are no rows.
-        """
-        size, V = self._directions(unit, 0.0)
-        root = np.sqrt(size)
-        R = (V * root).T / unit
-        return R, R @ self.value + V.T @ (self.pull * unit) / root
+def loosened(D: Floats, pull: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats]:
+    """
+    Return information and pull of legs with errors of their own taken out, (S34).
 
-    def _directions(self, unit: Floats, least: float) -> tuple[Floats, Floats]:
-        size, V = np.linalg.eigh(self.information * np.multiply.outer(unit, unit))
+    D, pull : (J, m, m), (J, m).   at, sigmas : (k,) constants and sigmas of their errors, inf:
+    not bounded.
+    """
+    known, own = np.isfinite(sigmas), np.diagonal(D, axis1=1, axis2=2)[:, at]
+    # a column of any length will do for what is not bounded
+    size = np.where(known, sigmas, np.where(own > 0, 1 / np.sqrt(np.maximum(own, 1e-300)), 0.0))
+    A = np.eye(D.shape[1])[:, at] * size[:, None]
+    DA, A_t = D @ A, np.swapaxes(A, 1, 2)
+    taken = DA @ np.linalg.pinv(np.diag(known * 1.0) + A_t @ DA)
+    left = D - taken @ np.swapaxes(DA, 1, 2)
+    return ((left + np.swapaxes(left, 1, 2)) / 2,
+            pull - (taken @ (A_t @ pull[:, :, None]))[:, :, 0])
+
+
+def directions(D: Floats, unit: Floats, least: float = 0.0) -> Iterator[tuple[Floats, Floats]]:
+    """
+    Yield size (r,) and direction (m, r) of the information of each leg, in ``unit``.
+
+    D : (J, m, m).   unit : (m,).   least : of a size; directions of but rounding are left out.
+    """
+    for size, V in zip(*np.linalg.eigh(D * np.multiply.outer(unit, unit)), strict=True):
         rounding = 1e-12 * size[-1]       # of doubles, times what elimination loses
         keep = size > max(rounding, least, 1e-300)
-        return size[keep], V[:, keep]
+        yield size[keep], V[:, keep]

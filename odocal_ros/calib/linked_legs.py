@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from odocal_ros.calib.border import Border
+from odocal_ros.calib.border import Border, directions, loosened
 from odocal_ros.data.arrays import Floats, Ints
 
 # relative, rad: unit of a constant without a prior, ln K and angles. Judgement: a leg's equations
@@ -67,13 +67,15 @@ class LinkedLegs:
     def system(self, spread: dict[str, float] | None = None,
                borders: Sequence[Border] | None = None) -> tuple[Floats, Floats]:
         """Return the rows of all legs and of the walk, and what they should be."""
-        m, J = len(self.names), len(self.borders)
+        m, J, borders = len(self.names), len(self.borders), borders or self.borders
         A, b = [], []
-        for j, border in enumerate(borders or self.borders):
-            R, y = _scattering(border, spread).rows(self.unit)
+        D, pull = self._scattering(borders, spread)
+        for j, (size, V) in enumerate(directions(D, self.unit)):
+            root = np.sqrt(size)
+            R = (V * root).T / self.unit
             A.append(np.zeros((len(R), m + J)))
             A[-1][:, self.columns(j)] = R
-            b.append(y)
+            b.append(R @ borders[j].value + V.T @ (pull[j] * self.unit) / root)
         walk = np.zeros((J - 1, m + J))
         k = np.arange(J - 1)
         walk[k, m + k], walk[k, m + k + 1] = -1 / self.steps, 1 / self.steps
@@ -163,20 +165,30 @@ class LinkedLegs:
         """
         x, C = self.solve(spread)
         out = np.zeros((len(self.borders), len(self.names)))
-        for j, border in enumerate(self.determined()):
-            border = _scattering(border, spread)
-            D, where = border.information, self.place(j)
-            pull = border.pull - D @ (x[where] - border.value)
+        legs = self.determined()
+        for j, (D, pull) in enumerate(zip(*self._scattering(legs, spread), strict=True)):
+            where = self.place(j)
+            pull = pull - D @ (x[where] - legs[j].value)
             variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
             # if the others predict all of a constant, to a millionth, a leg adds nothing
             news = variance > np.maximum(1e-6 * np.diag(D), 1e-300)
             out[j, news] = pull[news] / np.sqrt(variance[news])
         return out
 
+    def _scattering(self, borders: Sequence[Border],
+                    spread: dict[str, float] | None) -> tuple[Floats, Floats]:
+        """
+        Return information and pull of legs whose constants scatter: (J, m, m), (J, m).
 
-def _scattering(border: Border, spread: dict[str, float] | None) -> Border:
-    """Return the border of a leg whose constants scatter; combined legs determine their mean."""
-    return border.loosened(spread) if spread and not border.evidence else border
+        Combined legs determine their mean.
+        """
+        D, pull = (np.stack([getattr(b, what) for b in borders]) for what in (
+            'information', 'pull'))
+        own = [not b.evidence for b in borders]
+        if spread and any(own):
+            D[own], pull[own] = loosened(D[own], pull[own], [self.names.index(n) for n in spread],
+                                         np.array(list(spread.values())))
+        return D, pull
 
 
 def _left(A: Floats, b: Floats, keep: Ints) -> tuple[Floats, Floats]:

@@ -72,7 +72,7 @@ LN_K, YAW, PITCH = map(CONSTANTS.index, ('scale_factor', 'yaw_mounting_angle',
 # from the IMU, base_link axes, m
 ODO_ARM = constants_from('odometer_lever_arm_x', 'odometer_lever_arm_z')
 GNSS_ARM = constants_from('antenna_lever_arm_x', 'antenna_lever_arm_z')
-# s; error of the outside heading, the same through the leg, rad
+# s; error of the external heading, constant over the leg, rad
 ODO_DELAY, GNSS_DELAY, HEADING = map(CONSTANTS.index, ('odometer_delay', 'gnss_delay',
                                                        'heading_offset'))
 GYRO = constants_from('gyro_scale_z', 'gyro_z_by_force_y')
@@ -95,12 +95,13 @@ FIX_BY_MOTION, FIX_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_moti
 # what the tyres pull and brake, 1/(m/s^2): a wheel that is not driven only brakes
 TYRES = constants_from('scale_by_speed', 'scale_by_braking')
 BY_SPEED, BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
-FAST_SPEED = 20.0           # m/s, definition: where the slope is said, of a road out of town
+FAST_SPEED = 20.0           # m/s, definition: at which the slope is stated, a country road
 # of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
-# change, rad per m/s^3: a body answers late, tyres at once
+# change, rad per m/s^3: a body reacts late, tyres at once
 LEAN = constants_from('squat', 'sideslip_by_jerk')
-# what an ideal vehicle has not: all to here
+# m, ahead of the odometer: points about which the body pitches on hills, and in addition on bumps
 PITCH_CENTRE = constants_from('pitch_centre', 'pitch_centre_of_bumps')
+# deviations from an ideal vehicle
 IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre_of_bumps')
 # kinds of these with one size each, and their numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,

@@ -4,6 +4,7 @@
 """odocal compare: changes of the vehicle since earlier calibrations."""
 
 import argparse
+import re
 from typing import TYPE_CHECKING
 
 from odocal_ros.offline.say import say, say_json
@@ -50,7 +51,9 @@ def _screen(found: 'Comparison') -> list[str]:
                  _cell(change, e.to_previous, stored)) for e in change.entries]
         rows.insert(0, ('', 'value', 'since the first', 'since the previous'))
         lines += ['', label(change.parameter), *columns(rows, ' ')]
-    return [*lines, '', *(f'note: {note}' for note in found.notes), found.sentence,
+    # a line for each value that changed
+    said = re.split('; (?=[a-z ]+ changed by )', found.sentence)
+    return [*lines, '', *(f'note: {note}' for note in found.notes), *said,
             *hints(found.changes, stored)]
 
 

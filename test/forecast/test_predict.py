@@ -119,7 +119,8 @@ def test_the_prediction_is_the_sigma_of_the_result(scenario, source):
     settled = with_settings(Config(), {
         f'{group}.{name}': value for group, values in groups.items()
         for name, value in values.items()} | {
-        'gnss.correlation_time': 0.0, 'alignment.heading_source': source})
+        'method': 'two_point', 'gnss.correlation_time': 0.0,
+        'alignment.heading_source': source})
     result = calibrate(drive.leg(), settled).methods['two_point']
     predicted = predict(planned(options), Sigmas(config=settled, fix_rate=4.0,
                                                  quantum=options.scale))

@@ -164,10 +164,10 @@ def test_pulses_without_stamps_keep_the_times_they_were_sent_at(start, connect, 
 
 @pytest.fixture(scope='module')
 def slow():
-    """Return light messages: a minute of rest and motion."""
+    """Return light messages: 100 s of rest and motion."""
     types, sent = messages_of(simulate(SimOptions(
         duration=180.0, imu_rate=20.0, odometer_rate=10.0, odometer='speed')))
-    return types, part(sent, 45, 105)
+    return types, part(sent, 45, 145)
 
 
 def test_a_folder_that_cannot_be_written_is_a_warning_and_no_more(start, connect, slow, tmp_path):

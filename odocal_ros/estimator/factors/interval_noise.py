@@ -113,7 +113,7 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     axes = axes + np.swapaxes(motion.C @ motion.state.C_bv, 1, 2)
     axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
     speed = np.linalg.norm(motion.way, axis=1) / T
-    share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # some of it where a wheel hardly turns
+    share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero where a wheel hardly turns
     hard, turning = hard_and_turning(motion)
     spread = np.ones((K, 3)) if spread is None else spread
     left = motion.state.C_bv[:, 1]
@@ -145,7 +145,7 @@ def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Float
         given = np.zeros((len(rest), ROWS, 1))
         given[:, D, 0] = axes[:, 0] * sigma[:, None]
         return given * ~rest[:, None, None]
-    # as long as it may be, it goes where the wheels roll; how the body pitches is not in that
+    # of any length, in the direction in which the wheels roll, without the pitching of the body
     size = np.linalg.norm(motion.rolled, axis=1, keepdims=True)
     along = np.where(size > 1e-3, motion.rolled / np.maximum(size, 1e-3), axes[:, 0])
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)) * motion.T[:, 0]
@@ -158,7 +158,7 @@ def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Float
 
 def rest_noise(speed: Floats, rest: Bools) -> float:
     """Return the variance of the travel in a second at rest, m^2."""
-    measured = float((speed[rest]**2).mean()) if rest.sum() >= 5 else 0.0      # s to know it by
+    measured = float((speed[rest]**2).mean()) if rest.sum() >= 5 else 0.0      # s: judgement
     return max(measured, REST_NOISE**2)
 
 
@@ -184,7 +184,7 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     # s: a longer step between IMU samples hides motion
     gap = np.where(sums.longest_step > max(0.06, 3 * np.median(sums.longest_step)),
                    sums.longest_step, 0.0)
-    rate, force = 0.1, 1.5      # rad/s, m/s^2, 1 sigma of what may hide in it: of a car in town
+    rate, force = 0.1, 1.5      # rad/s, m/s^2, 1 sigma of hidden motion: of a car in town
     extra[:, PHI] = (rate * gap[:, None])**2
     extra[:, V] = (force * gap[:, None])**2
     extra[:, P] = (force * gap * T)[:, None]**2

@@ -5,9 +5,10 @@
 The motion between keyframes, docs/method.md (S5) to (S9): residuals and their derivatives.
 
 Rows of an interval: [position, velocity, attitude, gyro bias, accelerometer bias, odometer], each
-the state at its end less what the state at its begin and the preintegrated sums make of it. n
-turns with the Earth, so Coriolis and the turn of n within the interval are taken in to first order
-of the Earth rate (what is left is below 1e-8 of the motion), gravity where the vehicle is.
+the state at its end less the prediction from the state at its begin and the preintegrated sums. n
+turns with the Earth: Coriolis and the rotation of n within the interval are included to first
+order of the Earth rate (the remainder is below 1e-8 of the motion), gravity at the vehicle's
+place.
 """
 
 from copy import copy
@@ -48,7 +49,7 @@ from odocal_ros.nav.rotations import exp_so3, skew, transpose
 
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
 ROWS = D.stop
-# judgement: intervals of a hill; what pitches the body faster is a bump of the road, or squat
+# judgement: intervals of a hill; faster pitching is a bump of the road, or squat
 HILL_INTERVALS = 5
 # of Motion, what each interval has
 EACH = ('T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed',
@@ -103,7 +104,7 @@ class Motion:
         dv, dp = turn(self.C, intervals.dv), turn(self.C, intervals.dp)
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
         along = self.f + self._vary()
-        # the odometer measures the path, wherever the body points
+        # the odometer measures the path, in any direction of the body
         along *= state.scale / np.linalg.norm(along, axis=1, keepdims=True)
         way = turn(intervals.S, along) * self.varied
         self.faster = self._by_odometer_filter()
@@ -195,7 +196,7 @@ class Motion:
     def _by_odometer_filter(self) -> Floats:
         """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
         wheel = self.axle.wheel / self.state.scale
-        # by the fit, whose accelerometer knows it better than readings do
+        # from the fit: its accelerometer determines it better than the readings
         push = np.gradient(wheel, self.state.t)
         return np.stack([np.diff(wheel), -np.diff(push) / 2], -1)
 
@@ -234,7 +235,7 @@ class Motion:
         s, C, state = self.sums, self.C, self.state
         c = np.zeros((len(self.T), ROWS, M))
         swing = self.C_end - C
-        # a body that pitches lifts the odometer by no count
+        # the lift of the odometer by pitching is in no count
         c[:, D, LN_K] = self.heaved - (self.travelled if self.fitted else self.way)
         c[:, D, TYRES] = (c[:, D, LN_K] / self.varied)[:, :, None] \
             * self.from_mean[:, None]

@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What of the IMU's signals its errors multiply: docs/method.md, noise in the regressor.
+The fitted signals of the IMU, which its errors multiply: decision 9, noise in the regressor.
 
-Derivatives by a scale error go by a signal. By the signal as measured they hold its noise, which
-the fit then takes for information, and a smaller signal for a better one. So, once the state is so
-near that residuals are noise, that is taken out: what an axis has put into the residual, and,
-since the noise of a gyro turns the force within an interval, what gravity makes of that.
+A derivative by a scale error is a signal. The signal as measured contains noise, which the fit
+would use as information, and it would prefer a smaller signal. Once steps are below a sigma, the
+estimated noise is removed: the residual of the axis, and, since gyro noise rotates the force
+within an interval, its effect on gravity.
 
-Of the heave, what odometer and attitude do not predict is noise of the road. The fit judges it by
-the level of this noise, so it is taken out as well.
+Heave that odometer and attitude do not predict is noise of the road. The fit has a level for this
+noise, so it is removed as well.
 """
 
 import numpy as np
