@@ -21,7 +21,7 @@ from odocal_ros.live.answers import action_first
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session import SessionView
 from odocal_ros.live.status import calibration_status, in_force, input_status
-from odocal_ros.live.watch import LATCHED
+from odocal_ros.live.status_listener import LATCHED
 from odocal_ros.live.worker import Paths
 from odocal_ros.output.figures import iso
 from odocal_ros.outside.yaml_files import no_date

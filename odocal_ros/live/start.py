@@ -47,7 +47,8 @@ def run(args: Namespace) -> int:
     try:
         from rich.live import Live
 
-        from odocal_ros.live.watch import panel, StatusListener
+        from odocal_ros.live.panel import panel
+        from odocal_ros.live.status_listener import StatusListener
     except ModuleNotFoundError as error:
         name = (error.name or '').partition('.')[0]
         raise BadUsage(f'odocal watch needs the package {name}: '

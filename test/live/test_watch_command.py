@@ -16,7 +16,7 @@ import pytest
 from std_msgs.msg import Float64, String
 
 from odocal_ros.live.start import NEEDS
-from odocal_ros.live.watch import LATCHED, StatusListener
+from odocal_ros.live.status_listener import LATCHED, StatusListener
 
 ODOCAL = [sys.executable, '-m', 'odocal_ros.offline.cli', 'watch', '--once']
 
@@ -61,7 +61,7 @@ def test_the_panel_shows_a_running_node(start, connect):
 
 def test_while_a_leg_is_computed_the_panel_shows_its_running_estimate():
     rich = pytest.importorskip('rich.console')
-    from odocal_ros.live.watch import panel
+    from odocal_ros.live.panel import panel
     status = {'state': 'computing', 'scale_factor': '0.03', 'scale_factor_sigma': '0.0001',
               'estimate_scale_factor': '0.02', 'estimate_scale_factor_sigma': '0.0001'}
 
@@ -78,7 +78,7 @@ def test_while_a_leg_is_computed_the_panel_shows_its_running_estimate():
 
 def test_the_bars_are_shares_of_what_is_asked():
     pytest.importorskip('rich')
-    from odocal_ros.live.watch import shares
+    from odocal_ros.live.panel import shares
     found = shares({'distance_m': '75.0', 'metres_to_least': '25.0', 'seconds_to_stand': '4.0',
                     'asked_scale_sigma_ppm': '1000.0', 'predicted_scale_sigma_ppm': '4000.0',
                     'asked_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
