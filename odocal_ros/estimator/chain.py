@@ -37,7 +37,8 @@ class Normal:
     Normal equations H x = g of N blocks of n unknowns and a border of m, initially zero.
 
     diagonal : (N, n, n).   beside : (N - 1, n, n), row k, column k + 1.   border : (N, n, m).
-    corner : (m, m).   g, g_border : (N, n), (m,).
+    corner : (m, m).   g, g_border : (N, n), (m,).   absent : weights of the priors of further
+    constants, on which nothing depends: they are in the results only.
     """
 
     def __init__(self, N: int, n: int, m: int) -> None:
@@ -47,6 +48,7 @@ class Normal:
         self.border = self.wide[:, :, n:n + m]
         self.g = self.wide[:, :, n + m]
         self.corner, self.g_border = np.zeros((m, m)), np.zeros(m)
+        self.absent = np.zeros(0)
 
 
 @dataclass(eq=False)
@@ -54,23 +56,24 @@ class Solved:
     """The step, and the factorisation from which the covariances are computed."""
 
     step: Floats              # (N, n)
-    step_border: Floats       # (m,)
+    step_border: Floats       # (m,), here and below with the absent constants
     covariance: Floats        # (m, m) of the border
     log_determinant: float    # of H
     reduced: Floats           # (m, m) Schur complement of the border
     g_reduced: Floats         # (m,)
     _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n), until marginals
     _scale: Floats            # (N, n)
-    _scale_border: Floats     # (m,)
+    _scale_border: Floats     # (m,) of those that are not absent
 
     def marginals(self) -> 'JointMarginals':
         """Return the joint marginals of adjacent blocks; once, since they reuse the memory."""
         assert self._chain is not None, 'the chain was used up'
         (wide, own), self._chain = self._chain, None
         N, n = self.step.shape
-        m = len(self.step_border)
+        m = len(self._scale_border)
         z = np.empty((n + m, n + m))          # of block k + 1 and the border, scaled
-        corner = self.covariance / np.multiply.outer(self._scale_border, self._scale_border)
+        corner = self.covariance[:m, :m] / np.multiply.outer(self._scale_border,
+                                                             self._scale_border)
         H = wide[N - 1][:, n:n + m]
         z[n:, n:] = corner
         z[:n, n:] = -H @ corner
@@ -96,7 +99,7 @@ class Solved:
             across[rows, :, n:] *= s_c
         for rows in blocks(len(own) - 1):
             across[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
-        return JointMarginals(own, across, self.covariance)
+        return JointMarginals(own, across, self.covariance[:len(s_c), :len(s_c)])
 
     def products(self, chain: Floats, border: Floats) -> tuple[Floats, Floats]:
         """
@@ -108,7 +111,7 @@ class Solved:
         assert self._chain is not None, 'the chain was used up'
         wide, own = self._chain
         N, n = self.step.shape
-        m = len(self.step_border)
+        m = len(self._scale_border)
         square = np.zeros((chain.shape[2],) * 2)
         rest = border * self._scale_border[:, None]
         y = np.zeros((n, chain.shape[2]))
@@ -119,8 +122,8 @@ class Solved:
             rest -= eliminated[n:]
             y = eliminated[:n]
         rest /= self._scale_border[:, None]
-        moved = self.covariance @ rest
-        return square + rest.T @ moved, moved
+        moved = self.covariance[:, :m] @ rest
+        return square + rest.T @ moved[:m], moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +267,7 @@ def solve(normal: Normal) -> Solved:
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
         raise NotPositive('the constants are not determined')
-    logdet += 2 * np.log(root.diagonal().copy()).sum()
+    logdet += 2 * np.log(root.diagonal().copy()).sum() + np.log(normal.absent).sum()
     reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
     c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
     covariance = dpotrs(root, np.eye(m), lower=1)[0]
@@ -272,5 +275,18 @@ def solve(normal: Normal) -> Solved:
                         for rows in blocks(N)])
     for k in stepping(range(N - 2, -1, -1)):
         x[k] -= wide[k][:, :n] @ x[k + 1]
-    return Solved(x * s, c * s_c, covariance * np.multiply.outer(s_c, s_c), float(logdet),
-                  reduced, corner[:m, m] / s_c, (wide, diagonal), s, s_c)
+    absent = normal.absent
+    return Solved(
+        x * s, _with_absent(c * s_c, 0 * absent),
+        _with_absent(covariance * np.multiply.outer(s_c, s_c), 1 / absent), float(logdet),
+        _with_absent(reduced, absent), _with_absent(corner[:m, m] / s_c, 0 * absent),
+        (wide, diagonal), s, s_c)
+
+
+def _with_absent(x: Floats, absent: Floats) -> Floats:
+    """Return a vector, or a matrix by its diagonal, with the absent constants: (m,), (m, m)."""
+    if x.ndim == 1:
+        return np.concatenate([x, absent])
+    out = np.diag(np.concatenate([np.zeros(len(x)), absent]))
+    out[:len(x), :len(x)] = x
+    return out

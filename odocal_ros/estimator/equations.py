@@ -31,7 +31,7 @@ from odocal_ros.estimator.level_information import LevelInformation, LevelSides
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.preintegrate import Intervals, Points, preintegrate
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BARE, M, Priors, State, WITH_SLOW
+from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW
 
 SomeFactor = TypeVar('SomeFactor', bound=Factor)
 FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, PressureRows,
@@ -64,6 +64,7 @@ class Equations:
         self.state = state
         point = LinearisationPoint(state, *sums(problem, state), priors or problem.priors, spread,
                                    fitted)
+        self.constants_in_use = point.priors.in_use
         self.parts = {kind.name: kind(problem, point) for kind in FACTORS if kind.there(problem)}
 
     def at(self, levels: Levels) -> 'Weighted':
@@ -82,7 +83,8 @@ class Weighted:
     def __init__(self, equations: Equations, levels: Levels) -> None:
         self.state, self.levels = equations.state, levels
         self.n = WITH_SLOW if levels.correlation_time else BARE
-        self.parts = {name: part.weighed(levels) for name, part in equations.parts.items()
+        self.m = equations.constants_in_use
+        self.parts = {name: part.weighed(levels, self.m) for name, part in equations.parts.items()
                       if part.in_use(levels)}
 
     def __getitem__(self, kind: type[SomeFactor]) -> SomeFactor:
@@ -90,7 +92,7 @@ class Weighted:
 
     def normal(self) -> Normal:
         """Return the normal equations of the step."""
-        out = Normal(len(self.state.t), self.n, M)
+        out = Normal(len(self.state.t), self.n, self.m)
         for part in self.parts.values():
             part.add(out)
         return out
@@ -106,7 +108,7 @@ class Weighted:
     def information(self, solved: Solved) -> LevelInformation:
         """Return the information on the levels, sizes last; call before ``solved.marginals``."""
         names = sorted(self.levels.values, key=SIZES.__contains__)
-        sides = LevelSides(len(self.state.t), self.n, M, names)
+        sides = LevelSides(len(self.state.t), self.n, self.m, names)
         for part in self.parts.values():
             part.add_levels(sides)
         taken, moves = solved.products(sides.chain, sides.border)

@@ -235,3 +235,8 @@ class Priors:
     accel_bias: Floats
     constants: Floats
     centre: Floats               # (M,) of the constants
+
+    @property
+    def in_use(self) -> int:
+        """Return the number of constants up to the last one that a row depends on."""
+        return int(np.flatnonzero(self.constants > NO_ERROR)[-1]) + 1

@@ -12,7 +12,7 @@ from smoother_legs import leg_of, made, truth
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.state import BA, P, PHI, PRESSURE, V
+from odocal_ros.estimator.state import PRESSURE
 from odocal_ros.settings.config import with_settings
 
 pytestmark = pytest.mark.slow
@@ -40,25 +40,6 @@ def test_rows_vanish_at_the_truth_but_for_the_constants():
     # a mean of twenty heights of a second, 4 m/s^2 up at most at a change of slope: 4 / 24 m
     assert np.abs(left).max() < 4 / 24
     assert np.ptp(problem.outside['pressure'].height) > 1.0
-
-
-@pytest.mark.parametrize(('columns', 'step', 'omitted'), [
-    (P, 1e-2, 1e-4), (V, 1e-3, 1e-4), (PHI, 1e-5, 1e-4),
-    # the turn within a second, 0.05 rad in the mean, of the force on the speed: 2 0.01 10 m/s
-    (BA, 1e-3, 0.2 * 0.05)])
-def test_derivatives_by_a_keyframe_are_central_differences(columns, step, omitted):
-    problem, state = exact()
-    constants = state.constants.copy()
-    constants[PRESSURE] = 0.0, 0.0, 0.01, 0.02
-    state = replace(state, constants=constants)
-    part = rows_at(problem, state)
-    J = part.jacobians(16)[0][:, 0]
-    for i in range(columns.start, columns.stop):
-        move = np.zeros((len(state.t), 16))
-        move[:, i] = step
-        up, down = (rows_at(problem, state.moved(by * move, 0 * constants)).raw[:, 0]
-                    for by in (1, -1))
-        np.testing.assert_allclose((up - down) / (2 * step), J[:, i], atol=omitted)
 
 
 def test_heights_sharpen_the_pitch_and_hold():

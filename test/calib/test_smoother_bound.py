@@ -43,7 +43,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
         return np.arange(k * n, (k + 1) * n)
 
     border = np.arange(N * n, size)
-    a, b, c = motion.weighed(levels).derivatives(slice(None))
+    a, b, c = motion.weighed(levels, M).derivatives(slice(None))
     Q = motion.noise.covariance(levels)
     for k in range(N - 1):
         s = 1 / np.sqrt(np.diag(Q[k]))

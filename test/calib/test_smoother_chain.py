@@ -56,6 +56,31 @@ def test_step_and_covariances_are_those_of_a_dense_solve():
                                    atol=1e-10 * np.sqrt(np.outer(P[i, i], P[i, i])).min())
 
 
+def test_absent_constants_have_their_priors_as_if_they_were_in_the_border():
+    H, g = _dense()
+    solved = solve(_as_chain(H, g))
+    normal, weights = _as_chain(H, g), np.array([4.0, 0.25])
+    normal.absent = weights
+    some = solve(normal)
+    whole, part = Normal(N, SIZE, BORDER + 2), _as_chain(H, g)
+    for to, of in zip((whole.diagonal, whole.beside, whole.g),
+                      (part.diagonal, part.beside, part.g), strict=True):
+        to[:] = of
+    whole.border[:, :, :BORDER], whole.corner[:BORDER, :BORDER] = part.border, part.corner
+    whole.corner[[-2, -1], [-2, -1]], whole.g_border[:BORDER] = weights, part.g_border
+    all_of = solve(whole)
+    for name in ('step', 'step_border', 'covariance', 'reduced', 'g_reduced'):
+        np.testing.assert_allclose(getattr(some, name), getattr(all_of, name), rtol=1e-9,
+                                   atol=1e-12, err_msg=name)
+    assert some.log_determinant == pytest.approx(all_of.log_determinant, abs=1e-9)
+    sides, border = np.ones((N, SIZE, 2)), np.ones((BORDER, 2))
+    squares, moves = some.products(sides, border)
+    wide = np.concatenate([border, np.zeros((2, 2))])
+    for found, want in zip((squares, moves), all_of.products(sides, wide), strict=True):
+        np.testing.assert_allclose(found, want, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(some.marginals()[1], solved.marginals()[1], rtol=1e-12)
+
+
 def test_what_nothing_holds_is_said():
     H, g = _dense()
     H[N * SIZE + 1, :] = H[:, N * SIZE + 1] = 0.0

@@ -79,7 +79,7 @@ def by_second(rows, k):
 def shaken():
     """Return the problem of a leg with all sensors, and a state where no term vanishes."""
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, heading_sigma=0.0,
-                            antenna_lever_arm=(0.5, -0.3, 1.2))
+                            pressure_sigma=0.0, antenna_lever_arm=(0.5, -0.3, 1.2))
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=END,
                   imu_arm=np.array([1.2, 0.3, 0.4]))
     problem, state = problem_of(leg, config), truth(drive, config, leg)
@@ -199,9 +199,9 @@ def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
 def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, name):
     problem, state = stepping if name == 'steps' else shaken
     # so wide that nothing lies far out: squares only
-    wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'heading', 'steps'), 1e8)
+    wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'heading', 'pressure', 'steps'), 1e8)
     levels = problem.first_levels.but(correlation_time=40.0, **wide)
-    part = part_at(problem, state, name).weighed(levels)
+    part = part_at(problem, state, name).weighed(levels, M)
     normal = Normal(len(state.t), N, M)
     part.add(normal)
     rng = np.random.default_rng(2)

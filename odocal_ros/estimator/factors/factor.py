@@ -65,6 +65,7 @@ class Factor:
     state: State
     levels: Levels           # weighed: by these,
     n: int                   # of so many unknowns of a keyframe
+    m: int                   # and so many constants, the first ones: no row depends on others
     log_R: float = 0.0       # log determinant of the rows' covariance, but for a constant
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
@@ -84,10 +85,10 @@ class Factor:
         """Return True if the rows exist at these levels."""
         return True
 
-    def weighed(self, levels: Levels) -> 'Factor':
-        """Return a copy with weighted rows."""
+    def weighed(self, levels: Levels, m: int) -> 'Factor':
+        """Return a copy with weighted rows and the first m constants."""
         new = copy(self)
-        new.levels = levels
+        new.levels, new.m = levels, m
         new.n = WITH_SLOW if levels.correlation_time else BARE
         new.weigh(levels)
         return new

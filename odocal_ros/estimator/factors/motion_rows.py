@@ -29,7 +29,7 @@ from odocal_ros.estimator.imu_noise import at_rest, sensor_noise
 from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BG, M, State
+from odocal_ros.estimator.state import BG, State
 
 ALONG = ('along', 'along_hard')
 # sources in the budget
@@ -90,15 +90,16 @@ class MotionRows(Factor):
         for rows in blocks(len(r)):
             J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
             r[rows] += np.einsum('kij,kj->ki', J[:, :, :n], step[rows]) + np.einsum(
-                'kij,kj->ki', J[:, :, n:2 * n], step[ends]) + J[:, :, 2 * n:] @ constants
+                'kij,kj->ki', J[:, :, n:2 * n], step[ends]) + J[:, :, 2 * n:] @ constants[:self.m]
         self.r = r
 
     @cached_property
     def J(self) -> Floats:
         """Return the whitened derivatives: (K, 18, 2n + M)."""
-        J = room(*self.raw.shape, 2 * self.n + M)
+        J = room(*self.raw.shape, 2 * self.n + self.m)
         for rows in blocks(len(J)):
-            J[rows] = self.whiten[rows] @ np.concatenate(self.derivatives(rows), axis=2)
+            J[rows] = self.whiten[rows] @ np.concatenate(
+                self.derivatives(rows), axis=2)[:, :, :J.shape[2]]
         return J
 
     def derivatives(self, rows: slice) -> tuple[Floats, Floats, Floats]:

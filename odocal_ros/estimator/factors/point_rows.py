@@ -21,7 +21,7 @@ from odocal_ros.estimator.factors.factor import ChunkedSum, Factor
 from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import M, SLOW, State, WITH_SLOW
+from odocal_ros.estimator.state import SLOW, State, WITH_SLOW
 from odocal_ros.nav.statistics import NORMAL_MEDIAN
 
 # sigmas beyond which a row, or the slip of an interval, has a heavy tail. Statistical: one normal
@@ -88,10 +88,10 @@ class PointRows(Factor):
     def J(self) -> Floats:
         """Return the whitened derivatives: (m, d, n + M)."""
         rows, constants = self.jacobians(self.n)
-        out = room(*self.raw.shape, self.n + M)
+        out = room(*self.raw.shape, self.n + self.m)
         out[:, :, :self.n] = self.stated(rows)
         del rows
-        out[:, :, self.n:] = self.stated(constants)
+        out[:, :, self.n:] = self.stated(constants[:, :, :self.m])
         out *= self._root
         return out
 
@@ -118,7 +118,8 @@ class PointRows(Factor):
 
     def after(self, step: Floats, constants: Floats, reached: State) -> None:
         """Apply the step to the residuals."""
-        own = np.concatenate([step[self.k], np.broadcast_to(constants, (len(self.k), M))], axis=1)
+        own = np.concatenate([step[self.k], np.broadcast_to(
+            constants[:self.m], (len(self.k), self.m))], axis=1)
         self.r = self.r + np.einsum('kij,kj->ki', self.J, own)
         if self.J_end is not None:
             self.r = self.r + np.einsum('kij,kj->ki', self.J_end, step[self.k + 1, SLOW])
@@ -170,7 +171,7 @@ class PointRows(Factor):
     def _columns(self) -> tuple[Ints, Ints]:
         """Return the columns of J and of J_end in the joint marginals."""
         n = self.n
-        return np.r_[0:n, 2 * n:2 * n + M], np.arange(n + SLOW.start, n + SLOW.stop)
+        return np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         """Return the quadratic sum and its expectation for each level."""

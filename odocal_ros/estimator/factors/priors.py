@@ -28,7 +28,6 @@ from odocal_ros.estimator.state import (
     IMPERFECT,
     KIND_OF,
     KIND_SIZES,
-    M,
     NO_ERROR,
     ODO_ARM,
     ODO_CLOCK,
@@ -143,9 +142,10 @@ class PriorRows(Factor):
             add_prior(out, 0, UP, LEVEL_START**2, 0.0)
         for columns, value, sigma in self._biases():
             add_prior(out, 0, columns, sigma**2, value)
-        w = 1 / self.priors.constants**2
-        out.corner[range(M), range(M)] += w
-        out.g_border -= w * self._constants_off()
+        w, m = 1 / self.priors.constants**2, self.m
+        out.corner[range(m), range(m)] += w[:m]
+        out.g_border -= (w * self._constants_off())[:m]
+        out.absent = w[m:]
 
     def cost(self) -> float:
         """Return the sum of squares, in sigmas."""
