@@ -127,7 +127,7 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
         assert f'next time:\n  odocal replay {words[1]} ' in out
     elif words[0] == 'inspect':
         assert '<- imu' in out
-        assert 'try' in out
+        assert 'suggested command' in out
     else:
         assert out
 
