@@ -199,7 +199,7 @@ def test_the_figures_of_the_page_are_those_that_are_drawn():
     table = page_of('docs/report.md').partition('| figure |')[2].partition('\n\n')[0]
     told = re.findall(r'^\| ([A-Z][\w ]+) \|', table, re.MULTILINE)
     source = ''.join((ROOT / 'odocal_ros' / 'output' / name).read_text()
-                     for name in ('plots.py', 'plots_speed.py', 'plots_compare.py'))
+                     for name in ('plots.py', 'plots_scale.py'))
     drawn = re.findall(r"return '([^']+)', says", source)
     assert told == drawn
     assert 'Origin' in (ROOT / 'odocal_ros/output/templates/report.html').read_text()

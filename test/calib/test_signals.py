@@ -29,9 +29,9 @@ def scores(fitted):
     weighted = Equations(problem, state, fitted=fitted).at(
         problem.first_levels)
     rows = weighted[MotionRows]
-    J = rows.J[:, :, -len(CONSTANTS):]
+    J = rows.J[:, :, -rows.m:]
     score, information = np.einsum('kij,ki->j', J, rows.r), (J**2).sum(axis=(0, 1))
-    return {name: score[i] / np.sqrt(information[i]) for i, name in enumerate(CONSTANTS)
+    return {name: score[i] / np.sqrt(information[i]) for i, name in enumerate(CONSTANTS[:rows.m])
             if name in GYRO_ERRORS or name in ACCEL_ERRORS}
 
 
@@ -66,9 +66,10 @@ KERBS = {'scenario': 'yard', 'real': Real(kerbs=0.06, wheelbase=0.5)}
 def test_without_noise_the_whole_signal_counts(road):
     drive, config, leg = made(duration=300.0, imu_grade='perfect', **road)
     problem, state = problem_of(leg, config), truth(drive, config, leg)
-    raw, fitted = (Equations(problem, state, fitted=x).at(problem.first_levels)[MotionRows].J[
-        :, :, -len(CONSTANTS):] for x in (False, True))
-    for i, name in enumerate(CONSTANTS):
+    raw, fitted = (rows.J[:, :, -rows.m:] for rows in (
+        Equations(problem, state, fitted=x).at(problem.first_levels)[MotionRows]
+        for x in (False, True)))
+    for i, name in enumerate(CONSTANTS[:raw.shape[2]]):
         if name in GYRO_ERRORS or name in ACCEL_ERRORS and road is BANKED:
             # what kerbs lift the axle by is noise of the road; a roll of 0.2 rad is none
             off = np.linalg.norm(fitted[:, :, i] - raw[:, :, i]) / np.linalg.norm(raw[:, :, i])

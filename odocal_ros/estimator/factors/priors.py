@@ -24,7 +24,6 @@ from odocal_ros.estimator.state import (
     GNSS_ARM,
     GNSS_CLOCK,
     GNSS_DELAY,
-    HEIGHT_DRIFT,
     IMPERFECT,
     KIND_OF,
     KIND_SIZES,
@@ -80,7 +79,8 @@ class PriorRows(Factor):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
-        self.own, self.level = problem.own, not problem.leg.felt
+        self.own = problem.own | {'slow_fix_errors': constants_from('fix_height_drift')}
+        self.level = not problem.leg.felt
         self.shared = {name: where for name, where in SHARED.items()
                        if (problem.priors.constants[where] > NO_ERROR).any()}
 
@@ -158,10 +158,9 @@ class PriorRows(Factor):
         first = self.with_wanted(marginals[0][None])[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
-        drift = 2 * self.n + HEIGHT_DRIFT
-        yield 'slow_fix_errors', first[:, [drift]] / self.priors.constants[HEIGHT_DRIFT]
         for name, where in self.own.items():
-            yield name, first[:, 2 * self.n:][:, where] / self.priors.constants[where]
+            if where.stop <= self.m:
+                yield name, first[:, 2 * self.n:][:, where] / self.priors.constants[where]
 
     def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
         """Yield names and effects, (3, k), of errors that all legs share."""
