@@ -36,9 +36,10 @@ def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
         return {}      # the hint has the passes: their total is unknown
     driven, lacks = number(status, 'distance_m'), number(status, 'metres_to_least')
     stand = number(status, 'seconds_to_stand')
-    done = driven / (driven + lacks) if driven + lacks > 0 else 0.0
-    found = {'path': (done, f'{lacks:.0f} m to go'),
-             'standstill': (1 - stand / REST_FORESEEN_S, f'{stand:.0f} s to go')}
+    found = {}
+    if driven + lacks > 0:      # a leg
+        found['path'] = driven / (driven + lacks), f'{lacks:.0f} m to go'
+    found['standstill'] = 1 - stand / REST_FORESEEN_S, f'{stand:.0f} s to go'
     for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
         asked = number(status, f'asked_{name}_sigma_{unit}')
         sigma = number(status, f'predicted_{name}_sigma_{unit}') or _of_result(status)[name]
