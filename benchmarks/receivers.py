@@ -217,13 +217,13 @@ def share(rows, names):
 
 def print_false(by_run):
     """Print by reason its false alarms and their rows."""
-    told: dict[str, Counter] = {}
+    false: dict[str, Counter] = {}
     for name, own in by_run.items():
         true = {*RUNS[name].names, *RUNS[name].also}
         for row in own:
             for code in {*row['codes']} - true - NEVER_FALSE - BY_KIND.get(row['kind'], set()):
-                told.setdefault(code, Counter())[name] += 1
-    for code, where in sorted(told.items(), key=lambda item: -item[1].total()):
+                false.setdefault(code, Counter())[name] += 1
+    for code, where in sorted(false.items(), key=lambda item: -item[1].total()):
         without = sum(len(own) for name, own in by_run.items()
                       if code not in {*RUNS[name].names, *RUNS[name].also})
         print(f'false {code}: {where.total()} of {without} {dict(where)}')

@@ -10,7 +10,7 @@ If the path cannot be continued, it restarts at its origin, with a note.
 import numpy as np
 
 from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
-from odocal_ros.apply.errors import Pose
+from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.reckoning import ODOMETER_SILENCE, Reckoning
 from odocal_ros.apply.start import begin
 from odocal_ros.apply.stream import ImuStream

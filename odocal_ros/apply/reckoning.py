@@ -28,16 +28,8 @@ from odocal_ros.apply.attitude import (
     Vector,
     ZERO,
 )
-from odocal_ros.apply.errors import (
-    BA,
-    BG,
-    GRAVITY,
-    PHI,
-    Pose,
-    pose_covariance,
-    SHAKING,
-    twist_covariance,
-)
+from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
+from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
 from odocal_ros.apply.start import Start
 from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle

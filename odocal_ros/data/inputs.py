@@ -16,7 +16,8 @@ class Input(NamedTuple):
     label : for people.   kind : name of the class of its samples (``data/samples.py``).   needed :
     columns without which a row is unusable.   clock : group of settings that holds its
     ``time_offset``, or empty.   topic : the node subscribes to it; empty for further wheels of one
-    message.   queue : messages that the subscription keeps.
+    message.   queue : messages that the subscription keeps.   possible : least and largest value
+    of the needed column, where a sensor of one number has any.
     """
 
     label: str
@@ -25,6 +26,7 @@ class Input(NamedTuple):
     clock: str = ''
     topic: str = ''
     queue: int = 0
+    possible: tuple[float, float] | None = None
 
 
 # queues, physical: five seconds of the highest expected rate, 4 kHz, 1 kHz and 100 Hz: messages
@@ -40,7 +42,9 @@ INPUTS = {
     'heading': Input('heading', 'HeadingSamples', ('q_ni',), '', 'heading', 5000),
     'fix_velocity': Input('GNSS velocity', 'VelocitySamples', ('velocity_n',), 'gnss',
                           'fix_velocity', 500),
-    'pressure': Input('air pressure', 'ScalarSamples', ('value',), '', 'pressure', 1000),
+    # physical: Pa, from 16 km above the ground to 6 km below; a value in hPa is not possible
+    'pressure': Input('air pressure', 'ScalarSamples', ('value',), '', 'pressure', 1000,
+                      (1e4, 2e5)),
 }
 # the sensors besides IMU, odometer and fixes
 OUTSIDE = tuple(slot for slot in INPUTS if slot not in ('imu', *WHEELS, 'fix'))

@@ -18,8 +18,8 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
-from odocal_ros.apply.errors import Pose
 from odocal_ros.apply.odometry import BEGINS_ANEW, Odometry
+from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.inputs import WHEELS

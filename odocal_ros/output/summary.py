@@ -297,5 +297,4 @@ def _budget(calibration: Calibration, width: int, small: bool) -> list[str]:
         return []
     hidden = {name for name in estimates if known(estimates, name).value is None}
     shown = 0.01    # share of a variance from which a source is worth a line
-    return budget_lines(method.details.get('budget'), scale.value, shown, hidden,
-                        width, small)
+    return budget_lines(method.details.get('budget'), scale.value, shown, hidden, width, small)

@@ -109,9 +109,12 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
     """Return masks of rows with a stamp and all required values, and of impossible rows."""
     stamped = samples.stamp_ns > 0
     finite, wild = np.ones(len(stamped), bool), np.zeros(len(stamped), bool)
+    possible = INPUTS[slot].possible
     for name in INPUTS[slot].needed:
         column = getattr(samples, name)
         odd = beyond(name, column)
+        if possible is not None:
+            odd |= ~((column >= possible[0]) & (column <= possible[1]))
         finite &= ~odd
         wild[odd] |= np.isfinite(column[odd]).all(axis=tuple(range(1, column.ndim)))
     if slot == 'fix':

@@ -163,6 +163,16 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_too():
     assert 'the antenna lever arm (left, up)' in said[Code.PARAMETER_NOT_DETERMINED]
 
 
+def test_a_delay_without_a_value_is_called_unobservable_also_if_it_is_off():
+    _, config, leg = made(scenario='town', duration=300.0, imu_grade='consumer', seed=4,
+                          odometer_delay=0.06)
+    found = smooth(leg, with_settings(config, {'odometer.time_sigma': 2e-3}))
+    assert found.details['posterior_to_prior']['odometer_delay'] > 0.5
+    assert found.estimates['odometer_delay'].value is None
+    said = {r.code: r.text for r in found.reasons}
+    assert 'odometer delay' in said[Code.PARAMETER_NOT_DETERMINED]
+
+
 def test_what_a_vehicle_shows_beside_its_values_is_said():
     real = Real(receiver_lag=0.8, speed_law=0.006, stated_factor=0.5)
     drive, config, leg = made(scenario='town', duration=250.0, imu_grade='industrial', seed=4,

@@ -13,6 +13,7 @@ from odocal_ros.estimator import smooth
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import PRESSURE
+from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import with_settings
 
 pytestmark = pytest.mark.slow
@@ -75,6 +76,17 @@ def test_doors_and_tunnels_are_outliers():
     leg = leg_of(drive.leg().with_rows(pressure=replace(sent, value=value)), config)
     pitch = smooth(leg, config).estimates['pitch_mounting_angle']
     assert abs(pitch.value - drive.truth.pitch) < 3.3 * pitch.sigma
+
+
+def test_hectopascals_are_no_pascals():
+    drive, config, _ = made(**SHORT)
+    sent = drive.leg().rows('pressure')
+    leg = drive.leg().with_rows(pressure=replace(sent, value=sent.value / 100))
+    inputs, found = screen(leg, config)
+    assert not len(inputs.outside['pressure'].t)
+    assert any('air pressure messages hold NaN, Inf or an impossible value' in r.text
+               for r in found)
+    assert not leg_of(leg, config).outside
 
 
 def test_it_can_be_left_out():

@@ -11,7 +11,7 @@ from player import messages_of, part, Player, with_clock
 import pytest
 from rclpy.qos import QoSProfile
 
-from odocal_ros.apply.errors import Pose
+from odocal_ros.apply.pose import Pose
 from odocal_ros.live.odometry import transform_of
 from odocal_ros.settings.node_configs import OdomFrames
 from odocal_ros.sim.scenarios import SimOptions, simulate

@@ -55,16 +55,13 @@ class PressureRows(OutsideRows):
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Pressure | None:
         """Return heights as means over seconds."""
         sent, t = inputs.outside['pressure']
-        pressure, variance = sent.value, sent.variance
-        good = (pressure > 1e4) & (pressure < 2e5)      # Pa
-        if good.sum() < 2 or not (config.imu.use_pressure and inputs.felt):
+        if not (config.imu.use_pressure and len(t) and inputs.felt):
             return None
-        t, pressure, variance = t[good], pressure[good], variance[good]
         cell = np.floor(t * RATE)
         first = np.r_[0, np.flatnonzero(np.diff(cell)) + 1]
         count = np.diff(np.r_[first, len(t)])
         t_mean, p_mean, v_mean = (np.add.reduceat(x, first) / count
-                                  for x in (t, pressure, variance))
+                                  for x in (t, sent.value, sent.variance))
         per_pa = SCALE_HEIGHT / p_mean
         stated = np.sqrt(np.maximum(v_mean, 0.0) / count) * per_pa
         sigma = np.where(stated > 0, stated, HEIGHT_SIGMA / np.sqrt(count))

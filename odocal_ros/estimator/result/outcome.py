@@ -31,8 +31,8 @@ from odocal_ros.estimator.result.left_over import bias_sigmas, correlation, left
 from odocal_ros.estimator.result.mismatch import mismatch
 from odocal_ros.estimator.result.refusal import OPTIONAL, UNITS, unknown
 from odocal_ros.estimator.result.remarks import (
+    arms_off,
     beside,
-    contradicted_settings,
     level_pitch,
     MODEL_FLOOR,
     remarks,
@@ -103,10 +103,9 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
         ratio[name] = float(bias_sigma[i] / fit.first.gyro_bias[i])
         if ratio[name] < INFORMED_SHARE:
             found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
-    # of what the drive contradicts the fit does not use the setting, and another reason says so
-    contradicted = {CONSTANTS[i] for i in contradicted_settings(c, sigma)}
+    said = {CONSTANTS[i] for i in arms_off(c, sigma)}      # by LEVER_ARM_OFF
     unsaid = [name for name in ratio if name in found and found[name].value is None
-              and name not in contradicted]
+              and name not in said]
     if unsaid:
         reasons.append(not_observable('this drive', unsaid))
     reasons += assumed(problem, fit.levels)

@@ -25,12 +25,10 @@ from odocal_ros.estimator.state import (
     FIX_TIME,
     GNSS_ARM,
     GNSS_CLOCK,
-    GNSS_DELAY,
     IMPERFECT,
     LN_K,
     ODO_ARM,
     ODO_CLOCK,
-    ODO_DELAY,
     PITCH,
     YAW,
 )
@@ -159,18 +157,18 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
                    'value is the mean over this leg', FALLS_WITH_SPEED if less else '')]
 
 
-def contradicted_settings(c: Floats, sigma: Floats) -> set[int]:
-    """Return the lever arms and delays that the drive puts far from their setting, by index."""
-    least = dict.fromkeys((*range(ODO_ARM.start, ODO_ARM.stop - 1),      # not z of the odometer
-                           *range(GNSS_ARM.start, GNSS_ARM.stop)), 0.3)    # m, worth a word
-    least |= {ODO_DELAY: 0.0, GNSS_DELAY: 0.0}
-    return {i for i, most in least.items() if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], most)}
+def arms_off(c: Floats, sigma: Floats) -> set[int]:
+    """Return the axes of lever arms that the drive puts far from their setting, by index."""
+    axes = (*range(ODO_ARM.start, ODO_ARM.stop - 1),      # not z of the odometer
+            *range(GNSS_ARM.start, GNSS_ARM.stop))
+    worth = 0.3     # m
+    return {i for i in axes if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], worth)}
 
 
 def _arms(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
     """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
     said, do = [], []
-    off = contradicted_settings(c, sigma)
+    off = arms_off(c, sigma)
     for name, arm, where in (('odometer.lever_arm', config.odometer.lever_arm, ODO_ARM),
                              ('gnss.lever_arm', config.gnss.lever_arm, GNSS_ARM)):
         for i, axis, value, most in zip(range(where.start, where.stop), 'xyz', arm, VEHICLE,
