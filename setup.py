@@ -86,6 +86,8 @@ setup(
         'tables': [
             'pandas>=2',
             'pyarrow>=14',
+            # LGPL-3.0, read by one test
+            'pymavlink>=2.4',
         ],
         # the site: sphinx-build -W docs site
         'docs': SITE,
@@ -116,6 +118,7 @@ setup(
             'pytest-cov>=4',
             'pytest-xdist>=3.5',
             'pyubx2>=1.2',
+            'readme_renderer[md]>=42',
             'rich>=13',
             'ruff>=0.6',
         ],
