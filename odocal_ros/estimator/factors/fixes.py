@@ -7,7 +7,6 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
-from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import PointRows
 from odocal_ros.estimator.problem import Problem
@@ -114,7 +113,7 @@ class Fixes(PointRows):
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         """Return initial and minimum levels, factors on the stated variances."""
-        least = (LEAST.fix / problem.fix_sigma)**2
+        least = (problem.fix_least / problem.fix_sigma)**2
         return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
 
     @classmethod
