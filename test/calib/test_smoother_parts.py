@@ -265,19 +265,18 @@ def sized(problem, where, sigma, centre):
 @pytest.mark.parametrize(('name', 'where', 'prior'), [
     ('size_fix_lag_square', constants_from('fix_lag_square', 'fix_lag_square'), 1.0),
     ('size_scale_by_force', constants_from('scale_by_pull', 'scale_by_braking'), 0.1)])
-def test_sizes_of_what_is_well_known_have_the_largest_likelihood(shaken, name, where, prior):
+def test_sizes_of_what_is_well_known_are_the_mean_of_their_likelihood(shaken, name, where, prior):
     problem, state = shaken
     problem = sized(problem, where, prior, 1.5 * prior)
     levels = problem.first_levels
     weighted, solved, at = least(problem, state, levels)
     found = weighted[PriorRows].sizes(solved.marginals())[name]
-    count = where.stop - where.start
     # 1.5 of the prior for each, against the log-normal prior of the size
-    likelihood = slope(at, levels.but(**{name: found}), name)
-    prior_slope = -np.log(found / SIZE) / SIZE_SPREADS[name]**2
-    # half a step of the grid, times the curvature: of each constant less than its square
-    most = 0.025 * (count * 1.5**2 / found + 1)
-    assert likelihood + prior_slope == pytest.approx(0.0, abs=most)
+    logs = np.log(SIZE) + np.arange(-2.5, 5.0, 0.25)
+    likelihood = np.array([at(levels.but(**{name: float(np.exp(x))}))[2] for x in logs])
+    likelihood -= ((logs - np.log(SIZE)) / SIZE_SPREADS[name])**2 / 2
+    p = np.exp(likelihood - likelihood.max())
+    assert found == pytest.approx((np.exp(logs) * p).sum() / p.sum(), rel=0.01)
     assert found > 1.5 * SIZE      # far from where it started
 
 
@@ -290,9 +289,9 @@ def test_what_the_drive_hardly_knows_has_no_say_in_its_size(shaken):
     weighted, solved, at = least(problem, state, levels)
     name = 'size_squat_by_jerk'
     assert slope(at, levels, name) > 0.1         # the likelihood would have it grow
-    # (7e-6 / 1e-3)^2 of that slope, 5e-5: it stays at its median, within half a step of the grid
-    assert np.log(weighted[PriorRows].sizes(solved.marginals())[name] / SIZE) == pytest.approx(
-        0.0, abs=0.03)
+    # (7e-6 / 1e-3)^2 of that slope, 5e-5: it stays at the mean of its log-normal prior
+    assert weighted[PriorRows].sizes(solved.marginals())[name] == pytest.approx(
+        SIZE * np.exp(SIZE_SPREADS[name]**2 / 2), rel=1e-3)
 
 
 def test_the_bias_turns_with_a_robot_in_a_local_frame(shaken):
