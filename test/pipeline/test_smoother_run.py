@@ -3,6 +3,8 @@
 
 """The smoother as a member of the pipeline."""
 
+from dataclasses import replace
+
 from drives import drive, settings
 import numpy as np
 import pytest
@@ -36,6 +38,16 @@ def test_scale_yaw_and_pitch_come_without_a_heading(made, held):
                        ('pitch_mounting_angle', made.truth.pitch)):
         assert abs(found[name].value - true) < SIGMAS * found[name].sigma, name
     assert held.methods['two_point'].estimates['yaw_mounting_angle'].value is None
+
+
+def test_fixes_without_altitude_give_all_three(made):
+    leg = made.leg()
+    flat = replace(leg, fix=replace(leg.fix, height=np.full(len(leg.fix.height), np.nan)))
+    found = calibrate(flat, settings(made, **ASKED)).methods['smoother'].estimates
+    for name, true, limit in (('scale_factor', made.truth.scale, 1e-3 * made.truth.scale),
+                              ('yaw_mounting_angle', made.truth.yaw, np.deg2rad(0.25)),
+                              ('pitch_mounting_angle', made.truth.pitch, np.deg2rad(0.25))):
+        assert abs(found[name].value - true) < SIGMAS * found[name].sigma < SIGMAS * limit, name
 
 
 def test_the_fifth_held_back_is_met_by_dead_reckoning_with_the_values_found(made, held):
