@@ -171,7 +171,7 @@ def _marked(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans
 
 
 def _common(recorder: LegRecorder) -> tuple[int, int]:
-    """Return the first and last stamp of what IMU, odometer and fix have in common, if any."""
+    """Return the first and the last stamp that IMU, odometer and fix have in common, if any."""
     firsts, lasts = zip(*_ends(recorder).values() or [(0, 1)], strict=True)
     return max(firsts), min(lasts)
 
@@ -186,7 +186,7 @@ def _ends(recorder: LegRecorder) -> dict[str, tuple[int, int]]:
 
 
 def _apart(recorder: LegRecorder) -> str:
-    """Return which times the topics have, where none is in common."""
+    """Return a sentence with the first and last stamp of each required topic."""
     spans = ', '.join(
         f'{INPUTS[slot].label} {" to ".join(str(np.datetime64(ns, "ns"))[:19] for ns in ends)}'
         for slot, ends in _ends(recorder).items())
