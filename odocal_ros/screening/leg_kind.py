@@ -36,7 +36,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G
 
 LEAST_GRAVITY = 0.5  # judgement: of 9.8 m/s^2, or of 1 g; a smaller median is motion only
-TESTED_ROWS = 20_000   # judgement: at the most, for the median
+GRAVITY_ROWS = 20_000  # judgement: at the most, for the median
 TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
 
 
@@ -58,7 +58,7 @@ def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
     if not felt(imu.f_i):
         return 'publishes turn rates but no acceleration'
     with np.errstate(all='ignore'):
-        some = imu.f_i[::max(1, len(imu.f_i) // TESTED_ROWS)]
+        some = imu.f_i[::max(1, len(imu.f_i) // GRAVITY_ROWS)]
         some = some[np.isfinite(some).all(axis=1)]
         if len(some) and np.linalg.norm(np.median(some, axis=0)) * accel_scale < LEAST_GRAVITY:
             return 'publishes accelerations without gravity'
