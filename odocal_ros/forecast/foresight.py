@@ -47,7 +47,7 @@ from odocal_ros.forecast.smoother_forecast import (
     without_force,
     YAW,
 )
-from odocal_ros.screening.leg_kind import felt
+from odocal_ros.screening.leg_kind import lacking
 from odocal_ros.settings.config import Config
 
 DRIVE_ROWS = 1000         # judgement: of the drive of a prediction
@@ -85,6 +85,7 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
 
     Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
     """
+    unusable = lacking(leg.imu, config.imu.accel_scale)
     running = look(leg, config, smoother, wanted)
     if deciding(config.method) == ONLY or gives_all(running):     # the ends add nothing to it
         forecast = nothing_foreseen(config)
@@ -92,9 +93,9 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
         forecast = _by_ends(leg, fix_rate, config, wanted)
         if smoother is not None and 'smoother' in deciding(config.method):
             forecast = replace(forecast, scale=_open_yet(forecast.scale))
-            if felt(leg.imu.f_i):
+            if not unusable:
                 forecast = replace(forecast, yaw=_open_yet(forecast.yaw))
-    if not felt(leg.imu.f_i):
+    if unusable:
         forecast = without_force(forecast)
     if not wanted():
         raise Abandoned

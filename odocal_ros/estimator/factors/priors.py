@@ -80,7 +80,7 @@ class PriorRows(Factor):
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
         self.own = problem.own | {'slow_fix_errors': constants_from('fix_height_drift')}
-        self.level = not problem.leg.felt
+        self.no_heights = bool(np.isnan(problem.leg.fixes_n[:, 2]).all())
         self.shared = {name: where for name, where in SHARED.items()
                        if (problem.priors.constants[where] > NO_ERROR).any()}
 
@@ -142,7 +142,7 @@ class PriorRows(Factor):
         """Add the rows to normal equations; the first keyframe has a wide prior at its value."""
         for columns, sigma in START_SIGMAS.values():
             add_prior(out, 0, columns, sigma**2, 0.0)
-        if self.level:
+        if self.no_heights:
             add_prior(out, 0, UP, LEVEL_START**2, 0.0)
         for columns, value, sigma in self._biases():
             add_prior(out, 0, columns, sigma**2, value)
