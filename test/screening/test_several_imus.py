@@ -26,7 +26,7 @@ def second(x, by):
     return np.where((np.arange(len(x)) % 2 == 1)[:, None], by(x), x)
 
 
-@pytest.mark.parametrize('column, by', [
+@pytest.mark.parametrize(('column', 'by'), [
     ('w_i', lambda w: w + BIAS), ('f_i', lambda f: f + 100 * BIAS),
     ('w_i', lambda w: w @ matrix_from_rpy([0.1, 0.0, 0.0]).T)], ids=['gyro', 'force', 'axes'])
 def test_rows_that_alternate_between_two_imus_reject_the_leg(leg, column, by):
