@@ -70,6 +70,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     good, wild = _finite(sent, slot, leg, found)
     clean = sent if good.all() else take(sent, good)
     clean = _one_by_one(clean) if slot in WHEELS else clean
+    clean = _unpacked(clean, found) if slot == 'imu' else clean
     order = _rising(clean, slot, leg, found)
     clean = clean if order is None else take(clean, order)
     t = room(len(clean.stamp_ns))
@@ -165,6 +166,29 @@ def _one_by_one(samples: Any) -> Any:
         return samples
     order = np.arange(len(stamp))
     return replace(samples, stamp_ns=np.maximum.accumulate(stamp - order) + order)
+
+
+def _unpacked(imu: Any, found: list[Reason]) -> Any:
+    """Return IMU samples with those that share a stamp spread over the time since the last one."""
+    stamp, packed_share = imu.stamp_ns, 1 / 3       # judgement: of all; fewer are duplicates
+    step = np.diff(stamp)
+    same = step == 0
+    if same.sum() <= packed_share * len(stamp) or (step < 0).any():
+        return imu
+    again = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in (imu.w_i, imu.f_i)], axis=0)
+    if (same & ~again).sum() <= packed_share * len(stamp):
+        return imu
+    first = np.flatnonzero(np.append(True, ~same))
+    count = np.diff(np.append(first, len(stamp)))
+    # a packet after a gap took no longer than others
+    usual = int(np.median(np.diff(stamp[first]))) if len(first) > 1 else 0
+    took = np.minimum(np.diff(stamp[first], prepend=stamp[0] - usual), usual)
+    left = np.repeat(first + count - 1, count) - np.arange(len(stamp))      # until the last one
+    found.append(Reason(Code.STAMPS_NOT_RISING, f'{int(same.sum())} of {len(stamp)} '
+                        f'{LABEL["imu"]} messages repeat the previous stamp: packets with one '
+                        'stamp, spread evenly over the time since the packet before',
+                        'Stamp each message with the time of its measurement.'))
+    return replace(imu, stamp_ns=stamp - left * np.repeat(took // count, count))
 
 
 def _rising(samples: Samples, slot: str, leg: Leg, found: list[Reason]) -> Ints | None:

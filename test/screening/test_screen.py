@@ -100,9 +100,25 @@ def test_rows_out_of_order_are_no_clock_that_was_set(leg):
     assert (np.diff(inputs.t_imu) > 0).all()
 
 
+@pytest.mark.parametrize('packet', [2, 5])
+def test_imu_packets_with_one_stamp_are_spread_over_their_time(leg, packet):
+    n = len(leg.imu.stamp_ns) // packet * packet
+    imu = take(leg.imu, slice(0, n))
+    stamp = np.repeat(imu.stamp_ns[packet - 1::packet], packet)
+    inputs, codes, _ = said(replace(leg, imu=replace(imu, stamp_ns=stamp)))
+    alone, *_ = said(replace(leg, imu=imu))
+    assert len(inputs.t_imu) == len(alone.t_imu) == n
+    # stamps of IMUs have microseconds
+    np.testing.assert_allclose(inputs.t_imu, alone.t_imu, atol=1e-6)
+    assert 'packets with one stamp' in codes[Code.STAMPS_NOT_RISING]
+
+
 def test_duplicates_are_used_once(leg):
     twice = join([take(leg.fix, slice(0, 200)), take(leg.fix, slice(150, None))])
     again = take(leg.fix, np.repeat(np.arange(len(leg.fix.stamp_ns)), 2))
+    imu = take(leg.imu, np.repeat(np.arange(len(leg.imu.stamp_ns)), 2))
+    inputs, codes, _ = said(replace(leg, imu=imu))
+    assert len(inputs.t_imu) == len(leg.imu.stamp_ns)
     for fix, repeats in ((twice, 50), (again, len(leg.fix.stamp_ns))):
         inputs, codes, _ = said(replace(leg, fix=fix))
         np.testing.assert_array_equal(inputs.geodetic[:, 0], leg.fix.latitude)
