@@ -143,8 +143,11 @@ def parse_accept(text: str) -> dict[str, float]:
     if not (equals and colon and limits != ':'):
         raise BadUsage(f'--accept {text}: required: {WANTED}')
     try:
-        return {f'accept.{plain}_{side}': float(value) * factor
-                for side, value in (('min', low), ('max', high)) if value.strip()}
+        found = {f'accept.{plain}_{side}': float(value) * factor
+                 for side, value in (('min', low), ('max', high)) if value.strip()}
+        if any(map(math.isnan, found.values())):
+            raise ValueError
+        return found
     except ValueError:
         raise BadUsage(f'--accept {text}: {limits} are not two numbers; required: '
                        f'{WANTED}') from None

@@ -95,6 +95,6 @@ def test_limits_on_the_command_line_take_degrees():
     assert parse_accept('yaw_mounting_angle_deg=-0.5:') == {
         'accept.yaw_mounting_angle_min': pytest.approx(-0.5 * pi / 180, rel=1e-15)}
     for wrong in ('scale_ratio', 'scale_ratio=1', 'scale_ratio=:', 'scale_ratio=a:b',
-                  'scale_ratio_deg=1:2', 'speed=1:2'):
+                  'scale_ratio=nan:1', 'scale_ratio_deg=1:2', 'speed=1:2'):
         with pytest.raises(BadUsage, match='--accept'):
             parse_accept(wrong)
