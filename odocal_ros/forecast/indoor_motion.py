@@ -126,5 +126,4 @@ def _spot(size: float) -> list[Move]:
     return [(size, 0, 0), (0, 0, FULL_TURN + math.pi), (size, 0, 0), (0, 0, -FULL_TURN - math.pi)]
 
 
-PATTERNS = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight,
-            'spot': _spot}
+PATTERNS = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight, 'spot': _spot}

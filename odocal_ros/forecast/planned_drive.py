@@ -115,8 +115,7 @@ class PlannedDrive:
     def until(self, t_stop: float, rest: float) -> 'PlannedDrive':
         """Return the drive up to a time and a stop of ``rest`` s there."""
         keep = self.t <= t_stop
-        cut = replace(self, **{n: getattr(self, n)[keep]
-                               for n in ('t', 'speed', 'yaw', 'slope')})
+        cut = replace(self, **{n: getattr(self, n)[keep] for n in ('t', 'speed', 'yaw', 'slope')})
         return cut._held(len(cut.t) - 1, rest, at_rest=True)
 
     def _held(self, k: int, seconds: float, at_rest: bool = False) -> 'PlannedDrive':
@@ -145,8 +144,7 @@ def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.p
     """
     t, speed, yaw_rate = (np.asarray(x, dtype=float) for x in (t, speed, yaw_rate))
     yaw = np.pi / 2 - heading + running_integral(t, yaw_rate)
-    return marked(t, speed, yaw, more.pop('slope', np.zeros_like(t)),
-                  **more)
+    return marked(t, speed, yaw, more.pop('slope', np.zeros_like(t)), **more)
 
 
 def marked(t: Floats, speed: Floats, yaw: Floats, slope: Floats, **more: Any) -> PlannedDrive:

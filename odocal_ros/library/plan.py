@@ -75,8 +75,7 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
            sigmas)
     least_rest = 60.0    # s
     rest = max(least_rest, *before.two_point.standing)
-    yield (f'standing {time_span(rest)} longer at both marks', drive.standing_longer(rest),
-           sigmas)
+    yield (f'standing {time_span(rest)} longer at both marks', drive.standing_longer(rest), sigmas)
     yield 'one more stop and start', stop_and_start(drive), sigmas
     yield 'one more left turn and right turn', left_and_right_turns(drive), sigmas
     town_minutes = 5
@@ -84,8 +83,7 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
            sigmas)
     farthest = _until_farthest(drive, sigmas)
     if farthest is not None:
-        yield (f'end mark at the farthest point ({length(farthest.distance)})',
-               farthest, sigmas)
+        yield (f'end mark at the farthest point ({length(farthest.distance)})', farthest, sigmas)
 
 
 def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,

@@ -8,12 +8,7 @@ import difflib
 import math
 from typing import Any
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces import msg
 from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -53,7 +48,7 @@ def _result_defaults(estimates: Iterable[str]) -> dict[str, Any]:
 RESULTS = _result_defaults(ESTIMATES)
 
 
-def descriptor(setting: Setting) -> ParameterDescriptor:
+def descriptor(setting: Setting) -> msg.ParameterDescriptor:
     """
     Return the descriptor of a setting.
 
@@ -64,7 +59,7 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
     """
     about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
     about += ' Fixed at start-up.' if setting.ro else ''
-    result = ParameterDescriptor(description=about)
+    result = msg.ParameterDescriptor(description=about)
     result.dynamic_typing = setting.kind in ('floats', 'strs') and not (
         setting.ro and setting.default)
     limits = []
@@ -73,9 +68,10 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
     if setting.low is not None and setting.high is not None:
         limits.append(f'{setting.low:g} to {setting.high:g}')
         if setting.kind == 'int':
-            result.integer_range = [IntegerRange(from_value=setting.low, to_value=setting.high)]
+            result.integer_range = [msg.IntegerRange(from_value=setting.low,
+                                                     to_value=setting.high)]
         elif setting.kind == 'float' and not math.isnan(setting.default):
-            result.floating_point_range = [FloatingPointRange(
+            result.floating_point_range = [msg.FloatingPointRange(
                 from_value=float(setting.low), to_value=float(setting.high))]
     if setting.kind == 'floats':
         limits.append('0 or 4 values' if not setting.default else f'{len(setting.default)} values')
@@ -153,12 +149,12 @@ def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]
     return ''
 
 
-def fixed(kind: type) -> Callable[[list[Parameter]], SetParametersResult]:
+def fixed(kind: type) -> Callable[[list[Parameter]], msg.SetParametersResult]:
     """Return the on-set callback of a node that reads settings of a kind only at start-up."""
-    def refuse(parameters: list[Parameter]) -> SetParametersResult:
+    def refuse(parameters: list[Parameter]) -> msg.SetParametersResult:
         ours = [p.name for p in parameters
                 if p.name.startswith(PREFIX) or p.name in settings_of(kind)]
-        return SetParametersResult(successful=not ours, reason=(
+        return msg.SetParametersResult(successful=not ours, reason=(
             f'{ours[0]} is only read at start-up: restart the node with it') if ours else '')
     return refuse
 
@@ -167,7 +163,7 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
     """Declare ``result.*``; return the saved result that came as overrides at start-up, if any."""
     for name, default in _result_defaults(estimates).items():
         unit = estimates.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
-        about = ParameterDescriptor(dynamic_typing=True, description=(
+        about = msg.ParameterDescriptor(dynamic_typing=True, description=(
             'Set by the node after each leg' + (f' [{unit}]' if unit else '')))
         value = node.declare_parameter(name, default, about).value
         kind = type(default)

@@ -205,8 +205,7 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
             def report(stage: Stage, k: int = k) -> None:
                 if progress is not None:
                     progress(replace(stage, done=(k + stage.done) / len(parts)))
-            results.append(calibrate(part, config, notes=notes, holdout=holdout,
-                                     progress=report))
+            results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
         return [one for one in results if one.verdict is not Verdict.REJECTED]
 
     good, why = good_of(parts_of(leg, config.leg.max_gap)), None

@@ -183,8 +183,7 @@ def _further(method: MethodResult, leg: LegResult) -> list[Reason]:
 
 def _why(reasons: Sequence[Reason]) -> str:
     """Return the rejecting reasons as text."""
-    return '; '.join(dict.fromkeys(r.text for r in reasons
-                                   if r.code.gravity is Verdict.REJECTED))
+    return '; '.join(dict.fromkeys(r.text for r in reasons if r.code.gravity is Verdict.REJECTED))
 
 
 def _imu_rotation(estimates: Mapping[str, Estimate],
@@ -195,8 +194,7 @@ def _imu_rotation(estimates: Mapping[str, Estimate],
     pitch = estimates.get('pitch_mounting_angle')
     if C_bi is None or yaw is None or yaw.value is None:
         return None, None
-    small = [0.0, pitch.value if pitch is not None and pitch.value is not None else 0.0,
-             yaw.value]
+    small = [0.0, pitch.value if pitch is not None and pitch.value is not None else 0.0, yaw.value]
     C_vi = matrix_from_rpy(small) @ C_bi
     return (tuple(float(x) for x in quat_from_matrix(C_vi)),
             tuple(float(x) for x in rpy_from_matrix(C_vi)))

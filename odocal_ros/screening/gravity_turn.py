@@ -82,8 +82,7 @@ def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
         return None
     w = np.where(full[:, None], w - np.median(w[full], axis=0), 0.0)
     f = np.where(full[:, None], f, np.median(f[full], axis=0))
-    return _fit(*_segments(Rows(w @ axes.T, f @ axes.T, travel.at(edges) * metres_per_unit,
-                                full)))
+    return _fit(*_segments(Rows(w @ axes.T, f @ axes.T, travel.at(edges) * metres_per_unit, full)))
 
 
 def _segments(rows: Rows) -> tuple[Complexes, Complexes]:

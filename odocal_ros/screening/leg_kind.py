@@ -36,8 +36,7 @@ def felt(f_i: Floats) -> bool:
     if not len(f_i):
         return True
     with np.errstate(invalid='ignore'):      # a NaN that signals
-        return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all()
-                   for rows in chunks(len(f_i)))
+        return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all() for rows in chunks(len(f_i)))
 
 
 def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:

@@ -81,8 +81,7 @@ class FramesConfig:
                         about='Vehicle frame in the result files.')
     imu: str = setting('', ro=True, frame=True,
                        about='IMU frame; empty: frame of the IMU messages.')
-    local: str = setting('odocal_enu', ro=True, frame=True,
-                         about='Frame of the published paths.')
+    local: str = setting('odocal_enu', ro=True, frame=True, about='Frame of the published paths.')
 
 
 @dataclass(frozen=True, kw_only=True)

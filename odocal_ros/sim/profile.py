@@ -106,8 +106,7 @@ def ramp(duration: float, gain: float, blend: float = 1.0) -> list[Piece]:
     It rises and falls in straight lines of ``blend`` seconds (0: at once, as in the paper).
     """
     peak = gain / (duration - blend)
-    return [line(blend, 0.0, peak), line(duration - 2 * blend, peak, peak),
-            line(blend, peak, 0.0)]
+    return [line(blend, 0.0, peak), line(duration - 2 * blend, peak, peak), line(blend, peak, 0.0)]
 
 
 def turn(duration: float, angle: float, blend: float) -> list[Piece]:

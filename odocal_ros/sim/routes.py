@@ -155,8 +155,7 @@ def motorway(duration: float, rng: np.random.Generator) -> Route:
         stretches.append((ramp(change, to - fast) + hold(length - change),
                           turn(length, angle, 6.0)))
         fast, left = to, round(left - length, 9)
-    stretches.append((hold(left) + ramp(down, -fast) + hold(30),
-                      hold(left + down + 30)))
+    stretches.append((hold(left) + ramp(down, -fast) + hold(30), hold(left + down + 30)))
     return _route(stretches)
 
 
