@@ -48,11 +48,7 @@ def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
 
 def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path,
                       files: bool) -> list[dict[str, Any]]:
-    """
-    Return the rows of all vehicles, the worst first; write legs.parquet and vehicles.parquet.
-
-    files : write the load-ready files of each vehicle too.
-    """
+    """Return the vehicles' rows, the worst first; write the tables, with ``files`` theirs too."""
     parts = folder / f'.parts.{uuid.uuid4().hex}'
     parts.mkdir(parents=True)
     try:

@@ -127,11 +127,8 @@ class Calibration:
 
         ``tell`` receives a sentence if the report cannot be drawn.
 
-        Raises
-        ------
-        BadUsage
-            There is a calibration.json and no ``force``, or the folder cannot be written.
-
+        Raises BadUsage: there is a calibration.json and no ``force``, or the folder cannot be
+        written.
         """
         from odocal_ros.output.files import write_results
         return write_results(self.result, self.config, Path(folder), list(self.inputs),

@@ -56,11 +56,7 @@ def journal_notes(bag: Path) -> JournalNotes | None:
     """
     Return the metadata of a journal from its folder or a file; None for other bags.
 
-    Raises
-    ------
-    BadUsage, BadConfig
-        Its settings cannot be read, or are not those of this version.
-
+    Raises BadUsage, BadConfig: its settings cannot be read, or are not of this version.
     """
     path = (bag if bag.is_dir() else bag.parent) / JOURNAL
     if not path.exists():

@@ -87,8 +87,11 @@ def declare(node: Node, kind: type = Config) -> Any:
     """
     values, settings = {}, settings_of(kind)
     for name, setting in settings.items():
+        # None for an empty list, which rclpy takes for bytes
+        listed = setting.kind in ('floats', 'strs')
+        default = list(setting.default) or None if listed else setting.default
         try:
-            value = node.declare_parameter(name, _as_ros(setting), descriptor(setting)).value
+            value = node.declare_parameter(name, default, descriptor(setting)).value
             if value is None:
                 array = 'STRING_ARRAY' if setting.kind == 'strs' else 'DOUBLE_ARRAY'
                 node.set_parameters([Parameter(name, Parameter.Type[array], [])])
@@ -188,8 +191,8 @@ def as_results(calibration: Calibration, stamp: str,
     values = dict(RESULTS)
     for name in ESTIMATES:
         estimate = calibration.estimates.get(name) or Estimate(None, None, '')
-        values[PREFIX + name] = _number(estimate.value)
-        values[PREFIX + name + '_sigma'] = _number(estimate.sigma)
+        for key, number in ((name, estimate.value), (f'{name}_sigma', estimate.sigma)):
+            values[PREFIX + key] = math.nan if number is None else float(number)
     values[PREFIX + 'legs'] = len(calibration.legs)
     values[PREFIX + 'valid'] = calibration.verdict is not Verdict.REJECTED
     values[PREFIX + 'stamp'], values[PREFIX + 'vehicle'] = stamp, vehicle
@@ -221,17 +224,6 @@ def restored_from(results: dict[str, Any],
         return None
     return Restored(found, legs, results[PREFIX + 'valid'], stamp or NO_STAMP,
                     results[PREFIX + 'vehicle'])
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _as_ros(setting: Setting) -> Any:
-    """Return a default rclpy can type: None for an empty list, which it takes for bytes."""
-    if setting.kind in ('floats', 'strs'):
-        return list(setting.default) or None
-    return setting.default
 
 
 def _plain(value: Any) -> Any:
