@@ -39,9 +39,8 @@ class RobotMotion:
     @property
     def increments(self) -> Floats:
         """Return m forward, m to the left and rad in each interval: (n, 3)."""
-        out: Floats = np.diff([running_integral(self.t, x) for x in (
+        return np.diff([running_integral(self.t, x) for x in (
             self.speed, self.side, self.rate)], axis=1).T
-        return out
 
     @property
     def moving(self) -> Bools:

@@ -78,8 +78,7 @@ class PlannedDrive:
     def travel(self) -> NDArray[np.float64]:
         """Return the signed travel at each time, 0 at the start mark, (m,) m."""
         s = running_integral(self.t, self.speed)
-        path_length: Floats = s - np.interp(0.0, self.t, s)
-        return path_length
+        return s - np.interp(0.0, self.t, s)
 
     @property
     def distance(self) -> float:

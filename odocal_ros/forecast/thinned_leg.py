@@ -143,8 +143,7 @@ def _gathered(rows: SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> SomeS
         return last
 
     def mean(values: Floats | Ints) -> Floats:
-        means: Floats = (np.add.reduceat(values, first).T / count).T
-        return means
+        return (np.add.reduceat(values, first).T / count).T
 
     columns: dict[str, Any] = {name: mean(getattr(rows, name)) for name in averaged}
     since_ns = rows.stamp_ns - np.repeat(rows.stamp_ns[first], count)

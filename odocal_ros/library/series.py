@@ -71,8 +71,7 @@ def _vehicle(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
     found = leg.methods['smoother'].estimates
     yaw, pitch = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
     C_nb = smoothed['key_C_nb']
-    C_nv: Floats = _rows(smoothed, C_nb) @ C_bv(forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0))
-    return C_nv
+    return _rows(smoothed, C_nb) @ C_bv(forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0))
 
 
 def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:

@@ -111,8 +111,7 @@ def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
     C_bi = next((leg.C_bi for leg in calibration.legs if leg.C_bi is not None), None)
     if C_bi is None or len(bias) < len(AXES):
         return None
-    bias_i: Floats = np.asarray(C_bi).T @ bias / config.imu.gyro_scale
-    return bias_i
+    return np.asarray(C_bi).T @ bias / config.imu.gyro_scale
 
 
 def _imu_corrector(bias_i: Floats) -> str:

@@ -96,8 +96,7 @@ def _segments(rows: Rows) -> tuple[Complexes, Complexes]:
 
     def cut(x: NDArray[Any]) -> NDArray[Any]:
         k = len(x) // length
-        segments: NDArray[Any] = x[:k * length].reshape(k, length, *x.shape[1:])
-        return segments
+        return x[:k * length].reshape(k, length, *x.shape[1:])
     psi = np.concatenate([[0.0], np.cumsum(rows.w[:, 2]) * ROW_S])
     turned = np.exp(0.5j * (psi[1:] + psi[:-1]))
     tilts = [_seconds(_integral(1j * G * rate * turned)) for rate in rows.w.T]

@@ -88,8 +88,7 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
 def _rolling(steps: Floats, quantum: float) -> Bools:
     """Return a mask of the times at which each wheel certainly rolls: (2, n)."""
     top = np.percentile(np.abs(steps), 95, axis=1, keepdims=True)
-    rolls: Bools = np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
-    return rolls
+    return np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
 
 
 def _held(two: Pair, steps: Floats, k: int) -> Bools:
