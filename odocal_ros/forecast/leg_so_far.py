@@ -120,11 +120,7 @@ def _placed(inputs: Inputs, config: Config) -> Placed:
 
 
 def count_size(inputs: Inputs, config: Config) -> float:
-    """
-    Return the metres of one count of the odometer, 0 for speeds.
-
-    Raises BadData: the scale is not known.
-    """
+    """Return the metres of one count, 0 for speeds; raise BadData if the scale is not known."""
     return inputs.travel.quantum * _placed(inputs, config).rough
 
 

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-A drive that is planned or recorded: speed, direction and slope by time; manoeuvres to add to it.
-
-Manoeuvres determine what a straight run does not.
-"""
+"""A drive that is planned or recorded: speed, direction, slope by time; manoeuvres to add."""
 
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar

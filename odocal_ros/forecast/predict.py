@@ -112,11 +112,7 @@ class Prediction:
 
 
 def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
-    """
-    Return the prediction of the two-point method for a drive.
-
-    Raises BadUsage: the drive is shorter than one fix interval.
-    """
+    """Return the two-point prediction; BadUsage if the drive is shorter than one fix interval."""
     config = sigmas.config
     if drive.duration < 1 / sigmas.fix_rate:
         raise BadUsage(f'the leg lasts {drive.duration:.3g} s, less than one fix interval '

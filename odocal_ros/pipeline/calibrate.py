@@ -185,7 +185,7 @@ def _carried(leg: Leg, config: Config) -> Ints:
 
 
 def _near(stamps: Ints, first_ns: int, stop_ns: int) -> Ints:
-    """Return the stamps between two, rising: a view where they rise as they came."""
+    """Return the rising stamps between two: a view where they rise as they came."""
     if by_step(lambda stamps: np.diff(stamps) > 0, stamps).all():
         return stamps[slice(*np.searchsorted(stamps, [first_ns, stop_ns + 1]))]
     return np.unique(stamps[(stamps >= first_ns) & (stamps <= stop_ns)])

@@ -114,7 +114,7 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
     """
     Return the result of a method for several legs, including carried ones if possible.
 
-    results : sequence of MethodResult, one a leg.   times_ns, numbers : as for ``combine_legs``.
+    results : one a leg.   times_ns, numbers : as for ``combine_legs``.
     """
     if carried and all(r.border for r in results):
         unknown = {n: Estimate(None, None, e.unit) for n, e in results[0].estimates.items()}
@@ -131,11 +131,7 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
 
 def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
               carried: Carried | None = None) -> MethodResult:
-    """
-    Return a method's combination of the legs where it is not rejected, of all if of none.
-
-    driven : list of (MethodResult, driven_ns, number).
-    """
+    """Return a method's combination of the legs that do not reject it; of all if all do."""
     good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(good or driven), strict=True)
     whole = together(name, list(results), times_ns, config, numbers, carried if good else None)

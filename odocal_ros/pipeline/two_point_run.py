@@ -33,11 +33,7 @@ NAMES = ('start', 'end')
 
 
 def two_point(ready: PreparedLeg, passed: Passed | None = None) -> MethodRun:
-    """
-    Run the two-point method on a leg.
-
-    ready : PreparedLeg.   passed : not called, it makes no passes.
-    """
+    """Run the two-point method on a leg; it makes no passes."""
     return TwoPointRun(ready).result()
 
 

@@ -70,8 +70,7 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """
     Return a leg and LOCAL_FRAME if its positions are in a local frame, otherwise nothing.
 
-    The leg is without GNSS velocities, which are east and north, and without a heading topic
-    unless the settings ask for it: that is a heading in the local frame then.
+    Without GNSS velocities, and without a heading topic unless the settings ask for it.
     """
     if not is_local(leg.fix):
         return leg, ()

@@ -145,11 +145,7 @@ def _stood(samples: Any) -> Any:
 
 
 def _one_by_one(samples: Any) -> Any:
-    """
-    Return odometer samples without a header, stamped at arrival, with equal stamps 1 ns apart.
-
-    If many samples repeat stamp and value of the one before, each was sent twice.
-    """
+    """Return samples stamped at arrival, equal stamps 1 ns apart; those sent twice once."""
     stamp, twice_share = samples.stamp_ns, 1 / 3    # of all, a half: what comes at once moves on
     step = np.diff(stamp)
     if (step > 0).all() or (step < 0).any() or (stamp != samples.received_ns).any():

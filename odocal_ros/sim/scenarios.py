@@ -182,11 +182,7 @@ def _with(sway: Profile, more: Floats) -> Profile:
 
 
 def simulate(options: SimOptions | None = None) -> Drive:
-    """
-    Return a drive; equal options give equal drives, to the last bit.
-
-    Raises BadUsage: an option is unknown or out of range.
-    """
+    """Return a drive; equal options give equal drives, to the last bit."""
     options = resolved(options or SimOptions())
     motion = motion_of(options)
     imu = sensors.imu(motion, options)
