@@ -225,7 +225,6 @@ def _cell(row: dict[str, Any], name: str, factor: float) -> str:
 
 
 def remarks(row: dict[str, Any]) -> list[str]:
-    """Return the remarks on a vehicle."""
     out = [row['decision'] or row['verdict']]
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else

@@ -4,8 +4,8 @@
 """
 The leg that is recorded: its faults, by the functions that will check it, and its profile.
 
-Its rows in cells show most faults, every few seconds in the worker (``pipeline.faults``). A gap of
-the IMU is detected in the stamps at once, and is kept. Sigmas are predicted from the profile.
+Its rows in cells show most faults, every few seconds in the worker (``calibrate.faults``). A gap
+of the IMU is detected in the stamps at once, and is kept. Sigmas are predicted from the profile.
 """
 
 from collections.abc import Callable, Iterable

@@ -26,7 +26,7 @@ from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import quat_from_matrix
-from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import SWAY
 
@@ -104,11 +104,6 @@ class Prediction:
     def sigma(self, parameter: str) -> float | None:
         """Return the sigma of a parameter, relative or rad; None: it will not be determined."""
         return self.method.estimates[parameter].sigma
-
-    @property
-    def verdict(self) -> Verdict:
-        """Return the predicted verdict of such a leg."""
-        return Verdict.worst(r.code.gravity for r in self.reasons)
 
 
 def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:

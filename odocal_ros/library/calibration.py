@@ -102,7 +102,7 @@ class Calibration:
         return states(self.result)
 
     def residuals(self) -> Series:
-        """Return the residuals of each sensor with their sigmas; see ``residuals.residuals``."""
+        """Return the residuals of each sensor with their sigmas; see ``series.residuals``."""
         return residuals(self.result)
 
     def plot_track(self, ax: Any, leg: int = 1) -> Any:

@@ -230,7 +230,7 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     config : Config, mapping of dotted names, or a parameter file, optional
         Settings: IMU grade, heading source and the like.
     figures
-        As ``plan.predict.Sigmas`` has them: fix, fix_up m, fix_rate Hz, quantum m a count,
+        As ``forecast.predict.Sigmas`` has them: fix, fix_up m, fix_rate Hz, quantum m a count,
         sway m/s, slip m/sqrt(s).
 
     Raises

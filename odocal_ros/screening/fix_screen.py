@@ -10,7 +10,6 @@ IMU predict, far better than elsewhere. The jump at the end is the sum of their 
 fixes contain no information on the scale.
 """
 
-
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Complexes, Floats

@@ -44,7 +44,7 @@ def sideways(found: list[Stretch]) -> list[tuple[list[Piece], list[Piece], list[
 
 def square_stretches() -> list[Stretch]:
     """
-    Return a square_stretches of 4 m to the left, and one to the right, with stops at the corners.
+    Return a square of 4 m to the left, and one to the right, with stops at the corners.
 
     10 s still; then eight times: 9 s of motion, 3 s still, a turn of 90 deg in 2 s, 3 s still.
     """

@@ -43,7 +43,7 @@ class Truth:
     The scale of tyres that grow or slip is the mean of the leg by travel: true metres rolled
     between the marks over the change of the count there, before quantisation; likewise its ratio
     and those of the wheels. Yaw and pitch are those of the IMU's own axes (turn-and-push frame,
-    ``real_imu.py``), which equal those of its housing for perpendicular triads.
+    ``real_sensors.py``), which equal those of its housing for perpendicular triads.
     """
 
     scale: float                 # m/pulse, 1 or m/rad; of two wheels that of their mean count

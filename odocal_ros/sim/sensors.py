@@ -74,7 +74,7 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
     C_vi = imu_rotation(options)
     w_v, f_v = body.felt(motion, state, options.imu_lever_arm)
     w_i, f_i = real_sensors.crooked(w_v @ C_vi * (1 + options.gyro_scale_error),
-                                f_v @ C_vi * (1 + options.accel_scale_error), options.real)
+                                    f_v @ C_vi * (1 + options.accel_scale_error), options.real)
     gyro, accel = imu_errors(options, len(t))
     gyro_drift, accel_drift = real_sensors.drifts(t, state.speed, options)
     q_ni = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
@@ -92,7 +92,7 @@ def _imu_stamps(ns: Ints, options: SimOptions) -> Ints:
     if not (real.imu_latency or real.imu_jitter or real.imu_batch > 1):
         return ns
     return real_sensors.stamped(ns, stream(options.seed, 'real imu stamps'), real.imu_latency,
-                            real.imu_jitter, real.imu_batch)
+                                real.imu_jitter, real.imu_batch)
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:
