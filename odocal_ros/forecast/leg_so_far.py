@@ -15,11 +15,18 @@ import time
 
 import numpy as np
 
-from odocal_ros import estimator
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import ImuSamples
 from odocal_ros.errors import BadData
+from odocal_ros.estimator import (
+    GrowingFit,
+    Running,
+    smoother_leg,
+    SmootherLeg,
+    too_little,
+    too_little_of,
+)
 from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 from odocal_ros.nav.dead_reckoning import Origin
@@ -164,7 +171,7 @@ class SmootherSoFar:
     """The smoother on one leg while it grows."""
 
     def __init__(self) -> None:
-        self._growing = estimator.GrowingFit(time.thread_time)
+        self._growing = GrowingFit(time.thread_time)
         self._origin: Origin | None = None
 
     @property
@@ -172,8 +179,7 @@ class SmootherSoFar:
         """Return the CPU time of the last update for work that is done ever less often, s."""
         return self._growing.once_s
 
-    def look(self, leg: Leg, config: Config,
-             wanted: Callable[[], bool] = lambda: True) -> estimator.Running:
+    def look(self, leg: Leg, config: Config, wanted: Callable[[], bool] = lambda: True) -> Running:
         """
         Return the running estimate.
 
@@ -193,12 +199,12 @@ class SmootherSoFar:
             raise
         return self._growing.fit(view, config, trace)
 
-    def _view(self, leg: Leg, config: Config) -> estimator.SmootherLeg:
+    def _view(self, leg: Leg, config: Config) -> SmootherLeg:
         seen = screened_in_cells(leg, config)
         inputs = seen.inputs
         if len(inputs.t_imu) < 4 or len(inputs.travel.t) < 2:
             raise BadData('the smoother needs IMU and odometer samples')
-        few = estimator.too_little(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
+        few = too_little(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
         if few:
             raise BadData(few.text)
         _refuse_unusable(seen.reasons)
@@ -212,9 +218,9 @@ class SmootherSoFar:
         spans = inputs.standstills(placed.rough, config)
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
-        view = estimator.smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
+        view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
                                       placed.rough, t_stop)
-        few = estimator.too_little_of(view)
+        few = too_little_of(view)
         if few:
             raise BadData(few.text)
         return view

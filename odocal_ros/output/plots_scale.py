@@ -75,8 +75,8 @@ def by_window(found: Floats, name: str) -> drawing.Drawing:
             'to minutes, ± their scatter over eight parts of the leg. A level line at 0: errors '
             'of the fixes do not depend on the motion. Short windows that differ: the fixes '
             'contain an odometer, the receiver filters, or the fixes are late.')
-    return ('Scale against the length of the window', says,
-            drawing.svg(figure, f'{name}-by-window', says))
+    picture = drawing.svg(figure, f'{name}-by-window', says)
+    return 'Scale against the length of the window', says, picture
 
 
 def compared(calibration: Calibration, name: str) -> list[tuple[str, str, str]]:
