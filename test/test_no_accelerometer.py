@@ -58,6 +58,26 @@ def test_one_counter_gives_the_scale_within_its_sigma(how):
     assert not any('housing' in name for name in method.details['beside'])
 
 
+@pytest.mark.parametrize(('w', 'g', 'why'), [
+    ((0.0, 0.0, 1.0), 0.0, 'no turn rate about x and y, so'),
+    ((1.0, 0.0, 1.0), 0.0, 'no turn rate about y, so'),
+    ((1.0, 1.0, 1.0), 9.8, 'accelerations without gravity')])
+def test_accelerations_that_cannot_be_levelled_are_not_used(w, g, why):
+    made = drive(**TOWN)
+    leg = made.leg()
+    part = replace(leg.imu, w_i=leg.imu.w_i * w, f_i=leg.imu.f_i - [0.0, 0.0, g])
+    config = settings(made, heading_sigma=None, method='auto')
+    result = calibrate(replace(leg, imu=part), config)
+    calibration = combine([result], config)
+    scale = calibration.estimates['scale_factor']
+    assert abs(scale.value - made.truth.scale) < 3 * scale.sigma < 0.003 * made.truth.scale
+    assert all(calibration.estimates[name].value is None for name in ANGLES)
+    said = everything_said(result)
+    assert why in said[Code.NO_ACCELEROMETER]
+    assert not {Code.IMU_AXES, Code.IMU_UNITS, Code.NO_IMU} & set(said)
+    assert calibration.verdict is Verdict.CAUTION
+
+
 def test_two_wheels_give_both_scales_and_the_track_width():
     made, config, result = calibrated(two_wheels=True)
     found = combine([result], config).estimates

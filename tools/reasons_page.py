@@ -35,8 +35,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'zero. Without turn rates there is no track, except with two or more wheels on a level '
         'floor ([indoor.md](indoor.md)).',
         Code.NO_ACCELEROMETER: 'Every acceleration of the IMU is zero, NaN, or marked as missing '
-        '(`linear_acceleration_covariance[0]` of -1), as for a yaw rate from a bus. The scale is '
-        'estimated from gyro, odometer and fixes, with 0.05 % in its sigma for unmodelled '
+        '(`linear_acceleration_covariance[0]` of -1), as for a yaw rate from a bus; or they '
+        'contain no gravity, or a turn rate is always zero, so they cannot be levelled. The scale '
+        'is estimated from gyro, odometer and fixes, with 0.05 % in its sigma for unmodelled '
         'slopes. Yaw and pitch mounting angle, slips and reversing are not determined without '
         'accelerations.',
         Code.NO_ODOMETER: 'There is no usable odometer message between the marks: a wrong topic, '

@@ -29,9 +29,10 @@ from odocal_ros.estimator.factors.travel_error import TravelError
 from odocal_ros.estimator.factors.velocity import VelocityRows
 from odocal_ros.estimator.level_information import LevelInformation, LevelSides
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.preintegrate import Intervals, Points, preintegrate
+from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW
+from odocal_ros.estimator.sums import Intervals, Points
 
 SomeFactor = TypeVar('SomeFactor', bound=Factor)
 FACTORS: tuple[type[Factor], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, PressureRows,

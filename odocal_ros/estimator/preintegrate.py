@@ -12,7 +12,7 @@ steps: rotations by a prefix product, the rest by cumulative sums, some interval
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import TypeVar
 
 import numpy as np
@@ -29,6 +29,7 @@ from odocal_ros.estimator.state import (
     GYRO_AXIS,
     GYRO_SIGNAL,
 )
+from odocal_ros.estimator.sums import Intervals, Points
 from odocal_ros.nav.rotations import (
     exp_so3,
     matrix_from_quat,
@@ -36,71 +37,19 @@ from odocal_ros.nav.rotations import (
     quat_from_rotvec,
     quat_multiply,
     skew,
+    turn,
 )
 from odocal_ros.nav.strapdown import prefix_product
 
 Floats = NDArray[np.float64]
 # judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
 STEPS_AT_A_TIME = 2048
-
-
-@dataclass(frozen=True, eq=False)
-class Intervals:
-    """Sums over K intervals of length T, s; (K, ...) in the body frame at each begin."""
-
-    T: Floats        # (K,)
-    R: Floats        # (K, 3, 3) attitude at the end
-    dv: Floats       # (K, 3) m/s
-    dp: Floats       # (K, 3) m
-    A: Floats        # (K, 3, 3) integral of R, s: d dv = -A d ba
-    AA: Floats       # (K, 3, 3) its integral: d dp = -AA d ba
-    F: Floats        # (K, 3, a) integral of R's columns ACCEL_AXIS times the forces ACCEL_SIGNAL
-    #                  as measured: d dv = -F d constants; A times the mean force may be
-    #                  millimetres off, which would determine a scale that is not observable
-    FF: Floats       # (K, 3, a) its integral: d dp = -FF d constants
-    # by the gyro bias (3) and by the constants of GYRO (g)
-    turned: Floats   # (K, 3, 3 + g) the end turns by -turned d; the first three are A
-    dv_by: Floats    # (K, 3, 3 + g) derivative of dv
-    dp_by: Floats    # (K, 3, 3 + g)
-    S: Floats        # (K, 3, 3) sum of R over travel, scale units
-    S_by: Floats     # (K, 3, 3 + g) derivative of S @ forward
-    mean_rate: Floats   # (K, 3) mean turn rate as measured, bias and all, rad/s
-    mean_force: Floats  # (K, 3) mean specific force as measured, m/s^2
-    longest_step: Floats   # (K,) longest gap between IMU rows, s
-
-    def take(self, rows: slice) -> 'Intervals':
-        """Return the intervals of a slice."""
-        return Intervals(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """Sums from the begin of an interval to m times within it."""
-
-    interval: NDArray[np.int64]   # (m,)
-    tau: Floats      # (m,) s since the begin
-    dv: Floats       # (m, 3)
-    dp: Floats       # (m, 3)
-    R: Floats        # (m, 3, 3)
-    AA: Floats       # (m, 3, 3)
-    F: Floats        # (m, 3, a)
-    FF: Floats       # (m, 3, a)
-    force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
-    rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
-    spin: Floats     # (m, 3) rad/s^2, by which that rises
-
-    def take(self, index: Ints) -> 'Points':
-        """Return the points that an index picks."""
-        return Points(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+# definition: of the signals (1, w, f) of a step, those that errors of the gyro and of the
+# accelerometer multiply
+OF_GYRO, OF_ACCEL = slice(6), np.array([0, 4, 5, 6])
 
 
 Some = TypeVar('Some', Intervals, Points)
-
-
-def turn(C: Floats, vectors: Floats) -> Floats:
-    """Return C @ v row by row: (K, 3, 3), (K, 3)."""
-    out: Floats = np.einsum('kij,kj->ki', C, vectors)
-    return out
 
 
 def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
@@ -128,8 +77,10 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
         last = min(first + per, K)
         mine = slice(np.searchsorted(owner, first), np.searchsorted(owner, last))
         part = _Chunk(imu, first, last, gyro_bias[first:last], accel_bias[first:last], constants)
+        steps = part.steps_of(t_points[mine], owner[mine] - first)
+        part.cut(steps)
         out.append(part.intervals(travel, forward))
-        points.append(part.points(t_points[mine], owner[mine] - first, first))
+        points.append(part.points(t_points[mine], steps, owner[mine] - first, first))
         let_go()
     return _joined(Intervals, out), _joined(Points, points)
 
@@ -177,9 +128,8 @@ class _Chunk:
         self.t, self.key = imu.t[key[0]:key[-1] + 1], key - key[0]
         self.own = np.repeat(np.arange(len(key) - 1), np.diff(key))     # interval of each step
         self.dt = np.diff(self.t)
-        self.signals, self.longest = imu.signals[rows], imu.longest[rows]
-        dt = self.dt[:, None]
-        gyro, accel = self._errors(gyro_bias, accel_bias, constants)
+        self.longest, dt = imu.longest[rows], self.dt[:, None]
+        gyro, accel = self._errors(imu.signals[rows], gyro_bias, accel_bias, constants)
         self.turn, self.turn_mean = imu.turn[rows] - gyro, imu.turn_mean[rows] - gyro / 2
         square = skew(self.turn) @ skew(self.turn)
         # integral of the attitude over a step of unit length, and the integral of that
@@ -200,12 +150,11 @@ class _Chunk:
         self.p, self.dp = self._running(self.v * dt + self.step_p)
         # integrals of R over a step, single and double
         self.mean, self.twice = self.R @ self.G, self.R @ self.GG * dt[:, None]
-        # what biases and constants of gyro and accelerometer multiply
-        self.by_gyro, self.by_accel = (np.concatenate([dt, self.signals[:, columns]], axis=1)
-                                       for columns in (slice(5), slice(3, 6)))
+        # what biases, and constants of gyro and accelerometer, multiply
+        self.signals = np.concatenate([dt, imu.signals[rows]], axis=1)
         self.since = self.t[:-1] - self.t[self.key[:-1]][self.own]      # s, begin of the interval
 
-    def _errors(self, gyro_bias: Floats, accel_bias: Floats,
+    def _errors(self, signals: Floats, gyro_bias: Floats, accel_bias: Floats,
                 constants: Floats | None) -> tuple[Floats, Floats]:
         """Return the sums of the errors in each step: (n, 3) rad, (n, 3) m/s, method (S3)."""
         gyro, accel = (bias[self.own] * self.dt[:, None] for bias in (gyro_bias, accel_bias))
@@ -213,8 +162,8 @@ class _Chunk:
             by_gyro, by_accel = np.zeros((3, 6)), np.zeros((3, 3))
             by_gyro[GYRO_AXIS, GYRO_SIGNAL] = constants[GYRO]
             by_accel[ACCEL_AXIS, ACCEL_SIGNAL] = constants[ACCEL]
-            gyro = gyro + self.signals @ by_gyro.T
-            accel = accel + self.signals[:, 3:] @ by_accel.T
+            gyro = gyro + signals @ by_gyro.T
+            accel = accel + signals[:, 3:] @ by_accel.T
         return gyro, accel
 
     def _running(self, step: Floats) -> tuple[Floats, Floats]:
@@ -228,40 +177,69 @@ class _Chunk:
         """Return the sum of each interval."""
         return np.add.reduceat(step, self.key[:-1])
 
-    def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
-        """
-        Return the sums of each interval.
+    def steps_of(self, t: Floats, interval: Ints) -> Ints:
+        """Return the step that each time lies in."""
+        return np.clip(np.searchsorted(self.t, t, side='right') - 1, self.key[interval],
+                       self.key[interval + 1] - 1)
 
-        An error in a step acts on what follows it in the interval: a turn on the rest of dv, dp
-        and S, a force for the rest of the time.
+    def cut(self, steps: Ints) -> None:
         """
-        T, dt, ds = np.diff(self.t[self.key]), self.dt[:, None], np.diff(travel(self.t))[:, None]
-        rest = T[self.own, None] - self.since[:, None] - dt
-        v, way = self.v + self.step_v, self.mean * ds[:, :, None]
+        Sum up what the errors in each step do, from the interval's begin to its end and to steps.
+
+        An error in a step acts on what follows: a turn on the rest of dv and dp, a force for the
+        rest of the time. What depends on the end is a factor of the sums (``_effects``).
+        """
+        self.cuts = np.unique(np.concatenate([self.key[:-1], steps]))
+        dt, by = self.dt[:, None], self.signals
+        end, v, p = self.since[:, None] + dt, self.v + self.step_v, self.p + self.v * dt
+        moment, grown = self.step_v - self.step_p / dt, self.R @ self.grows
+        self.sums = [self._before(*one) for one in (
+            (self.mean, by),
+            (_cross(v, self.mean) - _cross(moment, grown), by[:, OF_GYRO]),
+            (_cross(p + self.step_p - v * end, self.mean)
+             + _cross(moment * end - self.step_v * (dt / 6), grown), by[:, OF_GYRO]),
+            (self.twice - self.mean * end[:, :, None], by[:, OF_ACCEL]))]
+
+    def _before(self, step: Floats, signals: Floats) -> Floats:
+        """Return the sums of (n, 3, 3) times signals (n, s) before each cut and up to the last."""
+        out = np.zeros((len(self.cuts) + 1, 3, 3, signals.shape[1]))
+        np.add.reduceat(_by(step, signals), self.cuts, out=out[1:])
+        return np.cumsum(out, axis=0, out=out)
+
+    def _effects(self, begin: Ints, end: Ints, dv: Floats, dp: Floats,
+                 tau: Floats) -> tuple[Floats, ...]:
+        """
+        Return A, AA, F, FF, turned, dv_by and dp_by of errors in the steps from begin to end.
+
+        begin, end : (m,) cuts.   dv, dp, tau : (m, 3) and (m, 1, 1) s since the interval's begin.
+        """
+        first, last = (np.searchsorted(self.cuts, x) for x in (begin, end))
+        turns, once, twice, late = (x[last] - x[first] for x in self.sums)
+        by_turn = _gyro(turns[..., OF_GYRO])
+        once, force = _gyro(once), turns[..., OF_ACCEL]
+        (A, F), (AA, FF) = _accel(force), _accel(force * tau[..., None] + late)
+        return (A, AA, F, FF, by_turn, _cross(dv, by_turn) - once,
+                _cross(dp, by_turn) - once * tau - _gyro(twice))
+
+    def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
+        """Return the sums of each interval."""
+        T, ds = np.diff(self.t[self.key]), np.diff(travel(self.t))[:, None]
+        way = self.mean * ds[:, :, None]
         walked, walk = self._running(way @ forward)
-        dv_rest = self.dv[self.own] - v
-        dp_rest = self.dp[self.own] - self.p - self.v * dt - self.step_p - v * rest
         S_rest = walk[self.own] - walked - way @ forward
-        grown, moment = self.R @ self.grows, self.step_v - self.step_p / dt
         cross, ahead = skew(self.turn), skew(forward)
         own = ahead / 2 + (cross @ ahead + skew(np.cross(self.turn, forward))) / 6
-        by_turn = (self.mean, _cross(dv_rest, self.mean) + _cross(moment, grown),
-                   _cross(dp_rest, self.mean)
-                   + _cross(moment * rest + self.step_v * (dt / 6), grown),
-                   _cross(S_rest, self.mean) + self.R @ own * ds[:, :, None])
-        turned, dv_by, dp_by, S_by = (_gyro(self._sum(_by(step, self.by_gyro)))
-                                      for step in by_turn)
-        by_force = (self.mean, self.mean * rest[:, :, None] + self.twice)
-        (A, F), (AA, FF) = (_accel(self._sum(_by(step, self.by_accel))) for step in by_force)
-        measured = self._sum(self.signals) / T[:, None]
+        S_by = self._sum(_by(_cross(S_rest, self.mean) + self.R @ own * ds[:, :, None],
+                             self.signals[:, OF_GYRO]))
+        A, AA, F, FF, turned, dv_by, dp_by = self._effects(
+            self.key[:-1], self.key[1:], self.dv, self.dp, T[:, None, None])
+        measured = self._sum(self.signals[:, 1:]) / T[:, None]
         return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, turned, dv_by, dp_by,
-                         self._sum(way), S_by, measured[:, :3], measured[:, 3:],
+                         self._sum(way), _gyro(S_by), measured[:, :3], measured[:, 3:],
                          np.maximum.reduceat(self.longest, self.key[:-1]))
 
-    def points(self, t: Floats, interval: Ints, first: int) -> Points:
-        """Return the sums to times in given intervals: rate and force change evenly in a step."""
-        j = np.clip(np.searchsorted(self.t, t, side='right') - 1, self.key[interval],
-                    self.key[interval + 1] - 1)
+    def points(self, t: Floats, j: Ints, interval: Ints, first: int) -> Points:
+        """Return the sums to times in steps j, a cut each: rate and force change evenly in it."""
         h, dt = (t - self.t[j])[:, None], self.dt[j, None]
         rise = (6 * self.step_v[j] - 12 * self.step_p[j] / dt) / dt**2
         force = self.step_v[j] / dt - rise * dt / 2
@@ -270,19 +248,17 @@ class _Chunk:
         spin = 6 * (self.turn[j] - 2 * self.turn_mean[j]) / dt**2
         rate = self.turn[j] / dt - spin * dt / 2
         R = self.R[j] @ exp_so3(rate * h + spin * h**2 / 2)
-        # those of the steps before, and of the step
-        begin, share = self.key[interval], (h / dt)[:, None]
-        tau = (self.since[j, None] + h)[:, :, None, None]
-
-        def before(step: Floats) -> Floats:
-            step = _by(step, self.by_accel)
-            total = np.cumsum(step, axis=0) - step
-            out: Floats = total[j] - total[begin]
-            return out
-
-        single, by = before(self.mean), self.by_accel[j]
-        _, F = _accel(single + _by(self.mean[j] * share, by))
-        AA, FF = _accel(single * tau + _by(self.twice[j] * share**2, by) + before(
-            self.twice - self.mean * (self.since + self.dt)[:, None, None]))
-        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, AA,
-                      F, FF, force + rise * h, rate + spin * h, spin)
+        tau = t - self.t[self.key[interval]]
+        A, AA, F, FF, turned, dv_by, dp_by = self._effects(
+            self.key[interval], j, dv, dp, tau[:, None, None])
+        # those in the step itself
+        share, by = (h / dt)[:, None], self.signals[j]
+        own, moved = _gyro(_by(self.mean[j] * share, by[:, OF_GYRO])), self.step_v[j] * (h / dt)
+        by = by[:, OF_ACCEL]
+        (A, F), (AA, FF) = (
+            (x + y for x, y in zip(before, _accel(_by(step, by)), strict=True))
+            for before, step in (((A, F), self.mean[j] * share),
+                                 ((AA, FF), self.twice[j] * share**2)))
+        return Points(interval + first, tau, dv, dp, R, A, AA, F, FF, turned + own,
+                      dv_by + _cross(moved / 2, own), dp_by + _cross(moved * h / 6, own),
+                      force + rise * h, rate + spin * h, spin, self.signals[j, 1:] / dt)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.imu_steps import ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
@@ -45,3 +46,8 @@ class Problem:
         """Return the median stated sigma of a horizontal axis of the fixes, m."""
         out: float = np.sqrt(np.median(self.leg.covariance_n[self.use][:, 0, 0]))
         return out
+
+    @property
+    def fix_least(self) -> float:
+        """Return the minimum sigma of fix errors, white and correlated each, m."""
+        return LEAST.pose if self.leg.origin.local else LEAST.fix

@@ -21,8 +21,9 @@ from odocal_ros.data.arrays import Bools, Complexes, Floats
 from odocal_ros.data.pieces import by_row
 from odocal_ros.estimator.imu_steps import ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.estimator.preintegrate import Intervals, preintegrate
+from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.state import LN_K, M, PITCH, Priors, State, YAW
+from odocal_ros.estimator.sums import Intervals
 from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import gravity

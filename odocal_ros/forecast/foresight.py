@@ -30,7 +30,7 @@ from odocal_ros.forecast.forecast import (
 )
 from odocal_ros.forecast.planned_drive import inserted, PlannedDrive, REST_SPEED
 from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
-from odocal_ros.screening.leg_kind import felt
+from odocal_ros.screening.leg_kind import lacking
 from odocal_ros.settings.config import Config
 
 DRIVE_ROWS = 1000         # judgement: of the drive of a prediction
@@ -68,6 +68,7 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
 
     Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
     """
+    unusable = lacking(leg.imu, config.imu.accel_scale)
     running = smoother_forecast.look(leg, config, smoother, wanted)
     only_smoother = deciding(config.method) == smoother_forecast.ONLY
     if only_smoother or smoother_forecast.gives_all(running):     # the ends add nothing to it
@@ -76,9 +77,9 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
         forecast = _by_ends(leg, fix_rate, config, wanted)
         if smoother is not None and 'smoother' in deciding(config.method):
             forecast = replace(forecast, scale=_open_yet(forecast.scale))
-            if felt(leg.imu.f_i):
+            if not unusable:
                 forecast = replace(forecast, yaw=_open_yet(forecast.yaw))
-    if not felt(leg.imu.f_i):
+    if unusable:
         forecast = smoother_forecast.without_force(forecast)
     if not wanted():
         raise Abandoned

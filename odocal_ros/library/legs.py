@@ -10,11 +10,13 @@ import numpy as np
 
 from odocal_ros.bagio.read import Bag
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.asked import EACH_STOP, LegSpan
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.clocks import OFFSET_REACH
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.screen import screen
@@ -113,9 +115,15 @@ def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | st
     marks : (start, stop) as the node marked them.   config : standstills, least distance.
     stops : what ``stops_of`` finds in all that the topics have in common, where that is known.
 
-    Raises BadUsage: an asked leg lies outside the bag.
+    Raises BadUsage: an asked leg lies outside the bag; BadData: the stamps of the topics have no
+    time in common, and a leg is to be found or open-ended.
     """
     first, last = _common(recorder)
+    closed = marks or any(isinstance(a, LegSpan) and None not in (a.start_ns, a.stop_ns)
+                          for a in asked)
+    if first - last > OFFSET_REACH * 1e9 and not closed:
+        raise BadData(f'{bag.name}: {_apart(recorder)}')
+    last = max(last, first + 1)
 
     def stops_known() -> Stops:
         return stops or stops_of(screen(recorder.close(first, last, preroll=0.0), config,
@@ -142,16 +150,28 @@ def _marked(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans
 
 
 def _common(recorder: LegRecorder) -> tuple[int, int]:
-    """Return the first and the last stamp at which all of IMU, odometer and fix are there."""
-    stamps = [recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')]
-    stamps = [s[s > 0] for s in stamps]
-    stamps = [s for s in stamps if len(s)]
-    if not stamps:
-        return 0, 1
+    """Return the first and the last stamp that IMU, odometer and fix have in common, if any."""
+    firsts, lasts = zip(*_ends(recorder).values() or [(0, 1)], strict=True)
+    return max(firsts), min(lasts)
+
+
+def _ends(recorder: LegRecorder) -> dict[str, tuple[int, int]]:
+    """Return the first and the last stamp of each required slot that has stamps."""
+    rows = {slot: recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')}
+    stamps = {slot: s[s > 0] for slot, s in rows.items()}
     # percentiles of order, not extremes: one wild stamp must not move the leg
-    first = max(int(np.median(s[:5])) if len(s) > 20 else int(s.min()) for s in stamps)
-    last = min(int(np.median(s[-5:])) if len(s) > 20 else int(s.max()) for s in stamps)
-    return first, max(last, first + 1)
+    return {slot: (int(np.median(s[:5])), int(np.median(s[-5:]))) if len(s) > 20
+            else (int(s.min()), int(s.max())) for slot, s in stamps.items() if len(s)}
+
+
+def _apart(recorder: LegRecorder) -> str:
+    """Return a sentence with the first and last stamp of each required topic."""
+    spans = ', '.join(
+        f'{INPUTS[slot].label} {" to ".join(str(np.datetime64(ns, "ns"))[:19] for ns in ends)}'
+        for slot, ends in _ends(recorder).items())
+    return (f'the stamps of the topics have no time in common: {spans} (UTC); stamp all sensors '
+            'with one clock (likely causes: a time zone, time since boot, GPS time), or record '
+            'them together')
 
 
 def _placed(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, int]:

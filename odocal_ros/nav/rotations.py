@@ -38,6 +38,12 @@ def transpose(C: Floats) -> Floats:
     return np.swapaxes(C, -1, -2)
 
 
+def turn(C: Floats, vectors: Floats) -> Floats:
+    """Return C @ v row by row: (K, 3, 3), (K, 3)."""
+    out: Floats = np.einsum('kij,kj->ki', C, vectors)
+    return out
+
+
 def quat_from_rotvec(phi: ArrayLike) -> Floats:
     """Return the quaternion of rotation vector phi, rad: (..., 3) to (..., 4)."""
     phi = np.asarray(phi, dtype=float)

@@ -22,7 +22,9 @@ from odocal_ros.library.asked import EACH_STOP, LegSpan
 from odocal_ros.library.legs import find_legs, marked_legs, stops_of
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
+from odocal_ros.pipeline.calibrate import missing_data
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.clocks import TOO_FAR
 from odocal_ros.screening.facing import imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.inputs import Inputs
@@ -45,19 +47,16 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
         return []
     try:
         (first, last), = find_legs(recorder, bag, [LegSpan(None, None)], [], config)
-    except BadUsage:
-        first, last = 0, -1
-    try:
         leg = recorder.close(first, last, preroll=0.0)
-    except BadData as error:
-        findings.append(Reason(Code.CLOCKS_DIFFER, str(error)))
+    except (BadData, BadUsage) as error:
+        findings.append(Reason(Code.CLOCKS_DIFFER, str(error), TOO_FAR))
         return []
     config = settings_by_frame(leg.fix, config)
     inputs, reasons = screen(leg, config)
     findings += [r for r in reasons if r.code is not Code.NO_FIX or 'fix' in found['mapping']]
     if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:
-        findings.append(Reason(Code.CLOCKS_DIFFER, 'the stamps of IMU, odometer and fixes do not '
-                               'overlap in time'))
+        known = {reason.code for reason in findings}
+        findings += [r for r in missing_data(leg, inputs) if r.code not in known]
         return []
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)

@@ -157,9 +157,9 @@ def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
         jitter = timing['arrival_jitter']
         yield 'no header: arrival time (bag time) is used as stamp' + (
             '' if jitter is None else f'; arrival jitter {1e3 * jitter:.1f} ms')
-    elif abs(timing['header_to_bag']) > 0.5e-3:
-        where = 'after' if timing['header_to_bag'] > 0 else 'before'
-        yield (f'recorded {abs(timing["header_to_bag"]):.3f} s {where} its header stamp '
+    elif abs(late := timing['header_to_bag'] or 0.0) > 0.5e-3:     # None: no row has a stamp
+        where = 'after' if late > 0 else 'before'
+        yield (f'recorded {abs(late):.3f} s {where} its header stamp '
                f'(spread {timing["header_to_bag_spread"]:.3f} s)')
     odd = [f'{timing[key]} {what}' for key, what in (
         ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the stamp of the previous '

@@ -100,7 +100,7 @@ def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened
     config = settings_by_frame(leg.fix, config)
     inputs, found = screen(leg, config)
     reasons = (*notes, *found)
-    missing = _missing(leg, inputs)
+    missing = missing_data(leg, inputs)
     if missing or not len(inputs.t_fix):
         seen = {r.code for r in reasons}
         return Screened(inputs, (*reasons, *(r for r in missing if r.code not in seen)), False)
@@ -121,7 +121,7 @@ def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
     return doubled(smoother.details['slips'], inputs.travel, scale), scale
 
 
-def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:
+def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:
     """Return the data that a leg lacks for any method."""
     missing = []
     if leg.stop_ns <= leg.start_ns:

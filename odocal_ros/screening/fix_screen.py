@@ -69,8 +69,8 @@ def usable_fixes(fix: FixSamples, sent: int,
     bad = [(f'{int(m.sum())} {what}', do) for m, what, do in (
         (no_fix, f'with status below {gnss.min_status}', 'Drive under open sky, or lower '
          'gnss.min_status if these fixes are good.'),
-        (lost & ~no_fix, 'at an invalid position', 'Check the driver: these positions are not on '
-         'Earth.'),
+        (lost & ~no_fix, _invalid(fix, lost & ~no_fix), 'Check the driver: latitude and longitude '
+         'in degrees (swapped?), altitude in m, no 0, 0 in place of a missing position.'),
         (poor & ~no_fix & ~lost, f'with sigma above {limit:.3g} m', 'If these '
          'uncertainties are correct, raise gnss.max_sigma (0: no limit): each fix is weighted by '
          'its own uncertainty.')) if m.any()]
@@ -80,6 +80,14 @@ def usable_fixes(fix: FixSamples, sent: int,
         found += (Reason(code, f'{sent - int(use.sum())} of {sent} fixes are not used: '
                          f'{", ".join(said)}', ' '.join(do)),)
     return use, covariance, found
+
+
+def _invalid(fix: FixSamples, lost: Bools) -> str:
+    """Return what the invalid positions are, with the first one as an example."""
+    first = int(np.argmax(lost))
+    latitude, longitude = np.degrees([fix.latitude[first], fix.longitude[first]])
+    return (f'at an invalid position (the first: latitude {latitude:.6g}, longitude '
+            f'{longitude:.6g} deg, altitude {fix.height[first]:.6g} m)')
 
 
 def sigma_limit(sigma: Floats, max_sigma: float) -> float:

@@ -4,8 +4,9 @@
 """
 Legs without an accelerometer, or with positions in a local frame.
 
-An IMU may send turn rates only: the yaw rate of a car on the bus, the gyro of a robot. The ground
-is then assumed level and the IMU upright: gravity replaces the specific force, so the rest of the
+An IMU may send turn rates only: the yaw rate of a car on the bus, the gyro of a robot. Without
+gravity in them, or without roll and pitch rate, accelerations are of no use. The ground is then
+assumed level and the IMU upright: gravity replaces the specific force, so the rest of the
 code needs no other case. The errors of this assumption are added to the level
 (``pipeline/align.py``) and to the scale (``pipeline/beyond_model.py``).
 
@@ -20,7 +21,13 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import chunks
-from odocal_ros.data.samples import FixSamples, HeadingSamples, LOCAL, VelocitySamples
+from odocal_ros.data.samples import (
+    FixSamples,
+    HeadingSamples,
+    ImuSamples,
+    LOCAL,
+    VelocitySamples,
+)
 from odocal_ros.nav.earth import OMEGA
 from odocal_ros.nav.local_frame import LARGEST_FRAME
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -28,6 +35,8 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G
 
+LEAST_GRAVITY = 0.5  # judgement: of 9.8 m/s^2, or of 1 g; a smaller median is motion only
+GRAVITY_ROWS = 20_000  # judgement: at the most, for the median
 TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
 
 
@@ -39,21 +48,42 @@ def felt(f_i: Floats) -> bool:
         return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all() for rows in chunks(len(f_i)))
 
 
+def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
+    """
+    Return why the accelerations of a leg cannot be used, '' if they can.
+
+    They are level only with turn rates about all axes: an axis that is always zero has no gyro.
+    """
+    if not felt(imu.f_i):
+        return 'publishes turn rates but no acceleration'
+    with np.errstate(all='ignore'):
+        some = imu.f_i[::max(1, len(imu.f_i) // GRAVITY_ROWS)]
+        some = some[np.isfinite(some).all(axis=1)]
+        if len(some) and np.linalg.norm(np.median(some, axis=0)) * accel_scale < LEAST_GRAVITY:
+            return 'publishes accelerations without gravity'
+    dead = np.logical_and.reduce([(imu.w_i[rows] == 0).all(axis=0) for rows in chunks(
+        len(imu.w_i))] or [np.zeros(3, bool)])
+    if dead.any() and not dead.all():
+        axes = ' and '.join(name for name, axis in zip('xyz', dead, strict=True) if axis)
+        return f'publishes no turn rate about {axes}, so accelerations cannot be levelled'
+    return ''
+
+
 def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """
-    Return a leg whose IMU, where it sends no force, stands upright on level ground; and why.
+    Return a leg; where its IMU has no usable force, it is upright on level ground; and why.
 
     None is sent where each value is zero or NaN (as REP-145's covariance[0] of -1 is read).
     """
-    f_i = leg.imu.f_i
-    if felt(f_i):
+    why = lacking(leg.imu, config.imu.accel_scale)
+    if not why:
         return leg, ()
     up_i = matrix_from_rpy(config.imu.mounting_rpy).T[:, 2]
-    gravity_i = np.tile(up_i * G / (config.imu.accel_scale or 1.0), (len(f_i), 1))
+    gravity_i = np.tile(up_i * G / (config.imu.accel_scale or 1.0), (len(leg.imu.f_i), 1))
     return replace(leg, imu=replace(leg.imu, f_i=gravity_i)), (Reason(
-        Code.NO_ACCELEROMETER, 'the IMU publishes turn rates but no acceleration. The scale is '
-        'estimated from gyro, odometer and fixes on assumed level ground; yaw and pitch mounting '
-        'need an accelerometer (yaw: or an external heading)'),)
+        Code.NO_ACCELEROMETER, f'the IMU {why}. The scale is estimated from gyro, odometer and '
+        'fixes on assumed level ground; yaw and pitch mounting need an accelerometer (yaw: or an '
+        'external heading)'),)
 
 
 def settings_by_frame(fix: FixSamples, config: Config) -> Config:

@@ -243,6 +243,20 @@ def test_units(tmp_path, capsys):
     assert 'GYRO_SIGN' in codes(told)
 
 
+def test_topics_that_cannot_be_combined(tmp_path, capsys):
+    rows = drive(60)
+    for name, _, message in rows:
+        if name == '/imu/data':
+            message.header.stamp = make.header(0).stamp
+    told, text = inspect(ros_bags.write(tmp_path / 'zero', rows), capsys)
+    assert topic(told, '/imu/data')['timing']['header_to_bag'] is None
+    assert 'NO_IMU: none of the ' in text
+    assert 'CLOCKS_DIFFER' not in codes(told)
+    told, text = inspect(ros_bags.write(tmp_path / 'zone', drive(60, lag=8 * 3600.0)), capsys)
+    assert codes(told) == {'CLOCKS_DIFFER'}
+    assert 'have no time in common' in text
+
+
 def test_clocks_and_stamps(tmp_path, capsys):
     told, _ = inspect(ros_bags.write(tmp_path / 'lag', drive(lag=-3.0)), capsys)
     assert 'CLOCKS_DIFFER' in codes(told)

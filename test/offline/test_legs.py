@@ -3,7 +3,7 @@
 
 """Legs of a recording: as asked on the command line, as marked, from standstills."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -114,6 +114,18 @@ def test_without_marks_one_leg_from_first_to_last_standstill(out_and_back):
     assert leg[1] >= out_and_back.truth.stop_ns - 2 * S
     assert not moving(out_and_back, leg[0] - S)
     assert not moving(out_and_back, leg[1])
+
+
+def test_stamps_without_a_time_in_common(out_and_back):
+    recorder, bag = recorded(out_and_back)
+    late = LegRecorder()
+    for slot in ('imu', 'odometer', 'fix'):
+        rows = recorder.rows(slot)
+        late.feed(slot, replace(rows, stamp_ns=rows.stamp_ns + 8 * 3600 * S * (slot == 'fix')))
+    with pytest.raises(BadData, match='no time in common: IMU .* fix .*; stamp all sensors with'):
+        find_legs(late, bag, [], [], Config())
+    mark = int(out_and_back.truth.start_ns), int(out_and_back.truth.stop_ns)
+    assert find_legs(late, bag, [], [mark], Config()) == [mark]
 
 
 def test_each_stop_splits_where_the_vehicle_stood(out_and_back):

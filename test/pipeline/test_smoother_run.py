@@ -3,11 +3,14 @@
 
 """The smoother as a member of the pipeline."""
 
-from drives import drive, settings
+from dataclasses import replace
+
+from drives import drive, everything_said, seconds, settings
 import numpy as np
 import pytest
 
 from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.data.samples import take
 from odocal_ros.estimator.fit import CONVERGENCE
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.odometer import Travel
@@ -36,6 +39,29 @@ def test_scale_yaw_and_pitch_come_without_a_heading(made, held):
                        ('pitch_mounting_angle', made.truth.pitch)):
         assert abs(found[name].value - true) < SIGMAS * found[name].sigma, name
     assert held.methods['two_point'].estimates['yaw_mounting_angle'].value is None
+
+
+def test_fixes_without_altitude_give_all_three(made):
+    leg = made.leg()
+    flat = replace(leg, fix=replace(leg.fix, height=np.full(len(leg.fix.height), np.nan)))
+    found = calibrate(flat, settings(made, **ASKED)).methods['smoother'].estimates
+    for name, true, limit in (('scale_factor', made.truth.scale, 1e-3 * made.truth.scale),
+                              ('yaw_mounting_angle', made.truth.yaw, np.deg2rad(0.25)),
+                              ('pitch_mounting_angle', made.truth.pitch, np.deg2rad(0.25))):
+        assert abs(found[name].value - true) < SIGMAS * found[name].sigma < SIGMAS * limit, name
+
+
+def test_a_start_within_a_gap_of_the_odometer_is_no_slip(made):
+    leg = made.leg()
+    t, value = seconds(leg, leg.odometer), leg.odometer.value
+    moves = t[1:][np.diff(value) > 0]
+    start = moves[1:][(np.diff(moves) > 2.0) & (moves[1:] > 30.0)][0]     # after a stop
+    lost = take(leg.odometer, np.abs(t - start) > 10.0)
+    found = [calibrate(one, settings(made, **ASKED)) for one in (leg, replace(leg, odometer=lost))]
+    assert Code.WHEEL_SLIP not in everything_said(found[1])
+    scale, with_gap = (one.methods['smoother'].estimates['scale_factor'] for one in found)
+    assert abs(with_gap.value - made.truth.scale) < SIGMAS * with_gap.sigma
+    assert with_gap.sigma < 1.1 * scale.sigma       # 20 s of 200 are missing
 
 
 def test_the_fifth_held_back_is_met_by_dead_reckoning_with_the_values_found(made, held):

@@ -13,9 +13,10 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import stepping
-from odocal_ros.estimator.preintegrate import Intervals, turn
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
+from odocal_ros.estimator.sums import Intervals
+from odocal_ros.nav.rotations import turn
 from odocal_ros.settings.grades import G
 
 WALK_SPEED = 1.0     # m/s, below it slopes are reduced: judgement

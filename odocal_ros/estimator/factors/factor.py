@@ -22,9 +22,9 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import blocks, JointMarginals, Normal
 from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.preintegrate import Intervals, Points
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW
+from odocal_ros.estimator.sums import Intervals, Points
 
 # variance factors of an interval: of the odometer forward, sideways and up (slips), and of the
 # driving noise of the correlated fix error (jumps of the receiver)

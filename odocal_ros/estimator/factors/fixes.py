@@ -7,10 +7,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
-from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import PointRows
-from odocal_ros.estimator.preintegrate import turn
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
     ACCEL,
@@ -23,6 +21,7 @@ from odocal_ros.estimator.state import (
     GNSS_ARM,
     GNSS_CLOCK,
     GNSS_DELAY,
+    GYRO,
     HEIGHT_DRIFT,
     M,
     P,
@@ -34,7 +33,7 @@ from odocal_ros.estimator.state import (
     YAW,
 )
 from odocal_ros.nav.receiver_filter import odometer_error, smoothing
-from odocal_ros.nav.rotations import skew
+from odocal_ros.nav.rotations import skew, turn
 
 
 class Fixes(PointRows):
@@ -47,8 +46,9 @@ class Fixes(PointRows):
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         leg, state, points = problem.leg, point.state, point.points['fixes']
         self.state, self.points, self.root = state, points, problem.root
-        k, tau = points.interval, points.tau[:, None]
-        self.k, self.t_fix = k, leg.t_fix[problem.use]
+        super().__init__(points)
+        k, tau = self.k, points.tau[:, None]
+        self.t_fix = leg.t_fix[problem.use]
         self.C = state.C_nb[k]
         dp = turn(self.C, points.dp)
         v = state.v_n[k]
@@ -94,7 +94,8 @@ class Fixes(PointRows):
         J[:, :, P], J[:, :, V] = -one, -one * tau
         J[:, :, PHI] = skew(self.dp + self.arm_n)
         J[:, :, BA] = self.C @ self.points.AA
-        J[:, :, BG] = -skew(self.dp) @ self.C * tau / 3 - skew(self.arm_n) @ self.C * tau
+        by_gyro = -self.C @ self.points.dp_by - skew(self.arm_n) @ self.C @ self.points.turned
+        J[:, :, BG], c[:, :, GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
         if n > BARE:
             J[:, :, SLOW] = -one * (1 - self.share)[:, None, None]
         by_yaw, by_pitch = self.state.C_bv_gradient
@@ -112,7 +113,7 @@ class Fixes(PointRows):
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         """Return initial and minimum levels, factors on the stated variances."""
-        least = (LEAST.fix / problem.fix_sigma)**2
+        least = (problem.fix_least / problem.fix_sigma)**2
         return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
 
     @classmethod

@@ -19,9 +19,9 @@ from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
 from odocal_ros.estimator.outside import convergence, Outside, thinned
-from odocal_ros.estimator.preintegrate import Points
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BARE, BG, GYRO_SCALE, HEADING, M, PHI, State
+from odocal_ros.estimator.state import BARE, BG, GYRO, HEADING, M, PHI, State
+from odocal_ros.estimator.sums import Points
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.angles import arctan2, wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
@@ -122,7 +122,7 @@ def _heading(sent: Heading, state: State, points: Points) -> Rows:
                       np.ones(len(k))], -1)
     J, c = np.zeros((len(k), 1, BARE)), np.zeros((len(k), 1, M))
     J[:, 0, PHI] = -turns
-    J[:, 0, BG] = np.einsum('ki,kij->kj', turns, C) * points.tau[:, None]
-    c[:, 0, GYRO_SCALE] = J[:, 0, BG.start + 2] * points.rate[:, 2]
+    by_gyro = np.einsum('ki,kij->kj', turns, C @ points.turned)
+    J[:, 0, BG], c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]
     c[:, 0, HEADING] = -1.0
     return Rows(k, raw[:, None], J, c, 1 / sent.noise[:, None])

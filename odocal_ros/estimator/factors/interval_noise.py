@@ -21,7 +21,9 @@ from odocal_ros.estimator.factors.odometer_filter import stamp_of
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.state import BA, BG, P, PHI, V
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import skew
+from odocal_ros.nav.statistics import gaps_in_rhythm
 
 Floats = NDArray[np.float64]
 # level: variance per second of the white noise or walk; of the road also the axis of the vehicle
@@ -35,6 +37,8 @@ GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
 TURNING_RATE = 0.05
 # m in a second, minimum error of an odometer at rest: physical, play of a drive train
 REST_NOISE = 5e-4
+# rad/s, m/s^2, 1 sigma of motion that no sample shows: judgement, of a car in town
+HIDDEN_RATE, HIDDEN_FORCE = 0.1, 1.5
 ABSENT_VARIANCE = 1e4   # m^2, of travel without odometer samples
 
 
@@ -184,7 +188,7 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     # s: a longer step between IMU samples hides motion
     gap = np.where(sums.longest_step > max(0.06, 3 * np.median(sums.longest_step)),
                    sums.longest_step, 0.0)
-    rate, force = 0.1, 1.5      # rad/s, m/s^2, 1 sigma of hidden motion: of a car in town
+    rate, force = HIDDEN_RATE, HIDDEN_FORCE
     extra[:, PHI] = (rate * gap[:, None])**2
     extra[:, V] = (force * gap[:, None])**2
     extra[:, P] = (force * gap * T)[:, None]**2
@@ -192,9 +196,26 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     stamp = stamp_of(t, motion.state.constants)
     outside = (stamp[:-1] < way.t[0] - 0.1) | (stamp[1:] > way.t[-1] + 0.1)
     extra[outside, D] = ABSENT_VARIANCE
+    extra[:, D] += _in_gaps(stamp, way, motion.state.scale)[:, None]
     for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
         k = np.searchsorted(t, at) - 1
         if 0 <= k < len(T) and sigma > 0:
             near = slice(max(k - 1, 0), k + 2)       # the row before the gap may lie in the last
             extra[near, D] += (motion.state.scale * sigma)**2
     return extra
+
+
+def _in_gaps(stamp: Floats, way: Travel, scale: float) -> Floats:
+    """
+    Return variances of travel that is interpolated across gaps of the odometer: (K,) m^2.
+
+    A speed that rises and falls within a gap is off the mean speed by up to half the gap times its
+    acceleration, and the travel of the whole gap is the most that an interval contains.
+    """
+    variance = np.zeros(len(stamp) - 1)
+    for begin, end in gaps_in_rhythm(way.t):
+        inside = (stamp[1:] > begin) & (stamp[:-1] < end)
+        T = np.minimum(np.diff(stamp)[inside], (end - begin) / 4)
+        moved = scale * abs(float(np.diff(way.at(np.array([begin, end])))[0]))
+        variance[inside] += np.minimum(HIDDEN_FORCE * (end - begin) * T / 2, moved)**2
+    return variance

@@ -16,6 +16,7 @@ class LeastNoise:
     """
 
     fix: float = 0.005          # m, east or north or up, of white and of slow errors each
+    pose: float = 2e-4          # m, of positions in a local frame: motion capture
     velocity: float = 0.005     # m/s, of one from outside
     heading: float = 5e-4       # rad, of one from outside
     height: float = 0.02        # m, by air pressure

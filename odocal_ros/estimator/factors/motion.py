@@ -17,7 +17,6 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.axle import Axle, varies_with
-from odocal_ros.estimator.preintegrate import Intervals, turn
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
     ACCEL,
@@ -42,10 +41,11 @@ from odocal_ros.estimator.state import (
     V,
     YAW,
 )
+from odocal_ros.estimator.sums import Intervals
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en, gravity
-from odocal_ros.nav.rotations import exp_so3, skew, transpose
+from odocal_ros.nav.rotations import exp_so3, skew, transpose, turn
 
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
 ROWS = D.stop

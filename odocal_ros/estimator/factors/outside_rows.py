@@ -41,7 +41,8 @@ class OutsideRows(PointRows):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self._rows = self.rows(problem, point)
-        self.k, self.raw = self._rows.k, self._rows.raw
+        super().__init__(point.points[self.name])
+        self.raw = self._rows.raw
         self.per_effective = problem.per_effective.get(self.name, 1.0)
 
     @classmethod

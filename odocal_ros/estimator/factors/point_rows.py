@@ -22,6 +22,7 @@ from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import SLOW, State, WITH_SLOW
+from odocal_ros.estimator.sums import Points
 from odocal_ros.nav.statistics import NORMAL_MEDIAN
 
 # sigmas beyond which a row, or the slip of an interval, has a heavy tail. Statistical: one normal
@@ -37,7 +38,7 @@ class PointRows(Factor):
     """
     Rows of d components each.
 
-    A subclass sets k (m,), the keyframes before; raw (m, d), the residuals; per_effective, rows
+    k (m,) are the keyframes before. A subclass sets raw (m, d), the residuals; per_effective, rows
     per independent row; share (m,), the weight of the correlated fix error of the keyframe after,
     in rows of three components, or None. It implements ``jacobians`` and ``stated``. Weighted are
     r (m, d), J (m, d, n + M), and J_end (m, 3, 3) by that correlated error, or None.
@@ -49,6 +50,9 @@ class PointRows(Factor):
     raw: Floats
     per_effective = 1.0
     share: Floats | None = None
+
+    def __init__(self, points: Points) -> None:
+        self.k = points.interval
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:

@@ -18,11 +18,10 @@ from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
 from odocal_ros.estimator.outside import Outside
-from odocal_ros.estimator.preintegrate import turn
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BA, BARE, BG, M, P, PHI, PRESSURE, V
+from odocal_ros.estimator.state import BA, BARE, BG, GYRO, M, P, PHI, PRESSURE, V
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.rotations import skew
+from odocal_ros.nav.rotations import skew, turn
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
@@ -97,7 +96,8 @@ class PressureRows(OutsideRows):
         t = tau[:, None, None]
         J[:, :, P], J[:, :, V] = -up, -up * t - by_velocity
         J[:, :, PHI] = up @ skew(dp) + by_velocity @ skew(dv)
-        J[:, :, BA] = up @ C @ points.AA + by_velocity @ C * t
-        J[:, :, BG] = -(up @ skew(dp) / 3 + by_velocity @ skew(dv) / 2) @ C * t
+        J[:, :, BA] = up @ C @ points.AA + by_velocity @ C @ points.A
+        by_gyro = -up @ C @ points.dp_by - by_velocity @ C @ points.dv_by
+        J[:, :, BG], c[:, :, GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
         c[:, 0, PRESSURE] = -by_constants
         return Rows(k, raw[:, None], J, c, 1 / sent.sigma[:, None])

@@ -80,7 +80,7 @@ class PriorRows(Factor):
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
         self.own = problem.own | {'slow_fix_errors': constants_from('fix_height_drift')}
-        self.level = not problem.leg.felt
+        self.no_heights = bool(np.isnan(problem.leg.fixes_n[:, 2]).all())
         self.shared = {name: where for name, where in SHARED.items()
                        if (problem.priors.constants[where] > NO_ERROR).any()}
 
@@ -99,10 +99,11 @@ class PriorRows(Factor):
 
     def sizes(self, marginals: JointMarginals) -> dict[str, float]:
         """
-        Return the most likely size of each type, all else as it is: docs/method.md (S29).
+        Return the expected size of each type, all else as it is: docs/method.md (S29).
 
         An imperfection is weighted by the share of the drive in its information: a model error
-        elsewhere would move the size of one that is hardly observable.
+        elsewhere would move the size of one that is hardly observable. Of the wide prior of a
+        rare effect the most likely size: its mean is that of the few who have it.
         """
         at = 2 * self.n + np.arange(IMPERFECT.start, IMPERFECT.stop)
         usual = self.base.constants[IMPERFECT]**2
@@ -114,8 +115,11 @@ class PriorRows(Factor):
         variance = np.exp(LOG_SIZES)[:, None] * usual + 1 / data
         off = (known * (found / variance + np.log(variance))) @ np.eye(len(SIZES))[KIND_OF]
         spread = np.array([SIZE_SPREADS[name] for name in SIZES])
-        best = np.argmin(off + ((LOG_SIZES[:, None] - np.log(SIZE)) / spread)**2, axis=0)
-        return dict(zip(SIZES, np.exp(LOG_SIZES[best]).tolist(), strict=True))
+        cost = off + ((LOG_SIZES[:, None] - np.log(SIZE)) / spread)**2
+        likely = np.exp(LOG_SIZES[np.argmin(cost, axis=0)])
+        mean = np.average(np.broadcast_to(np.exp(LOG_SIZES)[:, None], cost.shape), axis=0,
+                          weights=np.exp((cost.min(axis=0) - cost) / 2))
+        return dict(zip(SIZES, np.where(spread > 1, likely, mean).tolist(), strict=True))
 
     def add_levels(self, out: LevelSides) -> None:
         """Add the right-hand sides of the sizes."""
@@ -138,7 +142,7 @@ class PriorRows(Factor):
         """Add the rows to normal equations; the first keyframe has a wide prior at its value."""
         for columns, sigma in START_SIGMAS.values():
             add_prior(out, 0, columns, sigma**2, 0.0)
-        if self.level:
+        if self.no_heights:
             add_prior(out, 0, UP, LEVEL_START**2, 0.0)
         for columns, value, sigma in self._biases():
             add_prior(out, 0, columns, sigma**2, value)

@@ -17,7 +17,6 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
-from odocal_ros.estimator.preintegrate import turn
 from odocal_ros.estimator.state import (
     ACCEL,
     ACCEL_AXIS,
@@ -30,7 +29,7 @@ from odocal_ros.estimator.state import (
     PHI,
     V,
 )
-from odocal_ros.nav.rotations import transpose
+from odocal_ros.nav.rotations import transpose, turn
 
 # definition: the axis whose force is gravity and heave; signals of a gyro from there on are forces
 UPRIGHT, FORCES = 2, 3

@@ -17,7 +17,6 @@ from odocal_ros.estimator.factors.factor import (
     JUMP,
     LinearisationPoint,
 )
-from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
@@ -53,7 +52,7 @@ class SlowError(Factor):
         """Return initial levels by the stated sigmas of the fixes, and minimum levels."""
         gain = 2 * problem.fix_sigma**2 / USUAL_TIME
         return {'slow': gain, 'slow_up': 4 * gain}, {
-            **dict.fromkeys(('slow', 'slow_up'), 2 * LEAST.fix**2 / USUAL_TIME),
+            **dict.fromkeys(('slow', 'slow_up'), 2 * problem.fix_least**2 / USUAL_TIME),
             'correlation_time': 5.0}      # s: less is not separable from white
 
     def in_use(self, levels: Levels) -> bool:

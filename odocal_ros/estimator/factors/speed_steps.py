@@ -15,13 +15,14 @@ from odocal_ros.estimator.factors.axle import Axle, varies_with
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import PointRows
-from odocal_ros.estimator.preintegrate import turn
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
     ACCEL,
     BA,
     BG,
-    GYRO_SCALE,
+    GYRO,
+    GYRO_AXIS,
+    GYRO_SIGNAL,
     LN_K,
     M,
     ODO_ARM,
@@ -35,6 +36,7 @@ from odocal_ros.estimator.state import (
     YAW,
 )
 from odocal_ros.nav.coarse_speed import SpeedInstants
+from odocal_ros.nav.rotations import turn
 
 
 class SpeedSteps(PointRows):
@@ -45,8 +47,8 @@ class SpeedSteps(PointRows):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         leg, state, points = problem.leg, point.state, point.points[self.name]
-        self.state, self.points = state, points
-        self.instants, self.k = _within(problem), points.interval
+        super().__init__(points)
+        self.state, self.points, self.instants = state, points, _within(problem)
         self.sigma = self.instants.sigma * leg.rough_scale
         # at an even acceleration the speed is at the same place of its cell again and again
         self.per_effective = problem.per_effective.get(self.name, 1.0)
@@ -102,13 +104,17 @@ class SpeedSteps(PointRows):
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
         """Return derivatives by the keyframe before and by constants: (m, 1, n), (m, 1, M)."""
-        state, ahead, v, tau = self.state, self.ahead, self.v_n, self.points.tau[:, None]
+        state, ahead, v = self.state, self.ahead, self.v_n
         J, c = np.zeros((len(v), n)), np.zeros((len(v), M))
         J[:, V], J[:, PHI] = -ahead, -np.cross(ahead, v - self.dv)
-        J[:, BA] = turn(np.swapaxes(self.C, 1, 2), ahead) * tau
+        J[:, BA] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.A)
         arm = state.C_bv @ self.arm_v
-        turned = np.cross(ahead, v) - np.cross(ahead, self.dv) / 2
-        J[:, BG] = turn(np.swapaxes(self.C, 1, 2), turned) * tau + np.cross(arm, state.forward)
+        by_rate = np.cross(arm, state.forward)
+        by_gyro = np.einsum('ki,kij->kj', np.cross(ahead, v), self.C @ self.points.turned) \
+            - np.einsum('ki,kij->kj', ahead, self.C @ self.points.dv_by)
+        J[:, BG] = by_gyro[:, :3] + by_rate
+        c[:, GYRO] = by_gyro[:, 3:] + (by_rate[list(GYRO_AXIS)]
+                                       * self.points.measured[:, GYRO_SIGNAL])
         K = state.scale * self.varied
         # by what is said: the speed lies anywhere in its cell, so the error is the speed's alone
         c[:, LN_K], c[:, SPEED_OFFSET] = self.said, K * self.instants.side
@@ -119,7 +125,6 @@ class SpeedSteps(PointRows):
                 rate, gradient @ self.arm_v) @ state.forward
         c[:, ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
         c[:, ODO_DELAY], c[:, ODO_CLOCK] = self.gained, self.gained * self.instants.t
-        c[:, GYRO_SCALE] = J[:, BG.start + 2] * rate[:, 2]
         c[:, ACCEL] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.F)
         return J[:, None], c[:, None]
 

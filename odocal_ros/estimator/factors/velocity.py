@@ -19,7 +19,6 @@ from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
 from odocal_ros.estimator.outside import from_place, Outside, thinned
-from odocal_ros.estimator.preintegrate import Points, turn
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
     ACCEL,
@@ -29,7 +28,9 @@ from odocal_ros.estimator.state import (
     BARE,
     BG,
     GNSS_ARM,
-    GYRO_SCALE,
+    GYRO,
+    GYRO_AXIS,
+    GYRO_SIGNAL,
     M,
     PHI,
     PITCH,
@@ -40,9 +41,10 @@ from odocal_ros.estimator.state import (
     VELOCITY_SCALE,
     YAW,
 )
+from odocal_ros.estimator.sums import Points
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.receiver_filter import smoothing
-from odocal_ros.nav.rotations import skew, transpose
+from odocal_ros.nav.rotations import skew, transpose, turn
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
@@ -132,18 +134,19 @@ def _velocity(problem: Problem, point: LinearisationPoint, points: Points) -> Ro
     # on the prediction: on what is sent it would be on its noise too, and the smallest fit best
     times = 1 + state.constants[VELOCITY_SCALE]
     m, t, rate = len(k), tau[:, :, None], point.intervals.mean_rate[k]
+    measured = np.concatenate([rate, point.intervals.mean_force[k]], axis=1)[:, None]
     J, c = np.zeros((m, 3, BARE)), np.zeros((m, 3, M))
     J[:, :, V] = -np.eye(3)
     J[:, :, PHI] = skew(dv + swing)
-    J[:, :, BA] = C * t
-    # a turn rate less by the bias: half the turn acts on what force did, all of it on the arm
-    J[:, :, BG] = -(skew(dv) / 2 + skew(swing)) @ C * t - C_t @ skew(arm_b)
+    J[:, :, BA] = C @ points.A
+    by_gyro, by_rate = -C @ points.dv_by - skew(swing) @ C @ points.turned, -C_t @ skew(arm_b)
+    J[:, :, BG] = by_gyro[:, :, :3] + by_rate
+    c[:, :, GYRO] = by_gyro[:, :, 3:] + by_rate[:, :, GYRO_AXIS] * measured[:, :, GYRO_SIGNAL]
     by_yaw, by_pitch = state.C_bv_gradient
     W = C_t @ skew(rate)
     c[:, :, YAW], c[:, :, PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
     c[:, :, GNSS_ARM] = -W @ state.C_bv
     c[:, :, VELOCITY_DELAY], c[:, :, VELOCITY_LAG2] = faster, -by_lag
-    c[:, :, GYRO_SCALE] = J[:, :, BG.start + 2] * rate[:, 2:]
     force, signals = turn(transpose(C), faster - g), np.zeros((m, 3, len(ACCEL_AXIS)))
     # as fitted, (m, 3) m/s^2, by the axes that it enters
     signals[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]

@@ -1,0 +1,66 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What preintegration returns, docs/method.md (S4): sums over intervals, and to times in them."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """Sums over K intervals of length T, s; (K, ...) in the body frame at each begin."""
+
+    T: Floats        # (K,)
+    R: Floats        # (K, 3, 3) attitude at the end
+    dv: Floats       # (K, 3) m/s
+    dp: Floats       # (K, 3) m
+    A: Floats        # (K, 3, 3) integral of R, s: d dv = -A d ba
+    AA: Floats       # (K, 3, 3) its integral: d dp = -AA d ba
+    F: Floats        # (K, 3, a) integral of R's columns ACCEL_AXIS times the forces ACCEL_SIGNAL
+    #                  as measured: d dv = -F d constants; A times the mean force may be
+    #                  millimetres off, which would determine a scale that is not observable
+    FF: Floats       # (K, 3, a) its integral: d dp = -FF d constants
+    # by the gyro bias (3) and by the constants of GYRO (g)
+    turned: Floats   # (K, 3, 3 + g) the end turns by -turned d; the first three are A
+    dv_by: Floats    # (K, 3, 3 + g) derivative of dv
+    dp_by: Floats    # (K, 3, 3 + g)
+    S: Floats        # (K, 3, 3) sum of R over travel, scale units
+    S_by: Floats     # (K, 3, 3 + g) derivative of S @ forward
+    mean_rate: Floats   # (K, 3) mean turn rate as measured, bias and all, rad/s
+    mean_force: Floats  # (K, 3) mean specific force as measured, m/s^2
+    longest_step: Floats   # (K,) longest gap between IMU rows, s
+
+    def take(self, rows: slice) -> 'Intervals':
+        """Return the intervals of a slice."""
+        return Intervals(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Sums from the begin of an interval to m times within it."""
+
+    interval: NDArray[np.int64]   # (m,)
+    tau: Floats      # (m,) s since the begin
+    dv: Floats       # (m, 3)
+    dp: Floats       # (m, 3)
+    R: Floats        # (m, 3, 3)
+    A: Floats        # (m, 3, 3)
+    AA: Floats       # (m, 3, 3)
+    F: Floats        # (m, 3, a)
+    FF: Floats       # (m, 3, a)
+    turned: Floats   # (m, 3, 3 + g)
+    dv_by: Floats    # (m, 3, 3 + g)
+    dp_by: Floats    # (m, 3, 3 + g)
+    force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
+    rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
+    spin: Floats     # (m, 3) rad/s^2, by which that rises
+    measured: Floats    # (m, 6) turn rate and specific force as measured, means of the step
+
+    def take(self, index: Ints) -> 'Points':
+        """Return the points that an index picks."""
+        return Points(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
