@@ -83,7 +83,9 @@ def usable_fixes(fix: FixSamples, sent: int,
 
 
 def _invalid(fix: FixSamples, lost: Bools) -> str:
-    """Return what the invalid positions are, with the first one as an example."""
+    """Return a phrase for the invalid positions of a mask, with the first one as an example."""
+    if not lost.any():
+        return ''
     first = int(np.argmax(lost))
     latitude, longitude = np.degrees([fix.latitude[first], fix.longitude[first]])
     return (f'at an invalid position (the first: latitude {latitude:.6g}, longitude '

@@ -50,7 +50,7 @@ def felt(f_i: Floats) -> bool:
 
 def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
     """
-    Return why the accelerations of a leg cannot be used, '' if they can.
+    Return the cause for which the accelerations of a leg cannot be used, '' if they can.
 
     They are level only with turn rates about all axes: an axis that is always zero has no gyro.
     """
