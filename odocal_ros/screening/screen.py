@@ -7,7 +7,6 @@ Screening: from a raw leg to clean arrays on one time axis, with a reason for ea
 Times are s since the start mark, an IMU stamp: its time offset is subtracted from the others'.
 """
 
-from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,10 +29,9 @@ from odocal_ros.screening.inputs import Inputs, place, UsableRows
 from odocal_ros.screening.leg_kind import with_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import topic_gap, usable_rows
+from odocal_ros.screening.several_imus import alternating, other_imus
 from odocal_ros.screening.wheel_travel import Wheels, wheels
-from odocal_ros.settings.config import Config, ImuConfig, SIDES
-
-MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not a second IMU
+from odocal_ros.settings.config import Config, SIDES
 
 
 def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
@@ -45,7 +43,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     """
     leg, unfelt = with_force(leg, config)
     leg, local = without_north(leg, config)
-    found: list[Reason] = [*unfelt, *local, *_other_imus(leg, config.imu)]
+    found: list[Reason] = [*unfelt, *local, *other_imus(leg, config.imu)]
     found += _missing(leg, found)
     if judged:
         found += judge_clocks(leg, config)
@@ -54,6 +52,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     inputs = replace(inputs, felt=not unfelt, local=bool(local))
     found += _wheel_gaps(leg, rows.wheels)
     if judged:
+        found += alternating(rows.imu.w_i, rows.imu.f_i)
         found += frozen(inputs.t_imu, rows.imu.w_i, rows.wheels.mean, config.leg.max_gap)
         wheels, why = _axles(inputs, rows.wheels)
         inputs = replace(inputs, **_travel(leg, wheels))
@@ -188,24 +187,3 @@ def _turned(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:
         return vector_i if scale == 1.0 else vector_i * scale
     x, y, z = vector_i.T
     return np.stack([x * a + y * b + z * c for a, b, c in scale * C_bi], -1)
-
-
-def _other_imus(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
-    """Return the reasons about messages whose frame_id is not that of the IMU in use."""
-    other = leg.imu_other
-    count, total = len(other.stamp_ns), len(other.stamp_ns) + len(leg.imu.stamp_ns)
-    if not count or (imu.frame_id and len(leg.imu.stamp_ns)):
-        return ()
-    frames = Counter(frame.decode(errors='replace') for frame in other.frame.tolist())
-    names = ', '.join(f'{n} of {frame!r}' for frame, n in frames.most_common(3))
-    used = other.used[-1].decode(errors='replace')
-    if imu.frame_id:
-        return (Reason(Code.NO_IMU, f'no IMU message has the frame_id {used!r} of imu.frame_id; '
-                       f'received: {names}', 'Set imu.frame_id to a frame_id that is sent.'),)
-    if count < MIXED_SHARE * total:
-        return (Reason(Code.BAD_ROWS_DROPPED, f'{count} of {total} IMU messages have another '
-                       f'frame_id than {used!r} ({names}); dropped'),)
-    return (Reason(Code.SEVERAL_IMUS, f'the IMU topic carries several IMUs: '
-                   f'{len(leg.imu.stamp_ns)} messages of {used!r}, {names}; only {used!r} was '
-                   'used', f'Set imu.frame_id to the IMU to calibrate (imu.frame_id: {used!r}), '
-                   'or publish each IMU on its own topic.'),)

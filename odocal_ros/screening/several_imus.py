@@ -1,0 +1,85 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Several IMUs on one topic: by their frame_ids, or by rows that alternate."""
+
+from collections import Counter
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.leg import Leg
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import ImuConfig
+
+MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not a second IMU
+# judgement, of rows that may alternate: rows of a mean; means needed, and the most that are looked
+# at, which end with the leg; times the median, an outlier; share of rows that repeat
+MEAN_ROWS, FEWEST_MEANS, MOST_MEANS, OUTLYING, REPEATED = 50, 40, 2000, 10.0, 0.2
+# statistical: F of a constant and the signals in the differences of odd and even rows. Of one IMU
+# it is 14 at most (25 zoo drives); with an axis 3 deg off or other biases 50 and more
+SURE_F = 30.0
+# judgement: least size of what they explain, in variances of a mean of white noise; 2.7 is that of
+# a mean over that of a row. Smooth signals without noise have none of it
+LEAST_POWER = 0.1 * 8 / 3
+
+
+def other_imus(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
+    """Return the reasons about messages whose frame_id is not that of the IMU in use."""
+    other = leg.imu_other
+    count, total = len(other.stamp_ns), len(other.stamp_ns) + len(leg.imu.stamp_ns)
+    if not count or (imu.frame_id and len(leg.imu.stamp_ns)):
+        return ()
+    frames = Counter(frame.decode(errors='replace') for frame in other.frame.tolist())
+    names = ', '.join(f'{n} of {frame!r}' for frame, n in frames.most_common(3))
+    used = other.used[-1].decode(errors='replace')
+    if imu.frame_id:
+        return (Reason(Code.NO_IMU, f'no IMU message has the frame_id {used!r} of imu.frame_id; '
+                       f'received: {names}', 'Set imu.frame_id to a frame_id that is sent.'),)
+    if count < MIXED_SHARE * total:
+        return (Reason(Code.BAD_ROWS_DROPPED, f'{count} of {total} IMU messages have another '
+                       f'frame_id than {used!r} ({names}); dropped'),)
+    return (Reason(Code.SEVERAL_IMUS, f'the IMU topic carries several IMUs: '
+                   f'{len(leg.imu.stamp_ns)} messages of {used!r}, {names}; only {used!r} was '
+                   'used', f'Set imu.frame_id to the IMU to calibrate (imu.frame_id: {used!r}), '
+                   'or publish each IMU on its own topic.'),)
+
+
+def alternating(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
+    """
+    Return SEVERAL_IMUS if every second row is of another IMU.
+
+    w_i, f_i : (n, 3) turn rates and specific forces, in any unit.
+    """
+    share = max(_share_of_two(w_i), _share_of_two(f_i))
+    if not share:
+        return ()
+    return (Reason(Code.SEVERAL_IMUS, 'the IMU topic carries two IMUs: every second message has '
+                   f'other axes or biases ({100 * share:.0f} % of the differences between odd and '
+                   'even messages are constant or in proportion to the signal)',
+                   'Stop the second publisher, or publish each IMU on its own topic.'),)
+
+
+def _share_of_two(x: Floats) -> float:
+    """Return the share of odd less even rows that a second IMU explains, 0: none; x (n, 3)."""
+    x = x[-MOST_MEANS * MEAN_ROWS - 2:]
+    count = (len(x) - 2) // MEAN_ROWS
+    if count < FEWEST_MEANS or (x[1:] == x[:-1]).all(axis=1).mean() > REPEATED:
+        return 0.0
+    rows = np.where(np.arange(len(x) - 2) % 2, -0.5, 0.5)[:, None] \
+        * (x[1:-1] - (x[:-2] + x[2:]) / 2)
+    parts = rows[:count * MEAN_ROWS].reshape(count, MEAN_ROWS, 3)
+    off = parts.mean(axis=1)
+    size = np.abs(off).max(axis=1)
+    good = size <= OUTLYING * np.median(size)
+    mean = x[1:count * MEAN_ROWS + 1].reshape(parts.shape).mean(axis=1)[good]
+    off, A = off[good], np.column_stack([np.ones(len(mean)), mean])
+    free = len(off) - A.shape[1]
+    if free < FEWEST_MEANS // 2:
+        return 0.0
+    left = ((off - A @ np.linalg.lstsq(A, off, rcond=None)[0])**2).sum(axis=0)
+    total = (off**2).sum(axis=0)
+    explained, power = total - left, (parts[good]**2).mean(axis=(0, 1))
+    sure = (explained * free > SURE_F * A.shape[1] * left) & (
+        explained / len(off) > LEAST_POWER * power / MEAN_ROWS)
+    return float((explained[sure] / total[sure]).max(initial=0.0))
