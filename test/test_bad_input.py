@@ -250,8 +250,7 @@ def test_a_quarter_turn_is_told_with_the_setting_that_undoes_it(town):
     result, _ = run(spoilt('imu', w_i=sideways, f_i=sideways)(town.leg()), settings(town))
     (reason,) = (r for r in result.reasons if r.code is Code.IMU_AXES)
     rpy = json.loads(re.search(r"--set 'imu.mounting_rpy=(\[.*?\])'", reason.remedy)[1])
-    np.testing.assert_allclose(matrix_from_rpy(rpy), [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
-                               atol=1e-8)
+    np.testing.assert_allclose(matrix_from_rpy(rpy), [[0, 0, -1], [0, 1, 0], [1, 0, 0]], atol=1e-8)
     # refused, it still knows how far it was: knots on fixes cut corners by some per cent
     assert result.distance == pytest.approx(town.truth.distance, rel=0.05)
 

@@ -115,8 +115,7 @@ def test_the_bag_holds_what_the_folder_held(made, drive):
     wheels = read_bag(made / 'bag', topics | {'odometer': '/wheel_states'},
                       {'odometer.left': 'rear_left', 'odometer.right': 'rear_right'})
     assert (wheels.form.quantity, wheels.form.scale_unit) == ('rate', 'm/rad')
-    np.testing.assert_allclose(wheels.samples('odometer_right').value,
-                               1.01 * drive.odometer.value)
+    np.testing.assert_allclose(wheels.samples('odometer_right').value, 1.01 * drive.odometer.value)
 
 
 def test_its_calibration_stands_beside_its_truth(made, drive, tmp_path, capsys):

@@ -65,8 +65,7 @@ def test_a_driver_that_sends_nan_now_and_then_is_no_damage(made):
 
     def gaps(column):
         column[::50] = np.nan
-    said = everything_said(calibrate(replace(leg, imu=changed(leg.imu, w_i=gaps)),
-                                     settings(made)))
+    said = everything_said(calibrate(replace(leg, imu=changed(leg.imu, w_i=gaps)), settings(made)))
     assert Code.BAD_ROWS_DROPPED in said
     assert Code.ROWS_DAMAGED not in said
 

@@ -71,8 +71,7 @@ def test_the_sdist_holds_what_the_repository_holds(distributions):
 def test_the_wheel_holds_the_package_and_its_files(distributions):
     with zipfile.ZipFile(distributions[1]) as wheel:
         held = set(wheel.namelist())
-        about = email.message_from_bytes(
-            wheel.read(f'odocal_ros-{VERSION}.dist-info/METADATA'))
+        about = email.message_from_bytes(wheel.read(f'odocal_ros-{VERSION}.dist-info/METADATA'))
         entries = wheel.read(f'odocal_ros-{VERSION}.dist-info/entry_points.txt').decode()
     package = {name for name in repository_files() if name.startswith('odocal_ros/')}
     assert {name for name in held if name.startswith('odocal_ros/')} == package

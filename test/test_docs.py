@@ -245,6 +245,5 @@ def test_a_plan_says_what_the_page_quotes(capsys):
     for command in words:
         assert cli.main([*command, '--json']) == 0
         sigmas.append(json.loads(capsys.readouterr().out))
-    found = [plan['methods']['two_point']['estimates']['scale_factor']['sigma']
-             for plan in sigmas]
+    found = [plan['methods']['two_point']['estimates']['scale_factor']['sigma'] for plan in sigmas]
     assert found == pytest.approx([2000e-6, 30e-6], rel=0.2)

@@ -160,8 +160,7 @@ def test_docstrings_and_comments_are_plain():
 
 def test_docstrings_say_what_is_returned():
     vague = re.compile(r'Returns? (?:what|how|why|whether|where|which|when)\b|(?:Tell|Say)s?\b')
-    found = [f'{where}: {text.splitlines()[0]}' for where, text in remarks()
-             if vague.match(text)]
+    found = [f'{where}: {text.splitlines()[0]}' for where, text in remarks() if vague.match(text)]
     assert not found, '\n'.join(found)
 
 

@@ -41,8 +41,7 @@ def recording(data_dir, tmp_path_factory):
                 links[link.topic] = writer.add_connection(TOPICS[link.topic], link.msgtype,
                                                           typestore=ROS1)
             message = as_ros1(bag.deserialize(raw, link.msgtype), link.msgtype)
-            writer.write(links[link.topic], arrival,
-                         ROS1.serialize_ros1(message, link.msgtype))
+            writer.write(links[link.topic], arrival, ROS1.serialize_ros1(message, link.msgtype))
     return path, source
 
 

@@ -87,8 +87,7 @@ def test_plotjuggler_has_its_parts_and_subscribes_what_it_draws():
     root = shown.plotjuggler()
     assert root.tag == 'root'
     for splitter in root.iter('DockSplitter'):
-        assert int(splitter.get('count')) == len(splitter) == len(
-            splitter.get('sizes').split(';'))
+        assert int(splitter.get('count')) == len(splitter) == len(splitter.get('sizes').split(';'))
     assert len(list(root.iter('Tab'))) == 3
     wanted = {t for t in ('/calibrator/status', '/imu/data', '/odometer')
               if any(name.startswith(t + '/') for name in shown.curves())}

@@ -117,8 +117,7 @@ def test_a_steered_wheel_on_a_circle_rolls_about_the_centre():
     t = np.arange(0.0, 60.0, 0.1)
     s, turn = speed * t, speed * t / R
     more = x**2 * steering_path(t, turn, s, x, y)
-    np.testing.assert_allclose(more, (np.hypot(R - y, x) - (R - y)) / R * s, rtol=1e-9,
-                               atol=1e-9)
+    np.testing.assert_allclose(more, (np.hypot(R - y, x) - (R - y)) / R * s, rtol=1e-9, atol=1e-9)
     small = steering_path(t, turn, s)
     np.testing.assert_allclose(small, s / R**2 / 2, rtol=1e-9, atol=1e-9)
     back = steering_path(t, -turn, -s, x, y)

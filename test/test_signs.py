@@ -16,8 +16,7 @@ from odocal_ros.nav.rotations import matrix_from_quat, rpy_from_matrix
 from odocal_ros.screening.screen import screen
 
 PAGE = (Path(__file__).resolve().parent.parent / 'docs' / 'conventions.md').read_text()
-STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'fix_noise': 'rtk',
-            'imu_grade': 'perfect'}
+STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'fix_noise': 'rtk', 'imu_grade': 'perfect'}
 TURN = {'scenario': 'out_and_back', 'duration': 300.0, 'imu_grade': 'perfect'}
 
 

@@ -100,8 +100,7 @@ class Errors:
     @staticmethod
     def road(path_length: float) -> Floats:
         """Return the variance of travel by slip and sideslip along, left and up, m^2."""
-        variance: Floats = ROAD_PER_METRE**2 * abs(path_length)
-        return variance
+        return ROAD_PER_METRE**2 * abs(path_length)
 
     def lost(self, path_length: float) -> None:
         """Add travel, m, of unknown direction."""
@@ -149,8 +148,7 @@ class Errors:
         gain[observed] = np.linalg.solve(S, H @ cov)[:, observed].T
         keep = np.eye(N) - gain @ H
         self.cov = keep @ cov @ keep.T + gain @ R @ gain.T
-        by: Floats = gain @ z
-        return by
+        return gain @ z
 
     def pose(self, C_nb: Floats, arm_n: Floats) -> Floats:
         """

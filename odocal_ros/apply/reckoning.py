@@ -198,9 +198,8 @@ class Reckoning:
         moved = self.wheels.at(t) - self.wheels.at(t - SPEED_SPAN)
         arm_b = v.C_vb.T @ self.config.imu.lever_arm + v.arm_b
         rate = self.imu.w_b[self.imu.at] - self.bias
-        velocity: Floats = C_nb @ (
+        return C_nb @ (
             v.forward_b * moved / SPEED_SPAN + cross(rate.tolist(), arm_b.tolist()))
-        return velocity
 
     def _look(self) -> None:
         """Correct tilt and gyro bias, a second after the last time."""

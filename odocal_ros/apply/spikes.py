@@ -161,8 +161,7 @@ class SpikeScreen:
         return calm
 
     def _allowed(self) -> Floats:
-        allowed: Floats = np.maximum(1.0, USUAL_STEPS * self._usual)
-        return allowed
+        return np.maximum(1.0, USUAL_STEPS * self._usual)
 
     def _learn(self, steps: Floats) -> None:
         most = 4 * self._usual + 1 / USUAL_STEPS       # one spike hardly changes the usual size

@@ -73,11 +73,7 @@ class Vehicle:
 
 
 def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
-    """
-    Return the vehicle of a calibration's estimates.
-
-    Raises BadConfig: they hold no scale factor, or more than two wheels are configured.
-    """
+    """Return the vehicle; BadConfig without a scale factor, or with more than two wheels."""
     def estimate_of(name: str, otherwise: float, sigma: float = 0.0) -> tuple[float, float]:
         e = estimates.get(name)
         if e is None or e.value is None:

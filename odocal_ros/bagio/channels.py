@@ -32,7 +32,6 @@ class FileBytes:
         self._size = os.fstat(self._file.fileno()).st_size
 
     def __len__(self) -> int:
-        """Return the size."""
         return self._size
 
     def __getitem__(self, place: slice) -> bytes:
@@ -48,7 +47,6 @@ class FileBytes:
         return parts[0] if len(parts) == 1 else b''.join(parts)
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
 
@@ -88,7 +86,6 @@ class Recording:
         return None
 
     def close(self) -> None:
-        """Close the file."""
         raise NotImplementedError
 
     def _scan(self) -> Iterator[tuple[int, int]]:

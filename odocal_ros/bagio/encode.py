@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
     ImuSamples,
     OdometerSamples,
+    Samples,
     ScalarSamples,
     VelocitySamples,
 )
@@ -89,9 +90,14 @@ class _Layout:
             return out
         return pack
 
-
-def _stamp(out: NDArray[Any], stamp_ns: Ints) -> None:
-    out['sec'], out['nanosec'] = stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000
+    def topic(self, name: str, msgtype: str, samples: Samples,
+              fill: Callable[[NDArray[Any], slice], None]) -> Topic:
+        """Return the topic of stamped samples, ``fill`` setting the fields but the stamp."""
+        def stamped(out: NDArray[Any], rows: slice) -> None:
+            out['sec'], out['nanosec'] = np.divmod(samples.stamp_ns[rows], 10**9)
+            fill(out, rows)
+        return Topic(name, msgtype, samples.received_ns,
+                     self.packer(stamped, len(samples.stamp_ns)))
 
 
 def _imu_layout(frame: str) -> _Layout:
@@ -110,29 +116,21 @@ def imu(name: str, samples: ImuSamples, frame: str = 'imu_link', w_variance: Flo
 
     w_variance, f_variance : (n, 3), optional, of turn rates and forces; else zeros: unknown.
     """
-    layout = _imu_layout(frame)
-
     def fill(out: NDArray[Any], rows: slice) -> None:
-        _stamp(out, samples.stamp_ns[rows])
         out['w'], out['f'] = samples.w_i[rows], samples.f_i[rows]
         for field, variance in (('w_cov', w_variance), ('f_cov', f_variance)):
             if variance is not None:
                 out[field][:, ::4] = variance[rows]
         _orientation(out, samples.q_ni[rows], samples.yaw_variance[rows])
-    return Topic(name, 'sensor_msgs/msg/Imu', samples.received_ns,
-                 layout.packer(fill, len(samples.stamp_ns)))
+    return _imu_layout(frame).topic(name, 'sensor_msgs/msg/Imu', samples, fill)
 
 
 def heading(name: str, samples: HeadingSamples, frame: str = 'imu_link') -> Topic:
     """Return sensor_msgs/Imu of HeadingSamples: an orientation, no rates (covariance -1)."""
-    layout = _imu_layout(frame)
-
     def fill(out: NDArray[Any], rows: slice) -> None:
-        _stamp(out, samples.stamp_ns[rows])
         out['w_cov'][:, 0] = out['f_cov'][:, 0] = -1.0
         _orientation(out, samples.q_ni[rows], samples.yaw_variance[rows])
-    return Topic(name, 'sensor_msgs/msg/Imu', samples.received_ns,
-                 layout.packer(fill, len(samples.stamp_ns)))
+    return _imu_layout(frame).topic(name, 'sensor_msgs/msg/Imu', samples, fill)
 
 
 def _orientation(out: NDArray[Any], q_ni: Floats, variance: Floats) -> None:
@@ -154,10 +152,8 @@ def twist(name: str, samples: OdometerSamples, frame: str = 'base_link') -> Topi
     layout = _Layout().header(frame).add('linear', VECTOR).add('angular', VECTOR)
 
     def fill(out: NDArray[Any], rows: slice) -> None:
-        _stamp(out, samples.stamp_ns[rows])
         out['linear'][:, 0] = samples.value[rows]
-    return Topic(name, 'geometry_msgs/msg/TwistStamped', samples.received_ns,
-                 layout.packer(fill, len(samples.stamp_ns)))
+    return layout.topic(name, 'geometry_msgs/msg/TwistStamped', samples, fill)
 
 
 def joints(name: str, wheels: dict[str, OdometerSamples], frame: str = '',
@@ -174,12 +170,10 @@ def joints(name: str, wheels: dict[str, OdometerSamples], frame: str = '',
             layout.add(joint, '<f8')
 
     def fill(out: NDArray[Any], rows: slice) -> None:
-        _stamp(out, first.stamp_ns[rows])
         out['names'] = out[given] = len(wheels)
         for joint, samples in wheels.items():
             out[joint] = samples.value[rows]
-    return Topic(name, 'sensor_msgs/msg/JointState', first.received_ns,
-                 layout.packer(fill, len(first.stamp_ns)))
+    return layout.topic(name, 'sensor_msgs/msg/JointState', first, fill)
 
 
 def fix(name: str, samples: FixSamples, frame: str = 'gnss') -> Topic:
@@ -188,15 +182,13 @@ def fix(name: str, samples: FixSamples, frame: str = 'gnss') -> Topic:
               .add('place', VECTOR).add('cov', SQUARE).add('cov_type', 'u1'))
 
     def fill(out: NDArray[Any], rows: slice) -> None:
-        _stamp(out, samples.stamp_ns[rows])
         out['status'], out['service'] = samples.status[rows], 1
         out['place'][:, 0] = np.degrees(samples.latitude[rows])
         out['place'][:, 1] = np.degrees(samples.longitude[rows])
         out['place'][:, 2] = samples.height[rows]
         out['cov'] = samples.covariance_n[rows].reshape(-1, 9)
         out['cov_type'] = samples.covariance_type[rows]
-    return Topic(name, 'sensor_msgs/msg/NavSatFix', samples.received_ns,
-                 layout.packer(fill, len(samples.stamp_ns)))
+    return layout.topic(name, 'sensor_msgs/msg/NavSatFix', samples, fill)
 
 
 def point(name: str, samples: FixSamples, position: Floats, frame: str = 'map') -> Topic:
@@ -224,7 +216,6 @@ def _positions(name: str, kind: str, samples: FixSamples, position: Floats,
     """Return a topic of positions, with what else the layout has: a rotation, a covariance."""
     def fill(out: NDArray[Any], rows: slice) -> None:
         fields = out.dtype.names or ()
-        _stamp(out, samples.stamp_ns[rows])
         out['place'] = position[rows]
         if 'q' in fields:
             out['q'][:, 3] = 1.0
@@ -232,8 +223,7 @@ def _positions(name: str, kind: str, samples: FixSamples, position: Floats,
             square = out['cov'].reshape(-1, 6, 6)
             square[:, :3, :3] = samples.covariance_n[rows]
             out['cov'] = square.reshape(-1, 36)
-    return Topic(name, f'geometry_msgs/msg/{kind}', samples.received_ns,
-                 layout.packer(fill, len(samples.stamp_ns)))
+    return layout.topic(name, f'geometry_msgs/msg/{kind}', samples, fill)
 
 
 def velocity(name: str, samples: VelocitySamples, frame: str = 'gnss') -> Topic:
@@ -242,11 +232,9 @@ def velocity(name: str, samples: VelocitySamples, frame: str = 'gnss') -> Topic:
         'cov', ('<f8', 36))
 
     def fill(out: NDArray[Any], rows: slice) -> None:
-        _stamp(out, samples.stamp_ns[rows])
         out['linear'] = samples.velocity_n[rows]
         out['cov'][:, :15:7] = samples.variance_n[rows]
-    return Topic(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples.received_ns,
-                 layout.packer(fill, len(samples.stamp_ns)))
+    return layout.topic(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples, fill)
 
 
 def pressure(name: str, samples: ScalarSamples, frame: str = 'imu') -> Topic:
@@ -254,10 +242,8 @@ def pressure(name: str, samples: ScalarSamples, frame: str = 'imu') -> Topic:
     layout = _Layout().header(frame).add('values', ('<f8', 2))
 
     def fill(out: NDArray[Any], rows: slice) -> None:
-        _stamp(out, samples.stamp_ns[rows])
         out['values'][:, 0], out['values'][:, 1] = samples.value[rows], samples.variance[rows]
-    return Topic(name, 'sensor_msgs/msg/FluidPressure', samples.received_ns,
-                 layout.packer(fill, len(samples.stamp_ns)))
+    return layout.topic(name, 'sensor_msgs/msg/FluidPressure', samples, fill)
 
 
 def camera(name: str, times_ns: Sequence[int], size: int, rng: np.random.Generator) -> Topic:
@@ -267,7 +253,7 @@ def camera(name: str, times_ns: Sequence[int], size: int, rng: np.random.Generat
               .add('data', ('u1', size)))
 
     def fill(out: NDArray[Any], rows: slice) -> None:
-        _stamp(out, time_ns[rows])
+        out['sec'], out['nanosec'] = np.divmod(time_ns[rows], 10**9)
         out['bytes'] = size
         out['data'] = np.frombuffer(rng.bytes(out['data'].size), np.uint8).reshape(-1, size)
     return Topic(name, 'sensor_msgs/msg/CompressedImage', time_ns,

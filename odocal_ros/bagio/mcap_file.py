@@ -165,9 +165,6 @@ class McapFile(Recording):
             yield from self._merged(together, wanted)
 
     def _merged(self, places: list[Place], wanted: Mapping[int, Channel]) -> Iterator[Entry]:
-        if len(places) == 1:
-            return iter(self._of(places[0], wanted))
-
         def lazily(place: Place) -> Iterator[Entry | tuple[int]]:
             yield (place.start_ns,)        # the chunk is unpacked when its turn has come
             yield from self._of(place, wanted)
@@ -197,17 +194,14 @@ class McapFile(Recording):
         for op, body, whole in records_of(self._file, len(MAGIC)):
             try:
                 if op == CHUNK:
-                    yield from self._chunk(body, cut=not whole)
+                    chunk = unpacked(body, 0, len(body), self._allowance, cut=not whole)
+                    yield from self._walked(chunk, cut=not whole)
                 elif op == MESSAGE:
                     yield self._message(body)
                 elif op in (SCHEMA, CHANNEL):
                     self._learn(op, body)
             except (Damaged, struct.error, UnicodeDecodeError) as error:
                 self.damage = self.damage or _said(error)
-
-    def _chunk(self, body: bytes, cut: bool = False) -> list[Entry]:
-        """Return the messages of a chunk by time; or Damaged. ``cut``: the file ends in it."""
-        return self._walked(unpacked(body, 0, len(body), self._allowance, cut), cut)
 
     # ---- records one by one ----------------------------------------------------------------
 
@@ -270,7 +264,6 @@ class McapFile(Recording):
             self._channels[key] = Channel(topic, name, 0, form, definition)
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
 

@@ -37,7 +37,6 @@ class Columns(NamedTuple):
     raws: Raws
 
     def take(self, rows: Rows) -> 'Columns':
-        """Return some rows."""
         return Columns(self.time_ns[rows], self.channel[rows], self.raws.take(rows))
 
 

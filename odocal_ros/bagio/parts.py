@@ -87,7 +87,6 @@ class Part:
             yield channel, time_ns, raw
 
     def close(self) -> None:
-        """Close the file."""
         with suppress(Exception):
             self._file.close()
 

@@ -81,7 +81,6 @@ class Rosbag1File(Recording):
             yield channel, time_ns, raw
 
     def close(self) -> None:
-        """Close the file."""
         self._reader.close()
 
 

@@ -14,14 +14,7 @@ from typing import Any
 from odocal_ros.bagio.channels import possible
 from odocal_ros.bagio.segments import JOURNAL, without_joined
 from odocal_ros.errors import BadBag
-from odocal_ros.outside.limits import (
-    Allowance,
-    is_file,
-    LATEST_NS,
-    LimitReached,
-    read_text,
-    zstd_module,
-)
+from odocal_ros.outside import limits
 from odocal_ros.outside.yaml_files import loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
@@ -91,15 +84,16 @@ def _folder(path: Path) -> Source:
     known = _read_metadata(beside) if beside.exists() else None
     wanted = known.names if known else ()
     notes = [known.trouble] if known and known.trouble else []
-    files = _distinct([path / file for file in wanted if is_file(path / file)])
-    lost = [file for file in wanted if not is_file(path / file)]
+    files = _distinct([path / file for file in wanted if limits.is_file(path / file)])
+    lost = [file for file in wanted if not limits.is_file(path / file)]
     if lost and files:
         named = ', '.join(lost[:10]) + ' ...' * (len(lost) > 10)
         notes.append(f'{path}: {len(lost)} of {len(wanted)} files named in metadata.yaml are '
                      f'missing ({named}); the others are read')
     if not files:
         files = _distinct(sorted((f for f in path.iterdir()
-                                  if f.name.endswith(ENDINGS) and is_file(f)), key=_by_number))
+                                  if f.name.endswith(ENDINGS) and limits.is_file(f)),
+                                 key=_by_number))
         if (path / JOURNAL).exists():
             files = without_joined(files)
         if not files:
@@ -143,13 +137,13 @@ def _stem(path: Path) -> str:
 def _read_metadata(path: Path) -> Known:
     """Return the content of a metadata.yaml; with ``trouble`` if it is invalid."""
     import yaml
-    if not is_file(path):
+    if not limits.is_file(path):
         return Known(trouble=f'{path}: is not a regular file and is ignored')
     try:
-        return _known(yaml.load(read_text(path), Loader=loader(aliases=True)))
+        return _known(yaml.load(limits.read_text(path), Loader=loader(aliases=True)))
     except (OSError, MemoryError):
         raise
-    except LimitReached as error:
+    except limits.LimitReached as error:
         return Known(trouble=f'{error}; it is ignored')
     except Exception as error:      # of any kind: types, numbers, nesting, encoding
         why = ' '.join(str(error).split())[:100] or type(error).__name__
@@ -177,7 +171,7 @@ def _span(known: dict[str, Any]) -> Span | None:
     end_ns = (int(known['starting_time']['nanoseconds_since_epoch'])
               + int(known['duration']['nanoseconds']))
     count = int(known['message_count'])
-    if not (possible(end_ns) and 0 <= count < LATEST_NS):
+    if not (possible(end_ns) and 0 <= count < limits.LATEST_NS):
         raise ValueError('invalid times or counts')
     return Span(end_ns, count)
 
@@ -191,10 +185,10 @@ def unpack(path: Path, folder: Path, total: int) -> tuple[Path, str]:
     """
     kind = kind_of(path)
     if kind == '.zstd':
-        path = _decompressed(path, folder, Allowance(path, total))
+        path = _decompressed(path, folder, limits.Allowance(path, total))
         kind = kind_of(path)
     wal = path.with_name(path.name + '-wal')
-    if kind == '.db3' and is_file(wal) and wal.stat().st_size:
+    if kind == '.db3' and limits.is_file(wal) and wal.stat().st_size:
         path = _with_wal(path, wal, folder)
     if path.suffix != kind:
         link = folder / f'{path.name}{kind}'
@@ -205,7 +199,7 @@ def unpack(path: Path, folder: Path, total: int) -> tuple[Path, str]:
 
 def kind_of(path: Path) -> str:
     """Return the format of a file from its first bytes, or raise BadBag."""
-    if path.exists() and not is_file(path):
+    if path.exists() and not limits.is_file(path):
         raise BadBag(f'{path}: is not a regular file; give a bag file')
     with path.open('rb') as file:
         head = file.read(16)
@@ -217,9 +211,9 @@ def kind_of(path: Path) -> str:
                  'file')
 
 
-def _decompressed(path: Path, folder: Path, allowance: Allowance) -> Path:
+def _decompressed(path: Path, folder: Path, allowance: limits.Allowance) -> Path:
     """Decompress as much of a file as is there."""
-    zstd = zstd_module()
+    zstd = limits.zstd_module()
     target = folder / path.name.removesuffix('.zstd')
     with path.open('rb') as packed, target.open('wb') as out:
         frames = 1

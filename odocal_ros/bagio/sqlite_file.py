@@ -118,7 +118,6 @@ class Leaves:
         return b''.join(parts)
 
     def close(self) -> None:
-        """Close the file."""
         self._map.close()
 
 
@@ -283,7 +282,6 @@ class SqliteFile(Recording):
                          'first')
 
     def close(self) -> None:
-        """Close the file."""
         self._db.close()
         if self._leaves:
             self._leaves.close()

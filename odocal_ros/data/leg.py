@@ -175,8 +175,7 @@ def _key(samples: Samples) -> Ints:
 
 
 def _placed(stamp_ns: Ints, received_ns: Ints) -> Ints:
-    key: Ints = np.where(stamp_ns > 0, stamp_ns, received_ns)
-    return key
+    return np.where(stamp_ns > 0, stamp_ns, received_ns)
 
 
 def _cut(samples: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:

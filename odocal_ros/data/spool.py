@@ -41,7 +41,6 @@ class Rows:
         self._writes = True
 
     def feed(self, block: Samples) -> None:
-        """Append a block."""
         size = _size(block)
         self._fresh.append(block)
         self._fresh_size += size

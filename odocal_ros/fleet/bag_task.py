@@ -54,7 +54,6 @@ class BagJob:
         return key_of('failed', self.bag.bag, self.settings)
 
     def failed(self, reason: str, **more: Any) -> Row:
-        """Return the row of the bag, failed."""
         longest = 500    # characters of a reason
         return Row(key=self.place, bag=self.bag.bag, vehicle=self.bag.vehicle,
                    model=self.bag.model, odometer_km=self.bag.odometer_km, status=FAILED,
@@ -128,7 +127,8 @@ def _row(job: BagJob, store: RowStore, seen: str, began: float) -> tuple[Row, bo
     """Return the row of a bag, and whether it was computed: a copy of a known one is not."""
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.library.calibrate_bag import calibrate_bag as calibrated
-    with at_hand(job.bag.bag, _scratch()) as path:
+    worker = _worker()
+    with at_hand(job.bag.bag, worker.local_directory if worker else None) as path:
         with open_bag(path) as bag:
             sha256 = bag_sha256(bag)
             size = sum(Path(file).stat().st_size for file in bag.files)
@@ -153,11 +153,6 @@ def _worker() -> Any:
         return get_worker()
     except ValueError:
         return None
-
-
-def _scratch() -> str | None:
-    worker = _worker()
-    return None if worker is None else worker.local_directory
 
 
 @contextmanager

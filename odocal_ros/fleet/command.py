@@ -39,7 +39,6 @@ def _positive(text: str) -> int:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     add = parser.add_argument
     add('bags', nargs='+', metavar='BAG', help='a manifest (.csv or .parquet with columns vehicle '
         'and bag), or bags, folders of bags, globs, URLs')

@@ -55,11 +55,7 @@ def _from_anywhere(bag: FleetBag) -> FleetBag:
 
 def computed_rows(client: Any, jobs: Sequence[BagJob],
                   again: bool = False) -> Iterator[tuple[int, Done]]:
-    """
-    Yield (number of the job, outcome) of each job as it ends; its row is then stored.
-
-    again : retry jobs that failed before.
-    """
+    """Yield (number, outcome) of each job as it ends; ``again``: retry failed ones."""
     store = RowStore(jobs[0].folder)
     open_jobs = []
     for i, job in enumerate(jobs):
@@ -100,11 +96,7 @@ def _why(error: BaseException) -> str:
 
 
 def writable(folder: Path) -> None:
-    """
-    Make the output folder.
-
-    Raises BadUsage: it cannot be written.
-    """
+    """Make the output folder, or raise BadUsage."""
     try:
         for part in ('rows', 'seen'):
             (folder / part).mkdir(parents=True, exist_ok=True)

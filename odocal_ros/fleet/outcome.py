@@ -13,16 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.errors import OdocalError
+from odocal_ros.fleet import second_stage
 from odocal_ros.fleet.bag_task import BagJob
 from odocal_ros.fleet.bags import at_hand
 from odocal_ros.fleet.engine import results
 from odocal_ros.fleet.page import fleet_page, remarks
-from odocal_ros.fleet.second_stage import (
-    file_name,
-    flagged,
-    vehicle_jobs,
-    vehicles_together,
-)
 from odocal_ros.fleet.tables import VEHICLES
 from odocal_ros.outside.names import for_table
 from odocal_ros.outside.whole import locked, write_text
@@ -42,8 +37,8 @@ class ReportJob:
 def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], output: Path,
                   args: Namespace) -> list[dict[str, Any]]:
     """Write tables, reports and page from the rows of all bags; return the vehicles' rows."""
-    of = vehicle_jobs([job.bag for job in jobs], rows, asked(jobs))
-    vehicles = vehicles_together(client, of, output, args.files)
+    of = second_stage.vehicle_jobs([job.bag for job in jobs], rows, asked(jobs))
+    vehicles = second_stage.vehicles_together(client, of, output, args.files)
     with locked(output):          # another fleet's command may write here too
         write_text(output / TABLE, _csv(output / VEHICLES))
     _reports(client, vehicles, jobs, output, args.reports)
@@ -80,9 +75,10 @@ def _reports(client: Any, vehicles: Sequence[dict[str, Any]], jobs: Sequence[Bag
     """Draw single reports, each a task; note in a vehicle's row where it is, or why not."""
     of = {job.bag.bag: job for job in jobs}
     wanted = [row for row in vehicles if row['now'] and (
-        which == 'all' or which == 'flagged' and flagged(row))]
+        which == 'all' or which == 'flagged' and second_stage.flagged(row))]
     asked_for = [ReportJob(tuple(of[bag] for bag in row['now']), str(
-        (output / 'reports' / file_name(row['vehicle'])).resolve())) for row in wanted]
+        (output / 'reports' / second_stage.file_name(row['vehicle'])).resolve()))
+                 for row in wanted]
     keys = [f'{k}-{id(asked_for)}' for k in range(len(asked_for))]
     for k, why, error in results(client, draw_report, asked_for, 'report', keys):
         wanted[k]['report'] = why if error is None else f'{type(error).__name__}: {error}'
@@ -110,7 +106,7 @@ def said(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
     bags = sum(row['bags'] for row in vehicles)
     lines = [', '.join(f'{n} {what}' for what, n in sorted(counts.items()))
              + f'; {bags} bags, {failed} failed']
-    worth = [row for row in vehicles if flagged(row)]
+    worth = [row for row in vehicles if second_stage.flagged(row)]
     lines += [f'  {row["vehicle"]}: {"; ".join(remarks(row))}' for row in worth[:most]]
     if len(worth) > most:
         lines.append(f'  and {len(worth) - most} more')

@@ -49,8 +49,7 @@ def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
     scale, every = name == 'scale_factor', []
     for k, model in enumerate(models):
         some = [row for row in rows if row['model'] == model]
-        x, sigma = (np.array([row[key] for row in some], float)
-                    for key in (name, f'{name}_sigma'))
+        x, sigma = (np.array([row[key] for row in some], float) for key in (name, f'{name}_sigma'))
         far = np.array([COMPARED[name] in row['outlier'].split() for row in some])
         mean = np.median(x)
         off, error = ((x / mean - 1) * 100, sigma / mean * 100) if scale else (
@@ -226,7 +225,6 @@ def _cell(row: dict[str, Any], name: str, factor: float) -> str:
 
 
 def remarks(row: dict[str, Any]) -> list[str]:
-    """Return the remarks on a vehicle."""
     out = [row['decision'] or row['verdict']]
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else

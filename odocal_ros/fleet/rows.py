@@ -98,7 +98,6 @@ class RowStore:
         return self.folder / 'rows' / key[:2] / f'{key}.parquet'
 
     def put(self, row: Row) -> None:
-        """Write a row."""
         import pyarrow as pa
         import pyarrow.parquet as pq
         path = self.path(row.key)
@@ -156,11 +155,7 @@ def _whole(path: Path) -> bool:
 
 
 def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
-    """
-    Yield the rows of files, one file after the other.
-
-    Raises BadData: a file is no row of a fleet.
-    """
+    """Yield the rows of files in order; raise BadData where a file is no fleet row."""
     import pyarrow as pa
     import pyarrow.parquet as pq
     for path in paths:

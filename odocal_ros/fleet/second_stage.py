@@ -15,18 +15,10 @@ import uuid
 
 import numpy as np
 
+from odocal_ros.fleet import tables
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.engine import results
 from odocal_ros.fleet.statistics import FAR, population
-from odocal_ros.fleet.tables import (
-    batches,
-    in_batches,
-    leg_schema,
-    LEGS,
-    vehicle_schema,
-    VEHICLES,
-    write_table,
-)
 from odocal_ros.fleet.vehicles import Vehicle, vehicle_of, VehicleJob
 
 COMPARED = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
@@ -56,11 +48,7 @@ def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
 
 def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path,
                       files: bool) -> list[dict[str, Any]]:
-    """
-    Return the rows of all vehicles, the worst first; write legs.parquet and vehicles.parquet.
-
-    files : write the load-ready files of each vehicle too.
-    """
+    """Return the vehicles' rows, the worst first; write the tables, with ``files`` theirs too."""
     parts = folder / f'.parts.{uuid.uuid4().hex}'
     parts.mkdir(parents=True)
     try:
@@ -74,8 +62,10 @@ def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path,
                 raise error
             found[k] = rows
         vehicles = beside_their_model([row for k in sorted(found) for row in found[k]])
-        write_table(folder / LEGS, leg_schema(), batches(sorted(parts.glob('*.parquet'))))
-        write_table(folder / VEHICLES, vehicle_schema(), in_batches(vehicles))
+        tables.write_table(folder / tables.LEGS, tables.leg_schema(),
+                           tables.batches(sorted(parts.glob('*.parquet'))))
+        tables.write_table(folder / tables.VEHICLES, tables.vehicle_schema(),
+                           tables.in_batches(vehicles))
         return vehicles
     finally:
         shutil.rmtree(parts, ignore_errors=True)
@@ -98,7 +88,7 @@ def group_of(group: GroupJob) -> list[dict[str, Any]]:
     import pyarrow as pa
     import pyarrow.parquet as pq
     rows = []
-    with pq.ParquetWriter(group.part, leg_schema(), compression='zstd') as writer:
+    with pq.ParquetWriter(group.part, tables.leg_schema(), compression='zstd') as writer:
         legs: list[dict[str, Any]] = []
         for job in group.vehicles:
             vehicle = vehicle_of(job)
@@ -107,7 +97,7 @@ def group_of(group: GroupJob) -> list[dict[str, Any]]:
             if group.files and vehicle.calibration is not None:
                 _write_files(vehicle, Path(group.files))
         if legs:
-            writer.write_table(pa.Table.from_pylist(legs, schema=leg_schema()))
+            writer.write_table(pa.Table.from_pylist(legs, schema=tables.leg_schema()))
     return rows
 
 

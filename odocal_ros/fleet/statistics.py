@@ -148,11 +148,6 @@ class Population:
     spread: float
     deviates: Floats
 
-    @property
-    def outliers(self) -> NDArray[np.intp]:
-        """Return the numbers of those who lie outside."""
-        return np.flatnonzero(np.abs(self.deviates) > FAR)
-
 
 def population(values: Floats, sigmas: Floats) -> Population:
     """

@@ -19,11 +19,11 @@ from odocal_ros.calib.combine import DRAWN_ANEW
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import DONE, legs_from, Row, rows_of
-from odocal_ros.fleet.statistics import Change, covariance, History, history
+from odocal_ros.fleet.statistics import covariance, History, history
 from odocal_ros.fleet.tables import leg_row, utc, VALUES
 from odocal_ros.library.calibrate_bag import unique_names
 from odocal_ros.nav.angles import wrap
-from odocal_ros.output.figures import accept_line
+from odocal_ros.output.figures import accept_line, iso
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.acceptance import accept, Decision
 from odocal_ros.pipeline.calibrate import combine
@@ -226,9 +226,10 @@ def _changes(histories: dict[str, Any], driven: Sequence[Driven]) -> dict[str, A
         for change in past.changes:
             before, after = (driven[number[k]].leg for k in (change.leg - 1, change.leg))
             found.append({
-                'value': name, 'after': _iso(before.start_ns), 'by': _iso(after.start_ns),
-                'leg': number[change.leg] + 1, 'size': _size(name, change), 'sigma': change.sigma,
-                'unit': '1' if name == 'scale_factor' else 'rad'})
+                'value': name, 'after': iso(before.start_ns), 'by': iso(after.start_ns),
+                'leg': number[change.leg] + 1,
+                'size': math.expm1(change.size) if name == 'scale_factor' else change.size,
+                'sigma': change.sigma, 'unit': '1' if name == 'scale_factor' else 'rad'})
     odd = Counter(number[k] + 1 for number, past, _ in histories.values() for k in past.odd)
     _, by_date, by_distance = histories['scale_factor']
     return {'changes': json.dumps(sorted(found, key=lambda change: change['by'])),
@@ -238,10 +239,6 @@ def _changes(histories: dict[str, Any], driven: Sequence[Driven]) -> dict[str, A
             'drift_per_1000_km_sigma': by_distance.slope_sigma}
 
 
-def _size(name: str, change: Change) -> float:
-    return math.expm1(change.size) if name == 'scale_factor' else change.size
-
-
 def _leg_row(job: VehicleJob, k: int, one: Driven, starts: Sequence[int],
              histories: dict[str, Any]) -> dict[str, Any]:
     model = next((b.model for b in job.bags if b.model), '')
@@ -249,7 +246,3 @@ def _leg_row(job: VehicleJob, k: int, one: Driven, starts: Sequence[int],
         'period': sum(start <= k for start in starts),
         'odd': any(k in (number[i] for i in history.odd)
                    for number, history, _ in histories.values())}
-
-
-def _iso(stamp_ns: int) -> str:
-    return f'{utc(stamp_ns):%Y-%m-%dT%H:%M:%SZ}'

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Values that a drive can determine with these settings and inputs, before it is driven.
-
-By the code that will process the leg: its alignment and its methods.
-"""
+"""Values that a drive can determine, before it is driven; by the code that will process it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,7 +61,6 @@ class Ability:
     weak: str = ''
 
     def words(self) -> str:
-        """Return it as a sentence."""
         *first, last = self.can
         values = f'{", ".join(first)} and {last}' if first else last
         text = f'observable: {values}'
@@ -136,12 +131,7 @@ def stated_variance(sent: Oriented) -> float:
 
 
 def with_heading(config: Config, variances: dict[str, float]) -> Config:
-    """
-    Return config with the heading source, and its sigma, that the alignment will find.
-
-    variances : as in ``Received``. If the source stays ``auto``, the alignment selects gyrocompass
-    or course.
-    """
+    """Return config with the heading source and sigma that the alignment will find."""
     asked = config.alignment
     source, sigma = asked.heading_source, max(asked.heading_sigma, EXACT_HEADING)
     if source == 'auto' and not math.isnan(asked.heading):

@@ -70,11 +70,7 @@ class Prospect:
 
 @dataclass(frozen=True)
 class WheelsForecast:
-    """
-    Estimates of single wheels from the data so far; None: not determined.
-
-    left_right, track_width : relative sigmas, of the worse wheel and of the width.
-    """
+    """Relative sigmas of the worse wheel and of the track width so far; None: not determined."""
 
     left_right: float | None
     track_width: float | None
@@ -133,11 +129,7 @@ class Forecast:
 
 
 def better(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None:
-    """
-    Return the forecast of two sections of a leg, each quantity from the better one.
-
-    Both together are at least as good. Only the newest section continues and can improve.
-    """
+    """Return the forecast of two sections of a leg, each quantity from the better one."""
     if earlier is None or newest is None:
         return newest or earlier
     values = {name: min((f.estimates[name] for f in (newest, earlier) if name in f.estimates),
@@ -158,11 +150,7 @@ def _better(earlier: Prospect, newest: Prospect) -> Prospect:
 
 
 def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str, str | float]:
-    """
-    Return the keys of ``~/status``; values without forecast are empty.
-
-    age_s : age of the newest sample of the forecast.
-    """
+    """Return the keys of ``~/status``; age_s : of the newest sample of the forecast."""
     keys = _running(forecast, age_s)
     for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
         of = Prospect(None, 0.0, None) if forecast is None else getattr(forecast, name)

@@ -18,6 +18,7 @@ from odocal_ros.calib.choice import choose, deciding
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import take
+from odocal_ros.forecast import leg_so_far, smoother_forecast
 from odocal_ros.forecast.ability import stated_variance, with_heading
 from odocal_ros.forecast.forecast import (
     Abandoned,
@@ -27,26 +28,8 @@ from odocal_ros.forecast.forecast import (
     REST_FORESEEN_S,
     sources_of,
 )
-from odocal_ros.forecast.leg_so_far import (
-    count_size,
-    fix_figures,
-    profile_of,
-    screened_in_cells,
-    SmootherSoFar,
-)
 from odocal_ros.forecast.planned_drive import inserted, PlannedDrive, REST_SPEED
 from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
-from odocal_ros.forecast.smoother_forecast import (
-    gives_all,
-    look,
-    nothing_foreseen,
-    ONLY,
-    PITCH,
-    SCALE,
-    with_running,
-    without_force,
-    YAW,
-)
 from odocal_ros.screening.leg_kind import lacking
 from odocal_ros.settings.config import Config
 
@@ -75,7 +58,7 @@ class DriveSoFar(PlannedDrive):
 
 def forecast_of(leg: Leg, fix_rate: float, config: Config,
                 wanted: Callable[[], bool] = lambda: True,
-                smoother: SmootherSoFar | None = None) -> Forecast:
+                smoother: leg_so_far.SmootherSoFar | None = None) -> Forecast:
     """
     Return the forecast of a leg that ends here, and the reasons of its methods so far.
 
@@ -86,9 +69,10 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
     Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
     """
     unusable = lacking(leg.imu, config.imu.accel_scale)
-    running = look(leg, config, smoother, wanted)
-    if deciding(config.method) == ONLY or gives_all(running):     # the ends add nothing to it
-        forecast = nothing_foreseen(config)
+    running = smoother_forecast.look(leg, config, smoother, wanted)
+    only_smoother = deciding(config.method) == smoother_forecast.ONLY
+    if only_smoother or smoother_forecast.gives_all(running):     # the ends add nothing to it
+        forecast = smoother_forecast.nothing_foreseen(config)
     else:
         forecast = _by_ends(leg, fix_rate, config, wanted)
         if smoother is not None and 'smoother' in deciding(config.method):
@@ -96,11 +80,11 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
             if not unusable:
                 forecast = replace(forecast, yaw=_open_yet(forecast.yaw))
     if unusable:
-        forecast = without_force(forecast)
+        forecast = smoother_forecast.without_force(forecast)
     if not wanted():
         raise Abandoned
     if running is not None:
-        forecast = with_running(forecast, running, config)
+        forecast = smoother_forecast.with_running(forecast, running, config)
     estimates, _ = choose(forecast.methods, config.method)
     return replace(forecast, estimates=estimates, until_ns=leg.stop_ns)
 
@@ -108,10 +92,11 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
 def _by_ends(leg: Leg, fix_rate: float, config: Config,
              wanted: Callable[[], bool]) -> Forecast:
     """Return the two_point forecast of the leg with its end points."""
-    inputs = screened_in_cells(leg, config).inputs
-    driven = profile_of(inputs, config)
-    sigmas = Sigmas(config=_heading_found(leg, config), quantum=count_size(inputs, config),
-                    **fix_figures(inputs) | {'fix_rate': fix_rate})
+    inputs = leg_so_far.screened_in_cells(leg, config).inputs
+    driven = leg_so_far.profile_of(inputs, config)
+    sigmas = Sigmas(config=_heading_found(leg, config),
+                    quantum=leg_so_far.count_size(inputs, config),
+                    **leg_so_far.fix_figures(inputs) | {'fix_rate': fix_rate})
     drive = _at_rest(_thinned(driven), wanted)
     now = predict(drive, sigmas)
 
@@ -125,9 +110,10 @@ def _by_ends(leg: Leg, fix_rate: float, config: Config,
 
     limits = config.verdict
     return Forecast(
-        prospect(SCALE, limits.max_scale_sigma),
-        prospect(YAW, limits.max_yaw_sigma, _yaw_limit(now, limits.max_yaw_sigma)),
-        now.method.estimates[PITCH].sigma)
+        prospect(smoother_forecast.SCALE, limits.max_scale_sigma),
+        prospect(smoother_forecast.YAW, limits.max_yaw_sigma,
+                 _yaw_limit(now, limits.max_yaw_sigma)),
+        now.method.estimates[smoother_forecast.PITCH].sigma)
 
 
 def _open_yet(by_ends: Prospect) -> Prospect:

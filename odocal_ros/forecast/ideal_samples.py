@@ -72,8 +72,7 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
     sample_rate = 20.0    # Hz: the noise of a second does not depend on the sample rate
     samples_enough = 50    # samples between keyframes that lie far apart
     rate = min(sample_rate, samples_enough / spacing)
-    t = np.linspace(t_begin, drive.duration,
-                    max(2, round((drive.duration - t_begin) * rate) + 1))
+    t = np.linspace(t_begin, drive.duration, max(2, round((drive.duration - t_begin) * rate) + 1))
     motion = _motion(drive, t, origin, config)
     t_fix = _times(t_begin, drive.duration, sigmas.fix_rate, spacing)
     antenna = motion.p_n + motion.C_nb @ np.subtract(config.gnss.lever_arm, config.imu.lever_arm)

@@ -39,9 +39,8 @@ class RobotMotion:
     @property
     def increments(self) -> Floats:
         """Return m forward, m to the left and rad in each interval: (n, 3)."""
-        out: Floats = np.diff([running_integral(self.t, x) for x in (
+        return np.diff([running_integral(self.t, x) for x in (
             self.speed, self.side, self.rate)], axis=1).T
-        return out
 
     @property
     def moving(self) -> Bools:
@@ -126,5 +125,4 @@ def _spot(size: float) -> list[Move]:
     return [(size, 0, 0), (0, 0, FULL_TURN + math.pi), (size, 0, 0), (0, 0, -FULL_TURN - math.pi)]
 
 
-PATTERNS = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight,
-            'spot': _spot}
+PATTERNS = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight, 'spot': _spot}

@@ -4,8 +4,8 @@
 """
 The leg that is recorded: its faults, by the functions that will check it, and its profile.
 
-Its rows in cells show most faults, every few seconds in the worker (``pipeline.faults``). A gap of
-the IMU is detected in the stamps at once, and is kept. Sigmas are predicted from the profile.
+Its rows in cells show most faults, every few seconds in the worker (``calibrate.faults``). A gap
+of the IMU is detected in the stamps at once, and is kept. Sigmas are predicted from the profile.
 """
 
 from collections.abc import Callable, Iterable
@@ -127,11 +127,7 @@ def _placed(inputs: Inputs, config: Config) -> Placed:
 
 
 def count_size(inputs: Inputs, config: Config) -> float:
-    """
-    Return the metres of one count of the odometer, 0 for speeds.
-
-    Raises BadData: the scale is not known.
-    """
+    """Return the metres of one count, 0 for speeds; raise BadData if the scale is not known."""
     return inputs.travel.quantum * _placed(inputs, config).rough
 
 
@@ -215,8 +211,7 @@ class SmootherSoFar:
         placed = place(inputs, config)
         if not placed.rough:
             raise BadData('the scale is not known yet')
-        _refuse_unusable(axes_reasons(
-            facing(inputs, placed.rough), config.imu.nominal_yaw))
+        _refuse_unusable(axes_reasons(facing(inputs, placed.rough), config.imu.nominal_yaw))
         if vars(placed.origin) != (self._origin and vars(self._origin)):
             self._origin = placed.origin
             self._growing.forget()
@@ -224,7 +219,7 @@ class SmootherSoFar:
         # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
-                            placed.rough, t_stop)
+                                      placed.rough, t_stop)
         few = too_little_of(view)
         if few:
             raise BadData(few.text)

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-A drive that is planned or recorded: speed, direction and slope by time; manoeuvres to add to it.
-
-Manoeuvres determine what a straight run does not.
-"""
+"""A drive that is planned or recorded: speed, direction, slope by time; manoeuvres to add."""
 
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -78,8 +74,7 @@ class PlannedDrive:
     def travel(self) -> NDArray[np.float64]:
         """Return the signed travel at each time, 0 at the start mark, (m,) m."""
         s = running_integral(self.t, self.speed)
-        path_length: Floats = s - np.interp(0.0, self.t, s)
-        return path_length
+        return s - np.interp(0.0, self.t, s)
 
     @property
     def distance(self) -> float:
@@ -115,8 +110,7 @@ class PlannedDrive:
     def until(self, t_stop: float, rest: float) -> 'PlannedDrive':
         """Return the drive up to a time and a stop of ``rest`` s there."""
         keep = self.t <= t_stop
-        cut = replace(self, **{n: getattr(self, n)[keep]
-                               for n in ('t', 'speed', 'yaw', 'slope')})
+        cut = replace(self, **{n: getattr(self, n)[keep] for n in ('t', 'speed', 'yaw', 'slope')})
         return cut._held(len(cut.t) - 1, rest, at_rest=True)
 
     def _held(self, k: int, seconds: float, at_rest: bool = False) -> 'PlannedDrive':
@@ -145,8 +139,7 @@ def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.p
     """
     t, speed, yaw_rate = (np.asarray(x, dtype=float) for x in (t, speed, yaw_rate))
     yaw = np.pi / 2 - heading + running_integral(t, yaw_rate)
-    return marked(t, speed, yaw, more.pop('slope', np.zeros_like(t)),
-                  **more)
+    return marked(t, speed, yaw, more.pop('slope', np.zeros_like(t)), **more)
 
 
 def marked(t: Floats, speed: Floats, yaw: Floats, slope: Floats, **more: Any) -> PlannedDrive:

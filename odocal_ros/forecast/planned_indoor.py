@@ -20,15 +20,10 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.result.outcome import outcome
+from odocal_ros.forecast import planned_methods
 from odocal_ros.forecast.ideal_samples import ideal
 from odocal_ros.forecast.indoor_motion import MOTION_STEP, RobotMotion
 from odocal_ros.forecast.planned_drive import from_rates
-from odocal_ros.forecast.planned_methods import (
-    fit_at as smoother_at,
-    planned_levels,
-    spacing_for,
-    SWAY_RATE,
-)
 from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.forecast.smoother_forecast import relative
 from odocal_ros.nav.earth import rate_without_north
@@ -156,10 +151,10 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: Config) -> Metho
     correlated = robot.drift_length / max(speed, 1e-3) if drifts else 0.0
     config = with_settings(config.in_local_frame(), {'gnss.correlation_time': correlated})
     sigmas = Sigmas(config=config, fix=robot.white, fix_up=robot.white, fix_rate=robot.rate,
-                    sway=float(robot.slip * np.sqrt(SWAY_RATE)),
+                    sway=float(robot.slip * np.sqrt(planned_methods.SWAY_RATE)),
                     slip=float(robot.slip / np.sqrt(robot.wheels)))
     drive = from_rates(motion.t, motion.speed, motion.rate)
-    made = ideal(drive, sigmas, spacing_for(drive))
+    made = ideal(drive, sigmas, planned_methods.spacing_for(drive))
     leg = made.leg
     turned = np.interp(leg.t_imu, drive.t, drive.yaw - drive.yaw[0]) * robot.width / 2
     used = _at_rests(leg.t_fix, motion) if robot.at_rests else slice(None)
@@ -174,10 +169,10 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: Config) -> Metho
     problem = problem_of(leg, config, made.imu)
     white = 1 / made.fixes_in_one
     slow = 2 / max(correlated, 1.0) * robot.drift**2 * drifts
-    levels = planned_levels(problem, sigmas, made.fixes_in_one).but(
+    levels = planned_methods.planned_levels(problem, sigmas, made.fixes_in_one).but(
         fix=white, fix_up=white, slow=slow, slow_up=slow)
-    return _with_slip(outcome(leg, problem, smoother_at(problem, made, levels), config), motion,
-                      robot)
+    return _with_slip(outcome(leg, problem, planned_methods.fit_at(problem, made, levels), config),
+                      motion, robot)
 
 
 def _with_slip(method: MethodResult, motion: RobotMotion, robot: Robot) -> MethodResult:

@@ -37,11 +37,9 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     """
     Return the prediction of the smoother for a drive, covariance only.
 
-    The rows are those of ``smooth`` at the true states of ideal samples, the levels those of
-    ``planned_levels``; its reasons are by the code that gives them for a fit. Scale 1, angles 0,
-    sigmas and budget as they will be.
-
-    drive, sigmas : as for ``predict``.   spacing : s between keyframes; as ``spacing_for`` has it.
+    The rows are those of ``smooth`` at the true states of ideal samples; its reasons are by the
+    code that gives them for a fit. Scale 1, angles 0, sigmas and budget as they will be.
+    spacing : s between keyframes; default: ``spacing_for``.
     """
     few = too_little(int(drive.duration * sigmas.fix_rate), drive.duration)
     if few:
@@ -166,13 +164,7 @@ class Plan:
 
 
 def plan_methods(drive: PlannedDrive, sigmas: Sigmas, spacing: float | None = None) -> Plan:
-    """
-    Return the predictions of the configured methods for a drive.
-
-    drive, sigmas : as for ``predict``.   spacing : as for ``predict_smoother``.
-
-    Raises BadUsage: the drive is shorter than one fix interval.
-    """
+    """Return the predictions of the configured methods; arguments as ``predict_smoother``."""
     asked = sigmas.config.method
     two_point = predict(drive, sigmas)
     methods = {'two_point': two_point.method}

@@ -26,7 +26,7 @@ from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import quat_from_matrix
-from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import SWAY
 
@@ -105,18 +105,9 @@ class Prediction:
         """Return the sigma of a parameter, relative or rad; None: it will not be determined."""
         return self.method.estimates[parameter].sigma
 
-    @property
-    def verdict(self) -> Verdict:
-        """Return the predicted verdict of such a leg."""
-        return Verdict.worst(r.code.gravity for r in self.reasons)
-
 
 def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
-    """
-    Return the prediction of the two-point method for a drive.
-
-    Raises BadUsage: the drive is shorter than one fix interval.
-    """
+    """Return the two-point prediction; BadUsage if the drive is shorter than one fix interval."""
     config = sigmas.config
     if drive.duration < 1 / sigmas.fix_rate:
         raise BadUsage(f'the leg lasts {drive.duration:.3g} s, less than one fix interval '

@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-What the operator needs while driving: distance, speed, standstill, clocks that differ.
-
-Light estimates from the blocks as they come; nothing here enters a result.
-"""
+"""What the operator needs while driving: distance, speed, standstill, clocks that differ."""
 
 from collections import deque
 from dataclasses import replace
@@ -45,7 +41,6 @@ class Clocks:
         self._ahead_s: dict[str, deque[float]] = {}
 
     def feed(self, slot: str, block: Samples) -> None:
-        """Take a block."""
         if slot != 'imu':
             self._waiting[slot] = int(block.received_ns[-1]), int(block.stamp_ns[-1])
             return

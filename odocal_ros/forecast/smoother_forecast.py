@@ -45,13 +45,7 @@ DRIVE_ON = 'drive straights, and turn on the spot in both directions'
 
 def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
          wanted: Callable[[], bool]) -> Running | None:
-    """
-    Return the smoother's running estimate, None if there is none yet or it is not used.
-
-    leg : the data so far.   wanted : called between passes; if False, Abandoned is raised.
-
-    Raises OdocalError: there is no forecast yet, and the smoother is the only method.
-    """
+    """Return the running estimate, None without; raise OdocalError if no other method is used."""
     if smoother is None or 'smoother' not in deciding(config.method):
         return None
     try:
@@ -169,12 +163,7 @@ def digits(value: float, sigma: float) -> str:
 
 
 def planar_forecast(leg: Leg, config: Config, wanted: Callable[[], bool]) -> Forecast:
-    """
-    Return the forecast of a leg of the planar estimator that ends here.
-
-    Arguments and errors as for ``forecast_of``. The sigma of the scale falls with the root of the
-    distance.
-    """
+    """Return the forecast of a leg of the planar estimator that ends here, as ``forecast_of``."""
     def passed(_: Stage) -> None:
         if not wanted():
             raise Abandoned
@@ -195,7 +184,7 @@ def planar_forecast(leg: Leg, config: Config, wanted: Callable[[], bool]) -> For
 
 
 def _planar_scale(result: LegResult, asked: float) -> Prospect:
-    """Return the prospect of the scale."""
+    """Return the prospect of the scale, whose sigma falls with the root of the distance."""
     scale = result.methods[PLANAR].estimates['scale_factor']
     sigma = relative(scale)
     if sigma is None or scale.value is None or scale.sigma is None:

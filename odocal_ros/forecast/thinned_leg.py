@@ -143,8 +143,7 @@ def _gathered(rows: SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> SomeS
         return last
 
     def mean(values: Floats | Ints) -> Floats:
-        means: Floats = (np.add.reduceat(values, first).T / count).T
-        return means
+        return (np.add.reduceat(values, first).T / count).T
 
     columns: dict[str, Any] = {name: mean(getattr(rows, name)) for name in averaged}
     since_ns = rows.stamp_ns - np.repeat(rows.stamp_ns[first], count)
@@ -153,11 +152,7 @@ def _gathered(rows: SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> SomeS
 
 
 class LateSoFar:
-    """
-    The newest rows of one counter that never rolls over; ``feed`` takes them as sent.
-
-    Late ones are moved back as for the result.
-    """
+    """The newest rows of a counter that never rolls over; late rows are moved as in results."""
 
     def __init__(self) -> None:
         self._rows: OdometerSamples | None = None

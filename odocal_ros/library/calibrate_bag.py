@@ -82,7 +82,10 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     if len(paths) > 1:
         look_at_all(paths, lambda one: _look(one, asked))
     done = _each(paths, asked, received)
-    settings = _settings_of_all(done, received)
+    settings = done[-1].config
+    if unlike := unlike_settings([one.config for one in done]):
+        received.note(f'{", ".join(unlike)}: differ between the journals; each leg uses its own '
+                      f'settings, limits and files use those of {done[-1].path.name}')
     results, inputs = unique_names([one.path for one in done], [one.legs for one in done],
                                  [one.entry for one in done])
     frame = next((one.imu_frame for one in done if one.imu_frame), '')
@@ -151,14 +154,6 @@ def _one(path: Path, asked: _Asked, unit: str | None, received: Notes) -> _BagLe
                     bag.config, bag.imu_frame, own, _legs_of(bag, asked, received))
 
 
-def _settings_of_all(done: list[_BagLegs], received: Notes) -> Config:
-    """Return the settings of the last bag; a note lists the differences of the others."""
-    if unlike := unlike_settings([one.config for one in done]):
-        received.note(f'{", ".join(unlike)}: differ between the journals; each leg uses its own '
-                   f'settings, limits and files use those of {done[-1].path.name}')
-    return done[-1].config
-
-
 def _legs_of(bag: Recording, asked: _Asked, received: Notes) -> list[LegResult]:
     """Return the results of a bag's legs."""
     if bag.dropped and not asked.legs:
@@ -195,15 +190,17 @@ def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[
 def _worth_keeping(results: list[LegResult], received: Notes) -> list[LegResult]:
     """Return automatic legs without the unusable ones, as in the node."""
     from odocal_ros.pipeline.automatic import refusal
-    why = [refusal(leg) for leg in results]
-    if all(why):
-        return results
-    for leg, reason in zip(results, why, strict=True):
-        if reason:
+    kept, notes = [], []
+    for leg in results:
+        if reason := refusal(leg):
             start = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
-            received.note(f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
-                       f'{reason.code.name}: {reason.text}')
-    return [leg for leg, reason in zip(results, why, strict=True) if not reason]
+            notes.append(f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
+                         f'{reason.code.name}: {reason.text}')
+        else:
+            kept.append(leg)
+    for note in notes if kept else ():
+        received.note(note)
+    return kept or results
 
 
 def unique_paths(paths: list[Path]) -> tuple[list[Path], list[Path]]:
@@ -228,15 +225,7 @@ def about(path: Path, error: Exception) -> str:
 
 
 def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
-    """
-    Look at each of several bags, so that all errors are reported together, before the work.
-
-    Raises
-    ------
-    BadUsage
-        ``look`` raised for one bag or more.
-
-    """
+    """Look at each of several bags; BadUsage names all errors together, before the work."""
     troubles = []
     for path in paths:
         try:

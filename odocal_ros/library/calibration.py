@@ -102,7 +102,7 @@ class Calibration:
         return states(self.result)
 
     def residuals(self) -> Series:
-        """Return the residuals of each sensor with their sigmas; see ``residuals.residuals``."""
+        """Return the residuals of each sensor with their sigmas; see ``series.residuals``."""
         return residuals(self.result)
 
     def plot_track(self, ax: Any, leg: int = 1) -> Any:
@@ -127,11 +127,8 @@ class Calibration:
 
         ``tell`` receives a sentence if the report cannot be drawn.
 
-        Raises
-        ------
-        BadUsage
-            There is a calibration.json and no ``force``, or the folder cannot be written.
-
+        Raises BadUsage: there is a calibration.json and no ``force``, or the folder cannot be
+        written.
         """
         from odocal_ros.output.files import write_results
         return write_results(self.result, self.config, Path(folder), list(self.inputs),

@@ -78,11 +78,7 @@ def changes(stored: list[Stored]) -> list[Change]:
 
     A rejected calibration shows its change, but nothing later is measured from it.
 
-    Raises
-    ------
-    BadUsage
-        A parameter comes in different units: these are not calibrations of one odometer.
-
+    Raises BadUsage: a parameter comes in different units: these are different odometers.
     """
     names = sorted({n for s in stored for n, e in s.estimates.items()
                     if e.value is not None} - NOT_COMPARED, key=_order)
@@ -153,12 +149,8 @@ def _difference(name: str, stored: list[Stored], since: int | None,
                  for source, (share, shared) in a.budget.get(name, {}).items()
                  if shared and b.budget.get(name, {}).get(source, (0, False))[1])
     least = math.sqrt(max(sigma**2 - common, 0.0))
-    return Difference(since, change, sigma, _over(change, sigma),
-                      _over(change, least) if common else None)
-
-
-def _over(change: float, sigma: float) -> float | None:
-    return change / sigma if sigma > 0 else None
+    return Difference(since, change, sigma, change / sigma if sigma > 0 else None,
+                      change / least if common and least > 0 else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,18 +231,12 @@ def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | Non
 def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
     words = change.parameter.split('_')
     cause = next((text for key, text in CAUSES.items() if key in words), 'calibrate again')
-    if 'scale' in words and abs(difference.change) > ANOTHER_SCALE * _value_before(
-            change, difference, stored):
+    before = stored[difference.since].value(change.parameter) or 0.0
+    if 'scale' in words and abs(difference.change) > ANOTHER_SCALE * before:
         cause = f'{OTHER}; compare calibrations of the same odometer'
     return (f'{label(change.parameter)} changed by {amount(change, difference, stored)} '
             f'({abs(difference.sigmas or 0.0):.1f} sigma) since '
             f'{stored[difference.since].name}: {cause}')
-
-
-def _value_before(change: Change, difference: Difference, stored: Sequence[Stored]) -> float:
-    value = stored[difference.since].value(change.parameter)
-    assert value is not None      # what has none is no entry
-    return value
 
 
 def label(parameter: str) -> str:
@@ -261,7 +247,9 @@ def label(parameter: str) -> str:
 def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> str:
     """Return a change as people read it: scales in per cent or ppm, angles in deg."""
     if change.parameter.startswith('scale_'):
-        return change_in_words(difference.change / _value_before(change, difference, stored))
+        before = stored[difference.since].value(change.parameter)
+        assert before is not None      # what has no value is no entry
+        return change_in_words(difference.change / before)
     if change.unit == 'rad':
         return f'{math.degrees(1.0) * difference.change:+.3g} deg'
     return f'{difference.change:+.3g} {change.unit}'

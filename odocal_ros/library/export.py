@@ -48,7 +48,6 @@ def rrd(result: Calibration, path: Path) -> None:
 
 
 def _log_leg(recording: Any, name: str, pose: Series, state: Series) -> None:
-    """Log one leg below its name."""
     import rerun
     track_n = np.stack([pose[f'{axis}_m'] for axis in ('east', 'north', 'up')], -1)
     rotations = np.stack([pose[f'q{axis}'] for axis in 'xyzw'], -1)

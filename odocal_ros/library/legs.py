@@ -88,8 +88,7 @@ def leg_statuses(bag: Bag) -> list[dict[str, str]]:
         for _, message in bag.messages(topic.name):
             for status in message.status:
                 if status.name.endswith(STATUS_NAME):
-                    values = {kv.key: kv.value for kv in status.values}
-                    _remember(last, values)
+                    _remember(last, {kv.key: kv.value for kv in status.values})
     return list(last.values())
 
 
@@ -100,13 +99,9 @@ def _remember(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str
         return
     # ids begin again with each run of the node: a leg is identified by its start too
     leg_id = values.get('leg_id', ''), start
-    if leg_id[0] in ('', '0'):
-        return
-    before = last.get(leg_id, {})
-    if before.get('leg_event') in DROPPED:
-        return
-    event = values.get('leg_event') or before.get('leg_event', '')
-    last[leg_id] = values | {'leg_event': event}
+    before = last.get(leg_id, {}).get('leg_event', '')
+    if leg_id[0] not in ('', '0') and before not in DROPPED:
+        last[leg_id] = values | {'leg_event': values.get('leg_event') or before}
 
 
 def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | str],
@@ -115,29 +110,13 @@ def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | st
     """
     Return (start, stop) stamps of the legs of one bag.
 
-    Parameters
-    ----------
-    recorder : LegRecorder
-        Fed with the whole bag.
-    bag : Recorded
-        For its time span.
-    asked : list of LegSpan or 'each-stop'
-        Empty: marks if there are any, else automatic legs with leg.automatic, else one from
-        standstill to standstill.
-    marks : list of (start, stop)
-        As the node marked them.
-    config : Config
-        What counts as a standstill, least distance.
-    stops : optional
-        What ``stops_of`` finds in all that the topics have in common, where that is known.
+    recorder : fed with the whole bag.   bag : for its time span.   asked : empty: marks if there
+    are any, else automatic legs with leg.automatic, else one from standstill to standstill.
+    marks : (start, stop) as the node marked them.   config : standstills, least distance.
+    stops : what ``stops_of`` finds in all that the topics have in common, where that is known.
 
-    Raises
-    ------
-    BadUsage
-        An asked leg lies outside the bag.
-    BadData
-        A leg that is found or open-ended: the stamps of its topics have no time in common.
-
+    Raises BadUsage: an asked leg lies outside the bag; BadData: the stamps of the topics have no
+    time in common, and a leg is to be found or open-ended.
     """
     first, last = _common(recorder)
     closed = marks or any(isinstance(a, LegSpan) and None not in (a.start_ns, a.stop_ns)
@@ -202,13 +181,10 @@ def _placed(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, i
     begin, end = min(bag.start_ns, first), max(bag.end_ns, last)
     if stop <= start or stop < begin - 10**10 or start > end + 10**10:
         length = (bag.end_ns - bag.start_ns) * 1e-9
-        raise BadUsage(f'{bag.name}: the leg {_s(start, bag)}:{_s(stop, bag)} is empty; the bag '
-                       f'runs from 0 to {length:.1f} s')
+        asked = ':'.join(f'{(stamp - bag.start_ns) * 1e-9:.2f}' for stamp in (start, stop))
+        raise BadUsage(f'{bag.name}: the leg {asked} is empty; the bag runs from 0 to '
+                       f'{length:.1f} s')
     return start, stop
-
-
-def _s(stamp: int, bag: Recorded) -> str:
-    return f'{(stamp - bag.start_ns) * 1e-9:.2f}'
 
 
 def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
@@ -246,9 +222,8 @@ def _by_standstill(first: int, last: int, known: Stops) -> tuple[int, int]:
     start, stop, opening = first, last, 0
     if metres[0, 0] < OPENING * whole:       # else it is an intermediate stop, or the last one
         start, opening = int(stops[0, 1]), 1
-    after = np.flatnonzero(np.arange(len(stops)) >= opening)
-    if len(after) and whole - metres[after[-1], 1] < 0.02 * whole + 1.0:
-        stop = int(stops[after[-1], 1])
+    if len(stops) > opening and whole - metres[-1, 1] < 0.02 * whole + 1.0:
+        stop = int(stops[-1, 1])
     return start, stop
 
 

@@ -75,8 +75,7 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
            sigmas)
     least_rest = 60.0    # s
     rest = max(least_rest, *before.two_point.standing)
-    yield (f'standing {time_span(rest)} longer at both marks', drive.standing_longer(rest),
-           sigmas)
+    yield (f'standing {time_span(rest)} longer at both marks', drive.standing_longer(rest), sigmas)
     yield 'one more stop and start', stop_and_start(drive), sigmas
     yield 'one more left turn and right turn', left_and_right_turns(drive), sigmas
     town_minutes = 5
@@ -84,8 +83,7 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
            sigmas)
     farthest = _until_farthest(drive, sigmas)
     if farthest is not None:
-        yield (f'end mark at the farthest point ({length(farthest.distance)})',
-               farthest, sigmas)
+        yield (f'end mark at the farthest point ({length(farthest.distance)})', farthest, sigmas)
 
 
 def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
@@ -232,7 +230,7 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     config : Config, mapping of dotted names, or a parameter file, optional
         Settings: IMU grade, heading source and the like.
     figures
-        As ``plan.predict.Sigmas`` has them: fix, fix_up m, fix_rate Hz, quantum m a count,
+        As ``forecast.predict.Sigmas`` has them: fix, fix_up m, fix_rate Hz, quantum m a count,
         sway m/s, slip m/sqrt(s).
 
     Raises

@@ -64,27 +64,13 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
     """
     Predict the sigmas of runs of a small robot on a level floor.
 
-    Parameters
-    ----------
-    run
-        Of PATTERNS, or ``all``.
-    reference, drive, imu
-        Of KINDS; as ``odometer.drive``; False: the robot has no IMU.
-    size, rounds, speed
-        m of a straight, how often, m/s.
-    track_width, wheels, slip
-        m between the wheels (of skid steering it is widened by 1.7 on the spot and 1.4 straight
-        on); how many wheels; m/sqrt(s) of each.
-    points_sigma
-        m, accuracy of the robot on its marks; None: ``reference.points_sigma``.
-    config : Config, mapping of dotted names, or a parameter file, optional
-        Settings: grade of the IMU and the like.
+    run : of PATTERNS, or ``all``.   reference : of KINDS.   drive : as ``odometer.drive``.
+    imu : the robot has one.   size, rounds, speed : m of a straight, how often, m/s.
+    track_width : m between the wheels (skid steering widens it by 1.7 on the spot and 1.4
+    straight on).   wheels : how many.   slip : m/sqrt(s) of each.   points_sigma : m, accuracy of
+    the robot on its marks; None: ``reference.points_sigma``.   config : as ``calibrate_bag``.
 
-    Raises
-    ------
-    BadUsage, BadConfig
-        A name is unknown, or a figure is out of range.
-
+    Raises BadUsage, BadConfig: a name is unknown, or a figure is out of range.
     """
     for flag, value, names in (('--indoor', run, ('all', *PATTERNS)), ('--drive', drive, DRIVES),
                                ('--reference', reference, KINDS)):

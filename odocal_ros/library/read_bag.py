@@ -17,14 +17,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg, LegRecorder, SLOTS
 from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.asked import (
-    config_of,
-    Leg as AskedLeg,
-    legs_of,
-    LegSpan,
-    Listener,
-    Settings,
-)
+from odocal_ros.library import asked
 from odocal_ros.library.legs import dropped_legs, find_legs, leg_statuses, marked_legs
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.transforms import with_static
@@ -63,11 +56,7 @@ def journal_notes(bag: Path) -> JournalNotes | None:
     """
     Return the metadata of a journal from its folder or a file; None for other bags.
 
-    Raises
-    ------
-    BadUsage, BadConfig
-        Its settings cannot be read, or are not those of this version.
-
+    Raises BadUsage, BadConfig: its settings cannot be read, or are not of this version.
     """
     path = (bag if bag.is_dir() else bag.parent) / JOURNAL
     if not path.exists():
@@ -113,19 +102,19 @@ class Recording:
         rows: Samples = self.recorder.rows(slot)
         return rows
 
-    def spans(self, legs: list[LegSpan | str]) -> list[tuple[int, int]]:
+    def spans(self, legs: list[asked.LegSpan | str]) -> list[tuple[int, int]]:
         """Return (start, stop) stamps of legs that ``legs_of`` gave; of none, those it holds."""
         return find_legs(self.recorder, self, legs, [] if legs else list(self.marks), self.config)
 
-    def legs(self, legs: AskedLeg | list[AskedLeg] | None = None) -> list[Leg]:
+    def legs(self, legs: asked.Leg | list[asked.Leg] | None = None) -> list[Leg]:
         """Return the legs asked for, or those it holds, for ``pipeline.calibrate``."""
         return [self.recorder.close(start, stop, self.config.leg.preroll)
-                for start, stop in self.spans(legs_of(legs))]
+                for start, stop in self.spans(asked.legs_of(legs))]
 
 
 def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
                journal: JournalNotes | None,
-               hearer: Listener | None = None) -> tuple[dict[str, str], dict[str, Reader]]:
+               hearer: asked.Listener | None = None) -> tuple[dict[str, str], dict[str, Reader]]:
     """Return slot -> topic of a bag, and topic -> reader; named ones precede a journal's."""
     from odocal_ros.library.topics import choose_topics, local_reference
     named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
@@ -137,8 +126,8 @@ def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
                     for slot, topic in chosen.items()}
 
 
-def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: Settings = None,
-             *, hearer: Listener | None = None) -> Recording:
+def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
+             config: asked.Settings = None, *, hearer: asked.Listener | None = None) -> Recording:
     """
     Read a bag: a rosbag2 folder (sqlite3, mcap), a rosbag1 file, or a file of either.
 
@@ -160,10 +149,10 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
         The bag cannot be read, lacks an input, or holds several that could be it.
 
     """
-    hearer = hearer or Listener()
+    hearer = hearer or asked.Listener()
     path = Path(path)
     journal = journal_notes(path)
-    settings = config_of(config, journal.settings if journal else None)
+    settings = asked.config_of(config, journal.settings if journal else None)
     # the hash costs as long as reading the file: beside the decoding, which holds one core
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
         name = one_line(bag.name)

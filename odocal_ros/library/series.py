@@ -30,13 +30,7 @@ def trajectory(result: Calibration) -> Series:
 
     east_m, north_m, up_m : of the odometer's point, in n, which stands at the leg's origin.
     latitude_deg, longitude_deg, height_m : the same.   qx, qy, qz, qw : take vehicle axes
-    (forward, left, up) to n.
-
-    Raises
-    ------
-    BadUsage
-        No leg has a fit of the smoother.
-
+    (forward, left, up) to n.   Raises BadUsage: no leg has a fit of the smoother.
     """
     return _of_fits(result, _pose)
 
@@ -48,11 +42,7 @@ def states(result: Calibration) -> Series:
     roll, pitch, yaw : of the vehicle in n, yaw from east.   gyro_bias_x ... : rad/s, in the body
     frame b.   accelerometer_bias_x ... : m/s^2.   Each with its sigma: gyro_bias_x_sigma ...
 
-    Raises
-    ------
-    BadUsage
-        No leg has a fit of the smoother.
-
+    Raises BadUsage: no leg has a fit of the smoother.
     """
     return _of_fits(result, _state)
 
@@ -81,8 +71,7 @@ def _vehicle(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
     found = leg.methods['smoother'].estimates
     yaw, pitch = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
     C_nb = smoothed['key_C_nb']
-    C_nv: Floats = _rows(smoothed, C_nb) @ C_bv(forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0))
-    return C_nv
+    return _rows(smoothed, C_nb) @ C_bv(forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0))
 
 
 def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:
@@ -158,13 +147,7 @@ def residuals(result: Calibration) -> Series:
     ``track`` along, left: dead reckoning from the start mark less each fix, as calibrated;
     ``track_before`` as configured. By the smoother, where it could fit: ``fix`` east, north, up;
     of the second before, ``odometer`` along, left, up, and ``gyro`` and ``accelerometer`` x, y, z,
-    means, in the body frame b.
-
-    Raises
-    ------
-    BadUsage
-        No leg has a track.
-
+    means, in the body frame b.   Raises BadUsage: no leg has a track.
     """
     found = [(number, leg, _residual_rows(leg, one)) for number, leg in enumerate(result.legs, 1)
              for one in left_in(leg)]

@@ -34,23 +34,11 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     """
     Return slot -> topic.
 
-    Parameters
-    ----------
-    topics : dict
-        Name -> TopicInfo of a bag.
-    config : Config
-        Required inputs, and the type of the odometer.
-    overrides : dict
-        Slot -> topic, as the user named them.
-    marked : bool
-        The positions are those of marks.
+    topics : by name.   config : required inputs, and the type of the odometer.   overrides :
+    slot -> topic, as the user named them.   marked : the positions are those of marks.
 
-    Raises
-    ------
-    BadUsage
-        A named topic is missing, or a required input is not unique: none or several fit. All
-        such inputs are named at once, with the option that selects each.
-
+    Raises BadUsage: a named topic is missing, or a required input is not unique: none or several
+    fit. All such inputs are named at once, with the option that selects each.
     """
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     _check_reference(chosen)
@@ -108,8 +96,8 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
         found = _unless_all(found, ('filtered', 'fused'))
     elif slot == 'fix_velocity':
         found = [name for name in found if _of_receiver(name)]
-        named_so = [name for name in found if _last(name) == slot]
-        found = named_so or found       # by the name the node listens to
+        # by the name the node listens to
+        found = [name for name in found if _last(name) == slot] or found
     return found
 
 

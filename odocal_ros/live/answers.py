@@ -111,7 +111,10 @@ def hint(now: SessionView) -> str:
     if state is State.IDLE:
         if now.config.leg.automatic and now.imu:
             return 'start driving: a leg starts automatically'
-        return _before_start(now.still_s)
+        if now.still_s < REST_FORESEEN_S:
+            return (f'stand still {REST_FORESEEN_S:.0f} s before ~/start_leg '
+                    f'({now.still_s:.0f} s so far)')
+        return 'call ~/start_leg'
     return after_result(now)
 
 
@@ -178,12 +181,6 @@ def _of_two_wheels(now: SessionView) -> list[str]:
     if not config.odometer.track_width and (wheels is None or wheels.track_width is None):
         wants.append(TURNS if now.imu else SPOT_TURNS)
     return wants
-
-
-def _before_start(still_s: float) -> str:
-    if still_s < REST_FORESEEN_S:
-        return f'stand still {REST_FORESEEN_S:.0f} s before ~/start_leg ({still_s:.0f} s so far)'
-    return 'call ~/start_leg'
 
 
 def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:

@@ -25,19 +25,15 @@ class PlainLog:
 
     # rclpy distinguishes callers by their lines, and wants one severity of each
     def debug(self, text: str) -> None:
-        """Log for developers."""
         self._logger.debug(brief_line(text))
 
     def info(self, text: str) -> None:
-        """Log normal events."""
         self._logger.info(brief_line(text))
 
     def warning(self, text: str) -> None:
-        """Log problems that the operator can fix."""
         self._logger.warning(brief_line(text))
 
     def error(self, text: str) -> None:
-        """Log failures."""
         self._logger.error(brief_line(text))
 
     def __getattr__(self, name: str) -> Any:

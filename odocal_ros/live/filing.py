@@ -40,11 +40,6 @@ class Filed:
     legs: frozenset[int]
     before: str
 
-    @property
-    def root(self) -> Path:
-        """Return the folder that holds all results."""
-        return self.folder.parent
-
 
 class ResultFolders:
     """
@@ -107,10 +102,11 @@ class ResultFolders:
         dropped = [f for f in self._filed if not f.legs <= left]
         self._filed = [f for f in self._filed if f.legs <= left]
         for one in reversed(dropped):
-            link = one.root / LATEST
+            root = one.folder.parent
+            link = root / LATEST
             if _target(link) != one.folder.name:
                 continue       # somebody else has moved it since
-            if one.before and (one.root / one.before).is_dir():
+            if one.before and (root / one.before).is_dir():
                 _point(link, one.before)
             else:
                 link.unlink(missing_ok=True)
@@ -152,40 +148,6 @@ def output_root(config: Config, node: str) -> Path:
     home = os.environ.get('ROS_HOME') or '~/.ros'
     own = Path(home) / 'odocal' / node.lstrip('/')
     return Path(config.output.directory or own).expanduser()
-
-
-def _save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]], imu_frame: str,
-          now_ns: int, folders: ResultFolders,
-          force: bool) -> tuple[Path, str, Callable[[], str] | None]:
-    """
-    Write the result files into a folder named by the time, and point ``latest`` at it.
-
-    ``inputs`` name the node. ``imu_frame`` is that of the IMU's headers, for a ``frames.imu``
-    left empty. Returns the folder, why ``latest`` stays where it was, empty when it does not
-    (``force`` moves it), and what adds the report, which takes long to draw.
-
-    Raises OdocalError: the folder cannot be written.
-    """
-    from odocal_ros.output.files import Results
-    from odocal_ros.output.ros_files import framed
-    calibration, config = framed(calibration, config, imu_frame)
-    root = output_root(config, inputs[0]['node'])
-    try:
-        folder = new_folder(root, iso(now_ns).replace(':', '-'))
-        try:
-            results = Results(calibration, config, folder, inputs, iso(now_ns))
-            results.write()
-        except OdocalError:
-            with suppress(OSError):
-                folder.rmdir()      # empty: its name was only reserved
-            raise
-        stays = folders.file(folder, marks(calibration.legs), force)
-        if config.leg.automatic:
-            folders.prune(folder, config.output.automatic_kept)
-    except OSError as error:
-        raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
-                          'output.directory to a writable folder') from None
-    return folder, stays, results.draw if results.has_report else None
 
 
 def marks(legs: Iterable[LegResult]) -> frozenset[int]:
@@ -239,7 +201,7 @@ class Filing:
         self._worker.submit(partial(
             self._write, calibration, config, [{'bag': '', 'sha256': None, 'node': self._node,
                                                'topics': topics}],
-            imu_frame, now_ns, self._folders, asked and calibration is self._warned), then)
+            imu_frame, now_ns, asked and calibration is self._warned), then)
         return future
 
     @property
@@ -247,11 +209,37 @@ class Filing:
         """Return True while files are being written."""
         return self._under_way > 0 or self._artist.busy
 
-    def _write(self, *values: Any) -> tuple[Path, str]:
-        """Write the numbers; for the worker."""
-        folder, stays, draw = _save(*values)
-        if draw is not None:
-            self._artist.submit(draw, self._drawn)
+    def _write(self, calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
+               imu_frame: str, now_ns: int, force: bool) -> tuple[Path, str]:
+        """
+        Write the result files into a folder named by the time; for the worker.
+
+        imu_frame : of the IMU's headers, for an empty ``frames.imu``. Returns the folder, and why
+        ``latest`` stays where it was, empty when it does not (``force`` moves it).
+
+        Raises OdocalError: the folder cannot be written.
+        """
+        from odocal_ros.output.files import Results
+        from odocal_ros.output.ros_files import framed
+        calibration, config = framed(calibration, config, imu_frame)
+        root = output_root(config, self._node)
+        try:
+            folder = new_folder(root, iso(now_ns).replace(':', '-'))
+            try:
+                results = Results(calibration, config, folder, inputs, iso(now_ns))
+                results.write()
+            except OdocalError:
+                with suppress(OSError):
+                    folder.rmdir()      # empty: its name was only reserved
+                raise
+            stays = self._folders.file(folder, marks(calibration.legs), force)
+            if config.leg.automatic:
+                self._folders.prune(folder, config.output.automatic_kept)
+        except OSError as error:
+            raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
+                              'output.directory to a writable folder') from None
+        if results.has_report:      # which takes long to draw
+            self._artist.submit(results.draw, self._drawn)
         return folder, stays
 
     def _drawn(self, why: str, error: Exception | None) -> None:

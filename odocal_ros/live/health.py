@@ -138,13 +138,10 @@ class Health:
         """Return seconds since the last message, infinite before the first."""
         return (now_ns - self.received_ns) * 1e-9 if self.received_ns else float('inf')
 
-    def silence_allowed_s(self) -> float:
-        """Return the time without messages after which this topic counts as silent."""
-        return max(SILENCE_NS * 1e-9, 5 * self._interval_s)
-
     def flowing(self, now_ns: int) -> bool:
         """Return True if usable messages arrive."""
-        return bool(self.newest_ns) and self.silent_s(now_ns) < self.silence_allowed_s()
+        allowed_s = max(SILENCE_NS * 1e-9, 5 * self._interval_s)
+        return bool(self.newest_ns) and self.silent_s(now_ns) < allowed_s
 
     def rate_hz(self, now_ns: int) -> float:
         """Return rows per second by their stamps over the last seconds, 0 when silent."""

@@ -7,7 +7,7 @@ from rclpy.node import Node
 
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.errors import BadUsage
-from odocal_ros.live.topic_input import Input, StaticTransforms
+from odocal_ros.live.topic_input import Input
 from odocal_ros.messages.sensor_types import types_of
 from odocal_ros.settings.config import Config
 
@@ -71,10 +71,6 @@ class Inputs:
     def missing(self, config: Config) -> list[str]:
         """Return the causes why a leg cannot start, one line per missing topic."""
         return [one.why() for one in self.required(config) if not one.flowing()]
-
-    def static_transforms(self) -> StaticTransforms | None:
-        """Return the topic of static transforms, if the reference is TF."""
-        return self.by_slot['fix'].static if 'fix' in self.by_slot else None
 
     def begin_leg(self) -> None:
         """Count lost messages from here on."""

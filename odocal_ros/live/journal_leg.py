@@ -116,7 +116,6 @@ class LegJournal:
 
     def __init__(self, plan: Plan, channels: dict[int, Channel], chunks: list[Chunk]) -> None:
         self.plan = plan
-        self.leg_id = plan.leg_id
         self.trouble = ''
         self._channels = channels
         self._waiting = chunks        # the pre-roll goes out with the start mark, never before it
@@ -124,17 +123,12 @@ class LegJournal:
         self._claim: TextIO | None = None
         self._others = 0              # bytes of the other journals
         self._over = False            # given up, or finished
-        self._late: list[Chunk] = []  # marks that came after the end
+        self.late: list[Chunk] = []  # marks that came after the end, not written yet
 
     @property
     def folder(self) -> str:
         """Return the folder of the journal, empty before it exists."""
         return str(self._bag.folder) if self._bag else ''
-
-    @property
-    def marks_wait(self) -> bool:
-        """Return True if the finished journal lacks marks."""
-        return bool(self._late)
 
     def put(self, chunks: list[Chunk]) -> None:
         """Write chunks, after those that wait."""
@@ -162,21 +156,21 @@ class LegJournal:
 
     def add(self, chunks: list[Chunk]) -> None:
         """Add a mark to the finished journal."""
-        self._late += chunks
+        self.late += chunks
         self.retry()
 
     def retry(self) -> None:
         """Write marks that the disk has not taken yet."""
         bag = self._bag
         if bag is None or not bag.segments or not bag.folder.exists():
-            self._late = []         # there is nothing to replay
-        elif self._late:
+            self.late = []         # there is nothing to replay
+        elif self.late:
             self._try(self._add_late)
 
     def _add_late(self) -> None:
         assert self._bag is not None
-        self._bag.add(self._late)
-        self._late, self.trouble = [], ''
+        self._bag.add(self.late)
+        self.late, self.trouble = [], ''
 
     def _write(self) -> None:
         if self._bag is None:

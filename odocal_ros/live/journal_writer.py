@@ -109,12 +109,6 @@ class JournalWriter:
         if self._leg is not None:
             self.trouble, self.folder = self._leg.trouble, self._leg.folder
 
-    def _show_late(self) -> None:
-        """Retry unwritten marks of closed legs, so that dropped legs stay dropped."""
-        for leg in [leg for leg in self._closed.values() if leg.marks_wait]:
-            leg.retry()
-            self.trouble = leg.trouble
-
     # jobs
 
     def take(self, batch: dict[str, Received], reach_ns: int, marks: Received | None) -> None:
@@ -124,7 +118,10 @@ class JournalWriter:
             chunk = self._packed(received)
             chunks.append(chunk)
             self._preroll.feed(slot, received.newest_ns or received.sent_ns[-1], chunk, reach_ns)
-        self._show_late()
+        for leg in self._closed.values():     # so that dropped legs stay dropped
+            if leg.late:
+                leg.retry()
+                self.trouble = leg.trouble
         if self._leg is not None:
             self._leg.put(chunks * self._listening + ([self._packed(marks)] if marks else []))
 
@@ -154,7 +151,7 @@ class JournalWriter:
         if leg is not None:
             leg.finish()
             self._show()
-            self._closed[leg.leg_id] = leg
+            self._closed[leg.plan.leg_id] = leg
             self._leg = None
 
     def _packed(self, received: Received) -> Chunk:

@@ -18,7 +18,6 @@ from odocal_ros.forecast.leg_so_far import SILENT_TIME
 from odocal_ros.forecast.progress import clocks_differ
 from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, worker
-from odocal_ros.live.answers import after_result, hint, quantities_ok
 from odocal_ros.live.console import Console
 from odocal_ros.live.filing import Filing
 from odocal_ros.live.journal import Journal, replay_command
@@ -199,7 +198,7 @@ class LegCompletion:
             session.config.leg.preroll))
         self.show_status()
         text = (f'recording leg {session.leg_id} since {iso(mark_ns)}; '
-                f'{hint(self.view())}. With these settings, {self._ability.words()}')
+                f'{answers.hint(self.view())}. With these settings, {self._ability.words()}')
         self._log.info(text)
         return text
 
@@ -265,7 +264,8 @@ class LegCompletion:
         self._publishing.show_paths(paths)
         now = self.view()
         success, text = answers.outcome(calibration, parts, self.session.leg_id,
-                                        words(quantities_ok(now)), after_result(now))
+                                        words(answers.quantities_ok(now)),
+                                        answers.after_result(now))
         self._log.info(text)
         self._computing.answer(success, text)
         return success, text

@@ -130,7 +130,6 @@ class WaitingMessages:
         self.gate.is_open = self._simulated or self._carried
 
     def subscribe(self, kind: type, topic: str, qos: QoSProfile) -> None:
-        """Begin to listen."""
         self._most = qos.depth
         self._subscription = self._node.create_subscription(
             kind, topic, self._receive, qos,  # type: ignore[arg-type]
@@ -171,7 +170,6 @@ class WaitingMessages:
                 self._receive(raw, info)
 
     def _receive(self, raw: bytes, info: dict[str, Any]) -> None:
-        """Remember one message."""
         if self._simulated:
             info['source_timestamp'] = self._node.get_clock().now().nanoseconds
         self._pending.append((raw, info))

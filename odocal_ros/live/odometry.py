@@ -59,14 +59,10 @@ class NumbersPublisher:
     Publishes copies of one message with another stamp and other numbers.
 
     Setting the fields of a message object and serialising it takes many times as long.
+    ``message``: its header holds the frame; after its last string are only 64-bit floats.
     """
 
     def __init__(self, node: Node, topic: str, message: Any) -> None:
-        """
-        Create the publisher.
-
-        message : its header holds the frame; after its last string are only 64-bit floats.
-        """
         raw = serialize_message(message)      # what follows the message is no part of it
         package, name = type(message).__module__.split('.')[0], type(message).__name__
         layout = layout_of(f'{package}/msg/{name}', raw)

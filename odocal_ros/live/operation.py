@@ -12,11 +12,9 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import Samples
 from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, worker
-from odocal_ros.live.answers import after_result, hint, quantities_ok
 from odocal_ros.live.filing import latest_of
 from odocal_ros.live.leg_completion import LegCompletion
 from odocal_ros.live.session import Refused, State
-from odocal_ros.live.worker import Computed, LeftOut, PATIENCE_S
 from odocal_ros.output.figures import iso
 from odocal_ros.output.stored import Stored
 from odocal_ros.pipeline.automatic import LegSearch
@@ -115,9 +113,9 @@ class AutomaticLegs(LegCompletion):
         if self._search is not None:
             self._search.begin_anew(stamp_ns, at_rest)
 
-    def _take_leg(self, done: Computed | LeftOut) -> None:
+    def _take_leg(self, done: worker.Computed | worker.LeftOut) -> None:
         super()._take_leg(done)
-        for reason in done.calibration.reasons if isinstance(done, Computed) else ():
+        for reason in done.calibration.reasons if isinstance(done, worker.Computed) else ():
             if reason.code is Code.SCALE_CHANGED and reason.text not in self._warned:
                 self._warned.add(reason.text)
                 self._log.warning(f'{reason.code.name}: {reason.text}. {reason.code.remedy}')
@@ -144,7 +142,7 @@ class Operation(AutomaticLegs):
         session, mark_ns = self.session, self._mark_ns()
         if session.state is State.RECORDING and not session.by_itself:
             return True, (f'recording since {iso(session.start_ns)}, leg '
-                          f'{session.leg_id}; {hint(self.view())}')
+                          f'{session.leg_id}; {answers.hint(self.view())}')
         if why := self._why_not():
             raise Refused(f'no leg can be started: {why}')
         if session.state is State.RECORDING:      # one that nobody asked for
@@ -181,17 +179,17 @@ class Operation(AutomaticLegs):
             self._compute(self._snapshot)
         elif session.state is not State.COMPUTING:
             return self._last_result()
-        return self._computing.promise(PATIENCE_S)
+        return self._computing.promise(worker.PATIENCE_S)
 
     def _last_result(self) -> tuple[bool, str]:
         """Return the answer to a stop without a leg."""
         session, now = self.session, self.view()
         if now.lost:
             raise Refused(now.lost)
-        good = words(quantities_ok(now))
+        good = words(answers.quantities_ok(now))
         if session.calibration is not None:
             success, text = answers.outcome(session.calibration, good=good,
-                                            advice=after_result(now))
+                                            advice=answers.after_result(now))
             return success, f'no leg is running; the last result: {text}'
         if session.restored is not None:
             form = self._recording.inputs.form

@@ -8,12 +8,7 @@ import difflib
 import math
 from typing import Any
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces import msg
 from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -53,7 +48,7 @@ def _result_defaults(estimates: Iterable[str]) -> dict[str, Any]:
 RESULTS = _result_defaults(ESTIMATES)
 
 
-def descriptor(setting: Setting) -> ParameterDescriptor:
+def descriptor(setting: Setting) -> msg.ParameterDescriptor:
     """
     Return the descriptor of a setting.
 
@@ -64,7 +59,7 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
     """
     about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
     about += ' Fixed at start-up.' if setting.ro else ''
-    result = ParameterDescriptor(description=about)
+    result = msg.ParameterDescriptor(description=about)
     result.dynamic_typing = setting.kind in ('floats', 'strs') and not (
         setting.ro and setting.default)
     limits = []
@@ -73,9 +68,10 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
     if setting.low is not None and setting.high is not None:
         limits.append(f'{setting.low:g} to {setting.high:g}')
         if setting.kind == 'int':
-            result.integer_range = [IntegerRange(from_value=setting.low, to_value=setting.high)]
+            result.integer_range = [msg.IntegerRange(from_value=setting.low,
+                                                     to_value=setting.high)]
         elif setting.kind == 'float' and not math.isnan(setting.default):
-            result.floating_point_range = [FloatingPointRange(
+            result.floating_point_range = [msg.FloatingPointRange(
                 from_value=float(setting.low), to_value=float(setting.high))]
     if setting.kind == 'floats':
         limits.append('0 or 4 values' if not setting.default else f'{len(setting.default)} values')
@@ -91,8 +87,11 @@ def declare(node: Node, kind: type = Config) -> Any:
     """
     values, settings = {}, settings_of(kind)
     for name, setting in settings.items():
+        # None for an empty list, which rclpy takes for bytes
+        listed = setting.kind in ('floats', 'strs')
+        default = list(setting.default) or None if listed else setting.default
         try:
-            value = node.declare_parameter(name, _as_ros(setting), descriptor(setting)).value
+            value = node.declare_parameter(name, default, descriptor(setting)).value
             if value is None:
                 array = 'STRING_ARRAY' if setting.kind == 'strs' else 'DOUBLE_ARRAY'
                 node.set_parameters([Parameter(name, Parameter.Type[array], [])])
@@ -153,12 +152,12 @@ def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]
     return ''
 
 
-def fixed(kind: type) -> Callable[[list[Parameter]], SetParametersResult]:
+def fixed(kind: type) -> Callable[[list[Parameter]], msg.SetParametersResult]:
     """Return the on-set callback of a node that reads settings of a kind only at start-up."""
-    def refuse(parameters: list[Parameter]) -> SetParametersResult:
+    def refuse(parameters: list[Parameter]) -> msg.SetParametersResult:
         ours = [p.name for p in parameters
                 if p.name.startswith(PREFIX) or p.name in settings_of(kind)]
-        return SetParametersResult(successful=not ours, reason=(
+        return msg.SetParametersResult(successful=not ours, reason=(
             f'{ours[0]} is only read at start-up: restart the node with it') if ours else '')
     return refuse
 
@@ -167,7 +166,7 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
     """Declare ``result.*``; return the saved result that came as overrides at start-up, if any."""
     for name, default in _result_defaults(estimates).items():
         unit = estimates.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
-        about = ParameterDescriptor(dynamic_typing=True, description=(
+        about = msg.ParameterDescriptor(dynamic_typing=True, description=(
             'Set by the node after each leg' + (f' [{unit}]' if unit else '')))
         value = node.declare_parameter(name, default, about).value
         kind = type(default)
@@ -192,8 +191,8 @@ def as_results(calibration: Calibration, stamp: str,
     values = dict(RESULTS)
     for name in ESTIMATES:
         estimate = calibration.estimates.get(name) or Estimate(None, None, '')
-        values[PREFIX + name] = _number(estimate.value)
-        values[PREFIX + name + '_sigma'] = _number(estimate.sigma)
+        for key, number in ((name, estimate.value), (f'{name}_sigma', estimate.sigma)):
+            values[PREFIX + key] = math.nan if number is None else float(number)
     values[PREFIX + 'legs'] = len(calibration.legs)
     values[PREFIX + 'valid'] = calibration.verdict is not Verdict.REJECTED
     values[PREFIX + 'stamp'], values[PREFIX + 'vehicle'] = stamp, vehicle
@@ -225,17 +224,6 @@ def restored_from(results: dict[str, Any],
         return None
     return Restored(found, legs, results[PREFIX + 'valid'], stamp or NO_STAMP,
                     results[PREFIX + 'vehicle'])
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _as_ros(setting: Setting) -> Any:
-    """Return a default rclpy can type: None for an empty list, which it takes for bytes."""
-    if setting.kind in ('floats', 'strs'):
-        return list(setting.default) or None
-    return setting.default
 
 
 def _plain(value: Any) -> Any:

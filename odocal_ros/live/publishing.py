@@ -27,8 +27,7 @@ from odocal_ros.output.figures import iso
 from odocal_ros.outside.yaml_files import no_date
 from odocal_ros.settings.config import Config
 
-PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle',
-           'yaw_mounting_angle_sigma')
+PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_mounting_angle_sigma')
 PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
 
 

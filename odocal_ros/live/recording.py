@@ -51,7 +51,8 @@ class Recording:
 
     def pump(self, config: Config, found_scale: float) -> None:
         """Decode what has come since the last call, in blocks."""
-        static = self.inputs.static_transforms()
+        fix = self.inputs.by_slot.get('fix')
+        static = fix.static if fix else None     # a TF reference has a topic beside
         if static is not None:
             raws, sent_ns = static.take()
             if raws:
@@ -69,18 +70,19 @@ class Recording:
                     continue
                 if not source.sound.all():     # the pipeline screens for itself
                     block = take(block, source.sound)
-                self.progress.feed(slot, block, config, self.inputs.form, found_scale)
-                if self.tap is not None:
-                    self.tap(slot, block)
+                self._show(slot, block, config, found_scale)
             if not self.time_jumped:     # of another time: no sample of a leg before it
                 self._remember(source, raws, sent_ns)
 
     def add_marks(self, block: FixSamples, config: Config) -> None:
         """Take the positions of a mark, as those of a topic."""
         self.recorder.feed('fix', block)
-        self.progress.feed('fix', block, config, self.inputs.form, 0.0)
+        self._show('fix', block, config, 0.0)
+
+    def _show(self, slot: str, block: Samples, config: Config, found_scale: float) -> None:
+        self.progress.feed(slot, block, config, self.inputs.form, found_scale)
         if self.tap is not None:
-            self.tap('fix', block)
+            self.tap(slot, block)
 
     @property
     def local(self) -> bool:

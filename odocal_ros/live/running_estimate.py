@@ -10,14 +10,9 @@ from typing import Any, TypeAlias
 
 from odocal_ros.data.leg import LegRecorder, SLOTS
 from odocal_ros.data.samples import join, OdometerForm, take
+from odocal_ros.forecast import leg_so_far
 from odocal_ros.forecast.forecast import Abandoned, better, Forecast
 from odocal_ros.forecast.foresight import forecast_of
-from odocal_ros.forecast.leg_so_far import (
-    faults_in_cells,
-    ImuGaps,
-    screened_in_cells,
-    SmootherSoFar,
-)
 from odocal_ros.forecast.smoother_forecast import planar_forecast
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.live.answers import one_line
@@ -54,9 +49,9 @@ class RunningEstimate:
         self._newest: Forecast | None = None     # of the part that is driven
         self._earlier: Forecast | None = None    # of those before it
         self._faults: tuple[Reason, ...] = ()
-        self._gaps: ImuGaps | None = None
+        self._gaps: leg_so_far.ImuGaps | None = None
         self._thinned: ThinnedLeg | None = None
-        self._smoother = SmootherSoFar()
+        self._smoother = leg_so_far.SmootherSoFar()
         self._before: LegRecorder | None = None
         self._fresh: list[Block] = []
         self._over = threading.Event()
@@ -70,7 +65,7 @@ class RunningEstimate:
         self.end()
         self._config, self._before = config, recorder
         self._look_from(start_ns, recorder.form)
-        self._gaps = ImuGaps(start_ns, config.leg.max_gap)
+        self._gaps = leg_so_far.ImuGaps(start_ns, config.leg.max_gap)
         self._gaps.feed(recorder.rows('imu'))      # a mark may lie back, as leg.automatic sets it
 
     def end(self) -> None:
@@ -95,7 +90,7 @@ class RunningEstimate:
     def _look_from(self, start_ns: int, form: OdometerForm) -> None:
         """Look at what comes after a stamp."""
         self._over, self._start_ns = threading.Event(), start_ns
-        self._thinned, self._smoother = ThinnedLeg(form), SmootherSoFar()
+        self._thinned, self._smoother = ThinnedLeg(form), leg_so_far.SmootherSoFar()
         self._due_ns = start_ns + LOOK_PERIOD_NS
 
     def feed(self, slot: str, block: Any) -> None:
@@ -149,7 +144,7 @@ class RunningEstimate:
 
 
 def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], start_ns: int,
-          config: Config, over: threading.Event, smoother: SmootherSoFar,
+          config: Config, over: threading.Event, smoother: leg_so_far.SmootherSoFar,
           ) -> Look:
     """
     Return forecast, faults, the seconds of CPU it took and what went wrong; for the worker.
@@ -166,13 +161,13 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], s
         if is_planar(leg, config):
             forecast = planar_forecast(leg, config, lambda: not over.is_set())
         else:
-            found = faults_in_cells(leg, config)
+            found = leg_so_far.faults_in_cells(leg, config)
             forecast = forecast_of(leg, thinned.fix_rate(), config, lambda: not over.is_set(),
                                    smoother)
     except Exception as error:  # an error of the running estimate does not end the leg
         failure = error
     finally:
-        screened_in_cells.cache_clear()      # of this leg nobody asks again
+        leg_so_far.screened_in_cells.cache_clear()      # of this leg nobody asks again
     return forecast, found, time.thread_time() - begin - smoother.once_s, failure
 
 

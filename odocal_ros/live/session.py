@@ -268,7 +268,6 @@ class SessionView:
 
     @property
     def leg(self) -> LegConfig:
-        """Return the limits of the leg."""
         config = self.session.config
         return (config.in_local_frame() if self.local else config).leg
 

@@ -38,8 +38,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument('node', nargs='?', default='/calibrator',
                         help='full name of the node (default: /calibrator)')
-    parser.add_argument('--once', action='store_true',
-                        help='print the first status and exit')
+    parser.add_argument('--once', action='store_true', help='print the first status and exit')
 
 
 def run(args: Namespace) -> int:

@@ -11,13 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from odocal_ros.calib.result import wheel_factors
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import as_keys
-from odocal_ros.live.answers import (
-    hint,
-    manoeuvres,
-    metres_to_go,
-    quantities_ok,
-    seconds_to_stand,
-)
+from odocal_ros.live import answers
 from odocal_ros.live.console import losses_in_words
 from odocal_ros.live.health import Health
 from odocal_ros.live.session import Session, SessionView, State
@@ -43,7 +37,7 @@ VALUES = {f'{name}{end}{unit}': f'result.{name}{end}'      # key: parameter
 def calibration_status(now: SessionView) -> DiagnosticStatus:
     """Return the one status of ``~/status``."""
     session, results = now.session, now.results
-    text, ok = hint(now), quantities_ok(now)
+    text, ok = answers.hint(now), answers.quantities_ok(now)
     legs = results['result.legs'] if now.restored else len(session.legs)
     keys = {
         'state': now.state, 'leg_id': session.leg_id, 'leg_start_ns': session.start_ns,
@@ -58,10 +52,11 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
         'restored': now.restored,
         'standstill_s': now.still_s, 'max_speed_mps': now.max_speed,
-        'metres_to_least': metres_to_go(now), 'seconds_to_stand': seconds_to_stand(now),
+        'metres_to_least': answers.metres_to_go(now),
+        'seconds_to_stand': answers.seconds_to_stand(now),
         'asked_scale_sigma_ppm': now.config.verdict.max_scale_sigma * 1e6,
         'asked_yaw_sigma_deg': math.degrees(now.config.verdict.max_yaw_sigma),
-        'manoeuvres': '; '.join(manoeuvres(now)),
+        'manoeuvres': '; '.join(answers.manoeuvres(now)),
         'can_tell': ', '.join(now.ability.can) if now.ability else '',
         'cannot_tell': '; '.join(now.ability.cannot) if now.ability else '',
         'messages_lost': sum(now.lost_messages.values()),

@@ -39,7 +39,6 @@ class Raws(Sequence[bytes]):
         return cls(b''.join(raws), np.cumsum(size) - size, size)
 
     def __len__(self) -> int:
-        """Return the number of messages."""
         return len(self.start)
 
     @overload
@@ -90,13 +89,9 @@ class Raws(Sequence[bytes]):
 
 def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[cdr.Layout | None, Rows, Table]]:
     """
-    Sort messages by layout.
+    Yield each layout, its rows (numbers, or a slice: all of them) and messages, (n, size) bytes.
 
-    Yields
-    ------
-    Layout, where its rows stand (numbers, or a slice: all of them) and the messages, (n, size)
-    bytes. Rows that have no layout come last, with None and no messages.
-
+    Rows that have no layout come last, with None and no messages.
     """
     raws = Raws.of(raws)
     odd: list[Ints] = []

@@ -9,19 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data import samples
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.pieces import across
-from odocal_ros.data.samples import (
-    FixSamples,
-    HeadingSamples,
-    ImuSamples,
-    OdometerForm,
-    of_columns,
-    Samples,
-    ScalarSamples,
-    VelocitySamples,
-)
 from odocal_ros.errors import BadData
 from odocal_ros.messages.fields import array, Column, fixed, STAMP, stamp_ns, View, xyz
 from odocal_ros.nav.local_frame import local_fixes
@@ -31,8 +22,8 @@ from odocal_ros.settings.levels import RAD_PER_DEG
 IMU = 'sensor_msgs/msg/Imu'
 FIX = 'sensor_msgs/msg/NavSatFix'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
-Pairs = list[tuple[str, Samples]]
-Build = Callable[..., Samples]        # of stamps, arrivals and a slot's columns
+Pairs = list[tuple[str, samples.Samples]]
+Build = Callable[..., samples.Samples]        # of stamps, arrivals and a slot's columns
 # format: block of the position in a 6 x 6 covariance, row by row
 _COVARIANCE = array('pose.covariance', 0, 1, 2, 6, 7, 8, 12, 13, 14)
 # columns of each type: position, and its covariance where the type has one
@@ -48,7 +39,7 @@ LOCAL_TYPES: dict[str, Sequence[Column]] = {
 class SensorPlan:
     """Fields to read from a stamped sensor message, and the samples of them."""
 
-    form: OdometerForm | None = None
+    form: samples.OdometerForm | None = None
     known = True         # its layout is all there is to learn of its type
 
     def __init__(self, slot: str, columns: Sequence[Column], build: Build) -> None:
@@ -71,18 +62,18 @@ class SensorPlan:
 
 
 def _imu(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw: Floats, w_i: Floats,
-         f_i: Floats, of_force: Floats) -> ImuSamples:
+         f_i: Floats, of_force: Floats) -> samples.ImuSamples:
     with np.errstate(invalid='ignore'):      # a NaN that signals
         none = of_force[:, 0] == -1          # REP-145: none is sent
     if none.any():
         f_i[none] = np.nan
-    return of_columns(ImuSamples, stamps, received, w_i, f_i, q_ni,
-                      _yaw_variance(q_ni, of_roll, of_yaw))
+    return samples.of_columns(samples.ImuSamples, stamps, received, w_i, f_i, q_ni,
+                              _yaw_variance(q_ni, of_roll, of_yaw))
 
 
 def _heading(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw: Floats
-             ) -> HeadingSamples:
-    return HeadingSamples(stamps, received, q_ni, _yaw_variance(q_ni, of_roll, of_yaw))
+             ) -> samples.HeadingSamples:
+    return samples.HeadingSamples(stamps, received, q_ni, _yaw_variance(q_ni, of_roll, of_yaw))
 
 
 def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
@@ -92,22 +83,23 @@ def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
 
 
 def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
-         status: Ints) -> FixSamples:
+         status: Ints) -> samples.FixSamples:
     with np.errstate(invalid='ignore'):      # a NaN that signals
         latitude, longitude = position[:, 0] * RAD_PER_DEG, position[:, 1] * RAD_PER_DEG
-    return of_columns(FixSamples, stamps, received, latitude, longitude, position[:, 2].copy(),
-                      covariance.reshape(-1, 3, 3), known[:, 0], status[:, 0])
+    return samples.of_columns(samples.FixSamples, stamps, received, latitude, longitude,
+                              position[:, 2].copy(),
+                              covariance.reshape(-1, 3, 3), known[:, 0], status[:, 0])
 
 
 def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
-              *covariance: Floats) -> VelocitySamples:
+              *covariance: Floats) -> samples.VelocitySamples:
     variance = covariance[0] if covariance else np.zeros_like(velocity_n)
     known = (variance > 0) & (variance < 1e12)       # else unknown
-    return VelocitySamples(stamps, received, velocity_n, np.where(known, variance, 0.0))
+    return samples.VelocitySamples(stamps, received, velocity_n, np.where(known, variance, 0.0))
 
 
-def _scalar(stamps: Ints, received: Ints, sent: Floats) -> ScalarSamples:
-    return ScalarSamples(stamps, received, sent[:, 0], sent[:, 1])
+def _scalar(stamps: Ints, received: Ints, sent: Floats) -> samples.ScalarSamples:
+    return samples.ScalarSamples(stamps, received, sent[:, 0], sent[:, 1])
 
 
 # format: of sensor_msgs/Imu, whose covariances are 3 x 3, row by row

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     parser.description = (
         'Show each value and its change since the first and since the previous calibration, in '
         'its unit and in sigmas. A change is significant beyond 3 sigma. Exit code 0: no '

@@ -11,7 +11,6 @@ from odocal_ros.offline.say import say, say_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     parser.add_argument('bag', metavar='BAG', help='bag folder or file')
     parser.add_argument('--json', action='store_true', help='print everything as JSON')
     add_input_arguments(parser, 'the most likely one')

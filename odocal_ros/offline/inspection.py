@@ -22,25 +22,10 @@ from odocal_ros.messages.decode import Deserialize, make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.messages.transforms import with_static
-from odocal_ros.offline import survey
+from odocal_ros.offline import odometer_search, survey, wheel_survey
 from odocal_ros.offline.inspection_drive import lacking, look
-from odocal_ros.offline.odometer_search import (
-    best_topic,
-    configured,
-    match_of,
-    only_near_best,
-    searched,
-    still,
-)
 from odocal_ros.offline.suggest import command, left_open, likely_mapping
 from odocal_ros.offline.survey import fix_path, FixPath, Match
-from odocal_ros.offline.wheel_survey import (
-    alone,
-    FIELDS as LISTS,
-    in_words,
-    suggested,
-    Values,
-)
 from odocal_ros.output.files import plain
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond
@@ -58,7 +43,8 @@ class _Tap:
 
     def __init__(self, reader: Reader) -> None:
         self.reader, self.recorder, self.trouble = reader, LegRecorder(), ''
-        self.values = Values(reader.msgtype) if reader.msgtype in LISTS else None
+        listed = reader.msgtype in wheel_survey.FIELDS
+        self.values = wheel_survey.Values(reader.msgtype) if listed else None
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:
@@ -80,7 +66,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     Times are seconds from the bag's first message, angles rad, the rest SI.
     """
     taps, refused = _taps(bag, config, overrides)
-    search = searched(bag.topics, taps, overrides.values())
+    search = odometer_search.searched(bag.topics, taps, overrides.values())
     bag.read({**taps, **search, **_static(taps, bag)}, print)       # a tap gives nothing on
     mapping, config = likely_mapping(bag.topics, config, overrides)
     turn = _turn(taps[mapping['imu']]) if mapping.get('imu') in taps else None
@@ -88,7 +74,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         'fix') in taps else None
     lists = {name: tap.values.facts(turn, fixes) for name, tap in taps.items() if tap.values}
     matches = _matches(taps, lists, fixes) if fixes else {}
-    idle = still(matches)
+    idle = odometer_search.still(matches)
     mapping, config = likely_mapping(bag.topics, config, overrides, idle)
     topics = [_topic(bag, info, taps.get(name), refused.get(name, ''))
               for name, info in bag.topics.items()]
@@ -107,16 +93,16 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
             facts['odometer']['still'] = facts['name'] in idle
         if fixes and (tried := search.get(facts['name'])) and not tried.trouble:
             facts['fields'] = tried.facts(fixes)
-    only_near_best([facts['fields'] for facts in topics if 'fields' in facts])
+    odometer_search.only_near_best([facts['fields'] for facts in topics if 'fields' in facts])
     own = config
     if mapping.get('odometer') not in taps and (
-            best := best_topic(topics, overrides.get('odometer', ''))):
+            best := odometer_search.best_topic(topics, overrides.get('odometer', ''))):
         mapping['odometer'] = best['name']
         extra = search[best['name']].settings(best['fields']['found'], turn)
     else:
         extra = _wheels(taps, mapping, config, topics, lists)
     if extra:
-        config = configured(config, extra)
+        config = odometer_search.configured(config, extra)
         _read_again(bag, taps, mapping['odometer'], config, topics)
     if {'imu', 'odometer'} <= mapping.keys():
         extra += look(bag, _together(taps, mapping), config, found, findings)
@@ -199,7 +185,7 @@ def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[st
 def _matches(taps: dict[str, _Tap], lists: dict[str, list[dict[str, Any]]],
              fixes: FixPath) -> dict[str, Match]:
     """Return the comparison of each odometer topic with the path of the fixes."""
-    found = {name: match_of(tap.recorder.rows('odometer'), tap.reader.form, fixes)
+    found = {name: odometer_search.match_of(tap.recorder.rows('odometer'), tap.reader.form, fixes)
              for name, tap in taps.items() if tap.reader.form and not lists.get(name)}
     grows = {name: any(one['scale'] for one in some) for name, some in lists.items() if some}
     return found | {name: Match(float(some), 0.0, some) for name, some in grows.items()}
@@ -216,7 +202,7 @@ def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
         tap, moves = taps[facts['name']], lists[facts['name']]
         facts['values'] = moves
         if len(moves) > 1:
-            facts['moves'] = in_words(moves)
+            facts['moves'] = wheel_survey.in_words(moves)
         form = tap.reader.form
         assert form is not None      # a topic of lists is an odometer's
         if form.chosen:
@@ -228,7 +214,8 @@ def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
                 options += [f'odometer.{side}={key}' for side, key in zip(
                     SIDES, named, strict=True)]
             else:
-                options += suggested(moves) or alone(moves, tap.reader.wheels)
+                options += (wheel_survey.suggested(moves)
+                            or wheel_survey.alone(moves, tap.reader.wheels))
     return options
 
 

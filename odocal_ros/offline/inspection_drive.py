@@ -21,11 +21,7 @@ from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.asked import EACH_STOP, LegSpan
 from odocal_ros.library.legs import find_legs, marked_legs, stops_of
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.offline.survey import (
-    Drive,
-    straight_stretches,
-    survey_drive,
-)
+from odocal_ros.offline import survey
 from odocal_ros.pipeline.calibrate import missing_data
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.clocks import TOO_FAR
@@ -64,7 +60,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
         return []
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
-    drive = survey_drive(inputs, config)
+    drive = survey.survey_drive(inputs, config)
     path_length, chord = way_and_chord(drive.t_fix, drive.fixes_n, inputs.least_motion)
     driven = _driven(inputs, drive)
     long = path_length > 2.5 * inputs.least_motion      # judgement: then it is good to a per cent
@@ -86,7 +82,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     return options
 
 
-def _driven(inputs: Inputs, drive: Drive) -> float:
+def _driven(inputs: Inputs, drive: survey.Drive) -> float:
     """Return the travel between the first and the last fix (else all), in units."""
     t, s = inputs.travel.t, inputs.travel.s
     if len(drive.t_fix) > 1:
@@ -121,7 +117,7 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
     return ['gnss.max_sigma=nan'] if kept < every / 2 else []
 
 
-def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: Drive, config: Config,
+def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config: Config,
           found: dict[str, Any], findings: list[Reason]) -> list[str]:
     """Return the IMU orientation, and whether its gyro turns with the course."""
     m = mounting(inputs.t_imu, w_i, f_i, inputs.travel, drive.scale or 1.0)
@@ -146,7 +142,7 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: Drive, config: Config
     return [f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 
 
-def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: Drive, first: int,
+def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, first: int,
           config: Config, found: dict[str, Any]) -> list[str]:
     """Return the legs that replay would use, and better ones for the two-point method."""
     if not len(drive.t_fix):
@@ -165,13 +161,12 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: Drive, first: 
     stops = stops_of(inputs, first, config)
     found['legs'] = [described(a, b, marked=bool(marks))
                      for a, b in find_legs(recorder, bag, [], marks, config, stops)]
-    each = find_legs(recorder, bag, [EACH_STOP], [], config, stops) if len(
-        drive.stops) > 2 else []
+    each = find_legs(recorder, bag, [EACH_STOP], [], config, stops) if len(drive.stops) > 2 else []
     found['each_stop'] = [described(a, b) for a, b in each]
     found['straight'] = [
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
             _from_rest(drive.stops, *ends)
-            for ends in straight_stretches(inputs, drive, config.leg.min_distance)[:5])]
+            for ends in survey.straight_stretches(inputs, drive, config.leg.min_distance)[:5])]
     # of the whole drive the other methods make more than of its pieces
     if marks or config.method != 'two_point' or not all(closed(leg) for leg in found['legs']):
         return []

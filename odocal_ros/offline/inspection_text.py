@@ -33,10 +33,11 @@ def _head(found: dict[str, Any]) -> list[str]:
 
 def _topics(found: dict[str, Any], roles: dict[str, str]) -> list[str]:
     wide = max((len(topic['name']) for topic in found['topics']), default=0)
-    kinds = max((len(_short(topic['type'])) for topic in found['topics']), default=0)
+    short = {topic['type']: topic['type'].replace('/msg/', '/') for topic in found['topics']}
+    kinds = max(map(len, short.values()), default=0)
     lines = []
     for topic in found['topics']:
-        name, kind = one_line(topic['name']), one_line(_short(topic['type']))
+        name, kind = one_line(topic['name']), one_line(short[topic['type']])
         rate = f'{topic["rate_hz"]:8.2f} Hz' if topic['rate_hz'] and topic['count'] > 1 else ''
         role = f'<- {roles[topic["name"]]}' if topic['name'] in roles else ''
         if str(LOCAL) in topic.get('fix', {}).get('status', ()):
@@ -44,10 +45,6 @@ def _topics(found: dict[str, Any], roles: dict[str, str]) -> list[str]:
         lines.append(f'  {name:{wide}}  {kind:{kinds}} '
                      f'{topic["count"]:8d} {rate:11}  {role}'.rstrip())
     return ['topics', *lines]
-
-
-def _short(msgtype: str) -> str:
-    return msgtype.replace('/msg/', '/')
 
 
 def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:

@@ -17,7 +17,6 @@ NOISE = {'white': 0.0, 'correlated': 60.0}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     add = parser.add_argument
     add('--scenario', metavar='NAME', help='scenario: paper, straight, out_and_back or town')
     add('--duration', type=float, metavar='S', help='duration of the scenario, s')

@@ -79,8 +79,7 @@ def _methods(before: Plan) -> list[str]:
     rows = [('predicted sigma', 'scale', 'yaw', 'pitch'), *(
         (name, *(_shown(p, method.estimates[p].sigma) for p in PARAMETERS))
         for name, method in before.methods.items())]
-    return [*(table_row(row, (20, 14, 16, 16)) for row in rows),
-            f'  (result: {_result(before)})']
+    return [*(table_row(row, (20, 14, 16, 16)) for row in rows), f'  (result: {_result(before)})']
 
 
 def _result(before: Plan) -> str:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
     add = parser.add_argument
     add('bags', nargs='+', metavar='BAG', help='bag folder or file; several: legs of one vehicle')
     add_calibration_arguments(parser)
@@ -112,7 +111,6 @@ class _Screen(Listener):
         self._quiet, self._silent = args.quiet, args.quiet or args.json
 
     def note(self, text: str) -> None:
-        """Print a sentence."""
         if not self._quiet:
             warn(f'odocal: {text}')
 

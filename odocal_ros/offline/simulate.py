@@ -204,8 +204,7 @@ def run(args: argparse.Namespace) -> int:
                          heading_sigma=None if known is None else math.radians(known),
                          progress=progress)
     if not args.quiet:
-        replay = ['odocal', 'replay', str(out), '--config', str(settings),
-                  *topic_arguments(drive)]
+        replay = ['odocal', 'replay', str(out), '--config', str(settings), *topic_arguments(drive)]
         say(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
             f'{sum(len(t.time_ns) for t in drive_topics(drive))} messages; truth in {truth}; '
             f'next: {for_shell(replay)}')

@@ -94,16 +94,11 @@ def imu(samples: ImuSamples) -> dict[str, Any]:
 def odometer(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
     """Return the values that an odometer topic counts."""
     finite = samples.value[~beyond('value', samples.value)]
+    order = np.sort(finite)
+    ends = {'first': finite[:1], 'last': finite[-1:], 'least': order[:1], 'most': order[-1:]}
     return {'quantity': form.quantity, 'scale_unit': form.scale_unit, 'modulus': form.modulus,
-            'first': _number(finite[:1]), 'last': _number(finite[-1:]),
-            'least': _number(np.sort(finite)[:1]), 'most': _number(np.sort(finite)[-1:]),
+            **{name: x.item() if len(x) else None for name, x in ends.items()},
             'not_finite': len(samples.value) - len(finite)}
-
-
-def _number(array: NDArray[Any]) -> float | None:
-    """Return the first of some numbers, as Python has it."""
-    number: float | None = array[0].item() if len(array) else None
-    return number
 
 
 def fixes(samples: FixSamples) -> dict[str, Any]:

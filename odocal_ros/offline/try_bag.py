@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     if not found['command']:
         from odocal_ros.offline.inspection_text import text
         say(text(found))
-        missing = _missing(found)
+        missing = [slot for slot in ('imu', 'odometer', 'fix') if slot not in found['mapping']]
         labels = ', '.join(INPUTS[slot].label for slot in missing)
         raise BadData(f'{args.bag}: no topic was found for: {labels}; if one has another type, '
                       f'select it with its option, such as {topic_option(missing[0])} TOPIC')
@@ -121,11 +121,6 @@ def _asked(bag: 'Bag', choice: _Choice) -> _Choice:
             names.insert(0, names.pop(int(answer) - 1))
             return _Choice(choice.slot, names[0], names[1:], 'you selected it')
         say(f'enter a number from 1 to {len(names)}')
-
-
-def _missing(found: dict[str, Any]) -> list[str]:
-    """Return the slots without a topic."""
-    return [slot for slot in ('imu', 'odometer', 'fix') if slot not in found['mapping']]
 
 
 def _suggested(command: str, without_legs: bool) -> list[str]:

@@ -42,11 +42,7 @@ def look() -> Iterator[None]:
 
 def sheet(height: float, rows: int = 1, sharex: bool = True,
           heights: list[float] | None = None) -> tuple[Any, NDArray[Any]]:
-    """
-    Return a figure of ``height`` inch and its axes, one above the other, as an array.
-
-    heights : of the axes, in any unit; None: all equal.
-    """
+    """Return a figure of ``height`` inch and its axes in a column, of relative ``heights``."""
     from matplotlib.figure import Figure
     width = 5.6    # inch
     figure = Figure(figsize=(width, height))
@@ -136,11 +132,7 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """
-    Write a figure.
-
-    Raises BadUsage: the file cannot be written.
-    """
+    """Write a figure, or raise BadUsage."""
     part = path.with_name(f'.{path.name}.part')
     try:
         ending = path.suffix[1:].lower()

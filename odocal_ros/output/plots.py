@@ -11,34 +11,18 @@ import numpy as np
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.output.drawing import (
-    BAND,
-    BLUE,
-    Drawing,
-    evenly,
-    GREEN,
-    GREY,
-    key,
-    lengths,
-    MOST_MARKS,
-    PINK,
-    RED,
-    relative,
-    sheet,
-    svg,
-    thinned,
-)
+from odocal_ros.output import drawing
 from odocal_ros.output.plots_scale import by_speed, by_window
 
-PAUSE = {'no fix used': PINK, 'no IMU': RED, 'no odometer': GREEN}
-STATUS = {-1: ('no fix (-1)', 'x', GREY), 0: ('fix (0)', 'o', BLUE),
-          1: ('satellite based aid, SBAS (1)', 's', GREEN),
-          2: ('ground based aid, GBAS or RTK (2)', '^', PINK)}
+PAUSE = {'no fix used': drawing.PINK, 'no IMU': drawing.RED, 'no odometer': drawing.GREEN}
+STATUS = {-1: ('no fix (-1)', 'x', drawing.GREY), 0: ('fix (0)', 'o', drawing.BLUE),
+          1: ('satellite based aid, SBAS (1)', 's', drawing.GREEN),
+          2: ('ground based aid, GBAS or RTK (2)', '^', drawing.PINK)}
 
 
 def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
                 before_word: str = 'as configured',
-                smoothed: dict[str, Any] | None = None) -> list[Drawing]:
+                smoothed: dict[str, Any] | None = None) -> list[drawing.Drawing]:
     """
     Draw a leg.
 
@@ -74,13 +58,14 @@ def draw_track(ax: Any, found: Evidence, before_word: str = 'as configured',
                slips: list[dict[str, float]] | tuple[Any, ...] = ()) -> None:
     """Draw on axes the track as configured and as calibrated over the fixes."""
     start = found.track_n[0]
-    factor, unit = lengths(np.ptp(found.track_n[:, :2], axis=0).max())
+    factor, unit = drawing.lengths(np.ptp(found.track_n[:, :2], axis=0).max())
     after, before, fixes = (factor * (x - start)[:, :2] for x in (
         found.track_n, found.track_before_n, found.fix_n))
-    few = evenly(len(fixes))
+    few = drawing.evenly(len(fixes))
     ax.plot(*fixes[few].T, 'o', color='0.62', markersize=4.5, markeredgewidth=0, label='fixes')
-    ax.plot(*before[thinned(before)].T, '--', color=RED, label=before_word, linewidth=1.2)
-    ax.plot(*after[thinned(after)].T, '-', color=BLUE, label='as calibrated')
+    ax.plot(*before[drawing.thinned(before)].T, '--', color=drawing.RED, label=before_word,
+            linewidth=1.2)
+    ax.plot(*after[drawing.thinned(after)].T, '-', color=drawing.BLUE, label='as calibrated')
     ax.plot(*after[0], 'o', color='black', markersize=6, markerfacecolor='white', zorder=5)
     ax.plot(*after[-1], 's', color='black', markersize=5, zorder=5)
     middle = after.mean(axis=0)
@@ -98,20 +83,20 @@ def draw_track(ax: Any, found: Evidence, before_word: str = 'as configured',
 
 def _track(found: Evidence, name: str, before_word: str,
            slips: list[dict[str, float]] | tuple[Any, ...]) -> tuple[str, str, str]:
-    figure, (ax,) = sheet(5.2)
+    figure, (ax,) = drawing.sheet(5.2)
     draw_track(ax, found, before_word, slips)
-    key(figure, ax)
+    drawing.key(figure, ax)
     says = ('Dead reckoning over the fixes. Both tracks start at the start mark; the calibrated '
             'track should cover the fixes.')
-    return 'Track', says, svg(figure, f'{name}-track', says)
+    return 'Track', says, drawing.svg(figure, f'{name}-track', says)
 
 
 def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
            slips: list[dict[str, float]] | tuple[Any, ...]) -> None:
     """Mark on the track what is odd: fixes not used, gaps, slips, and where the fit ends."""
-    few = found.t_excluded[evenly(len(found.t_excluded))]
+    few = found.t_excluded[drawing.evenly(len(found.t_excluded))]
     if len(few):
-        ax.plot(*at(few), '.', color=GREY, markersize=3, zorder=4, label='fix not used')
+        ax.plot(*at(few), '.', color=drawing.GREY, markersize=3, zorder=4, label='fix not used')
     step = np.diff(found.t_fix)
     gap = 5.0    # median intervals between fixes: more is marked
     gaps = [('no fix used', found.t_fix[k], found.t_fix[k + 1]) for k in np.flatnonzero(
@@ -127,135 +112,136 @@ def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
         said.add(label)
     if found.t_fit < found.t[-1]:
         ax.plot(*at(np.array([found.t_fit])), 'D', color='black', markersize=6,
-                markerfacecolor=PINK, zorder=5, label='fitted to here')
+                markerfacecolor=drawing.PINK, zorder=5, label='fitted to here')
     if len(slips):
         ax.plot(*at(np.array([s['t'] + s['duration'] / 2 for s in slips])), '^', color='black',
-                markersize=6, markerfacecolor=GREEN, zorder=5, label='slip')
+                markersize=6, markerfacecolor=drawing.GREEN, zorder=5, label='slip')
 
 
 def draw_residuals(ax: Any, found: Evidence) -> None:
     """Draw on axes dead reckoning less fix along and across, as calibrated."""
-    factor, unit = lengths(found.distance[-1])
+    factor, unit = drawing.lengths(found.distance[-1])
     path_length = factor * found.fix_distance
     _band(ax, path_length, found.fix_sigma)
-    rows = thinned(found.residual)
-    for column, colour, word in zip(found.residual.T, (BLUE, RED), ('along', 'across'),
-                                    strict=True):
+    rows = drawing.thinned(found.residual)
+    for column, colour, word in zip(found.residual.T, (drawing.BLUE, drawing.RED),
+                                    ('along', 'across'), strict=True):
         ax.plot(path_length[rows], column[rows], '-', color=colour, linewidth=0.9, label=word)
     ax.set(xlabel=f'distance driven, {unit}', ylabel='dead reckoning minus fix, m')
 
 
 def _band(ax: Any, path_length: Floats, sigma: Floats) -> None:
-    band = evenly(len(path_length))
-    ax.fill_between(path_length[band], -sigma[band], sigma[band], color=BAND, linewidth=0,
+    band = drawing.evenly(len(path_length))
+    ax.fill_between(path_length[band], -sigma[band], sigma[band], color=drawing.BAND, linewidth=0,
                     label='± sigma of a fix')
-    ax.axhline(0.0, color=GREY, linewidth=0.8)
+    ax.axhline(0.0, color=drawing.GREY, linewidth=0.8)
     for edge in (-sigma[band], sigma[band]):      # seen through noise that fills the band
         ax.plot(path_length[band], edge, '--', color='black', linewidth=0.6)
 
 
 def _residuals(found: Evidence, name: str, before_word: str) -> tuple[str, str, str]:
-    factor, unit = lengths(found.distance[-1])
+    factor, unit = drawing.lengths(found.distance[-1])
     path_length = factor * found.fix_distance
-    figure, axes = sheet(5.2, 3)
-    rows = thinned(found.residual)
+    figure, axes = drawing.sheet(5.2, 3)
+    rows = drawing.thinned(found.residual)
     for ax, column, word in zip(axes, found.residual.T, ('along', 'across'), strict=False):
         _band(ax, path_length, found.fix_sigma)
-        ax.plot(path_length[rows], column[rows], '-', color=BLUE, linewidth=0.9,
+        ax.plot(path_length[rows], column[rows], '-', color=drawing.BLUE, linewidth=0.9,
                 label='as calibrated')
         ax.set_ylabel(f'{word}, m')
-    rows = thinned(found.residual_before)
+    rows = drawing.thinned(found.residual_before)
     for column, dash, word in zip(found.residual_before.T, ('--', ':'), ('along', 'across'),
                                   strict=True):
-        axes[2].plot(path_length[rows], column[rows], dash, color=RED, linewidth=1.3,
+        axes[2].plot(path_length[rows], column[rows], dash, color=drawing.RED, linewidth=1.3,
                      label=f'{before_word}, {word}')
-    axes[2].axhline(0.0, color=GREY, linewidth=0.8)
+    axes[2].axhline(0.0, color=drawing.GREY, linewidth=0.8)
     axes[2].set(xlabel=f'distance driven, {unit}', ylabel=f'{before_word}, m')
     axes[2].legend(loc='lower center', bbox_to_anchor=(0.5, 0.97), ncols=2, borderaxespad=0.0)
     figure.subplots_adjust(hspace=0.24)
-    key(figure, axes[0])
+    drawing.key(figure, axes[0])
     figure.align_ylabels(axes)
     says = ('Dead reckoning minus fix. Along > 0: ahead of the fix; across > 0: left of the fix. '
             'A slope along indicates a scale error, a curve across a heading drift.')
-    return 'Residuals', says, svg(figure, f'{name}-residuals', says)
+    return 'Residuals', says, drawing.svg(figure, f'{name}-residuals', says)
 
 
 def _sections(found: Evidence, name: str, scale_sigma: float | None) -> tuple[str, str, str]:
     part = found.sections
-    factor, unit = lengths(found.distance[-1])
+    factor, unit = drawing.lengths(found.distance[-1])
     middle, half = factor * (part.begin + part.end) / 2, factor * (part.end - part.begin) / 2
     off = part.ratio - 1
-    times, word = relative(max(np.nanmax(np.abs(off) + part.sigma), scale_sigma or 0.0))
-    figure, (ax,) = sheet(2.7)
+    times, word = drawing.relative(max(np.nanmax(np.abs(off) + part.sigma), scale_sigma or 0.0))
+    figure, (ax,) = drawing.sheet(2.7)
     if scale_sigma:
-        ax.axhspan(-scale_sigma * times, scale_sigma * times, color=BAND, linewidth=0,
+        ax.axhspan(-scale_sigma * times, scale_sigma * times, color=drawing.BAND, linewidth=0,
                    label='± sigma of the result')
-    ax.axhline(0.0, color=GREY, linewidth=0.8)
-    ax.hlines(off * times, middle - half, middle + half, color=BLUE, linewidth=1.1)
-    ax.errorbar(middle, off * times, part.sigma * times, fmt='o', color=BLUE, markersize=4.5,
-                capsize=3, linewidth=1.1, label='section, ± its sigma')
+    ax.axhline(0.0, color=drawing.GREY, linewidth=0.8)
+    ax.hlines(off * times, middle - half, middle + half, color=drawing.BLUE, linewidth=1.1)
+    ax.errorbar(middle, off * times, part.sigma * times, fmt='o', color=drawing.BLUE,
+                markersize=4.5, capsize=3, linewidth=1.1, label='section, ± its sigma')
     ax.set(xlabel=f'distance driven, {unit}', ylabel=f'scale minus result, {word}')
     ax.set_xlim(0.0, factor * found.distance[-1])
-    key(figure, ax)
+    drawing.key(figure, ax)
     says = ('Length from the fixes divided by the calibrated dead-reckoned length, in sections '
             'of equal path length. Bars: one sigma of the fixes. Slip, an odometer delay (at '
             'starts and stops) or bad fixes appear as outlier sections. Bars do not include fix '
             'errors that change more slowly than a section.')
-    return 'Scale by section', says, svg(figure, f'{name}-sections', says)
+    return 'Scale by section', says, drawing.svg(figure, f'{name}-sections', says)
 
 
 def _motion(found: Evidence, name: str) -> tuple[str, str, str]:
-    figure, (upper, lower) = sheet(3.6, 2)
+    figure, (upper, lower) = drawing.sheet(3.6, 2)
     speed, turn = 3.6 * found.speed, np.rad2deg(found.yaw_rate)
-    rows = thinned(speed)
-    upper.plot(found.t[rows], speed[rows], '-', color=BLUE, linewidth=1.0)
-    rows = thinned(turn)
-    lower.plot(found.t[rows], turn[rows], '-', color=BLUE, linewidth=1.0)
+    rows = drawing.thinned(speed)
+    upper.plot(found.t[rows], speed[rows], '-', color=drawing.BLUE, linewidth=1.0)
+    rows = drawing.thinned(turn)
+    lower.plot(found.t[rows], turn[rows], '-', color=drawing.BLUE, linewidth=1.0)
     for ax in (upper, lower):
-        ax.axhline(0.0, color=GREY, linewidth=0.8)
+        ax.axhline(0.0, color=drawing.GREY, linewidth=0.8)
     upper.set_ylabel('speed, km/h')
     lower.set(ylabel='turn rate, deg/s', xlabel='time since the start mark, s')
     figure.align_ylabels([upper, lower])
     says = ('Speed from the calibrated odometer (negative: reversing) and turn rate from the '
             'gyro (positive: left), averaged over one second.')
-    return 'Speed and turn rate', says, svg(figure, f'{name}-motion', says)
+    return 'Speed and turn rate', says, drawing.svg(figure, f'{name}-motion', says)
 
 
 def _fixes(found: Evidence, name: str) -> tuple[str, str, str]:
-    figure, (ax,) = sheet(2.7)
+    figure, (ax,) = drawing.sheet(2.7)
     for status in np.unique(found.fix_status):
         rows = np.flatnonzero(found.fix_status == status)
-        rows = rows[evenly(len(rows), MOST_MARKS // 2)]
-        label, shape, colour = STATUS.get(int(status), (f'status {status}', 'D', GREY))
+        rows = rows[drawing.evenly(len(rows), drawing.MOST_MARKS // 2)]
+        label, shape, colour = STATUS.get(int(status), (f'status {status}', 'D', drawing.GREY))
         ax.plot(found.t_fix[rows], found.fix_sigma[rows], shape, color=colour, markersize=3.5,
                 markeredgewidth=0 if shape != 'x' else 1, label=label)
-    rows = evenly(len(found.t_excluded))
+    rows = drawing.evenly(len(found.t_excluded))
     if len(rows):
-        ax.plot(found.t_excluded[rows], np.zeros(len(rows)), '.', color=GREY, markersize=3,
+        ax.plot(found.t_excluded[rows], np.zeros(len(rows)), '.', color=drawing.GREY, markersize=3,
                 clip_on=False, zorder=5, label='not used')
     ax.set(xlabel='time since the start mark, s', ylabel='sigma of a fix, m')
     top = float(found.fix_sigma.max(initial=0.0))
     ax.set_ylim(0.0, 1.25 * top if top else 1.0)
-    key(figure, ax)
+    drawing.key(figure, ax)
     says = ('Horizontal sigma of each axis as published (or gnss.default_sigma), by status. '
             'Dots at the bottom: fixes not used.')
-    return 'Fix quality', says, svg(figure, f'{name}-fixes', says)
+    return 'Fix quality', says, drawing.svg(figure, f'{name}-fixes', says)
 
 
 def _biases(t: Floats, biases: Floats, name: str) -> tuple[str, str, str]:
     # without an accelerometer its bias is zero throughout
     shown = [one for one in zip(biases, (np.rad2deg(3600.0), 1e3), (
         'gyro bias, deg/h', 'accelerometer bias, mm/s²'), strict=True) if np.any(one[0])]
-    figure, axes = sheet(1.8 * len(shown), len(shown))
+    figure, axes = drawing.sheet(1.8 * len(shown), len(shown))
     for ax, (columns, factor, word) in zip(axes, shown, strict=True):
-        for column, colour, dash, axis in zip(columns.T, (BLUE, RED, GREEN), ('-', '--', ':'),
-                                              'xyz', strict=True):
-            rows = thinned(column)
+        for column, colour, dash, axis in zip(
+                columns.T, (drawing.BLUE, drawing.RED, drawing.GREEN), ('-', '--', ':'), 'xyz',
+                strict=True):
+            rows = drawing.thinned(column)
             ax.plot(t[rows], factor * column[rows], dash, color=colour, linewidth=1.2, label=axis)
         ax.set_ylabel(word)
     axes[-1].set_xlabel('time since the start mark, s')
-    key(figure, axes[0])
+    drawing.key(figure, axes[0])
     figure.align_ylabels(axes)
     says = ('IMU biases along the drive, estimated by the smoother. They drift with temperature; '
             'a step, or a drift far beyond the grade, indicates a fault.')
-    return 'Biases', says, svg(figure, f'{name}-biases', says)
+    return 'Biases', says, drawing.svg(figure, f'{name}-biases', says)

@@ -11,23 +11,12 @@ import numpy as np
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.data.arrays import Floats
-from odocal_ros.output.drawing import (
-    BAND,
-    BLUE,
-    Drawing,
-    GREEN,
-    GREY,
-    key,
-    PINK,
-    RED,
-    relative,
-    sheet,
-    svg,
-)
+from odocal_ros.output import drawing
 from odocal_ros.output.figures import known, with_sigma
 from odocal_ros.output.summary import ANGLES, DEG
 
-STYLES = (('o', BLUE), ('s', RED), ('^', GREEN), ('D', PINK), ('v', 'black'), ('P', GREY))
+STYLES = (('o', drawing.BLUE), ('s', drawing.RED), ('^', drawing.GREEN), ('D', drawing.PINK),
+          ('v', 'black'), ('P', drawing.GREY))
 MOST_LEGS = 40    # judgement: bars that are distinguishable in a picture
 # title, (text, method, value, sigma) of what has one, band of the result: middle and half width
 Panel = tuple[str, list[tuple[str, str, float, float]], tuple[float, float] | None]
@@ -36,14 +25,15 @@ Panel = tuple[str, list[tuple[str, str, float, float]], tuple[float, float] | No
 def draw_by_speed(ax: Any, found: SpeedScale) -> None:
     """Draw on axes the ratio of fixes to odometer by speed, and the fit."""
     speed, ratio, sigma, _ = found.bins.T
-    ax.errorbar(3.6 * speed, ratio, sigma, fmt='o', color=BLUE, markersize=4.5, capsize=3,
+    ax.errorbar(3.6 * speed, ratio, sigma, fmt='o', color=drawing.BLUE, markersize=4.5, capsize=3,
                 linewidth=1.1, label='fixes / odometer as sent, ± sigma')
     if found.factor and found.offset:
         v = np.linspace(speed.min(), speed.max(), 100)
         # reference = factor * sent + offset, over what is sent
         fit = found.factor[0] * v / (v - found.offset[0])
-        ax.plot(3.6 * v, fit, '-', color=RED, linewidth=1.2, label='fit')
-        ax.axhline(found.factor[0], color=GREY, linewidth=0.8, linestyle='--', label='factor')
+        ax.plot(3.6 * v, fit, '-', color=drawing.RED, linewidth=1.2, label='fit')
+        ax.axhline(found.factor[0], color=drawing.GREY, linewidth=0.8, linestyle='--',
+                   label='factor')
     ax.set(xlabel='speed, km/h', ylabel='path by fixes / odometer')
     ax.ticklabel_format(axis='y', useOffset=False)
 
@@ -60,23 +50,23 @@ def fit_text(found: SpeedScale) -> str:
             f'{with_sigma(abs(lag[0]), lag[1])} s {late} than the fixes')
 
 
-def by_speed(found: SpeedScale, name: str) -> Drawing:
+def by_speed(found: SpeedScale, name: str) -> drawing.Drawing:
     """Return the figure of a leg: title, what it shows, svg element."""
-    figure, (ax,) = sheet(2.7)
+    figure, (ax,) = drawing.sheet(2.7)
     draw_by_speed(ax, found)
-    key(figure, ax)
+    drawing.key(figure, ax)
     fit = fit_text(found) or 'No fit: the speed varies too little'
     says = ('Path length by the fixes over the odometer as sent, each point a group of sections '
             f'of a few seconds. A constant factor is a level line. {fit}.')
-    return 'Scale against speed', says, svg(figure, f'{name}-by-speed', says)
+    return 'Scale against speed', says, drawing.svg(figure, f'{name}-by-speed', says)
 
 
-def by_window(found: Floats, name: str) -> Drawing:
+def by_window(found: Floats, name: str) -> drawing.Drawing:
     """Return the figure of the scale by windows of a leg, as ``by_speed``; found : (w, 4)."""
     length, excess, sigma, _ = found.T
-    figure, (ax,) = sheet(2.7)
-    ax.axhline(0.0, color=GREY, linewidth=0.8, linestyle='--')
-    ax.errorbar(length, 100 * excess, 100 * sigma, fmt='o-', color=BLUE, markersize=4.5,
+    figure, (ax,) = drawing.sheet(2.7)
+    ax.axhline(0.0, color=drawing.GREY, linewidth=0.8, linestyle='--')
+    ax.errorbar(length, 100 * excess, 100 * sigma, fmt='o-', color=drawing.BLUE, markersize=4.5,
                 capsize=3, linewidth=1.1)
     ax.set(xscale='log', xlabel='length of the window, s', ylabel='fixes / track - 1, %')
     ax.set_xticks(length, [f'{x:g}' for x in length], minor=False)
@@ -85,7 +75,8 @@ def by_window(found: Floats, name: str) -> Drawing:
             'to minutes, ± their scatter over eight parts of the leg. A level line at 0: errors '
             'of the fixes do not depend on the motion. Short windows that differ: the fixes '
             'contain an odometer, the receiver filters, or the fixes are late.')
-    return 'Scale against the length of the window', says, svg(figure, f'{name}-by-window', says)
+    picture = drawing.svg(figure, f'{name}-by-window', says)
+    return 'Scale against the length of the window', says, picture
 
 
 def compared(calibration: Calibration, name: str) -> list[tuple[str, str, str]]:
@@ -107,7 +98,8 @@ def _scale(calibration: Calibration,
     all_of = [(text, method, known(estimates, 'scale_factor')) for text, method, estimates in rows]
     found = [(text, method, e.value / result.value - 1, (e.sigma or 0.0) / abs(result.value))
              for text, method, e in all_of if e.value is not None and result.value]
-    times, word = relative(max((abs(off) + sigma for _, _, off, sigma in found), default=0.0))
+    times, word = drawing.relative(max((abs(off) + sigma for _, _, off, sigma in found),
+                                       default=0.0))
     band = (0.0, (result.sigma or 0.0) / abs(result.value) * times) if result.value else None
     return f'scale minus result, {word}', [
         (text, method, off * times, sigma * times) for text, method, off, sigma in found], band
@@ -128,15 +120,15 @@ def _angle(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estima
 def _draw(panels: list[Panel], name: str, legs: int) -> tuple[str, str, str]:
     heights = [0.24 * len(points) for _, points, _ in panels]
     whole = sum(heights) + 0.75 * len(panels)
-    figure, axes = sheet(whole, len(panels), sharex=False, heights=heights)
+    figure, axes = drawing.sheet(whole, len(panels), sharex=False, heights=heights)
     figure.subplots_adjust(left=0.27, hspace=0.75 * len(panels) / sum(heights),
                            top=1 - 0.1 / whole)
     methods = dict.fromkeys(m for _, points, _ in panels for _, m, _, _ in points)
     shapes = {m: STYLES[i % len(STYLES)] for i, m in enumerate(methods)}
     for ax, (title, points, band) in zip(axes, panels, strict=True):
         if band is not None and all(map(math.isfinite, band)):
-            ax.axvspan(band[0] - band[1], band[0] + band[1], color=BAND, linewidth=0)
-            ax.axvline(band[0], color=GREY, linewidth=0.8)
+            ax.axvspan(band[0] - band[1], band[0] + band[1], color=drawing.BAND, linewidth=0)
+            ax.axvline(band[0], color=drawing.GREY, linewidth=0.8)
         for place, (_, method, value, sigma) in enumerate(points):
             shape, colour = shapes[method]
             ax.errorbar(value, place, xerr=sigma, fmt=shape, color=colour, markersize=5,
@@ -148,4 +140,4 @@ def _draw(panels: list[Panel], name: str, legs: int) -> tuple[str, str, str]:
         ' Legs share some errors (heading source, lever arms), so bars may overlap more than '
         'random errors would.' if legs > 1 else '') + (
         f' Of {legs} legs, the newest {MOST_LEGS}.' if legs > MOST_LEGS else '')
-    return 'Side by side', says, svg(figure, f'{name}-compared', says)
+    return 'Side by side', says, drawing.svg(figure, f'{name}-compared', says)

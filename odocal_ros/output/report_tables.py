@@ -18,6 +18,7 @@ from odocal_ros.calib.result import (
     MethodResult,
     wheel_factors,
 )
+from odocal_ros.output import tables
 from odocal_ros.output.figures import (
     beyond_one,
     COUNTS,
@@ -29,20 +30,13 @@ from odocal_ros.output.figures import (
     with_sigma,
 )
 from odocal_ros.output.summary import DEG, DEG_PER_HOUR
-from odocal_ros.output.tables import (
-    before_label,
-    in_pieces,
-    LABELS as SOURCES,
-    largest_source,
-    shown_verdict,
-)
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 
-LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'ratio to nominal',
-                    'yaw_mounting_angle': 'yaw mounting angle',
-                    'pitch_mounting_angle': 'pitch mounting angle',
-                    'scale_factor_as_sent': 'scale factor of the speed as sent'}
+LABELS = tables.LABELS | {'scale_factor': 'scale factor', 'scale_ratio': 'ratio to nominal',
+                          'yaw_mounting_angle': 'yaw mounting angle',
+                          'pitch_mounting_angle': 'pitch mounting angle',
+                          'scale_factor_as_sent': 'scale factor of the speed as sent'}
 LOST = 'not determined'
 OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
            Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
@@ -99,11 +93,11 @@ def headline(calibration: Calibration) -> list[tuple[str, str, str]]:
         estimate = known(calibration.estimates, name)
         first, other, relative = in_units(name, estimate)
         found.append((words, first, f'± {relative}' if relative else other))
-    pieces = in_pieces(calibration.legs)
+    pieces = tables.in_pieces(calibration.legs)
     if pieces:
         last = pieces[-1]
         found.append((f'track error in {length(last.length)}', length(last.after),
-                      f'{before_label(calibration.legs)}: {length(last.before)}'))
+                      f'{tables.before_label(calibration.legs)}: {length(last.before)}'))
     return found
 
 
@@ -120,7 +114,7 @@ def undetermined(calibration: Calibration) -> list[str]:
 
 
 def _largest(method: MethodResult | None, name: str) -> str:
-    largest, share = largest_source(method, name)
+    largest, share = tables.largest_source(method, name)
     return f'{label(largest)} ({share:.0%})' if largest else ''
 
 
@@ -143,7 +137,7 @@ def method_table(methods: dict[str, MethodResult],
             cells.append(('-', '') if name not in method.estimates else (first, other))
         rows.append((label(name), cells))
     return {'heads': [label(m) for m in methods],
-            'verdicts': [shown_verdict(m, legs) for m in methods.values()], 'rows': rows,
+            'verdicts': [tables.shown_verdict(m, legs) for m in methods.values()], 'rows': rows,
             'reasons': [(label(n), r) for n, m in methods.items() for r in m.reasons]}
 
 

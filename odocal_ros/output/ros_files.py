@@ -26,14 +26,7 @@ from odocal_ros.output.device_files import (
 )
 from odocal_ros.output.geojson import geojson, TRACK
 from odocal_ros.output.tables import leg_table, LEGS
-from odocal_ros.outside.names import (
-    for_comment,
-    for_launch,
-    for_shell,
-    for_xml_comment,
-    is_frame,
-    one_line,
-)
+from odocal_ros.outside import names
 from odocal_ros.outside.yaml_files import no_date, parameters
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config, with_settings
@@ -118,8 +111,7 @@ def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
     C_bi = next((leg.C_bi for leg in calibration.legs if leg.C_bi is not None), None)
     if C_bi is None or len(bias) < len(AXES):
         return None
-    bias_i: Floats = np.asarray(C_bi).T @ bias / config.imu.gyro_scale
-    return bias_i
+    return np.asarray(C_bi).T @ bias / config.imu.gyro_scale
 
 
 def _imu_corrector(bias_i: Floats) -> str:
@@ -147,13 +139,13 @@ def _transform(calibration: Calibration, config: Config,
     ElementTree.SubElement(joint, 'child', link=imu)
     launch = ElementTree.Element('launch')
     ElementTree.SubElement(launch, 'node', pkg='tf2_ros', exec='static_transform_publisher',
-                           name=name, args=for_launch(words))
+                           name=name, args=names.for_launch(words))
     head = about(calibration, content)
-    command = (for_comment(
+    command = (names.for_comment(
         f'{head}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
         'this command publishes;\n'
         'it is not the yaw_offset of navsat_transform, which corrects a compass.')
-        + f'ros2 run tf2_ros static_transform_publisher {for_shell(words)}\n')
+        + f'ros2 run tf2_ros static_transform_publisher {names.for_shell(words)}\n')
     return {LAUNCH: '<?xml version="1.0"?>\n' + _xml(
                 launch, f'include it in the launch file of your vehicle\n{head}'),
             URDF: _xml(joint, f'put into your URDF in place of the joint that carries the IMU\n'
@@ -165,7 +157,7 @@ def _xml(root: Any, note: str) -> str:
     """Return an element as text after a comment."""
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding='unicode')
-    return f'<!-- {for_xml_comment(note)} -->\n{text}\n'
+    return f'<!-- {names.for_xml_comment(note)} -->\n{text}\n'
 
 
 MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': controllers,
@@ -182,9 +174,9 @@ def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibr
     if config.frames.imu or not frame:
         return calibration, config
     taken = frame.lstrip('/')       # as ROS 1 wrote it
-    taken = taken if is_frame(taken) else IMU_FRAME
+    taken = taken if names.is_frame(taken) else IMU_FRAME
     if taken != frame:
         note = Reason(Code.FRAME_REPLACED, 'the frame of the IMU messages, '
-                      f"'{one_line(frame[:60])}', is not valid in TF; {taken} is written")
+                      f"'{names.one_line(frame[:60])}', is not valid in TF; {taken} is written")
         calibration = replace(calibration, reasons=(*calibration.reasons, note))
     return calibration, with_settings(config, {'frames.imu': taken})

@@ -13,7 +13,7 @@ from odocal_ros.calib.carried import Carried, carried_from
 from odocal_ros.calib.result import BESIDE, Estimate, wheel_factors
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.figures import with_sigma, with_unit
-from odocal_ros.output.files import MAIN, SCHEMA
+from odocal_ros.output.files import MAIN, plain, SCHEMA
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, flat
 
@@ -59,8 +59,7 @@ def read_stored(path: Path) -> Stored:
     """
     Return the calibration in a file, or in the calibration.json of a folder.
 
-    Raises BadUsage: missing, unreadable, no JSON, of another schema, or without what every result
-    has.
+    Raises BadUsage: missing, unreadable, or no calibration of this schema.
     """
     path = Path(path)
     name = str(path)
@@ -128,7 +127,7 @@ def known_imu(config: Config) -> Carried | None:
         raise BadUsage(f'imu.constants: {error}') from None
     here = flat(config)
     other = ['vehicle'] * (found.vehicle != config.vehicle) + [
-        name for name in SAME_IMU if found.config.get(name) != _plain(here[name])]
+        name for name in SAME_IMU if found.config.get(name) != plain(here[name])]
     if other:
         raise BadUsage(f'imu.constants: {found.name} has another {" and ".join(other)}: the same '
                        'IMU with unchanged mounting is required')
@@ -136,10 +135,6 @@ def known_imu(config: Config) -> Carried | None:
         raise BadUsage(f'imu.constants: {found.name} contains no IMU constants: none of its legs '
                        'has a result of the smoother')
     return found.imu
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _part(content: dict[str, Any], key: str, kind: type[T]) -> T:

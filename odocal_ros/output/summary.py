@@ -19,6 +19,7 @@ from odocal_ros.calib.result import (
     MethodResult,
     wheel_factors,
 )
+from odocal_ros.output import tables
 from odocal_ros.output.figures import (
     bag_lines,
     beyond_one,
@@ -34,15 +35,6 @@ from odocal_ros.output.figures import (
     WIDTH,
     with_sigma,
     with_unit,
-)
-from odocal_ros.output.tables import (
-    budget_lines,
-    largest_source,
-    leg_verdicts,
-    search_lines,
-    shown_verdict,
-    source_label,
-    track_lines,
 )
 from odocal_ros.reasons import Verdict
 
@@ -71,7 +63,8 @@ def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
                                  (False, False, False)):
         parts = [_head(calibration, styled), _values(calibration, width),
                  _leg_table(calibration.legs, width), _method_table(calibration),
-                 search_lines(calibration.legs), track_lines(calibration.legs, width),
+                 tables.search_lines(calibration.legs),
+                 tables.track_lines(calibration.legs, width),
                  _budget(calibration, width, small) if budget else [],
                  reason_lines(calibration.reasons, width, brief=not notes)]
         text = '\n\n'.join('\n'.join(part) for part in parts if part)
@@ -216,10 +209,10 @@ def _largest_errors(calibration: Calibration, width: int) -> list[str]:
     found = []
     for name, word in {'scale_factor': 'scale', **ANGLES}.items():
         estimate = known(calibration.estimates, name)
-        source, part = ('', 0.0) if estimate.value is None else largest_source(
+        source, part = ('', 0.0) if estimate.value is None else tables.largest_source(
             calibration.methods.get(estimate.method), name)
         if source:
-            found.append(f'{word}: {source_label(source)} ({100 * part:.0f} %)')
+            found.append(f'{word}: {tables.source_label(source)} ({100 * part:.0f} %)')
     # lines are broken between the values only
     lines = textwrap.wrap('; '.join(found).replace(' ', '\xa0').replace(';\xa0', '; '), width - 22)
     return [_line('' if k else 'largest error', line.replace('\xa0', ' '))
@@ -249,7 +242,7 @@ def _leg_table(legs: tuple[LegResult, ...], width: int) -> list[str]:
     rows: list[tuple[str, ...]] = [('leg', 'start, UTC', 'distance', 'min:s', 'fixes',
                                     'scale factor', 'yaw, deg', 'verdict')]
     rows += [(str(number), *_leg_row(leg), verdict) for number, (leg, verdict) in enumerate(
-        zip(legs, leg_verdicts(legs), strict=True), 1)]
+        zip(legs, tables.leg_verdicts(legs), strict=True), 1)]
     if width < WIDTH:        # without the date, the duration and the number of fixes
         rows = [(row[0], row[1].removesuffix(', UTC').rpartition(' ')[2], row[2], *row[5:])
                 for row in rows]
@@ -261,14 +254,13 @@ def _method_table(calibration: Calibration) -> list[str]:
     methods = calibration.methods
     if len(methods) < 2:
         return []
-    rows: list[tuple[str, ...]] = [
-        ('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
+    rows: list[tuple[str, ...]] = [('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
     for name, method in methods.items():
         scale, *angles = (known(method.estimates, n) for n in ('scale_factor', *ANGLES))
         rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
                      *('-' if a.value is None else with_sigma(a.value, a.sigma, DEG, signed=True)
                        for a in angles),
-                     shown_verdict(method, calibration.legs) + _refused(method)))
+                     tables.shown_verdict(method, calibration.legs) + _refused(method)))
     return columns(rows)
 
 
@@ -297,4 +289,5 @@ def _budget(calibration: Calibration, width: int, small: bool) -> list[str]:
         return []
     hidden = {name for name in estimates if known(estimates, name).value is None}
     shown = 0.01    # share of a variance from which a source is worth a line
-    return budget_lines(method.details.get('budget'), scale.value, shown, hidden, width, small)
+    return tables.budget_lines(method.details.get('budget'), scale.value, shown, hidden, width,
+                               small)

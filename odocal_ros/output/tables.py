@@ -175,8 +175,7 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
     if not (small and small_too):
         return lines
     rest = f'under {shown:.1%}: '.replace('.0%', '%').replace('%', ' %') + ', '.join(small)
-    return lines + textwrap.wrap(rest, width, initial_indent='  ',
-                                 subsequent_indent='    ')
+    return lines + textwrap.wrap(rest, width, initial_indent='  ', subsequent_indent='    ')
 
 
 def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:

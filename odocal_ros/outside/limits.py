@@ -146,10 +146,7 @@ def read_text(path: Path) -> str:
     """
     Return the text of a YAML file, of a pipe too if the user names one.
 
-    Raises
-    ------
-    LimitReached, OSError, UnicodeDecodeError
-
+    Raises LimitReached, OSError, UnicodeDecodeError.
     """
     size = 2**19    # bytes of a YAML file
     most = int(size * factor())

@@ -70,7 +70,6 @@ def loader(aliases: bool = False) -> Any:
         depth = nodes = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
-            """Compose a node and what is in it."""
             mark = self.peek_event().start_mark
             if not aliases and self.check_event(yaml.AliasEvent):
                 raise yaml.composer.ComposerError(

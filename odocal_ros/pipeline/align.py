@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Alignment of a leg: which standstill, which heading source.
-
-Pure: takes screened inputs, returns an Alignment and its reasons.
-"""
+"""Alignment of a leg: which standstill, which heading source."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace

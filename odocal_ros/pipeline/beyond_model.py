@@ -73,11 +73,7 @@ def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
 
 
 def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
-    """
-    Return a method's result; without an accelerometer with the error of hills, and no angles.
-
-    See ``screening/leg_kind.py``.
-    """
+    """Return a result; without an accelerometer with the error of hills and no angles."""
     if prepared.inputs.felt:
         return method
     hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a path longer

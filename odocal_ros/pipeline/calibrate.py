@@ -185,7 +185,7 @@ def _carried(leg: Leg, config: Config) -> Ints:
 
 
 def _near(stamps: Ints, first_ns: int, stop_ns: int) -> Ints:
-    """Return the stamps between two, rising: a view where they rise as they came."""
+    """Return the rising stamps between two: a view where they rise as they came."""
     if by_step(lambda stamps: np.diff(stamps) > 0, stamps).all():
         return stamps[slice(*np.searchsorted(stamps, [first_ns, stop_ns + 1]))]
     return np.unique(stamps[(stamps >= first_ns) & (stamps <= stop_ns)])
@@ -205,8 +205,7 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
             def report(stage: Stage, k: int = k) -> None:
                 if progress is not None:
                     progress(replace(stage, done=(k + stage.done) / len(parts)))
-            results.append(calibrate(part, config, notes=notes, holdout=holdout,
-                                     progress=report))
+            results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
         return [one for one in results if one.verdict is not Verdict.REJECTED]
 
     good, why = good_of(parts_of(leg, config.leg.max_gap)), None

@@ -114,7 +114,7 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
     """
     Return the result of a method for several legs, including carried ones if possible.
 
-    results : sequence of MethodResult, one a leg.   times_ns, numbers : as for ``combine_legs``.
+    results : one a leg.   times_ns, numbers : as for ``combine_legs``.
     """
     if carried and all(r.border for r in results):
         unknown = {n: Estimate(None, None, e.unit) for n, e in results[0].estimates.items()}
@@ -131,11 +131,7 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
 
 def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
               carried: Carried | None = None) -> MethodResult:
-    """
-    Return a method's combination of the legs where it is not rejected, of all if of none.
-
-    driven : list of (MethodResult, driven_ns, number).
-    """
+    """Return a method's combination of the legs that do not reject it; of all if all do."""
     good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(good or driven), strict=True)
     whole = together(name, list(results), times_ns, config, numbers, carried if good else None)
@@ -183,8 +179,7 @@ def _further(method: MethodResult, leg: LegResult) -> list[Reason]:
 
 def _why(reasons: Sequence[Reason]) -> str:
     """Return the rejecting reasons as text."""
-    return '; '.join(dict.fromkeys(r.text for r in reasons
-                                   if r.code.gravity is Verdict.REJECTED))
+    return '; '.join(dict.fromkeys(r.text for r in reasons if r.code.gravity is Verdict.REJECTED))
 
 
 def _imu_rotation(estimates: Mapping[str, Estimate],
@@ -195,8 +190,7 @@ def _imu_rotation(estimates: Mapping[str, Estimate],
     pitch = estimates.get('pitch_mounting_angle')
     if C_bi is None or yaw is None or yaw.value is None:
         return None, None
-    small = [0.0, pitch.value if pitch is not None and pitch.value is not None else 0.0,
-             yaw.value]
+    small = [0.0, pitch.value if pitch is not None and pitch.value is not None else 0.0, yaw.value]
     C_vi = matrix_from_rpy(small) @ C_bi
     return (tuple(float(x) for x in quat_from_matrix(C_vi)),
             tuple(float(x) for x in rpy_from_matrix(C_vi)))

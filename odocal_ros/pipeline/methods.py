@@ -1,11 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The methods of a leg: each is a pure function of it; their results together are that of the leg.
-
-A method that fails costs itself only.
-"""
+"""The methods of a leg: each a pure function of it; their results are that of the leg."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace

@@ -165,8 +165,7 @@ def _gyro(inputs: Inputs, t: Floats) -> Floats:
             or inputs.t_imu[-1] < t[-1]:
         return np.empty(0)
     rate = np.einsum('ij,j->i', inputs.w_b, inputs.up_b)       # by BLAS it depends on its threads
-    out: Floats = np.diff(integral_at(t, inputs.t_imu, rate))
-    return out
+    return np.diff(integral_at(t, inputs.t_imu, rate))
 
 
 def _known(run: Run, config: Config) -> Known:

@@ -71,8 +71,7 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
                                  config)
     let_go()
     gap = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
-    epochs = attitude_of(inputs, placed.origin, alignment.t, alignment.q_nb,
-                         alignment.gyro_bias)
+    epochs = attitude_of(inputs, placed.origin, alignment.t, alignment.q_nb, alignment.gyro_bias)
     if own:
         alignment = with_seen_walk(alignment, inputs, spans, epochs, placed.origin.earth_rate_n)
     track = dead_reckon(*epochs, inputs.travel)

@@ -170,11 +170,6 @@ class PreparedLeg(Placed):
         """Return the track of a travel (of the mean of the wheels, or of one) as aligned."""
         return dead_reckon(*self.epochs, travel)
 
-    def attitude_from(self, t_begin: float, q_nb: Floats,
-                      gyro_bias: Floats) -> tuple[Floats, Floats]:
-        """Return the attitude from a time, s, on: t (m,) s, q_nb (m, 4); bias in b, rad/s."""
-        return attitude_of(self.inputs, self.origin, t_begin, q_nb, gyro_bias)
-
 
 def attitude_of(inputs: Inputs, origin: Origin, t_begin: float, q_nb: Floats,
                 gyro_bias: Floats) -> tuple[Floats, Floats]:

@@ -20,7 +20,7 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.estimator import smooth, smoother_leg
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
-from odocal_ros.pipeline.prepared import MethodRun, Passed, Path, Paths, PreparedLeg
+from odocal_ros.pipeline.prepared import attitude_of, MethodRun, Passed, Path, Paths, PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured, slip_check
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
@@ -29,8 +29,6 @@ from odocal_ros.settings.config import Config
 def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
     """
     Run the smoother on a leg.
-
-    ready : PreparedLeg.   passed : called with each pass.
 
     The Paths are by the smoother's own attitude, the calibrated one with all values found, delays
     and lever arms too; t is as the fixes stamp it.
@@ -84,7 +82,8 @@ def _attitude(ready: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, F
     Between keyframes the gyros turn it; where they end, beyond the fixes fitted, by them alone.
     """
     t_key, C_nb = details['key_t'], details['key_C_nb']
-    t, q_nb = ready.attitude_from(t_key[0], quat_from_matrix(C_nb[0]), details['gyro_bias'])
+    t, q_nb = attitude_of(ready.inputs, ready.origin, t_key[0], quat_from_matrix(C_nb[0]),
+                          details['gyro_bias'])
     off = quat_multiply(quat_from_matrix(C_nb), quat_conjugate(quat_at(t_key, t, q_nb)))
     return t, quat_multiply(quat_at(t, t_key, off), q_nb)
 
@@ -120,12 +119,10 @@ def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
     """
     Return a leg as the patent sees it: two tracks in the plane, and fixes.
 
-    ready : PreparedLeg.   pitch : rad, of the IMU on the vehicle.   None without two wheels, or
-    without a fix at the start.
+    pitch : rad, of the IMU on the vehicle. None without two wheels, or a fix at the start.
     """
     inputs = ready.inputs
-    two = 2
-    if len(inputs.travels) != two:
+    if len(inputs.travels) != 2:
         return None
     left, right = inputs.travels
     begin, end = (pick([float(x.t[at]) for x in (ready.track, left, right)])

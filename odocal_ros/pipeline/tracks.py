@@ -51,11 +51,7 @@ def near(ready: PreparedLeg, path: Path, pin: MarkFix,
 
 
 def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reason, ...]]:
-    """
-    Return the tracks, checks and evidence of a leg as fields of its result, and what they say.
-
-    ready : PreparedLeg.   paths : Paths.
-    """
+    """Return the tracks, checks and evidence of a leg as fields of its result, and reasons."""
     before, after = paths
     start = _start(ready, after)
     if start is None:
@@ -128,8 +124,7 @@ def slip_check(ready: PreparedLeg, track: Track, f: Floats,
     """
     Return the slips of the mean of the wheels, without those of one wheel, which are named.
 
-    ready : PreparedLeg.   track : Track, of a method.   f : (3,) scale times forward axis.
-    between : s.
+    track : of a method.   f : (3,) scale times forward axis.   between : s.
     """
     if not ready.inputs.felt:
         return Slips(np.empty(0), np.empty(0))

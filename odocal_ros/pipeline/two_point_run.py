@@ -8,15 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.calib import check
 from odocal_ros.calib.budget import displacement, drift_sources, epochs_between
-from odocal_ros.calib.check import (
-    bent,
-    fix_noise_factor,
-    mismatch,
-    steady,
-    stray,
-    track_check,
-)
 from odocal_ros.calib.drive import white_noise
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.marks import MarkFix
@@ -40,11 +33,7 @@ NAMES = ('start', 'end')
 
 
 def two_point(ready: PreparedLeg, passed: Passed | None = None) -> MethodRun:
-    """
-    Run the two-point method on a leg.
-
-    ready : PreparedLeg.   passed : not called, it makes no passes.
-    """
+    """Run the two-point method on a leg; it makes no passes."""
     return TwoPointRun(ready).result()
 
 
@@ -134,8 +123,8 @@ class TwoPointRun:
         fixes = self.inputs.t_fix[between], ready.fixes_n[between]
         drift_n = self._drift(chord, f)
         drift = float(np.linalg.norm(drift_n))
-        residual = stray(ready.path(f), chord.start, fixes)
-        up = stray(ready.path(solve(chord)[0]), chord.start, fixes)
+        residual = check.stray(ready.path(f), chord.start, fixes)
+        up = check.stray(ready.path(solve(chord)[0]), chord.start, fixes)
         residual[:, 2] = up[:, 2]              # without the error of the pitch
         covariance = self.inputs.covariance_n[between]
         factor = self._noise_factor(residual, covariance, drift, chord)
@@ -152,14 +141,13 @@ class TwoPointRun:
         """Return the bend of a track, fixed at both ends, by gyro errors: (3, k) m, 1 sigma."""
         keep = epochs_between(self.track, chord.start.t, chord.end.t)
         D = displacement(self.track, keep, chord.start.t, f)
-        sources = drift_sources(self.track.t[keep], D, self.track.q_nb[keep],
-                                self.ready.alignment)
+        sources = drift_sources(self.track.t[keep], D, self.track.q_nb[keep], self.ready.alignment)
         # the bow of a track fixed at both ends is a quarter of the drift of a free end
         return np.concatenate(list(sources.values()), axis=1) / 4
 
     def _noise_factor(self, residual: Floats, covariance: Floats, drift: float,
                       chord: Chord) -> Floats:
-        factor = fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
+        factor = check.fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
         if factor.max() > 1.0:
             self.reasons.append(Reason(
                 Code.FIXES_NOISIER_THAN_SAID, f'the fixes deviate from the track {factor[0]:.1f} '
@@ -170,17 +158,17 @@ class TwoPointRun:
                      drift: float) -> None:
         """Compare the corrected track with the fixes: reversing, sanity."""
         ready, (t, p) = self.ready, fixes
-        keep, _ = steady(residual, ready.fix_sigma)     # as noisy as the track is wrong
+        keep, _ = check.steady(residual, ready.fix_sigma)     # as noisy as the track is wrong
         sigma = max(ready.fix_sigma, white_noise(p[keep]))
         found = against_travel(pieces(ready.level_path(t[keep]), p[keep, :2], t[keep], sigma),
                                self.config.odometer.signed)
         self.found += found
         if not found:
-            off = stray(ready.path(f), chord.start, fixes)
-            wrong = mismatch(track_check(off, ready.distance), ready.fix_sigma, drift,
-                             ready.distance)
-            self.reasons += wrong or bent(t, off, chord.M @ f, ready.fix_sigma, drift,
-                                          ready.distance)
+            off = check.stray(ready.path(f), chord.start, fixes)
+            wrong = check.mismatch(check.track_check(off, ready.distance), ready.fix_sigma, drift,
+                                   ready.distance)
+            self.reasons += wrong or check.bent(t, off, chord.M @ f, ready.fix_sigma, drift,
+                                                ready.distance)
 
     def _reversed(self, chord: Chord) -> None:
         """Return the reason for an odometer that counts down without a known IMU orientation."""

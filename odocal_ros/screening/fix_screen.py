@@ -10,7 +10,6 @@ IMU predict, far better than elsewhere. The jump at the end is the sum of their 
 fixes contain no information on the scale.
 """
 
-
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Complexes, Floats
@@ -187,8 +186,7 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
     t_fix, geodetic, covariance = t_fix[inside], geodetic[inside], covariance_n[inside]
     if len(t_fix) < 2:
         return ()
-    pick = np.unique(np.searchsorted(t_fix, np.arange(t_fix[0], t_fix[-1],
-                                                DISPLACEMENT_WINDOW)))
+    pick = np.unique(np.searchsorted(t_fix, np.arange(t_fix[0], t_fix[-1], DISPLACEMENT_WINDOW)))
     meridian, normal = radii(geodetic[0, 0])
     east, north = (geodetic[pick, 1] * normal * np.cos(geodetic[0, 0]),
                    geodetic[pick, 0] * meridian)

@@ -49,8 +49,7 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
         size = np.abs(x)
         least_value = 1e-50    # smaller values than a float32 can hold, except 0, are damaged
         usable = (size <= most) & ((size >= least_value) | (size == 0))
-        odd: Bools = ~(usable if x.ndim == 1 else across(np.logical_and, usable))
-        return odd
+        return ~(usable if x.ndim == 1 else across(np.logical_and, usable))
     with np.errstate(invalid='ignore'):
         return by_row(odd, column)
 
@@ -61,9 +60,8 @@ def oriented(samples: Oriented) -> Oriented:
         length = lengths(np.where(wild[:, None], 0.0, q_ni))
         unit_length = 2.0    # times one, either way: a quaternion of another length is no attitude
         widest_variance = 1e12    # rad^2, drivers use smaller values for unknown
-        none: Bools = ((length < 1 / unit_length) | (length > unit_length)
-                       | (np.abs(variance) > widest_variance))
-        return none
+        return ((length < 1 / unit_length) | (length > unit_length)
+                | (np.abs(variance) > widest_variance))
 
     wild = beyond('q_ni', samples.q_ni)
     none = by_row(no_attitude, wild, samples.q_ni, samples.yaw_variance)
@@ -140,8 +138,7 @@ def single(x: Floats, least: float) -> Bools:
         apart = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
         is_off: Bools = ((at > np.maximum(least, SINGLE_TIMES * beside))
                          & (apart < EQUAL_NEIGHBOURS * at))
-        alone: Bools = across(np.logical_or, is_off)
-        return alone
+        return across(np.logical_or, is_off)
 
     found = np.zeros(len(x), bool)
     if len(x) > 2 * edge:

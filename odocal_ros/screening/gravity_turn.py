@@ -82,8 +82,7 @@ def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
         return None
     w = np.where(full[:, None], w - np.median(w[full], axis=0), 0.0)
     f = np.where(full[:, None], f, np.median(f[full], axis=0))
-    return _fit(*_segments(Rows(w @ axes.T, f @ axes.T, travel.at(edges) * metres_per_unit,
-                                full)))
+    return _fit(*_segments(Rows(w @ axes.T, f @ axes.T, travel.at(edges) * metres_per_unit, full)))
 
 
 def _segments(rows: Rows) -> tuple[Complexes, Complexes]:
@@ -97,8 +96,7 @@ def _segments(rows: Rows) -> tuple[Complexes, Complexes]:
 
     def cut(x: NDArray[Any]) -> NDArray[Any]:
         k = len(x) // length
-        segments: NDArray[Any] = x[:k * length].reshape(k, length, *x.shape[1:])
-        return segments
+        return x[:k * length].reshape(k, length, *x.shape[1:])
     psi = np.concatenate([[0.0], np.cumsum(rows.w[:, 2]) * ROW_S])
     turned = np.exp(0.5j * (psi[1:] + psi[:-1]))
     tilts = [_seconds(_integral(1j * G * rate * turned)) for rate in rows.w.T]

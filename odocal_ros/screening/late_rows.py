@@ -174,8 +174,7 @@ def _soonest(t: Floats, usual: float) -> Floats:
     end, jitter = least[len(t) - window:], 0.25     # of an interval: the least jitter of few rows
     end[:] = end[0] + usual * np.floor((end - end[0]) / usual + jitter)
     even = rows - _least_of_next(-least[::-1], window)[::-1]
-    out: Floats = even + np.median(t - even)      # a constant delay is not corrected
-    return out
+    return even + np.median(t - even)      # a constant delay is not corrected
 
 
 def _middle(t: Floats, usual: float) -> list[Floats]:

@@ -45,8 +45,7 @@ def felt(f_i: Floats) -> bool:
     if not len(f_i):
         return True
     with np.errstate(invalid='ignore'):      # a NaN that signals
-        return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all()
-                   for rows in chunks(len(f_i)))
+        return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all() for rows in chunks(len(f_i)))
 
 
 def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
@@ -101,8 +100,7 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """
     Return a leg and LOCAL_FRAME if its positions are in a local frame, otherwise nothing.
 
-    The leg is without GNSS velocities, which are east and north, and without a heading topic
-    unless the settings ask for it: that is a heading in the local frame then.
+    Without GNSS velocities, and without a heading topic unless the settings ask for it.
     """
     if not is_local(leg.fix):
         return leg, ()

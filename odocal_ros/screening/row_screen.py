@@ -17,14 +17,7 @@ from odocal_ros.data.pieces import by_step, chunks
 from odocal_ros.data.samples import OdometerForm, Samples, take
 from odocal_ros.nav.statistics import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.glitches import (
-    about_clumps,
-    beyond,
-    DAMAGED_SHARE,
-    imu_glitches,
-    SEVERAL_ROWS,
-    speed_glitches,
-)
+from odocal_ros.screening import glitches
 from odocal_ros.settings.config import Config
 
 LABEL = {slot: one.label for slot, one in INPUTS.items()}
@@ -81,7 +74,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
         found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
                             f'{LABEL[slot]} messages are isolated outliers, first at t = '
                             f'{t[np.argmax(spikes)]:.2f} s; dropped'))
-        if not about_clumps(wild).any():        # else what is about them is left out already
+        if not glitches.about_clumps(wild).any():      # else what is about them is left out
             at = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
             wild[at[spikes]] = True
             spikes |= _damaged(wild, good, slot, found)[at]
@@ -94,9 +87,9 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
 
 def _spikes(slot: str, samples: Any, t: Floats, form: OdometerForm, config: Config) -> Bools:
     if slot == 'imu':
-        return imu_glitches(t, samples.w_i, samples.f_i, config.imu)
+        return glitches.imu_glitches(t, samples.w_i, samples.f_i, config.imu)
     if slot in WHEELS and form.quantity == 'rate':
-        return speed_glitches(t, samples.value.astype(float))
+        return glitches.speed_glitches(t, samples.value.astype(float))
     return np.zeros(len(t), bool)
 
 
@@ -113,7 +106,7 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
     possible = INPUTS[slot].possible
     for name in INPUTS[slot].needed:
         column = getattr(samples, name)
-        odd = beyond(name, column)
+        odd = glitches.beyond(name, column)
         if possible is not None:
             odd |= ~((column >= possible[0]) & (column <= possible[1]))
         finite &= ~odd
@@ -128,14 +121,15 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
                                 f'{LABEL[slot]} messages {what}, first at '
                                 f'{_where(samples, first, leg)}; dropped'))
     good = stamped & finite
-    suspect = _damaged(wild, good, slot, found, min(DAMAGED_SHARE * len(wild), SEVERAL_ROWS))
+    suspect = _damaged(wild, good, slot, found,
+                       min(glitches.DAMAGED_SHARE * len(wild), glitches.SEVERAL_ROWS))
     return good & ~suspect, wild
 
 
 def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
              most: float = np.inf) -> Bools:
     """Return a mask of rows near groups of invalid rows, and the reason if there are many."""
-    suspect = about_clumps(wild)
+    suspect = glitches.about_clumps(wild)
     if suspect.any() or wild.sum() > most:
         found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
                             'messages hold impossible values or outliers; '
@@ -152,11 +146,7 @@ def _stood(samples: Any) -> Any:
 
 
 def _one_by_one(samples: Any) -> Any:
-    """
-    Return odometer samples without a header, stamped at arrival, with equal stamps 1 ns apart.
-
-    If many samples repeat stamp and value of the one before, each was sent twice.
-    """
+    """Return samples stamped at arrival, equal stamps 1 ns apart; those sent twice once."""
     stamp, twice_share = samples.stamp_ns, 1 / 3    # of all, a half: what comes at once moves on
     step = np.diff(stamp)
     if (step > 0).all() or (step < 0).any() or (stamp != samples.received_ns).any():

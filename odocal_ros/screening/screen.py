@@ -4,8 +4,7 @@
 """
 Screening: from a raw leg to clean arrays on one time axis, with a reason for each fault.
 
-Rows that cannot be used are dropped and counted. Times are seconds since the start mark; the mark
-is an IMU stamp, so the IMU's time offset is subtracted from those of the others.
+Times are s since the start mark, an IMU stamp: its time offset is subtracted from the others'.
 """
 
 from dataclasses import dataclass, replace

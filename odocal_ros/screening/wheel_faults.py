@@ -59,8 +59,7 @@ def broken_wheels(axle: Sequence[Travel], imu: Imu,
     A = np.stack([steps[0], turn, np.full(len(turn), FAULT_GRID)], -1)
     x, covariance = _line(A[keep], steps[1][keep], two.least_sigma(steps))
     held = [_not_pivoting(held[k], steps, A, x, k) for k in (0, 1)]
-    return _dead(two, steps, held) + _reversed(two, steps, A @ x, x[0], covariance[0, 0],
-                                               imu)
+    return _dead(two, steps, held) + _reversed(two, steps, A @ x, x[0], covariance[0, 0], imu)
 
 
 def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
@@ -89,8 +88,7 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
 def _rolling(steps: Floats, quantum: float) -> Bools:
     """Return a mask of the times at which each wheel certainly rolls: (2, n)."""
     top = np.percentile(np.abs(steps), 95, axis=1, keepdims=True)
-    rolls: Bools = np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
-    return rolls
+    return np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
 
 
 def _held(two: Pair, steps: Floats, k: int) -> Bools:
@@ -135,8 +133,7 @@ def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
     else:
         where = f'{len(spans)} time{"s" * (len(spans) > 1)}, first from t = {begin:.1f} s for ' \
                 f'{(spans[0][1] - first) * FAULT_GRID:.1f} s'
-        where += f', last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(
-            after and len(spans) > 1)
+        where += f', last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(after and len(spans) > 1)
     return (Reason(Code.WHEEL_DEAD, f'the {two.names[k]} wheel does not count {where} while the '
                    f'{two.names[1 - k]} wheel advances by {lost:.6g}: the mean of both is not the '
                    'travel'),)

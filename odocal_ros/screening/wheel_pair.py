@@ -55,7 +55,6 @@ def pair(axle: Sequence[Travel], imu: Imu, between: tuple[float, float], step: f
     """
     Return the wheels on a grid of ``step`` s, None where they share less than 20 cells.
 
-    axle : the left and the right wheel.
     imu : (t, w_b, f_b), (n,) s, (n, 3), (n, 3).   between : s, the marks.   doubt_t : (d,) s.
     """
     t_imu, w_b, f_b = imu

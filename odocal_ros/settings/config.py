@@ -13,16 +13,7 @@ import math
 from typing import Any
 
 from odocal_ros.data.inputs import TOPICS
-from odocal_ros.settings.config_groups import (
-    AcceptConfig,
-    FramesConfig,
-    JournalConfig,
-    OutputConfig,
-    PublishConfig,
-    ReferenceConfig,
-    UpdaterConfig,
-    VerdictConfig,
-)
+from odocal_ros.settings import config_groups
 from odocal_ros.settings.setting import (
     setting,
     settings_of as settings_of,  # for others too: they are its other half
@@ -250,16 +241,16 @@ class Config:
     gnss: GnssConfig = GnssConfig()
     leg: LegConfig = LegConfig()
     alignment: AlignmentConfig = AlignmentConfig()
-    reference: ReferenceConfig = ReferenceConfig()
+    reference: config_groups.ReferenceConfig = config_groups.ReferenceConfig()
     wheels: WheelsConfig = WheelsConfig()
     projection: ProjectionConfig = ProjectionConfig()
-    verdict: VerdictConfig = VerdictConfig()
-    accept: AcceptConfig = AcceptConfig()
-    output: OutputConfig = OutputConfig()
-    journal: JournalConfig = JournalConfig()
-    publish: PublishConfig = PublishConfig()
-    frames: FramesConfig = FramesConfig()
-    diagnostic_updater: UpdaterConfig = UpdaterConfig()
+    verdict: config_groups.VerdictConfig = config_groups.VerdictConfig()
+    accept: config_groups.AcceptConfig = config_groups.AcceptConfig()
+    output: config_groups.OutputConfig = config_groups.OutputConfig()
+    journal: config_groups.JournalConfig = config_groups.JournalConfig()
+    publish: config_groups.PublishConfig = config_groups.PublishConfig()
+    frames: config_groups.FramesConfig = config_groups.FramesConfig()
+    diagnostic_updater: config_groups.UpdaterConfig = config_groups.UpdaterConfig()
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -81,8 +81,7 @@ class FramesConfig:
                         about='Vehicle frame in the result files.')
     imu: str = setting('', ro=True, frame=True,
                        about='IMU frame; empty: frame of the IMU messages.')
-    local: str = setting('odocal_enu', ro=True, frame=True,
-                         about='Frame of the published paths.')
+    local: str = setting('odocal_enu', ro=True, frame=True, about='Frame of the published paths.')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,11 +126,7 @@ class AcceptConfig:
 
 
 def parse_accept(text: str) -> dict[str, float]:
-    """
-    Return the settings of one ``NAME=LOW:HIGH``; of ``NAME_deg`` the limits are in degrees.
-
-    Raises BadUsage: not of that form, or of no result that has limits.
-    """
+    """Return the settings of a ``NAME=LOW:HIGH``, or ``NAME_deg`` in degrees; BadUsage if not."""
     name, equals, limits = (part.strip() for part in text.partition('='))
     low, colon, high = limits.partition(':')
     plain, factor = name, 1.0

@@ -124,5 +124,4 @@ def grade_of(imu: ImuConfig) -> Grade:
     grade = GRADES[imu.grade]
     names = [f.name for f in dataclasses.fields(Grade)]
     given = {name: getattr(imu, SETTINGS.get(name, name)) for name in names}
-    return dataclasses.replace(
-        grade, **{k: v for k, v in given.items() if not math.isnan(v)})
+    return dataclasses.replace(grade, **{k: v for k, v in given.items() if not math.isnan(v)})

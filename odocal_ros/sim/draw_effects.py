@@ -117,8 +117,7 @@ def warming(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 def slip(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Tyres that slip as they pull and brake."""
-    return {}, {'tyre_slip': 1 / lognormal(rng, 30.0, 0.4),
-                'driven': bool(rng.uniform() < 0.5)}
+    return {}, {'tyre_slip': 1 / lognormal(rng, 30.0, 0.4), 'driven': bool(rng.uniform() < 0.5)}
 
 
 def sideslip(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -169,8 +168,7 @@ def slow_errors(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 def multipath(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Bursts of wrong positions in a city; of RTK, a false fix now and then."""
     if vehicle.rtk:
-        return {}, {'bursts': 12.0 if vehicle.city else 1.0, 'burst_size': 0.6,
-                    'burst_time': 60.0}
+        return {}, {'bursts': 12.0 if vehicle.city else 1.0, 'burst_size': 0.6, 'burst_time': 60.0}
     if not (vehicle.city or vehicle.alone):
         return {}, {}
     return {}, {'bursts': 40.0, 'burst_size': 12.0, 'burst_time': 8.0}

@@ -264,8 +264,7 @@ def contact_speed(state: State, lever_arm_v: Floats | tuple[float, float, float]
     """Return the speed of such a wheel, m/s: (n,)."""
     _, y, z = lever_arm_v
     y = y * np.cos(lean) - z * np.sin(lean)
-    speed: Floats = state.speed - y * turn_rate(state) - z * state.slope_rate
-    return speed
+    return state.speed - y * turn_rate(state) - z * state.slope_rate
 
 
 def turn_rate(state: State) -> Floats:

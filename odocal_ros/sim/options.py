@@ -150,11 +150,7 @@ ANGLES = {'latitude': 85.0, 'longitude': 180.0, 'heading': 360.0, 'slope': 20.0,
 
 
 def resolved(options: SimOptions) -> SimOptions:
-    """
-    Return options with the scenario's own values filled in.
-
-    Raises BadUsage: a name is unknown or a figure is out of range.
-    """
+    """Return options with the scenario's own values; BadUsage for a wrong name or figure."""
     _choice('--scenario', options.scenario, DEFAULTS)
     _choice('--odometer', options.odometer, ODOMETERS)
     defaults: dict[str, Any] = COMMON | DEFAULTS[options.scenario]

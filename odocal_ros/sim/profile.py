@@ -28,7 +28,6 @@ class Profile:
 
     @property
     def end(self) -> float:
-        """Return the last break."""
         return float(self.breaks[-1])
 
     def __call__(self, t: ArrayLike) -> Floats:
@@ -43,7 +42,6 @@ class Profile:
         return (self._on(before, t) + self._on(after, t)) / 2
 
     def derivative(self) -> 'Profile':
-        """Return the derivative."""
         order = np.arange(1, self.powers.shape[1])
         return Profile(self.breaks, self.powers[:, 1:] * order if len(order)
                        else np.zeros((len(self.powers), 1)))
@@ -106,8 +104,7 @@ def ramp(duration: float, gain: float, blend: float = 1.0) -> list[Piece]:
     It rises and falls in straight lines of ``blend`` seconds (0: at once, as in the paper).
     """
     peak = gain / (duration - blend)
-    return [line(blend, 0.0, peak), line(duration - 2 * blend, peak, peak),
-            line(blend, peak, 0.0)]
+    return [line(blend, 0.0, peak), line(duration - 2 * blend, peak, peak), line(blend, peak, 0.0)]
 
 
 def turn(duration: float, angle: float, blend: float) -> list[Piece]:

@@ -151,11 +151,7 @@ def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
 
 
 def parsed(text: str) -> tuple[str, Any]:
-    """
-    Return name and value of ``NAME=VALUE``.
-
-    Raises BadUsage: no such figure, or its value is no number, tuple or word.
-    """
+    """Return name and value of ``NAME=VALUE``; BadUsage without such a figure or value."""
     import ast
     name, _, value = text.partition('=')
     names = [f.name for f in fields(Real)]

@@ -253,5 +253,4 @@ def _velocity_errors(t: Floats, options: SimOptions, sigma: float) -> Floats:
     error = (gauss_markov(rng, sigma, time, t) if time
              else sigma * rng.standard_normal((len(t), 3)))
     far = rng.uniform(size=(len(t), 1)) < options.velocity_outliers
-    out: Floats = error + far * OUTLIER * rng.standard_normal((len(t), 3))
-    return out
+    return error + far * OUTLIER * rng.standard_normal((len(t), 3))

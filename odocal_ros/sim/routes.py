@@ -44,7 +44,7 @@ def sideways(found: list[Stretch]) -> list[tuple[list[Piece], list[Piece], list[
 
 def square_stretches() -> list[Stretch]:
     """
-    Return a square_stretches of 4 m to the left, and one to the right, with stops at the corners.
+    Return a square of 4 m to the left, and one to the right, with stops at the corners.
 
     10 s still; then eight times: 9 s of motion, 3 s still, a turn of 90 deg in 2 s, 3 s still.
     """
@@ -155,8 +155,7 @@ def motorway(duration: float, rng: np.random.Generator) -> Route:
         stretches.append((ramp(change, to - fast) + hold(length - change),
                           turn(length, angle, 6.0)))
         fast, left = to, round(left - length, 9)
-    stretches.append((hold(left) + ramp(down, -fast) + hold(30),
-                      hold(left + down + 30)))
+    stretches.append((hold(left) + ramp(down, -fast) + hold(30), hold(left + down + 30)))
     return _route(stretches)
 
 

@@ -8,18 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from odocal_ros.data import samples
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.samples import (
-    FixSamples,
-    HeadingSamples,
-    ImuSamples,
-    OdometerForm,
-    OdometerSamples,
-    ScalarSamples,
-    VelocitySamples,
-)
 from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.local_frame import local_fixes
@@ -38,9 +30,9 @@ from odocal_ros.sim.wheels import leg_factor, wheels_of
 __all__ = ['Drive', 'SCENARIOS', 'SimOptions', 'Truth', 'motion_of', 'simulate']
 
 SCENARIOS = tuple(DEFAULTS)
-FORMS = {'counts': OdometerForm('cumulative', 2**64, 'm/pulse'),
-         'speed': OdometerForm('rate', 0, '1'),
-         'angle': OdometerForm('cumulative', 0, 'm/rad')}
+FORMS = {'counts': samples.OdometerForm('cumulative', 2**64, 'm/pulse'),
+         'speed': samples.OdometerForm('rate', 0, '1'),
+         'angle': samples.OdometerForm('cumulative', 0, 'm/rad')}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +43,7 @@ class Truth:
     The scale of tyres that grow or slip is the mean of the leg by travel: true metres rolled
     between the marks over the change of the count there, before quantisation; likewise its ratio
     and those of the wheels. Yaw and pitch are those of the IMU's own axes (turn-and-push frame,
-    ``real_imu.py``), which equal those of its housing for perpendicular triads.
+    ``real_sensors.py``), which equal those of its housing for perpendicular triads.
     """
 
     scale: float                 # m/pulse, 1 or m/rad; of two wheels that of their mean count
@@ -76,13 +68,13 @@ class Drive:
     options: SimOptions
     motion: Motion
     truth: Truth
-    form: OdometerForm
-    imu: ImuSamples
-    wheels: tuple[OdometerSamples, ...]
-    fix: FixSamples
-    heading: HeadingSamples
-    velocity: VelocitySamples
-    pressure: ScalarSamples
+    form: samples.OdometerForm
+    imu: samples.ImuSamples
+    wheels: tuple[samples.OdometerSamples, ...]
+    fix: samples.FixSamples
+    heading: samples.HeadingSamples
+    velocity: samples.VelocitySamples
+    pressure: samples.ScalarSamples
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -90,14 +82,14 @@ class Drive:
         return tuple(wheel.name for wheel in wheels_of(self.options))
 
     @property
-    def odometer(self) -> OdometerSamples:
+    def odometer(self) -> samples.OdometerSamples:
         """Return the samples of the only or the left wheel."""
         return self.wheels[0]
 
     @property
-    def odometer_right(self) -> OdometerSamples:
+    def odometer_right(self) -> samples.OdometerSamples:
         """Return the samples of the right wheel, no rows without one."""
-        return self.wheels[1] if len(self.wheels) > 1 else OdometerSamples.none()
+        return self.wheels[1] if len(self.wheels) > 1 else samples.OdometerSamples.none()
 
     @property
     def reference(self) -> Reference:
@@ -122,8 +114,7 @@ class Drive:
         start = self.options
         position_n = Origin(start.latitude, start.longitude, start.height).to_n(
             np.stack([self.fix.latitude, self.fix.longitude, self.fix.height], -1))
-        position = position_n @ matrix_from_rpy(
-            [0.0, 0.0, float(yaw_from_heading(start.heading))])
+        position = position_n @ matrix_from_rpy([0.0, 0.0, float(yaw_from_heading(start.heading))])
         if self.reference.planar:
             position[:, 2] = 0.0
         return position
@@ -191,34 +182,29 @@ def _with(sway: Profile, more: Floats) -> Profile:
 
 
 def simulate(options: SimOptions | None = None) -> Drive:
-    """
-    Return a drive; equal options give equal drives, to the last bit.
-
-    Raises BadUsage: an option is unknown or out of range.
-    """
+    """Return a drive; equal options give equal drives, to the last bit."""
     options = resolved(options or SimOptions())
     motion = motion_of(options)
     imu = sensors.imu(motion, options)
     return Drive(
         options=options, motion=motion, truth=_truth(motion, options, imu),
-        form=FORMS[options.odometer], imu=imu if options.imu else ImuSamples.none(),
+        form=FORMS[options.odometer], imu=imu if options.imu else samples.ImuSamples.none(),
         wheels=tuple(sensors.odometers(motion, options)),
         fix=sensors.fixes(motion, options),
-        heading=(HeadingSamples.none() if options.heading_sigma is None
+        heading=(samples.HeadingSamples.none() if options.heading_sigma is None
                  else sensors.heading(motion, options, options.heading_sigma)),
         velocity=velocity(motion, options),
         pressure=sensors.pressure(motion, options))
 
 
-def _truth(motion: Motion, options: SimOptions, imu: ImuSamples) -> Truth:
+def _truth(motion: Motion, options: SimOptions, imu: samples.ImuSamples) -> Truth:
     gyro_bias, accel_bias = sensors.turn_on_biases(options)
     _, t = stamps(motion.duration, options.imu_rate)    # true, however late the stamps
     start = int(np.searchsorted(t, _first_move(motion) + 1e-9, side='right')) - 1
     C_vb = matrix_from_rpy([options.roll, options.pitch, options.yaw])
     x_n = (attitude(motion.at(t[start:start + 1])) @ C_vb)[0, :, 0]
     # a sum in steps of 0.02 s is the true scale of growing tyres
-    factor = leg_factor(motion.at(np.arange(0.0, motion.duration, 0.02)),
-                                    options.real)
+    factor = leg_factor(motion.at(np.arange(0.0, motion.duration, 0.02)), options.real)
     scale = options.scale * factor
     yaw, pitch, yaw_housing, pitch_housing = _angles(options)
     return Truth(

@@ -23,31 +23,15 @@ from odocal_ros.data.samples import (
     ScalarSamples,
     take,
 )
+from odocal_ros.nav import rotations
 from odocal_ros.nav.earth import radii
-from odocal_ros.nav.rotations import (
-    matrix_from_rpy,
-    quat_from_matrix,
-    quat_from_rotvec,
-    quat_multiply,
-)
 from odocal_ros.settings.config import DIFFERENTIAL, HOLONOMIC
-from odocal_ros.sim import body, real_sensors
+from odocal_ros.sim import body, real_sensors, wheels
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State
 from odocal_ros.sim.noise import gauss_markov, PHASE, random_walk, stamps, stream, TRANSPORT, white
 from odocal_ros.sim.options import SIM_GRADES, SimOptions
 from odocal_ros.sim.real import NONE3
 from odocal_ros.sim.references import drift, REFERENCES, stationary_sigma
-from odocal_ros.sim.wheels import (
-    coarse,
-    growth,
-    low_passed,
-    robot_path,
-    SimWheel,
-    slip_share,
-    steered_path,
-    tyre_slip,
-    wheels_of,
-)
 
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
 WHITE_SHARE = 0.2        # judgement: of the correlated sigma: receiver noise on top
@@ -57,8 +41,8 @@ AT_REST = 1e-9           # m/s and rad/s, judgement
 
 def imu_rotation(options: SimOptions) -> Floats:
     """Return C_vi, which takes the IMU's own frame to the vehicle: C_vb C_bi."""
-    return (matrix_from_rpy([options.roll, options.pitch, options.yaw])
-            @ matrix_from_rpy(options.mounting_rpy))
+    return (rotations.matrix_from_rpy([options.roll, options.pitch, options.yaw])
+            @ rotations.matrix_from_rpy(options.mounting_rpy))
 
 
 def turn_on_biases(options: SimOptions) -> tuple[Floats, Floats]:
@@ -90,7 +74,7 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
     C_vi = imu_rotation(options)
     w_v, f_v = body.felt(motion, state, options.imu_lever_arm)
     w_i, f_i = real_sensors.crooked(w_v @ C_vi * (1 + options.gyro_scale_error),
-                                f_v @ C_vi * (1 + options.accel_scale_error), options.real)
+                                    f_v @ C_vi * (1 + options.accel_scale_error), options.real)
     gyro, accel = imu_errors(options, len(t))
     gyro_drift, accel_drift = real_sensors.drifts(t, state.speed, options)
     q_ni = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
@@ -108,7 +92,7 @@ def _imu_stamps(ns: Ints, options: SimOptions) -> Ints:
     if not (real.imu_latency or real.imu_jitter or real.imu_batch > 1):
         return ns
     return real_sensors.stamped(ns, stream(options.seed, 'real imu stamps'), real.imu_latency,
-                            real.imu_jitter, real.imu_batch)
+                                real.imu_jitter, real.imu_batch)
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:
@@ -141,9 +125,9 @@ def pressure(motion: Motion, options: SimOptions) -> ScalarSamples:
 
 def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> Floats:
     """Return q_ni with a constant heading error, like that of a compass."""
-    q_ni = quat_from_matrix(attitude(state) @ imu_rotation(options))
+    q_ni = rotations.quat_from_matrix(attitude(state) @ imu_rotation(options))
     error = sigma * stream(options.seed, name).standard_normal()
-    return quat_multiply(quat_from_rotvec([0.0, 0.0, error]), q_ni)
+    return rotations.quat_multiply(rotations.quat_from_rotvec([0.0, 0.0, error]), q_ni)
 
 
 def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
@@ -153,7 +137,7 @@ def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
     stamp = options.start_ns + _late(ns, options, 'odometer')
     lean = motion.lean(t) if motion.lean else 0.0
     return [OdometerSamples(stamp, stamp, _reading(state, options, wheel, lean))
-            for wheel in wheels_of(options)]
+            for wheel in wheels.wheels_of(options)]
 
 
 def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
@@ -167,23 +151,23 @@ def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
     return real_sensors.stamped(ns, stream(options.seed, f'real {name} stamps'), delay, jitter)
 
 
-def _reading(state: State, options: SimOptions, wheel: SimWheel,
+def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
              lean: Floats | float) -> Floats | Ints:
     arm, scale = wheel.arm, wheel.scale
     real, spun = options.real, slip(state, options, wheel.draws)
-    grown = 1 + growth(state, real)
+    grown = 1 + wheels.growth(state, real)
     if options.odometer == 'speed':
         noise = options.speed_noise * stream(options.seed, 'speed').standard_normal(len(state.t))
         # current slip: differences of a speed sent twice a second would smooth it
-        pulled = slip_share(state, real) * state.speed
+        pulled = wheels.slip_share(state, real) * state.speed
         rate = (contact_speed(state, arm, lean) + pulled + np.gradient(spun, state.t)) / grown
-        sent = low_passed(rate + noise, state.t, real.speed_filter)
-        return coarse(sent / scale, real)
+        sent = wheels.low_passed(rate + noise, state.t, real.speed_filter)
+        return wheels.coarse(sent / scale, real)
     path = (contact_travel(state, arm, lean) if options.drive == DIFFERENTIAL else
-            robot_path(state, options, wheel))
-    rolled = path + spun + tyre_slip(state, real)
+            wheels.robot_path(state, options, wheel))
+    rolled = path + spun + wheels.tyre_slip(state, real)
     if wheel.steered:
-        rolled = rolled + steered_path(state, arm)
+        rolled = rolled + wheels.steered_path(state, arm)
     if np.ndim(grown):
         between = (grown + np.roll(grown, 1)) / 2
         rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / between)
@@ -272,8 +256,7 @@ def fix_errors(t: Floats, options: SimOptions) -> Floats:
     """Return the errors of fixes at (n,) times, ENU, m: (n, 3), outliers included."""
     draws = stream(options.seed, 'fix white').standard_normal((len(t), 3))
     if options.fix_noise == 'correlated':
-        slow = gauss_markov(stream(options.seed, 'fix slow'), 1.0,
-                            options.fix_correlation_time, t)
+        slow = gauss_markov(stream(options.seed, 'fix slow'), 1.0, options.fix_correlation_time, t)
         draws = slow + WHITE_SHARE * draws
     errors = _axes(options) * draws
     rng = stream(options.seed, 'outliers')

@@ -84,8 +84,7 @@ def _scales(options: SimOptions, counted: Bools) -> list[float]:
 
 def omni_angles(count: int) -> Floats:
     """Return the angles of omni wheels from the x axis, counter-clockwise, rad: (n,)."""
-    out: Floats = 2 * np.pi * np.arange(count) / count
-    return out
+    return 2 * np.pi * np.arange(count) / count
 
 
 def steered_path(state: State, arm: Floats) -> Floats:
@@ -107,8 +106,7 @@ def effective_width(options: SimOptions, radius: float = 0.0) -> float:
 
 def _widening(radius: Floats, width: float) -> Floats:
     """Return the effective over the geometric track width of skid steering, by turn radii."""
-    out: Floats = SPOT + (STRAIGHT - SPOT) * radius / (radius + width)
-    return out
+    return SPOT + (STRAIGHT - SPOT) * radius / (radius + width)
 
 
 def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:

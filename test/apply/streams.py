@@ -52,8 +52,7 @@ def true_estimates(drive, sigma=1e-4):
     values = {'scale_factor': truth.scale, 'yaw_mounting_angle': truth.yaw,
               'pitch_mounting_angle': truth.pitch}
     if len(truth.wheel_scales) == 2:
-        values |= zip(('scale_factor_left', 'scale_factor_right'), truth.wheel_scales,
-                      strict=True)
+        values |= zip(('scale_factor_left', 'scale_factor_right'), truth.wheel_scales, strict=True)
     return {name: Estimate(value, sigma * (value if 'scale' in name else 1.0), '')
             for name, value in values.items()}
 

@@ -43,8 +43,7 @@ def test_the_path_is_that_of_replay_as_calibrated(drive):
                      samples_of(drive, drive.imu.stamp_ns[row]), drive.form)
     assert len(poses) > 900
     rows = np.searchsorted(drive.imu.stamp_ns, [p.stamp_ns for p in poses]) - row
-    off = np.array([p.position for p in poses]) - (
-        result.track_n[rows] - result.track_n[0])
+    off = np.array([p.position for p in poses]) - (result.track_n[rows] - result.track_n[0])
     # of 600 m, summed in another order
     assert np.abs(off).max() < 1e-9
 

@@ -118,15 +118,13 @@ def test_a_growing_bag_is_read_at_any_moment(tmp_path):
     bag, messages = grown(tmp_path / 'leg', 4)
     (bag.folder / f'.{part_name(4, 4)}{PART}').write_bytes(b'being written')
     assert read(bag.folder) == messages
-    assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [
-        part_name(k, k) for k in range(4)]
+    assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [part_name(k, k) for k in range(4)]
 
 
 def test_a_finished_bag_is_one_file_with_metadata(tmp_path):
     bag, messages = grown(tmp_path / 'leg', 4)
     assert bag.finish() == bag.folder / 'leg_0.mcap'
-    assert sorted(p.name for p in bag.folder.iterdir()) == [
-        JOURNAL, 'leg_0.mcap', 'metadata.yaml']
+    assert sorted(p.name for p in bag.folder.iterdir()) == [JOURNAL, 'leg_0.mcap', 'metadata.yaml']
     assert read(bag.folder) == messages
     with rosbag2.Reader(bag.folder) as reader:
         assert (reader.message_count, reader.ros_distro) == (160, 'jazzy')
@@ -140,8 +138,7 @@ def test_sixty_segments_are_joined_while_it_grows(tmp_path, monkeypatch):
     assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [
         part_name(0, 0), part_name(1, 3), part_name(4, 6), part_name(7, 7), part_name(8, 8)]
     assert bag.size == sum(p.stat().st_size for p in bag.folder.glob('*.mcap'))
-    assert bag.loose_size == sum(
-        (bag.folder / part_name(k, k)).stat().st_size for k in (7, 8))
+    assert bag.loose_size == sum((bag.folder / part_name(k, k)).stat().st_size for k in (7, 8))
     assert read(bag.folder) == messages
 
 
@@ -211,8 +208,7 @@ def test_a_full_disk_leaves_what_was_written(tmp_path, monkeypatch):
 def test_without_room_for_the_copy_the_segments_are_the_bag(tmp_path):
     bag, messages = grown(tmp_path / 'leg', 3)
     bag.finish(room=bag.size - 1)
-    assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [
-        part_name(k, k) for k in range(3)]
+    assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [part_name(k, k) for k in range(3)]
     assert read(bag.folder) == messages
     with rosbag2.Reader(bag.folder) as reader:
         assert reader.message_count == 120

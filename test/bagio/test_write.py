@@ -60,8 +60,7 @@ def test_a_drive_comes_back_value_for_value(tmp_path, drive, storage, compressio
     assert {m.header.frame_id for _, m in imu} == {'imu_link'}
     assert np.array_equal([xyz(m.angular_velocity) for _, m in imu], drive.imu.w_i)
     assert np.array_equal([xyz(m.linear_acceleration) for _, m in imu], drive.imu.f_i)
-    assert np.array_equal([[*xyz(m.orientation), m.orientation.w] for _, m in imu],
-                          drive.imu.q_ni)
+    assert np.array_equal([[*xyz(m.orientation), m.orientation.w] for _, m in imu], drive.imu.q_ni)
     assert np.array_equal([m.orientation_covariance[8] for _, m in imu], drive.imu.yaw_variance)
     odometer = back['/odometer']
     assert [t for t, _ in odometer] == drive.odometer.stamp_ns.tolist()

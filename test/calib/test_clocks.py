@@ -45,6 +45,5 @@ def test_the_rate_is_stated(drifting):
 
 
 def test_clocks_that_agree_are_not_named():
-    _, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01,
-                          duration=300.0)
+    _, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01, duration=300.0)
     assert Code.CLOCKS_DRIFT not in {r.code for r in smooth(leg, config).reasons}

@@ -117,8 +117,7 @@ def test_a_spread_that_the_shared_error_explains_is_no_disagreement():
     rng, named = np.random.default_rng(5), 0
     for _ in range(400):
         legs = [method(scale=0.02 * np.exp(OWN * z)) for z in rng.standard_normal(4)]
-        named += any(r.text.startswith('scale') for r in
-                     combine_method('two_point', legs).reasons)
+        named += any(r.text.startswith('scale') for r in combine_method('two_point', legs).reasons)
     assert 0.02 < named / 400 < 0.09      # 5 % +- 3 * 1.1 %, and the approximation's 1 %
 
 

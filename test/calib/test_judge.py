@@ -135,8 +135,7 @@ class TestImu:
         assert not turned
 
     def test_an_imu_that_shows_nothing_is_no_crash(self):
-        reasons, turned = imu_sanity(np.zeros(3), np.zeros((50, 3)), np.eye(3),
-                                     ImuConfig())
+        reasons, turned = imu_sanity(np.zeros(3), np.zeros((50, 3)), np.eye(3), ImuConfig())
         assert codes(reasons) == [Code.NO_IMU, Code.NO_IMU]
         assert not turned
 

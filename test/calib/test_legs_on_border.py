@@ -46,8 +46,7 @@ class Toy:
     def draw(self, rng, constants=None):
         """Draw the noise, and the states where it matters not."""
         constants = np.tile(TRUTH, (len(self.A), 1)) if constants is None else constants
-        self.b = np.einsum('jrc,jc->jr', self.B, constants) + rng.standard_normal(
-            self.B.shape[:2])
+        self.b = np.einsum('jrc,jc->jr', self.B, constants) + rng.standard_normal(self.B.shape[:2])
         return self
 
     def border(self, j, about=None):

@@ -26,8 +26,7 @@ def scores(fitted):
     """Return what noise alone says of the IMU's errors at the truth, in its sigmas."""
     drive, config, leg = made(duration=300.0, imu_grade='consumer')
     problem, state = problem_of(leg, config), truth(drive, config, leg)
-    weighted = Equations(problem, state, fitted=fitted).at(
-        problem.first_levels)
+    weighted = Equations(problem, state, fitted=fitted).at(problem.first_levels)
     rows = weighted[MotionRows]
     J = rows.J[:, :, -rows.m:]
     score, information = np.einsum('kij,ki->j', J, rows.r), (J**2).sum(axis=(0, 1))

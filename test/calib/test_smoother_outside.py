@@ -194,7 +194,6 @@ def test_a_velocity_is_screened():
     def spoil(v):
         v[5:8, 0] = np.nan
 
-    inputs, found = screen(leg.with_rows(fix_velocity=changed(sent, velocity_n=spoil)),
-                           config)
+    inputs, found = screen(leg.with_rows(fix_velocity=changed(sent, velocity_n=spoil)), config)
     assert len(inputs.outside['fix_velocity'].t) == len(sent.stamp_ns) - 3
     assert any('3 of' in r.text and 'GNSS velocity messages' in r.text for r in found)

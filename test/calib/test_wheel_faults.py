@@ -263,8 +263,7 @@ def test_one_counter_sent_twice_is_no_second_wheel():
     inputs = prepared(**options)[0]
     copied = np.floor(inputs.travels[0].s / 2)      # in another resolution: not to the digit
     reasons, _ = faults(options, right=lambda s: copied, rough=4 / 3, track_width=1.6)
-    assert 'one counter is sent twice' in {r.code: r.text for r in reasons}[
-        Code.WHEEL_DEAD]
+    assert 'one counter is sent twice' in {r.code: r.text for r in reasons}[Code.WHEEL_DEAD]
 
 
 def said_of_copies():

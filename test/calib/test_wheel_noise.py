@@ -74,8 +74,7 @@ def test_of_a_walk_alone_the_ratio_is_that_of_the_ends():
     # the logarithm of a variance by k increments is known to sqrt(2 / k), the prior is far wider
     level, = line.levels
     assert abs(np.log(level / 1e-3**2)) < 4 * np.sqrt(2 / K)
-    assert np.sqrt(line.covariance[0, 0]) == pytest.approx(
-        np.sqrt(level / K) / WAY, rel=1e-4)
+    assert np.sqrt(line.covariance[0, 0]) == pytest.approx(np.sqrt(level / K) / WAY, rel=1e-4)
 
 
 def test_of_readings_alone_the_ratio_is_a_line_through_all_of_them():

@@ -145,8 +145,7 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
     assert operation.worker.compute is worker.compute
     # a fault after the numbers are there is an answer, too, and the node lives
     monkeypatch.setattr(answers, 'outcome', explode)
-    assert 'MemoryError: not enough for this leg' in client.result(
-        client.ask('stop_leg')).message
+    assert 'MemoryError: not enough for this leg' in client.result(client.ask('stop_leg')).message
     client.until(state='calibrated', leg_id='1', legs='1')
     monkeypatch.undo()
     assert 'scale factor' in client.call('stop_leg').message

@@ -90,8 +90,7 @@ def test_lateness_is_no_slip_and_slip_is_found(tmp_path):
         answers = {name: clients[name].result(one) for name, one in stopping.items()}
         for client in clients.values():
             wait_for(lambda client=client: client.status['saved'], 'the saved folder')
-        reasons = {name: one.until(state='calibrated')['reasons'] for name, one in
-                   clients.items()}
+        reasons = {name: one.until(state='calibrated')['reasons'] for name, one in clients.items()}
     finally:
         if load is not None:
             load.kill()

@@ -324,8 +324,7 @@ def counter_messages(messages, kind):
     topic = encode.counter('odometer', drive.odometer)
     raws = [row.tobytes() for row in topic.pack(slice(0, len(messages)))]
     assert kind == 'std_msgs/msg/Int64'
-    return [Sent(one.stamp_ns, 'odometer', raw)
-            for one, raw in zip(messages, raws, strict=False)]
+    return [Sent(one.stamp_ns, 'odometer', raw) for one, raw in zip(messages, raws, strict=False)]
 
 
 def test_the_odometer_type_is_taken_from_its_publisher(start, connect, sent):

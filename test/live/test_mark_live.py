@@ -32,8 +32,7 @@ def session(drive, tmp_path_factory):
     """Drive the square, with a mark at each point; keep what the node said."""
     wheels = dict(zip(('left', 'right'), drive.wheels, strict=True))
     imu = encode.imu('imu/data', drive.imu) if drive.options.imu else None
-    types, sent = messages_of(drive, imu=imu, odometer=encode.joints('odometer', wheels),
-                              fix=None)
+    types, sent = messages_of(drive, imu=imu, odometer=encode.joints('odometer', wheels), fix=None)
     settings = SETTINGS | {
         'output.directory': tmp_path_factory.mktemp('marked'),
         'odometer.nominal_scale': drive.options.nominal_scale,

@@ -59,8 +59,7 @@ def given(replayed):
     # from the very first message on: one lost would be another start
     values |= {f'qos_overrides./{topic}.subscription.reliability': 'reliable'
                for topic in ('imu/data', 'odometer')}
-    return [x for name, value in values.items()
-            for x in ('-p', f'{name}:={str(value).lower()}')]
+    return [x for name, value in values.items() for x in ('-p', f'{name}:={str(value).lower()}')]
 
 
 @pytest.fixture(scope='module')
@@ -69,8 +68,7 @@ def received(drive, replayed):
     from geometry_msgs.msg import TwistWithCovarianceStamped
     from nav_msgs.msg import Odometry
     from rclpy.qos import QoSProfile
-    node = NodeProcess('--params-file', str(replayed.path), *given(replayed),
-                       module='odometry')
+    node = NodeProcess('--params-file', str(replayed.path), *given(replayed), module='odometry')
     client = Client('odometry')
     seen = SimpleNamespace(odometry=[], twists=[], node=node)
     try:
@@ -144,8 +142,7 @@ def test_the_launch_file_starts_it_with_both_files():
     assert node.executable == 'odometry'
     assert f"'{node.executable} = odocal_ros.live.start:odometry'" in (
         ROOT / 'setup.py').read_text()
-    assert node.parameters[:2] == [str(ROOT / 'config' / 'odometry.yaml'),
-                                   '/tmp/calibration.yaml']
+    assert node.parameters[:2] == [str(ROOT / 'config' / 'odometry.yaml'), '/tmp/calibration.yaml']
     assert node.remappings['imu/data'] == '/a/imu'
 
 

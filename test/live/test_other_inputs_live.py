@@ -122,8 +122,7 @@ def test_a_robot_without_an_imu_is_calibrated_by_its_wheels(bare):
 def test_status_and_answer_have_each_of_four_wheels_by_its_name(four):
     for name, true in zip(four.drive.joints, four.drive.truth.wheel_scales, strict=True):
         assert f', {name} 0.3' in four.stop.message
-        value, sigma = (float(four.status[f'scale_factor_{name}{end}'])
-                        for end in ('', '_sigma'))
+        value, sigma = (float(four.status[f'scale_factor_{name}{end}']) for end in ('', '_sigma'))
         assert abs(value - true) < SIGMAS * sigma
         assert four.live['result'][f'scale_factor_{name}']['value'] == value
     assert four.status['left_right_ok'] == 'unknown'

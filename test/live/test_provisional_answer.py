@@ -108,8 +108,7 @@ def test_the_answer_does_not_wait_for_a_fit_that_takes_long(seen):
 
 
 def test_it_holds_the_running_estimate_as_the_status_had_it(seen):
-    value, sigma = (float(seen.computing[f'estimate_scale_factor{end}'])
-                    for end in ('', '_sigma'))
+    value, sigma = (float(seen.computing[f'estimate_scale_factor{end}']) for end in ('', '_sigma'))
     text = seen.first.answer.message
     assert f'the running estimate is scale factor {with_sigma(value, sigma)},' in text
     for end in ('', '_sigma'):
@@ -164,5 +163,4 @@ def test_a_leg_that_would_be_rejected_is_no_good_news():
     session.start(1, Config())
     now = SessionView(session, Config(), faults=(
         Reason(Code.IMU_GAP, 'no IMU data for 9 s'),), forecast_age_s=math.nan)
-    assert ('Now it would be rejected: IMU_GAP: no IMU data for 9 s. '
-            in answers.provisional(now))
+    assert ('Now it would be rejected: IMU_GAP: no IMU data for 9 s. ' in answers.provisional(now))

@@ -134,8 +134,7 @@ class Wire:
         wait_for(lambda: len(client.statuses) > seen_before, 'a status')
         if self.node.process.poll() is not None:
             seen.wrong.append(f'the node ended with {self.node.process.returncode}')
-        seen.wrong += [line for line in self.node.lines
-                       if any(word in line for word in BAD_WORDS)]
+        seen.wrong += [line for line in self.node.lines if any(word in line for word in BAD_WORDS)]
         for status in client.statuses:
             seen.wrong += [f'{key} {status[key]}' for key in SPANS if float(status[key]) < 0]
             value, sigma = (float(status[k]) for k in ('scale_factor', 'scale_factor_sigma'))

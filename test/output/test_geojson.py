@@ -98,8 +98,7 @@ def test_a_line_over_the_180th_meridian_is_cut_there(driven):
     # the cut lies on the line: as far north as the way to the east asks, to the digits kept
     share = (180.0 - west[-2, 0]) / (east[1, 0] + 360.0 - west[-2, 0])
     assert 0.1 < share < 0.9
-    assert west[-1, 1] == pytest.approx(west[-2, 1] + share * (east[1, 1] - west[-2, 1]),
-                                        abs=2e-8)
+    assert west[-1, 1] == pytest.approx(west[-2, 1] + share * (east[1, 1] - west[-2, 1]), abs=2e-8)
 
 
 def test_a_long_leg_is_thinned_and_says_so(driven):

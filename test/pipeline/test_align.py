@@ -364,8 +364,7 @@ def test_a_gyro_too_poor_for_a_compass_is_refused(plain, grade):
 def test_a_gyro_that_does_not_show_the_turn_of_the_earth_is_no_compass(plain, bias_deg_h):
     # a tactical gyro set as navigation grade: its compass would be 20 deg off, at 0.1 stated
     case = asked(plain, alignment__heading_source='gyrocompass')
-    case.inputs = replace(case.inputs,
-                          w_b=case.inputs.w_b + np.deg2rad(bias_deg_h) / 3600)
+    case.inputs = replace(case.inputs, w_b=case.inputs.w_b + np.deg2rad(bias_deg_h) / 3600)
     a, reasons = case.align()
     assert a.heading_source == 'course'
     assert [r.code for r in reasons] == [Code.GYROCOMPASS_REFUSED]

@@ -217,5 +217,4 @@ def test_a_widened_sigma_is_judged_again():
 def test_without_slip_nothing_is_widened():
     made = drive(**STRAIGHT)
     result = calibrate(made.leg(), settings(made, method='all'))
-    assert not any(s.name == 'slow_wheel_slip' for m in result.methods.values()
-                   for s in m.sources)
+    assert not any(s.name == 'slow_wheel_slip' for m in result.methods.values() for s in m.sources)

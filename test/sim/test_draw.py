@@ -68,8 +68,7 @@ def test_a_drawn_vehicle_can_be_driven(kind, grade):
 
 
 def test_arms_left_at_zero_and_wrong_grades_are_what_the_operator_sets():
-    vehicles = [drawn(seed, 'town', 'consumer', ('lever_arms', 'grade'))[0]
-                for seed in range(60)]
+    vehicles = [drawn(seed, 'town', 'consumer', ('lever_arms', 'grade'))[0] for seed in range(60)]
     zero = [o for o in vehicles if np.allclose(np.add(o.antenna_lever_arm,
                                                       o.real.antenna_arm_error), 0)]
     assert len(zero) == pytest.approx(0.3 * 60, abs=5 * np.sqrt(60 * 0.21))

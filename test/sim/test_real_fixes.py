@@ -71,8 +71,7 @@ def test_slow_errors_have_their_size_and_the_covariance_knows():
                                                                      stated_factor=0.5))
     drive = simulate(options)
     want = 0.3**2 + 1.2**2 + 0.9**2
-    assert_allclose(drive.fix.covariance_n[0],
-                    0.25 * np.diag([want, want, 4 * want]), rtol=1e-12)
+    assert_allclose(drive.fix.covariance_n[0], 0.25 * np.diag([want, want, 4 * want]), rtol=1e-12)
     made = np.array([real_sensors.errors(np.arange(0.0, 600, 1.0), replace(
         resolved(options), seed=s)) for s in range(60)])
     # 60 drives of 600 s hold 60 * 600 / (2 * 20) independent draws of the slower one, each axis
