@@ -117,15 +117,15 @@ def test_a_heading_from_outside_gives_the_yaw_all_the_same():
 def test_a_leg_without_force_tells_another_no_angle():
     """Its angles are held as set: they are no observation, however small their sigmas."""
     one, config, first = calibrated()
-    _, _, unfelt = calibrated(seed=8, start_ns=one.options.start_ns + 10**13)
-    felt = calibrate(one.leg(), config)
-    alone = combine([felt], config).estimates
-    for legs in ([felt, unfelt], [unfelt, felt]):
+    _, _, without = calibrated(seed=8, start_ns=one.options.start_ns + 10**13)
+    with_one = calibrate(one.leg(), config)
+    alone = combine([with_one], config).estimates
+    for legs in ([with_one, without], [without, with_one]):
         both = combine(legs, config).estimates
         for name in ANGLES:
             assert abs(both[name].value - alone[name].value) < alone[name].sigma
             assert both[name].sigma > 0.5 * alone[name].sigma
-    found = combine([first, unfelt], config)
+    found = combine([first, without], config)
     assert all(found.estimates[name].value is None for name in ANGLES)
     scale = found.estimates['scale_factor']
     assert abs(scale.value - one.truth.scale) < 3 * scale.sigma

@@ -71,7 +71,7 @@ class Reckoning:
         self._t = self._t_pose = self._t_look = float(self.imu.t[self.imu.at])
         self._s = self._s_pose = self.wheels.at(self._t)
         self._C_nb = np.array(matrix_of(self.q))
-        self._turn_b, self._felt_n, self._felt = ZERO, ZERO, True
+        self._turn_b, self._dv_n, self._levels = ZERO, ZERO, True
         self._T_grow, self._way_grow, self._turn_grow = 0.0, ZERO, ZERO
         self._w_look: list[Floats] = []
         self._rested, self._apart, self._strange_turn = False, 0, PLAUSIBLE
@@ -134,7 +134,7 @@ class Reckoning:
         s = [self.wheels.at(one) for one in t[at - low:-1]]
         gaps = [b - a for a, b in zip(t[at - low:-2], t[at - low + 1:-1], strict=True)]
         lost, self._s = abs(s[0] - self._s), s[-1]
-        C_nb, turn_b, way_n, felt_n = self._C_nb.tolist(), ZERO, ZERO, ZERO
+        C_nb, turn_b, way_n, dv_n = self._C_nb.tolist(), ZERO, ZERO, ZERO
         forward_n, f_n = rotated(C_nb, self._forward_b), rotated(C_nb, f[0])
         for k, T in enumerate(gaps):
             phi = rotation_increment(t, w, at - low + k)
@@ -143,9 +143,9 @@ class Reckoning:
             f_before, f_n = f_n, rotated(C_nb, f[k + 1])
             turn_b = plus(turn_b, phi)
             way_n = plus(way_n, plus(forward_before, forward_n), (s[k + 1] - s[k]) / 2)
-            felt_n = plus(felt_n, plus(f_before, f_n), T / 2)
+            dv_n = plus(dv_n, plus(f_before, f_n), T / 2)
         self._C_nb = np.array(C_nb)
-        self.position, self._felt_n = plus(self.position, way_n), plus(self._felt_n, felt_n)
+        self.position, self._dv_n = plus(self.position, way_n), plus(self._dv_n, dv_n)
         T, turn_n = t[-2] - self._t, rotated(C_nb, turn_b)
         self._grow(T, way_n, turn_n, [gap for gap in gaps if gap > HOLE_INTERVALS * imu.usual],
                    self.wheels.doubt(self._t, t[-2]))
@@ -154,7 +154,7 @@ class Reckoning:
         if lost > self.wheels.quantum:
             self.errors.lost(lost)
         calm = self._strange_turn is PLAUSIBLE and max(gaps) <= IMU_HOLE
-        self._felt &= calm and math.isfinite(sum(felt_n))
+        self._levels &= calm and math.isfinite(sum(dv_n))
         self._turn_b = plus(self._turn_b, turn_b)
         self._w_look.append(imu.w_b[at + 1:last + 1])
         self._t, imu.at = t[-2], last
@@ -213,8 +213,8 @@ class Reckoning:
             and (np.abs(w.mean(axis=0) - self.bias) < REST_TURN).all())
         # a rest that begins with this look may begin with the last of the braking
         standing = resting and self._rested
-        if self.config.levelling and received and self._felt:
-            off_n = (np.array(self._felt_n) - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
+        if self.config.levelling and received and self._levels:
+            off_n = (np.array(self._dv_n) - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
             doubt = self.wheels.doubt(self._t_look, self._t)      # changes the speed in T
             noise = 2 * np.hypot(self.wheels.quantum / SPEED_SPAN / T, np.sqrt(doubt) / T**2)
             by = self.errors.by_gravity(
@@ -233,7 +233,7 @@ class Reckoning:
             self._correct(self.errors.by_rest(w.mean(axis=0) - self.bias - earth_b, variance))
         self._rested = resting
         self._t_look, self._v_look = self._t, self._velocity_n(self._t)
-        self._felt_n, self._felt, self._w_look = ZERO, True, []
+        self._dv_n, self._levels, self._w_look = ZERO, True, []
 
     def _take_apart(self, off_n: Floats, velocity: Floats, T: float, w: Floats) -> None:
         """
@@ -248,7 +248,7 @@ class Reckoning:
         self.errors.turned(np.eye(3) * np.sum((w.mean(axis=0) - self.bias)**2) * T**2)
         self.errors.lost(min(float(np.linalg.norm(off_n)) * T**2 / 2,
                              float(np.linalg.norm(velocity - self._v_look)) * T))
-        length = float(np.linalg.norm(self._felt_n)) / T
+        length = float(np.linalg.norm(self._dv_n)) / T
         if self._apart >= MOST_APART and abs(length - GRAVITY) < AS_GRAVITY:
             self.failed = f'specific force and attitude have disagreed for {self._apart} s'
 

@@ -87,8 +87,8 @@ def _levelled(row: int, length: float, w: Floats, f: Floats, resting: bool, vehi
               grade: Grade) -> Start:
     """Return the start by gravity, x along the vehicle; the bias by a rest, else as calibrated."""
     mean = f.mean(axis=0)
-    felt = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_FORCE_OFF)      # not NaN either
-    C_Lb = level_frame(mean) if felt else vehicle.C_vb
+    level = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_FORCE_OFF)      # not NaN either
+    C_Lb = level_frame(mean) if level else vehicle.C_vb
     forward = C_Lb @ vehicle.forward_b
     C_nb = C_nL(-np.arctan2(forward[1], forward[0])) @ C_Lb
     if resting:
@@ -99,6 +99,6 @@ def _levelled(row: int, length: float, w: Floats, f: Floats, resting: bool, vehi
         known = vehicle.gyro_bias is not None
         bias, sigma = (vehicle.gyro_bias if known else np.zeros(3)), grade.gyro_bias
     errors = Errors(grade, vehicle, ROAD_TILT_SIGMA, sigma)
-    if felt:        # so that the tilt hangs on the accelerometer's bias
+    if level:        # so that the tilt hangs on the accelerometer's bias
         errors.by_gravity(C_nb, np.zeros(3), length, 0.0 if resting else BRAKING_SIGMA)
     return Start(row, quat_from_matrix(C_nb), bias, np.zeros(3), errors)

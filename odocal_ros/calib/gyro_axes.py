@@ -65,7 +65,7 @@ def gyro_axes(inputs: 'Inputs', placed: Placed) -> tuple[Reason, ...]:
     up = inputs.usual_f_b @ inputs.C_bi
     axes, names = sensor_axes(up / np.linalg.norm(up))
     found = by_course(inputs, placed, w_i, axes, names)
-    if not found and inputs.felt:
+    if not found and inputs.has_accelerometer:
         found = by_gravity(inputs, placed, w_i, f_i, axes, names)
     if not found:
         return ()

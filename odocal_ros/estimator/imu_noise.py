@@ -28,7 +28,7 @@ def sensor_noise(grade: Grade) -> dict[str, float]:
     return {name: max(sigma, LEAST.imu[name]) for name, sigma in stated.items()}
 
 
-def unfelt(grade: Grade) -> Grade:
+def without_accelerometer(grade: Grade) -> Grade:
     """Return the grade of an IMU without an accelerometer: its specific force is gravity."""
     return replace(grade, accel_noise=UNFELT_NOISE, accel_bias=TILT_SIGMA * G,
                    accel_bias_walk=UNFELT_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
@@ -50,10 +50,10 @@ def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     # the median: people get in and out, and a bus kneels
     found = {name: max(float(np.median(x)) / CHI2_3_MEDIAN, LEAST.imu[name]**2)
              for name, x in zip(('gyro', 'accel'), both, strict=True)}
-    return found if leg.felt else {'gyro': found['gyro']}
+    return found if leg.has_accelerometer else {'gyro': found['gyro']}
 
 
-def shaken(leg: SmootherLeg) -> dict[str, float]:
+def vibrating(leg: SmootherLeg) -> dict[str, float]:
     """
     Return white noise levels of gyro and accelerometer from adjacent samples.
 

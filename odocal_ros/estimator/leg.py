@@ -52,7 +52,7 @@ class SmootherLeg:
     doubt_sigma: Floats = _none()        # scale units
     outside: Mapping[str, Outside] = field(default_factory=dict)     # by the name of its factor
     wheels: tuple[Travel, ...] = ()     # in the order of odometer.wheels
-    felt: bool = True                   # False: no accelerometer, f_b is gravity, made up
+    has_accelerometer: bool = True      # False: f_b is gravity, made up
 
     @property
     def by_steps(self) -> bool:

@@ -13,7 +13,7 @@ from odocal_ros.estimator.factors.axle import rates_at, WARM_TIME
 from odocal_ros.estimator.factors.fixes import whitener
 from odocal_ros.estimator.factors.priors import SHARED
 from odocal_ros.estimator.factors.slide import turned
-from odocal_ros.estimator.imu_noise import at_rest, shaken, unfelt
+from odocal_ros.estimator.imu_noise import at_rest, vibrating, without_accelerometer
 from odocal_ros.estimator.imu_steps import ImuSteps
 from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, SmootherLeg
 from odocal_ros.estimator.outside import Outside
@@ -60,7 +60,7 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
     held-out rest); the stop mark by default.
     """
     t_stop = inputs.t_stop if t_stop is None else t_stop
-    if not inputs.felt:         # the ground is taken as level, so heights have no say
+    if not inputs.has_accelerometer:         # the ground is taken as level, so heights have no say
         fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
     before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = min(0.0, float(before[-1][0])) if before else 0.0
@@ -75,7 +75,7 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
         doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma,
         outside={part.name: sent for part in OUTSIDE
                  if (sent := part.prepared(inputs, config, origin)) is not None},
-        felt=inputs.felt, wheels=inputs.travels)
+        has_accelerometer=inputs.has_accelerometer, wheels=inputs.travels)
 
 
 def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:
@@ -85,7 +85,7 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     still = standing(leg, t)
     use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
     grade = grade_as_seen(config.imu, at_rest(imu, leg, still))
-    grade = grade if leg.felt else unfelt(grade)
+    grade = grade if leg.has_accelerometer else without_accelerometer(grade)
     root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
     made = Problem(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
                _within(leg, t), _own(leg), turned(leg, imu), config.gnss.correlation_time,
@@ -96,7 +96,7 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
             first, least = part.first_levels(made)
             made.first_levels = made.first_levels.but(**first)
             made.least |= least
-    made.shaken = {k: max(v, made.first_levels[k]) for k, v in shaken(leg).items()}
+    made.vibrating = {k: max(v, made.first_levels[k]) for k, v in vibrating(leg).items()}
     return made
 
 
@@ -170,7 +170,7 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     for part in OUTSIDE:
         sent = leg.outside.get(part.name)
         sigma[part.constants] = NO_ERROR if sent is None else part.prior_sigmas(sent, config)
-    if not leg.felt:        # mounting and attitude are not separable: as configured
+    if not leg.has_accelerometer:        # mounting and attitude are not separable: as configured
         sigma[ACCEL] = sigma[PITCH] = NO_ERROR
         if 'heading' not in leg.outside:
             centre[YAW], sigma[YAW] = nominal_yaw(config), NO_ERROR

@@ -37,7 +37,7 @@ class Problem:
     drift_time: np.ndarray   # (K,) s, in which the correlated fix error changes
     first_levels: Levels = field(default_factory=lambda: Levels({}))
     least: dict[str, float] = field(default_factory=dict)     # levels
-    shaken: dict[str, float] = field(default_factory=dict)    # initial levels of the IMU
+    vibrating: dict[str, float] = field(default_factory=dict)    # initial levels of the IMU
     # velocity, heading, steps of speed: errors that are one
     per_effective: dict[str, float] = field(default_factory=dict)
 

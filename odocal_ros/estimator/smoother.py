@@ -77,8 +77,8 @@ def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fi
 def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
     nominal = nominal_yaw(config)
     start = first_state(problem.leg, problem.imu, problem.priors,
-                        None if problem.leg.felt else nominal)
-    if problem.leg.felt and start.yaw_sigma > TWO_HEADINGS:
+                        None if problem.leg.has_accelerometer else nominal)
+    if problem.leg.has_accelerometer and start.yaw_sigma > TWO_HEADINGS:
         other = first_state(problem.leg, problem.imu, problem.priors, nominal)
         turned = wrap(other.state.constants[YAW] - start.state.constants[YAW])
         if abs(turned) > TWO_HEADINGS:
@@ -101,10 +101,11 @@ def _first_levels(problem: Problem, start: Start) -> Levels:
     """Return initial levels: fixes no better than their fit to the odometer track."""
     wide = max(1.0, (start.fix_spread / problem.fix_sigma)**2)
     time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
-    long = problem.leg.felt and problem.leg.t_stop - problem.leg.t_begin > LARGE_SIZE_FROM
+    leg = problem.leg
+    long = leg.has_accelerometer and leg.t_stop - leg.t_begin > LARGE_SIZE_FROM
     sizes = {'size_fix_error_by_motion': LARGE_SIZE} if long else {}
     return problem.first_levels.but(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE * wide,
-                                    correlation_time=time, **sizes, **problem.shaken)
+                                    correlation_time=time, **sizes, **problem.vibrating)
 
 
 def too_little_of(leg: SmootherLeg) -> Reason | None:

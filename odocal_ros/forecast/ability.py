@@ -40,7 +40,7 @@ class Received:
 
     variances : of the yaw, rad^2, in ``heading_topic`` and ``imu_orientation``, inf if none is
     sent.   rested_s : length of the current or last standstill.   latitude : rad.   height : the
-    fixes have one.   felt : the IMU has an accelerometer.   imu : there is one.
+    fixes have one.   has_accelerometer : the IMU has an accelerometer.   imu : there is one.
     """
 
     variances: dict[str, float]
@@ -48,7 +48,7 @@ class Received:
     latitude: float = 0.7
     height: bool = True
     two_wheels: bool = False
-    felt: bool = True
+    has_accelerometer: bool = True
     imu: bool = True
 
 
@@ -76,11 +76,11 @@ def ability(config: Config, received: Received) -> Ability:
         return Ability(OF_DRIVE[drive], (
             'yaw and pitch of the IMU' if received.imu else 'yaw and pitch (no IMU)',))
     methods = [name for name in METHODS if name in deciding(config.method)
-               and (received.felt or name != ALL_SAMPLES)]
+               and (received.has_accelerometer or name != ALL_SAMPLES)]
     values = [(True, 'the scale'), _yaw(config, received, methods),
             (True, 'the pitch') if received.height else
             (False, 'the pitch (fixes without height)')]
-    if not received.felt:
+    if not received.has_accelerometer:
         values[-1] = False, 'the pitch (IMU without acceleration)'
     if received.two_wheels:
         values += _of_two_wheels(config)

@@ -14,7 +14,7 @@ from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, S
 from odocal_ros.forecast.ability import Received, stated_variance
 from odocal_ros.nav.earth import radii
 from odocal_ros.screening.clocks import offsets, remedy
-from odocal_ros.screening.leg_kind import felt
+from odocal_ros.screening.leg_kind import has_accelerometer
 from odocal_ros.screening.odometer_care import Steps
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_APART, DAY_NS, FASTEST
@@ -210,7 +210,8 @@ class Progress:
         variances = {name: np.inf if block is None else stated_variance(block)
                      for name, block in sent.items()}
         imu = self._last.get('imu')
-        return replace(place, variances=variances, felt=imu is None or felt(imu.f_i),
+        return replace(place, variances=variances,
+                       has_accelerometer=imu is None or has_accelerometer(imu.f_i),
                        rested_s=self._travel.rested_s(preroll_s) if self._travel else 0.0)
 
     def begin_leg(self) -> None:

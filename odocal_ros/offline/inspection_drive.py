@@ -121,13 +121,14 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config:
           found: dict[str, Any], findings: list[Reason]) -> list[str]:
     """Return the IMU orientation, and whether its gyro turns with the course."""
     m = mounting(inputs.t_imu, w_i, f_i, inputs.travel, drive.scale or 1.0)
-    if not inputs.felt:
+    if not inputs.has_accelerometer:
         m = replace(m, C_bi=None)      # gravity is made up
     set_already = bool(np.any(config.imu.mounting_rpy))
     agrees = m.C_bi is not None and np.allclose(
         m.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
     found['mounting'] = {
-        'accelerometer': inputs.felt, 'rpy': m.rpy, 'assumed_forward': m.assumed, 'off': m.off,
+        'accelerometer': inputs.has_accelerometer, 'rpy': m.rpy, 'assumed_forward': m.assumed,
+        'off': m.off,
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}

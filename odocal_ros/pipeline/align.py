@@ -52,7 +52,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     noise = {} if span is None else _noise_at_rest(inputs, span)
     grade = with_turn_on_level(grade_as_seen(config.imu, {
         name: sigma**2 for name, sigma in noise.items() if sigma}), config.imu)
-    if not inputs.felt:
+    if not inputs.has_accelerometer:
         grade = replace(grade, accel_bias=TILT_SIGMA * G)
     gyro_noise = max(grade.gyro_noise, noise.get('gyro', 0.0))
     level, reasons = _level(inputs, span, metres_per_unit, origin.latitude, grade, gyro_noise)
@@ -151,7 +151,7 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
         return {}
     root_hz = np.sqrt((len(t) - 1) / (t[-1] - t[0]))
     return {name: float((np.diff(x, axis=0).std(axis=0) / np.sqrt(2)).max() / root_hz)
-            for name, x in signals.items() if inputs.felt or name == 'gyro'}
+            for name, x in signals.items() if inputs.has_accelerometer or name == 'gyro'}
 
 
 def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,

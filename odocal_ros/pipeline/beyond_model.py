@@ -74,7 +74,7 @@ def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
 
 def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """Return a result; without an accelerometer with the error of hills and no angles."""
-    if prepared.inputs.felt:
+    if prepared.inputs.has_accelerometer:
         return method
     hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a path longer
     method = with_scale_error(method, prepared, 'hills', dict.fromkeys(SCALES, hills))

@@ -161,7 +161,7 @@ def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
 
 def _gyro(inputs: Inputs, t: Floats) -> Floats:
     """Return the integral of the turn rate about the up axis in each interval, () without."""
-    if not inputs.felt or len(inputs.t_imu) < 2 or inputs.t_imu[0] > t[0] \
+    if not inputs.has_accelerometer or len(inputs.t_imu) < 2 or inputs.t_imu[0] > t[0] \
             or inputs.t_imu[-1] < t[-1]:
         return np.empty(0)
     rate = np.einsum('ij,j->i', inputs.w_b, inputs.up_b)       # by BLAS it depends on its threads

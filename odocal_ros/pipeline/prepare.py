@@ -47,7 +47,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     still = _standing(inputs, placed)
     if still is not None:
         return None, (*reasons, *still)
-    faces = facing(inputs, placed.rough) if inputs.felt else None
+    faces = facing(inputs, placed.rough) if inputs.has_accelerometer else None
     axes = axes_reasons(faces, config.imu.nominal_yaw)
     reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop), *with_axes(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
@@ -125,7 +125,7 @@ def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,
                    reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
     """Return the faults found by comparing left and right wheels, and the slips of one of them."""
     fixed = [axle for axle in axles_of(inputs.travels) if len(axle) > 1 and not axle[0].ahead]
-    if not fixed or not inputs.felt or BROKEN & {r.code for r in reasons}:
+    if not fixed or not inputs.has_accelerometer or BROKEN & {r.code for r in reasons}:
         return (), NO_SLIPS
     from odocal_ros.calib.wheels.slips import wheel_faults
     odometer, count = config.odometer, sum(not one.ahead for one in inputs.travels)

@@ -126,7 +126,7 @@ def slip_check(ready: PreparedLeg, track: Track, f: Floats,
 
     track : of a method.   f : (3,) scale times forward axis.   between : s.
     """
-    if not ready.inputs.felt:
+    if not ready.inputs.has_accelerometer:
         return Slips(np.empty(0), np.empty(0))
     slips = find_slips(ready.inputs.t_imu, ready.inputs.f_b, track, f, ready.origin.latitude,
                        rounding(ready.inputs.travel))

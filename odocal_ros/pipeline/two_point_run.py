@@ -74,7 +74,7 @@ class TwoPointRun:
 
     def _slips(self, chord: Chord, f: Floats) -> tuple[Floats, Floats]:
         """Return slips of the mean between the marks, s and m; name those not named already."""
-        if not self.inputs.felt:
+        if not self.inputs.has_accelerometer:
             return np.empty(0), np.empty(0)
         ends = chord.start.t, chord.end.t
         slips = slip_check(self.ready, self.track, toward(self.ready.facing, f), ends)

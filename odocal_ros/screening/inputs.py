@@ -51,7 +51,7 @@ class Inputs:
     outside: Mapping[str, UsableRows]      # of the other sensors, by slot
     fixes_rejected: int
     scale_unit: str
-    felt: bool = True                  # False: f_b is made up, no accelerometer is there
+    has_accelerometer: bool = True     # False: f_b is made up
     local: bool = False                # True: fixes are positions in a local frame
 
     @cached_property

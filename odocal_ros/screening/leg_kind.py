@@ -40,7 +40,7 @@ GRAVITY_ROWS = 20_000  # judgement: at the most, for the median
 TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
 
 
-def felt(f_i: Floats) -> bool:
+def has_accelerometer(f_i: Floats) -> bool:
     """Return True if any of the (n, 3) forces is valid, or none has arrived yet."""
     if not len(f_i):
         return True
@@ -54,7 +54,7 @@ def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
 
     They are level only with turn rates about all axes: an axis that is always zero has no gyro.
     """
-    if not felt(imu.f_i):
+    if not has_accelerometer(imu.f_i):
         return 'publishes turn rates but no acceleration'
     with np.errstate(all='ignore'):
         some = imu.f_i[::max(1, len(imu.f_i) // GRAVITY_ROWS)]

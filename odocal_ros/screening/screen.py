@@ -41,15 +41,15 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     judged : False for its motion alone: clocks, gyro and wheels that fail are not looked for, and
     orientations stay as sent.
     """
-    leg, unfelt = with_force(leg, config)
+    leg, levelled = with_force(leg, config)
     leg, local = without_north(leg, config)
-    found: list[Reason] = [*unfelt, *local, *other_imus(leg, config.imu)]
+    found: list[Reason] = [*levelled, *local, *other_imus(leg, config.imu)]
     found += _missing(leg, found)
     if judged:
         found += judge_clocks(leg, config)
     rows = _usable(leg, config, judged, found)
     inputs = _in_base(leg, config, rows, _fixes(leg, config, rows, found))
-    inputs = replace(inputs, felt=not unfelt, local=bool(local))
+    inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
     found += _wheel_gaps(leg, rows.wheels)
     if judged:
         found += alternating(rows.imu.w_i, rows.imu.f_i)
@@ -60,7 +60,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     let_go()
     if judged and not local:
         inputs = _without_reckoned(inputs, config, found)
-    return (inputs if unfelt else _without_reversing(inputs, config, found)), tuple(found)
+    return (inputs if levelled else _without_reversing(inputs, config, found)), tuple(found)
 
 
 def _missing(leg: Leg, found: list[Reason]) -> list[Reason]:
@@ -147,7 +147,7 @@ def _wheel_gaps(leg: Leg, wheels: Wheels) -> list[Reason]:
 
 def _axles(inputs: Inputs, wheels: Wheels) -> tuple[Wheels, list[Reason]]:
     """Return the wheels that count, and reasons; of one axle only with an accelerometer."""
-    if len(wheels.each) > (1 if inputs.felt else len(SIDES)):
+    if len(wheels.each) > (1 if inputs.has_accelerometer else len(SIDES)):
         return judged_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop))
     return wheels, []
 

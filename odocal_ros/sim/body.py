@@ -112,7 +112,7 @@ def rotation(motion: Motion, t: Floats) -> Floats:
     return matrix_from_rpy(np.stack([roll, pitch, np.zeros_like(roll)], -1))
 
 
-def felt(motion: Motion, state: State,
+def measured(motion: Motion, state: State,
          lever_arm: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
     """
     Return turn rate (rad/s) and specific force (m/s^2) in the body's axes: (n, 3) each.

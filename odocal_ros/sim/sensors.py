@@ -72,7 +72,7 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
     ns, t = stamps(motion.duration, options.imu_rate)
     state = motion.at(t)
     C_vi = imu_rotation(options)
-    w_v, f_v = body.felt(motion, state, options.imu_lever_arm)
+    w_v, f_v = body.measured(motion, state, options.imu_lever_arm)
     w_i, f_i = real_sensors.crooked(w_v @ C_vi * (1 + options.gyro_scale_error),
                                     f_v @ C_vi * (1 + options.accel_scale_error), options.real)
     gyro, accel = imu_errors(options, len(t))

@@ -131,8 +131,8 @@ def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_o
     for told, seen in (('navigation', 'tactical'), ('tactical', 'tactical'),
                        ('consumer', 'consumer')):
         assert grade_as_seen(replace(imu, grade=told), tactical) == GRADES[seen]
-    shaken = {name: 100.0 * value for name, value in tactical.items()}
-    assert grade_as_seen(replace(imu, grade='tactical'), shaken) == GRADES['consumer']
+    vibrating = {name: 100.0 * value for name, value in tactical.items()}
+    assert grade_as_seen(replace(imu, grade='tactical'), vibrating) == GRADES['consumer']
     assert grade_as_seen(replace(imu, grade='navigation'), {}) == GRADES['navigation']
 
 

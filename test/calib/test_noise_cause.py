@@ -74,8 +74,8 @@ def test_noise_that_single_samples_do_not_have_is_neither():
 
 def test_without_a_standstill_noise_that_does_not_add_up_is_vibration_else_unknown():
     one = noisy(1e-2, 1e-2, rest_s=0.0)
-    shaken = noise_remedy(one, {'gyro': 1e-3, 'accel': 1.0}, ['gyro'])
-    assert 'gyro samples vary 10 times as much as their means over seconds' in shaken
+    vibrating = noise_remedy(one, {'gyro': 1e-3, 'accel': 1.0}, ['gyro'])
+    assert 'gyro samples vary 10 times as much as their means over seconds' in vibrating
     assert 'unknown: there is no standstill' in noise_remedy(
         one, {'gyro': 1e-2, 'accel': 1.0}, ['gyro'])
 

@@ -73,7 +73,7 @@ def by_second(rows, k):
 
 
 @pytest.fixture(scope='module')
-def shaken():
+def moved():
     """Return the problem of a leg with all sensors, and a state where no term vanishes."""
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, heading_sigma=0.0,
                             pressure_sigma=0.0, antenna_lever_arm=(0.5, -0.3, 1.2))
@@ -95,9 +95,9 @@ def shaken():
 
 
 @pytest.fixture(scope='module')
-def stepping(shaken):
+def stepping(moved):
     """Return the problem of the same leg with a speed in whole km/h, and such a state."""
-    problem, state = shaken
+    problem, state = moved
     leg, step = problem.leg, 1 / 3.6
     t = np.arange(leg.t_begin, leg.t_stop, 0.1)
     speed = np.diff(leg.travel.at(np.append(t, t[-1] + 0.1))) / 0.1 * leg.rough_scale
@@ -123,8 +123,8 @@ def part_at(problem, state, name):
 
 
 @pytest.mark.parametrize('name', LOOSE)
-def test_derivatives_are_those_of_finite_differences(shaken, stepping, name):
-    problem, state = stepping if name == 'steps' else shaken
+def test_derivatives_are_those_of_finite_differences(moved, stepping, name):
+    problem, state = stepping if name == 'steps' else moved
     part = part_at(problem, state, name)
     *ends, constants = part.jacobians(N)
     begin, end = ends if len(ends) == 2 else (*ends, np.zeros_like(ends[0]))
@@ -189,8 +189,8 @@ def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
 
 
 @pytest.mark.parametrize('name', [part.name for part in FACTORS])
-def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, name):
-    problem, state = stepping if name == 'steps' else shaken
+def test_cost_after_a_step_is_what_the_normal_equations_say(moved, stepping, name):
+    problem, state = stepping if name == 'steps' else moved
     # so wide that nothing lies far out: squares only
     wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'heading', 'pressure', 'steps'), 1e8)
     levels = problem.first_levels.but(correlation_time=40.0, **wide)
@@ -214,8 +214,8 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, na
 
 
 @pytest.mark.parametrize('name', ['slow', 'slow_up', 'correlation_time'])
-def test_levels_of_slow_errors_climb_the_restricted_likelihood(shaken, name):
-    problem, state = shaken
+def test_levels_of_slow_errors_climb_the_restricted_likelihood(moved, name):
+    problem, state = moved
     levels = problem.first_levels.but(correlation_time=20.0, slow=0.01, slow_up=0.02,
                                       fix=1e4, fix_up=1e4, velocity=1.0)
 
@@ -265,8 +265,8 @@ def sized(problem, where, sigma, centre):
 @pytest.mark.parametrize(('name', 'where', 'prior'), [
     ('size_fix_lag_square', constants_from('fix_lag_square', 'fix_lag_square'), 1.0),
     ('size_scale_by_force', constants_from('scale_by_pull', 'scale_by_braking'), 0.1)])
-def test_sizes_of_what_is_well_known_are_the_mean_of_their_likelihood(shaken, name, where, prior):
-    problem, state = shaken
+def test_sizes_of_what_is_well_known_are_the_mean_of_their_likelihood(moved, name, where, prior):
+    problem, state = moved
     problem = sized(problem, where, prior, 1.5 * prior)
     levels = problem.first_levels
     weighted, solved, at = least(problem, state, levels)
@@ -280,8 +280,8 @@ def test_sizes_of_what_is_well_known_are_the_mean_of_their_likelihood(shaken, na
     assert found > 1.5 * SIZE      # far from where it started
 
 
-def test_what_the_drive_hardly_knows_has_no_say_in_its_size(shaken):
-    problem, state = shaken
+def test_what_the_drive_hardly_knows_has_no_say_in_its_size(moved):
+    problem, state = moved
     where = CONSTANTS.index('squat_by_jerk')
     # known to 1e-3 by the drive, to 7e-6 by the prior; a misfit pulls by 100 sigmas of the drive
     problem = sized(problem, where, 1e-5, 0.1)
@@ -294,8 +294,8 @@ def test_what_the_drive_hardly_knows_has_no_say_in_its_size(shaken):
         SIZE * np.exp(SIZE_SPREADS[name]**2 / 2), rel=1e-3)
 
 
-def test_the_bias_turns_with_a_robot_in_a_local_frame(shaken):
-    problem, state = shaken
+def test_the_bias_turns_with_a_robot_in_a_local_frame(moved):
+    problem, state = moved
     origin = replace(problem.leg.origin, local=rate_without_north(0.7))
     problem = replace(problem, leg=replace(problem.leg, origin=origin))
     part, h = part_at(problem, state, 'fixes'), 1e-4

@@ -74,10 +74,10 @@ def test_vibration_shakes_as_said_and_goes_nowhere(rate):
 
 def test_vibration_comes_with_speed_and_moves_the_bias_by_its_square():
     t, speed = np.arange(MANY) / 20.0, np.full(MANY, 5.0)       # half of it at 5 m/s
-    shaken = options(vibration=0.8, rectification=0.01)
-    _, accel = real_sensors.drifts(t, speed, shaken)
+    vibrating = options(vibration=0.8, rectification=0.01)
+    _, accel = real_sensors.drifts(t, speed, vibrating)
     assert accel.mean(axis=0) == pytest.approx(0.01 * 0.4**2, rel=1e-6)
-    _, still = real_sensors.drifts(t, 0 * speed, shaken)
+    _, still = real_sensors.drifts(t, 0 * speed, vibrating)
     assert (still == 0).all()
 
 

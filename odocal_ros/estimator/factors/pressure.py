@@ -54,7 +54,7 @@ class PressureRows(OutsideRows):
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Pressure | None:
         """Return heights as means over seconds."""
         sent, t = inputs.outside['pressure']
-        if not (config.imu.use_pressure and len(t) and inputs.felt):
+        if not (config.imu.use_pressure and len(t) and inputs.has_accelerometer):
             return None
         cell = np.floor(t * RATE)
         first = np.r_[0, np.flatnonzero(np.diff(cell)) + 1]

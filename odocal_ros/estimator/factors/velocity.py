@@ -76,7 +76,7 @@ class VelocityRows(OutsideRows):
         """Return the velocity of the antenna, in n."""
         sent, t = inputs.outside[cls.source]
         # without an accelerometer its change between keyframes is unknown
-        if not (config.gnss.use_velocity and len(t) and inputs.felt):
+        if not (config.gnss.use_velocity and len(t) and inputs.has_accelerometer):
             return None
         some = thinned(t)
         t, variance = t[some], sent.variance_n[some, :2]

@@ -44,7 +44,7 @@ def exported(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMarginals,
     biases = zip('xyz', fit.state.accel_bias[0], sigma, sigma / fit.first.accel_bias, strict=True)
     return {'odometer': odometer} | ({'accelerometer_bias': {
         axis: {'value': float(value), 'sigma': float(s), 'ratio': float(ratio)}
-        for axis, value, s, ratio in biases}} if leg.felt else {})
+        for axis, value, s, ratio in biases}} if leg.has_accelerometer else {})
 
 
 def _reading_sigma(leg: SmootherLeg, problem: Problem, fit: Fit) -> float:

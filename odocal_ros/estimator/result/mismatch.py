@@ -30,7 +30,8 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     gyro_sold, accel_sold = turn_on_bias(config.imu)
     level = fit.levels.roots()
     # of an accelerometer that is not there nothing is said
-    sensors = {'gyro': 'gyro', 'accel': 'accelerometer'} if problem.leg.felt else {'gyro': 'gyro'}
+    sensors = {'gyro': 'gyro'} | (
+        {'accel': 'accelerometer'} if problem.leg.has_accelerometer else {})
     remedy = noise_remedy(problem, level, [
         name for name in sensors if level[name] > WORSE_THAN_GRADE * min(own[name], stated[name])])
     over_grade = max(level[name] / own[name] for name in sensors)

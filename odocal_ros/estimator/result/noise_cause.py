@@ -30,17 +30,17 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
     worse : those of 'gyro' and 'accel' that exceed their grade; empty: no text.
     """
     coarse = {name: step for name, step in quantised(problem.leg, level).items() if name in worse}
-    shaken: list[str] = []
+    vibrating: list[str] = []
     own: list[str] = []
     unknown: list[str] = []
     moving, rest = at_rest_and_moving(problem)
     for name in (name for name in worse if name not in coarse):
         still, vary = rest.get(name, 0.0), moving.get(name, 0.0)
         if still and vary > VIBRATION * still:
-            shaken.append(f'{NAMES[name]} samples vary {vary / still:.0f} times as much '
+            vibrating.append(f'{NAMES[name]} samples vary {vary / still:.0f} times as much '
                           'in motion as at rest')
         elif not still and vary > VIBRATION * level[name]:
-            shaken.append(f'{NAMES[name]} samples vary {vary / level[name]:.0f} times as '
+            vibrating.append(f'{NAMES[name]} samples vary {vary / level[name]:.0f} times as '
                           'much as their means over seconds')
         else:       # less at rest than it adds up to: of no single samples
             (own if VIBRATION * still > level[name] else unknown).append(name)
@@ -48,9 +48,9 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
     if coarse:
         said.append(f'The cause is quantisation: {_steps_in_words(coarse)}. Set a finer '
                     'resolution or a smaller range in the IMU or its driver, if there is one.')
-    if shaken:
-        said.append(f'The cause is vibration: {", ".join(shaken)}. Mount the IMU firmly and away '
-                    'from the engine.')
+    if vibrating:
+        said.append(f'The cause is vibration: {", ".join(vibrating)}. Mount the IMU firmly and '
+                    'away from the engine.')
     said += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
              f'this is its normal noise, {_setting(name, level)}' for name in own]
     said += [f'The cause of the {NAMES[name]} noise is unknown: ' + (

@@ -112,15 +112,16 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     reasons += judge(found, leg.nominal_scale, config)
     sources = [*(_widened(s, widen) for s in shares(fit, near)),
                Source('model', np.diag(MODEL_FLOOR))]
+    grade = problem.grade if leg.has_accelerometer else None
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
                         | left_over(leg, problem, fit) | wheel_details(wheels)
                         | exported(leg, problem, fit, near, widen)
                         | {'key_bias_sigmas': bias_sigmas(near, widen),
                            'slips': [vars(s) for s in slips],
-                           'beside': beside(c, covariance, problem.grade if leg.felt else None)}
-                        | ({'level_pitch_angle': level_pitch(fit, near, widen)} if leg.felt
-                           else {}),
+                           'beside': beside(c, covariance, grade)}
+                        | ({} if grade is None else {
+                            'level_pitch_angle': level_pitch(fit, near, widen)}),
                         border_of(fit, configured(leg)).widened(widen))
 
 
