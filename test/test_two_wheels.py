@@ -46,7 +46,7 @@ def test_a_hidden_span_is_found_and_undone_to_the_count(made, clean, span, signe
     leg = with_right(made, lambda a: (a + half) % span - half)
     inputs, said = screened(leg, made)
     text = said[Code.WHEEL_COUNTERS_DIFFER]
-    assert f'right wheel counter rolls over at {span},' in text
+    assert f"right wheel's counter rolls over at {span}," in text
     # bridging would lose counts; here none is
     assert np.array_equal(inputs.travels[1].s, clean.travels[1].s)
     assert not len(inputs.doubt_t)
@@ -58,7 +58,7 @@ def test_the_wheel_and_the_first_time_are_named(made):
     leg = replace(made.leg(), odometer=left)
     _, said = screened(leg, made)
     text = said[Code.WHEEL_COUNTERS_DIFFER]
-    assert text.startswith('the left wheel counter')
+    assert text.startswith("the left wheel's counter")
     assert f't = {seconds(leg, left)[rolled[0] + 1]:.2f} s' in text
     assert f'{len(rolled)} jump' in text
 

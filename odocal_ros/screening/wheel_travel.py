@@ -100,14 +100,14 @@ def _measured(value: Values, rows: Ints, middle: float, slack: float) -> tuple[f
     return float(round((low + high) / 2)), max(1.0, (high - low) / np.sqrt(12))
 
 
-def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
-             side: str) -> tuple[OdometerSamples, tuple[Reason, ...], Floats, Floats]:
+def unrolled(t: Floats, samples: OdometerSamples, step: Floats, name: str, *,
+             of_one: bool = True) -> tuple[OdometerSamples, tuple[Reason, ...], Floats, Floats]:
     """
     Return rows with hidden rollovers corrected, reasons, times and sigmas of uncertain travel.
 
     t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its
-    steps, rollovers of the type's span undone.   side : of the counter, in reasons. Times are (k,)
-    s, sigmas (k,) counts.
+    steps, rollovers of the type's span undone.   name : of the counter, in reasons.   of_one : it
+    is the only one. Times are (k,) s, sigmas (k,) counts.
     """
     span = hidden_span(samples.value, step)
     none = np.empty(0)
@@ -120,10 +120,12 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
     times = len(span.rows)
     about = f'about {span.size:.6g} (± {span.sigma:.2g})' if span.sigma else NAMED_SPANS.get(
         span.size, f'{span.size:.0f}')
-    found = Reason(Code.WHEEL_COUNTERS_DIFFER, f'the {side} wheel counter rolls over at {about}, '
+    code, do = (Code.COUNTER_ROLLOVER, f'Set odometer.wrap to {span.size:.6g}.') if of_one else (
+        Code.WHEEL_COUNTERS_DIFFER, '')
+    found = Reason(code, f'{name} rolls over at {about}, '
                    f'not at the range of its message type: {times} jump{"s" * (times > 1)} of '
                    f'this size against the travel, first at t = {t[span.rows[0] + 1]:.2f} s; '
-                   'corrected')
+                   'corrected', do)
     # one error of the span for all jumps; the budget treats uncertainties as independent
     doubt = np.full(times, span.sigma * np.sqrt(times))
     return (replace(samples, value=value), (found,),
@@ -213,9 +215,9 @@ def _one(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config
     """Return the travel of a wheel, and times and sigmas of uncertain travel."""
     name = f"the {side} wheel's counter" if side else 'the counter'
     doubt_t = doubt = np.empty(0)
-    if side and form.quantity == 'cumulative':
+    if form.quantity == 'cumulative':
         step = counter_steps(samples.value, form.modulus)
-        samples, why, doubt_t, doubt = unrolled(t, samples, step, side)
+        samples, why, doubt_t, doubt = unrolled(t, samples, step, name, of_one=not side)
         found.extend(why)
     samples, t = mended(samples, t, form, found, f'{side} odometer'.strip())
     t = on_time(samples, t, form, found, f'{side} odometer'.strip())

@@ -113,6 +113,18 @@ def test_imu_packets_with_one_stamp_are_spread_over_their_time(leg, packet):
     assert 'packets with one stamp' in codes[Code.STAMPS_NOT_RISING]
 
 
+@pytest.mark.parametrize('span', [2**12, 2**16, 10_000])
+def test_a_counter_that_rolls_over_within_its_type_was_not_reset(span):
+    made = drive(**STRAIGHT | {'duration': 900.0}, odometer='counts', scale=0.02)
+    alone, *_ = said(made.leg())
+    inputs, codes, _ = said(replace(made.leg(), odometer=changed(
+        made.leg().odometer, value=lambda value: value % span)))
+    assert np.diff(made.odometer.value[[0, -1]]) > 3 * span
+    assert f'rolls over at {span}' in codes[Code.COUNTER_ROLLOVER]
+    assert Code.COUNTER_RESET not in codes
+    np.testing.assert_array_equal(inputs.travel.s, alone.travel.s)
+
+
 def test_duplicates_are_used_once(leg):
     twice = join([take(leg.fix, slice(0, 200)), take(leg.fix, slice(150, None))])
     again = take(leg.fix, np.repeat(np.arange(len(leg.fix.stamp_ns)), 2))
