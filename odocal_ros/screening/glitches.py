@@ -168,17 +168,21 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
     Return IMU_GAP where the gyro repeats one value to the last bit while the wheels roll.
 
     t, w : (n,), (n, 3) IMU rows.   travel : Travel.   limit : s, as long as a gap may be.
-    A gyro that reads zero is accepted: some drivers have a dead band.
+    A gyro that reads zero is accepted: some drivers have a dead band. So is one that often repeats
+    its value: it has coarse steps.
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()
     same = by_step(lambda w: across(np.logical_and, w[1:] == w[:-1])
                    & across(np.logical_or, w[1:] != 0), w)
-    begin, end = t[runs(same)].T
+    where = runs(same)
+    begin, end = t[where].T
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)
     rolled = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)
     held = np.flatnonzero((end - begin > limit) & (rolled > ROLLS * np.percentile(speed, 95)))
-    if not len(held):
+    elsewhere = len(same) - np.diff(where[held]).sum()
+    coarse_share = 0.2      # judgement: of the rows elsewhere; of a fine gyro none repeat
+    if not len(held) or same.sum() - np.diff(where[held]).sum() > coarse_share * elsewhere:
         return ()
     worst = held[np.argmax((end - begin)[held])]
     return (Reason(Code.IMU_GAP, 'the gyro repeats one value for '

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import changed, drive, seconds, settings, STRAIGHT
+from drives import changed, drive, seconds, settings, STRAIGHT, TOWN
 import numpy as np
 import pytest
 
@@ -316,6 +316,12 @@ def test_hard_driving_is_no_glitch():
     inputs, codes, _ = said(replace(leg, imu=bad))
     assert Code.BAD_ROWS_DROPPED not in codes
     assert len(inputs.t_imu) == len(t)
+
+
+def test_a_gyro_with_coarse_steps_does_not_hang():
+    leg, step = drive(**TOWN).leg(), np.radians(0.25)
+    coarse = changed(leg.imu, w_i=lambda w: np.round(w / step) * step + step)
+    assert Code.IMU_GAP not in said(replace(leg, imu=coarse))[1]
 
 
 def test_a_gyro_that_hangs_while_the_wheels_roll_is_a_gap(leg):
