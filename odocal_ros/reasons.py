@@ -33,9 +33,9 @@ class Code(Enum):
     NO_IMU = REJECT, ('Check the IMU topic and its QoS, or name the topic with --imu-topic. A '
                       'robot without an IMU: set odometer.left and odometer.right, or '
                       'odometer.wheels.')
-    NO_ACCELEROMETER = CAUTION, ('Yaw and pitch need an IMU that publishes acceleration with '
-                                 'gravity and three turn rates (REP-145). Drive on level '
-                                 'ground: unmodelled slopes bias the scale.')
+    NO_ACCELEROMETER = CAUTION, ('Yaw and pitch need an IMU that publishes specific force and '
+                                 'three turn rates (REP-145). Drive on level ground: unmodelled '
+                                 'slopes bias the scale.')
     NO_ODOMETER = REJECT, 'Check the odometer topic and odometer.type, or use --odometer-topic.'
     NO_FIX = REJECT, ('Drive under open sky and wait for a position before the start mark. '
                       'Without GNSS: start the localisation first, and name its topic with '

@@ -11,6 +11,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.equations import FACTORS, OUTSIDE
 from odocal_ros.estimator.factors.axle import rates_at, WARM_TIME
 from odocal_ros.estimator.factors.fixes import whitener
+from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.priors import SHARED
 from odocal_ros.estimator.factors.slide import turned
 from odocal_ros.estimator.imu_noise import at_rest, vibrating, without_accelerometer
@@ -90,7 +91,8 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     made = Problem(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
                _within(leg, t), _own(leg), turned(leg, imu), config.gnss.correlation_time,
                rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
-               drift_time(leg, t))
+               drift_time(leg, t), LEAST.fix if not leg.origin.local
+               or config.reference.points else LEAST.pose)     # a robot stands on marks
     for part in FACTORS:
         if part.there(made):
             first, least = part.first_levels(made)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.imu_steps import ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
@@ -35,6 +34,7 @@ class Problem:
     rate_b: np.ndarray       # (N, 3) rad/s, measured at the keyframes
     swings: np.ndarray       # (K, 3, 3) rad^2, of the angles within the intervals
     drift_time: np.ndarray   # (K,) s, in which the correlated fix error changes
+    fix_least: float         # m, minimum sigma of fix errors, white and correlated each
     first_levels: Levels = field(default_factory=lambda: Levels({}))
     least: dict[str, float] = field(default_factory=dict)     # levels
     vibrating: dict[str, float] = field(default_factory=dict)    # initial levels of the IMU
@@ -46,8 +46,3 @@ class Problem:
         """Return the median stated sigma of a horizontal axis of the fixes, m."""
         out: float = np.sqrt(np.median(self.leg.covariance_n[self.use][:, 0, 0]))
         return out
-
-    @property
-    def fix_least(self) -> float:
-        """Return the minimum sigma of fix errors, white and correlated each, m."""
-        return LEAST.pose if self.leg.origin.local else LEAST.fix

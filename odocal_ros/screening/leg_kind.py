@@ -63,7 +63,8 @@ def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
             return 'publishes accelerations without gravity'
     dead = np.logical_and.reduce([(imu.w_i[rows] == 0).all(axis=0) for rows in chunks(
         len(imu.w_i))] or [np.zeros(3, bool)])
-    if dead.any() and not dead.all():
+    # without that about the vertical there is no course either, which is another finding
+    if dead.any() and len(some) and not dead[int(np.argmax(np.abs(np.median(some, axis=0))))]:
         axes = ' and '.join(name for name, axis in zip('xyz', dead, strict=True) if axis)
         return f'publishes no turn rate about {axes}, so accelerations cannot be levelled'
     return ''

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import LOCAL
-from odocal_ros.estimator import prepare, problem as problem_module, smoother_leg
+from odocal_ros.estimator import prepare, smoother_leg
 from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.prepare import _priors
 from odocal_ros.nav.dead_reckoning import Origin
@@ -59,7 +59,7 @@ def estimates(leg, config):
     ids=['car', 'robot at walking speed, 91 m'])
 def test_poses_give_the_values_of_fixes(options, monkeypatch):
     # poses may be better than GNSS: here not
-    monkeypatch.setattr(problem_module, 'LEAST', replace(LEAST, pose=LEAST.fix))
+    monkeypatch.setattr(prepare, 'LEAST', replace(LEAST, pose=LEAST.fix))
     made = drive(**options)
     # the same first sigma: a fit that begins elsewhere ends within 0.03 sigma of it
     config = settings(made, **SMOOTHER, leg__min_distance=20.0, reference__default_sigma=2.5)
