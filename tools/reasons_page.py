@@ -55,7 +55,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'next to such messages: the recording itself is damaged. Other messages may be damaged '
         'without a visible sign, so messages near each group were left out too.',
         Code.STAMPS_NOT_RISING: 'Stamps of one topic repeat or step back. The smallest number of '
-        'messages was left out so that the stamps of the others increase.',
+        'messages was left out so that the stamps of the others increase. IMU messages of packets '
+        'that share a stamp are all used, at even times since the packet before.',
         Code.IMU_GAP: 'The IMU is silent, or repeats one value, for longer than `leg.max_gap`. '
         'The turns of the vehicle in this time are unknown, so the track is lost.',
         Code.LEG_CUT: 'The IMU was silent for longer than `leg.max_gap`. The leg is cut there; '
@@ -86,7 +87,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.COUNTER_RESET: 'The counter has a jump that no rollover explains: it was reset or '
         'lost power. The travel at this moment is interpolated, with a sigma.',
         Code.COUNTER_ROLLOVER: 'The counter reached its largest number and started again. This '
-        'is corrected exactly.',
+        'is corrected. A counter may have fewer bits than its message type: its span is then '
+        'found from the jumps.',
         Code.SPEED_COARSE: 'All published speeds are multiples of one step, such as 1 km/h. If '
         'truncated, they are half a step too low on average; if rounded, they are not. The '
         'values alone do not show which. The smoother uses the times of the step transitions and '
@@ -108,8 +110,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'the IMU frame.',
         Code.ODOMETER_STILL: 'The fixes move, but the counter does not: from the start, or for '
         '100 m or more of the drive. If it counts again, the leg is cut there (`LEG_CUT`).',
-        Code.SEVERAL_IMUS: 'Messages on the IMU topic have different frame_ids. Only one IMU '
-        'was used, the first on the topic. Which one is meant cannot be decided from the data.',
+        Code.SEVERAL_IMUS: 'Messages on the IMU topic have different frame_ids: only one IMU '
+        'was used, the first on the topic. Or they have one frame_id, and every second message is '
+        'of another IMU with other axes or biases. Which one is meant cannot be decided from the '
+        'data.',
         Code.IMU_UNITS: 'Gravity is not 9.8 m/s^2, or the gyro shows much larger turns than the '
         'vehicle can make: the unit is g, deg/s or another one.',
         Code.IMU_LOOKS_Z_DOWN: 'Gravity is on -z, as for an IMU with forward-right-down axes. '

@@ -76,7 +76,6 @@ GNSS_ARM = constants_from('antenna_lever_arm_x', 'antenna_lever_arm_z')
 ODO_DELAY, GNSS_DELAY, HEADING = map(CONSTANTS.index, ('odometer_delay', 'gnss_delay',
                                                        'heading_offset'))
 GYRO = constants_from('gyro_scale_z', 'gyro_z_by_force_y')
-GYRO_SCALE = GYRO.start
 ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_yz')
 # s^2, of a receiver's filter: square of the time constant of the mean of the past, or, below zero,
 # of a filter of position and velocity (nav/receiver_filter.py)

@@ -126,7 +126,11 @@ class AcceptConfig:
 
 
 def parse_accept(text: str) -> dict[str, float]:
-    """Return the settings of a ``NAME=LOW:HIGH``, or ``NAME_deg`` in degrees; BadUsage if not."""
+    """
+    Return the settings of one ``NAME=LOW:HIGH``; of ``NAME_deg`` the limits are in degrees.
+
+    Raises BadUsage: not of that form, or of no result that has limits.
+    """
     name, equals, limits = (part.strip() for part in text.partition('='))
     low, colon, high = limits.partition(':')
     plain, factor = name, 1.0

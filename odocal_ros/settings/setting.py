@@ -123,7 +123,11 @@ def settings_of(kind: type) -> dict[str, Setting]:
 
 
 def with_settings(config: AnyConfig, changes: Mapping[str, Any]) -> AnyConfig:
-    """Return config with settings changed by dotted name; BadConfig for a name or value."""
+    """
+    Return config with settings changed by dotted name, each checked.
+
+    Raises BadConfig: unknown name (the text names similar ones), wrong type, out of range.
+    """
     groups: dict[str, dict[str, Any]] = {}
     settings = settings_of(type(config))
     for name, value in changes.items():

@@ -20,7 +20,7 @@ from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.result.outcome import outcome
 from odocal_ros.estimator.start import first_state
-from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO_SCALE, IMPERFECT, M, YAW
+from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO, IMPERFECT, M, YAW
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
 from odocal_ros.settings.grades import GRADES, turn_on_bias
@@ -168,7 +168,7 @@ def test_the_gyro_scale_is_believed_as_it_is_set():
     _, config, leg = made(**SHORT)
     for asked, prior in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
         asking = with_settings(config, {'imu.gyro_scale_sigma': asked})
-        assert problem_of(leg, asking).priors.constants[GYRO_SCALE] == prior
+        assert problem_of(leg, asking).priors.constants[GYRO.start] == prior
 
 
 def test_too_little_is_refused():

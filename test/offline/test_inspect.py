@@ -70,47 +70,47 @@ def drive(seconds=150, C_ib=None, gyro=1.0, accel=1.0, lag=0.0, status=0, loop=F
 def inspect(path, capsys, *options):
     """Return what the command tells, as JSON and as text."""
     assert main(['inspect', str(path), '--json', *options]) == 0
-    told = json.loads(capsys.readouterr().out)
+    seen = json.loads(capsys.readouterr().out)
     assert main(['inspect', str(path), *options]) == 0
     out = capsys.readouterr()
     assert out.err == ''
     assert max(len(line) for line in out.out.splitlines() if str(path) not in line) < 100
-    return told, out.out
+    return seen, out.out
 
 
-def codes(told):
-    return {finding['code'] for finding in told['findings']}
+def codes(seen):
+    return {finding['code'] for finding in seen['findings']}
 
 
-def topic(told, name):
-    return next(t for t in told['topics'] if t['name'] == name)
+def topic(seen, name):
+    return next(t for t in seen['topics'] if t['name'] == name)
 
 
 # ---- real drives ---------------------------------------------------------------------------
 
 def test_comma(data_dir, capsys):
     path = data_dir / 'comma2k19_rav4' / 'bag'
-    told, text = inspect(path, capsys)
-    assert told['mapping'] == {'odometer': '/odometer/pulses_derived', 'imu': '/imu/data',
+    seen, text = inspect(path, capsys)
+    assert seen['mapping'] == {'odometer': '/odometer/pulses_derived', 'imu': '/imu/data',
                                'fix': '/fix'}
-    assert codes(told) == {'COVARIANCE_UNKNOWN', 'IMU_LOOKS_Z_DOWN', 'NO_STANDSTILL',
+    assert codes(seen) == {'COVARIANCE_UNKNOWN', 'IMU_LOOKS_Z_DOWN', 'NO_STANDSTILL',
                            'YAW_NOT_SEPARABLE'}
-    assert told['standstills'] == []
-    assert told['drive']['slowest'] > 7.9          # README: 8 to 20 m/s, never at rest
-    assert told['drive']['way'] == pytest.approx(1004, rel=0.01)
-    assert told['drive']['rough_scale'] == pytest.approx(0.010084, rel=0.005)
+    assert seen['standstills'] == []
+    assert seen['drive']['slowest'] > 7.9          # README: 8 to 20 m/s, never at rest
+    assert seen['drive']['way'] == pytest.approx(1004, rel=0.01)
+    assert seen['drive']['rough_scale'] == pytest.approx(0.010084, rel=0.005)
     # README: forward-right-down, pitch 3.75 deg on top
-    assert told['mounting']['rpy'] == pytest.approx([math.pi, 0, 0], abs=1e-9)
-    assert told['mounting']['needed']
-    assert not told['mounting']['assumed_forward']
-    imu = topic(told, '/imu/data')
+    assert seen['mounting']['rpy'] == pytest.approx([math.pi, 0, 0], abs=1e-9)
+    assert seen['mounting']['needed']
+    assert not seen['mounting']['assumed_forward']
+    imu = topic(seen, '/imu/data')
     assert imu['rate_hz'] == pytest.approx(104.3, abs=0.1)
     assert (imu['imu']['gravity_axis'], imu['imu']['orientation']) == ('-z', False)
-    assert topic(told, '/imu/data_flu')['imu']['gravity_axis'] == '+z'
-    fix = topic(told, '/fix')
+    assert topic(seen, '/imu/data_flu')['imu']['gravity_axis'] == '+z'
+    fix = topic(seen, '/fix')
     assert fix['fix']['sigma'] is None
     assert fix['timing']['header_to_bag'] == pytest.approx(0.20, abs=0.01)
-    pulses = topic(told, '/odometer/pulses_derived')
+    pulses = topic(seen, '/odometer/pulses_derived')
     assert pulses['timing']['headerless']
     assert (pulses['odometer']['quantity'], pulses['rate_hz']) == (
         'cumulative', pytest.approx(82.9, abs=0.1))
@@ -121,38 +121,38 @@ def test_comma(data_dir, capsys):
 
 def test_husky(data_dir, capsys):
     path = data_dir / 'husky_parking_lot' / 'bag'
-    told, text = inspect(path, capsys)
-    assert told['mounting']['rpy'] == pytest.approx([math.pi / 2, 0, -math.pi / 2], abs=1e-9)
-    assert not told['mounting']['assumed_forward']
-    imu = topic(told, '/imu/data')['imu']
+    seen, text = inspect(path, capsys)
+    assert seen['mounting']['rpy'] == pytest.approx([math.pi / 2, 0, -math.pi / 2], abs=1e-9)
+    assert not seen['mounting']['assumed_forward']
+    imu = topic(seen, '/imu/data')['imu']
     assert (imu['gravity_axis'], imu['orientation']) == ('+y', True)
-    assert topic(told, '/fix')['rate_hz'] == pytest.approx(2.5, abs=0.01)
-    (start, stop), = told['standstills']           # README: one stop of 11 s
+    assert topic(seen, '/fix')['rate_hz'] == pytest.approx(2.5, abs=0.01)
+    (start, stop), = seen['standstills']           # README: one stop of 11 s
     assert stop - start == pytest.approx(11, abs=1)
-    leg, = told['legs']
+    leg, = seen['legs']
     assert leg['chord'] < 0.1 * leg['way']         # a closed loop
     assert leg['way'] == pytest.approx(0.98 * 359, rel=0.02)
-    assert {'CHORD_TOO_SHORT', 'SPEED_TOO_LOW', 'IMU_AXES', 'YAW_NOT_SEPARABLE'} <= codes(told)
-    assert told['drive']['gyro_over_course'] == pytest.approx(1, abs=0.2)
+    assert {'CHORD_TOO_SHORT', 'SPEED_TOO_LOW', 'IMU_AXES', 'YAW_NOT_SEPARABLE'} <= codes(seen)
+    assert seen['drive']['gyro_over_course'] == pytest.approx(1, abs=0.2)
     # its counts, at the 0.980 mm of its README: 0.996 m in the fastest second
-    assert told['drive']['fastest'] == pytest.approx(0.996, rel=0.013)
-    assert len(told['straight']) == 2              # the long sides of 145 x 70 m
-    assert all(leg['chord'] > 0.9 * leg['way'] for leg in told['straight'])
+    assert seen['drive']['fastest'] == pytest.approx(0.996, rel=0.013)
+    assert len(seen['straight']) == 2              # the long sides of 145 x 70 m
+    assert all(leg['chord'] > 0.9 * leg['way'] for leg in seen['straight'])
     # the whole drive gives the smoother more than its straight sides: 1.7 % instead of 3.3 %
-    assert '--leg' not in told['command']
+    assert '--leg' not in seen['command']
     alone = text[text.index('affects the two-point method only'):]
     for code in ('NO_STANDSTILL', 'CHORD_TOO_SHORT', 'YAW_NOT_SEPARABLE'):
         assert text.count(f'{code}:') == alone.count(f'{code}:') == 1
-    told, text = inspect(path, capsys, '--set', 'method=two_point')
-    assert '--leg' in told['command']
+    seen, text = inspect(path, capsys, '--set', 'method=two_point')
+    assert '--leg' in seen['command']
     assert 'mounted on its side' in text
     assert 'affects the two-point method only' not in text
 
 
 def test_the_command_it_tells_runs(data_dir, capsys, tmp_path):
     for name in ('comma2k19_rav4', 'husky_parking_lot'):
-        told, _ = inspect(data_dir / name / 'bag', capsys)
-        words = shlex.split(told['command'])[1:]
+        seen, _ = inspect(data_dir / name / 'bag', capsys)
+        words = shlex.split(seen['command'])[1:]
         code = main([*words, '--output', str(tmp_path / name), '--quiet', '--json', '--set',
                      'output.formats=[params]'])
         result = json.loads(capsys.readouterr().out)
@@ -163,9 +163,9 @@ def test_the_command_it_tells_runs(data_dir, capsys, tmp_path):
 @pytest.mark.parametrize('name', ['talker_mcap', 'cdr_test_mcap', 'service_events_mcap',
                                   'split3_sqlite3_no_metadata', 'split5_mcap'])
 def test_bags_without_any_input(data_dir, capsys, name):
-    told, text = inspect(data_dir / 'reader_bags' / name, capsys)
-    assert codes(told) == {'NO_IMU', 'NO_ODOMETER', 'NO_FIX'}
-    assert told['command'] == ''
+    seen, text = inspect(data_dir / 'reader_bags' / name, capsys)
+    assert codes(seen) == {'NO_IMU', 'NO_ODOMETER', 'NO_FIX'}
+    assert seen['command'] == ''
     assert 'replay needs options: no odometer' in text
     unwrapped = ' '.join(text.split())       # a long path moves the line breaks
     assert ('metadata.yaml is missing' in unwrapped) == ('no_metadata' in name)
@@ -180,19 +180,19 @@ def test_bag_that_cannot_be_read(tmp_path, capsys):
 
 @pytest.mark.core
 def test_a_good_drive_lacks_only_a_heading(tmp_path, capsys):
-    told, text = inspect(ros_bags.write(tmp_path / 'bag', drive()), capsys)
-    assert codes(told) == {'YAW_NOT_SEPARABLE'}
-    (a, b), (c, d) = told['standstills']
+    seen, text = inspect(ros_bags.write(tmp_path / 'bag', drive()), capsys)
+    assert codes(seen) == {'YAW_NOT_SEPARABLE'}
+    (a, b), (c, d) = seen['standstills']
     assert (a, b, c, d) == pytest.approx((0, 12, 140, 150), abs=1.2)
-    leg, = told['legs']
+    leg, = seen['legs']
     t, v, w, _ = planar()
     assert leg['way'] == pytest.approx(v.sum() / RATE, rel=0.02)
     assert leg['start'] == pytest.approx(12, abs=1.2)
-    assert told['drive']['rough_scale'] == pytest.approx(K, rel=0.02)
-    assert told['drive']['gyro_over_course'] == pytest.approx(1, abs=0.05)
-    assert told['mounting'] == told['mounting'] | {'rpy': [0, 0, 0], 'needed': False}
-    assert told['command'] == f'odocal replay {tmp_path / "bag"}'
-    assert told['open'] == ''
+    assert seen['drive']['rough_scale'] == pytest.approx(K, rel=0.02)
+    assert seen['drive']['gyro_over_course'] == pytest.approx(1, abs=0.05)
+    assert seen['mounting'] == seen['mounting'] | {'rpy': [0, 0, 0], 'needed': False}
+    assert seen['command'] == f'odocal replay {tmp_path / "bag"}'
+    assert seen['open'] == ''
     assert 'imu.mounting_rpy is correct: [0, 0, 0] rad' in text
 
 
@@ -203,16 +203,16 @@ def test_axes_are_told(tmp_path, capsys, rpy):
     C_bi = matrix_from_rpy(rpy)
     small = matrix_from_rpy((0.0, 0.05, 0.08))    # what calibration is for must not confuse it
     rows = drive(C_ib=C_bi.T @ small.T)
-    told, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
-    assert matrix_from_rpy(told['mounting']['rpy']) == pytest.approx(C_bi, abs=1e-9)
-    assert told['mounting']['needed']
-    assert told['mounting']['off'] == pytest.approx(math.hypot(0.05, 0.08), abs=0.03)
-    setting = shlex.split(told['command'])[-1]
+    seen, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
+    assert matrix_from_rpy(seen['mounting']['rpy']) == pytest.approx(C_bi, abs=1e-9)
+    assert seen['mounting']['needed']
+    assert seen['mounting']['off'] == pytest.approx(math.hypot(0.05, 0.08), abs=0.03)
+    setting = shlex.split(seen['command'])[-1]
     assert setting.startswith('imu.mounting_rpy=[')
-    # set as told, nothing is left to say about the axes
-    told, _ = inspect(tmp_path / 'bag', capsys, '--set', setting)
-    assert codes(told) == {'YAW_NOT_SEPARABLE'}
-    assert not told['mounting']['needed']
+    # set as seen, nothing is left to say about the axes
+    seen, _ = inspect(tmp_path / 'bag', capsys, '--set', setting)
+    assert codes(seen) == {'YAW_NOT_SEPARABLE'}
+    assert not seen['mounting']['needed']
 
 
 def test_a_forward_axis_that_nothing_shows_is_assumed_or_left_open():
@@ -227,20 +227,20 @@ def test_a_forward_axis_that_nothing_shows_is_assumed_or_left_open():
 
 
 def test_units(tmp_path, capsys):
-    told, text = inspect(ros_bags.write(tmp_path / 'g', drive(accel=1 / 9.80665)), capsys)
-    assert 'IMU_UNITS' in codes(told)
+    seen, text = inspect(ros_bags.write(tmp_path / 'g', drive(accel=1 / 9.80665)), capsys)
+    assert 'IMU_UNITS' in codes(seen)
     assert 'specific force is not in m/s^2 but in g' in text
-    assert '--set imu.accel_scale=9.80665' in told['command']
-    told, _ = inspect(ros_bags.write(tmp_path / 'deg', drive(gyro=180 / math.pi)), capsys)
-    assert 'IMU_UNITS' in codes(told)
-    assert f'--set imu.gyro_scale={math.pi / 180!r}' in told['command']
-    told, text = inspect(ros_bags.write(tmp_path / 'twice', drive(gyro=2.0)), capsys)
-    assert told['drive']['gyro_over_course'] == pytest.approx(2, abs=0.1)
+    assert '--set imu.accel_scale=9.80665' in seen['command']
+    seen, _ = inspect(ros_bags.write(tmp_path / 'deg', drive(gyro=180 / math.pi)), capsys)
+    assert 'IMU_UNITS' in codes(seen)
+    assert f'--set imu.gyro_scale={math.pi / 180!r}' in seen['command']
+    seen, text = inspect(ros_bags.write(tmp_path / 'twice', drive(gyro=2.0)), capsys)
+    assert seen['drive']['gyro_over_course'] == pytest.approx(2, abs=0.1)
     assert 'IMU_UNITS: the gyro shows 2.' in text
-    told, text = inspect(tmp_path / 'twice', capsys, '--set', f'odometer.nominal_scale={4 * K}')
+    seen, text = inspect(tmp_path / 'twice', capsys, '--set', f'odometer.nominal_scale={4 * K}')
     assert 'typical for a counter of the four edges of a pulse' in ' '.join(text.split())
-    told, _ = inspect(ros_bags.write(tmp_path / 'sign', drive(gyro=-1.0)), capsys)
-    assert 'GYRO_SIGN' in codes(told)
+    seen, _ = inspect(ros_bags.write(tmp_path / 'sign', drive(gyro=-1.0)), capsys)
+    assert 'GYRO_SIGN' in codes(seen)
 
 
 def test_topics_that_cannot_be_combined(tmp_path, capsys):
@@ -248,19 +248,19 @@ def test_topics_that_cannot_be_combined(tmp_path, capsys):
     for name, _, message in rows:
         if name == '/imu/data':
             message.header.stamp = make.header(0).stamp
-    told, text = inspect(ros_bags.write(tmp_path / 'zero', rows), capsys)
-    assert topic(told, '/imu/data')['timing']['header_to_bag'] is None
+    seen, text = inspect(ros_bags.write(tmp_path / 'zero', rows), capsys)
+    assert topic(seen, '/imu/data')['timing']['header_to_bag'] is None
     assert 'NO_IMU: none of the ' in text
-    assert 'CLOCKS_DIFFER' not in codes(told)
-    told, text = inspect(ros_bags.write(tmp_path / 'zone', drive(60, lag=8 * 3600.0)), capsys)
-    assert codes(told) == {'CLOCKS_DIFFER'}
+    assert 'CLOCKS_DIFFER' not in codes(seen)
+    seen, text = inspect(ros_bags.write(tmp_path / 'zone', drive(60, lag=8 * 3600.0)), capsys)
+    assert codes(seen) == {'CLOCKS_DIFFER'}
     assert 'have no time in common' in text
 
 
 def test_clocks_and_stamps(tmp_path, capsys):
-    told, _ = inspect(ros_bags.write(tmp_path / 'lag', drive(lag=-3.0)), capsys)
-    assert 'CLOCKS_DIFFER' in codes(told)
-    assert topic(told, '/fix')['timing']['header_to_bag'] == pytest.approx(3.0, abs=1e-3)
+    seen, _ = inspect(ros_bags.write(tmp_path / 'lag', drive(lag=-3.0)), capsys)
+    assert 'CLOCKS_DIFFER' in codes(seen)
+    assert topic(seen, '/fix')['timing']['header_to_bag'] == pytest.approx(3.0, abs=1e-3)
     rows = drive()
     imu = [i for i, row in enumerate(rows) if row[0] == '/imu/data']
     rows[imu[100]][2].header.stamp.sec = 0          # zero
@@ -269,31 +269,31 @@ def test_clocks_and_stamps(tmp_path, capsys):
     rows[imu[301]] = (*rows[imu[301]][:2], rows[imu[300]][2])    # a row sent twice
     gone = set(imu[2000:2600])                      # 12 s of IMU
     rows = [row for i, row in enumerate(rows) if i not in gone]
-    told, text = inspect(ros_bags.write(tmp_path / 'odd', rows), capsys)
-    timing = topic(told, '/imu/data')['timing']
+    seen, text = inspect(ros_bags.write(tmp_path / 'odd', rows), capsys)
+    timing = topic(seen, '/imu/data')['timing']
     assert [timing[k] for k in ('zero_stamps', 'backward_steps', 'repeated_stamps')] == [1, 1, 1]
     longest = max(timing['gaps'], key=lambda gap: gap['length'])
     assert longest['length'] == pytest.approx(600 / RATE, abs=0.05)
     assert longest['at'] == pytest.approx(2000 / RATE, abs=0.05)
-    assert topic(told, '/imu/data')['rate_hz'] == pytest.approx(RATE, rel=0.01)
+    assert topic(seen, '/imu/data')['rate_hz'] == pytest.approx(RATE, rel=0.01)
     assert f'the longest {longest["length"]:.2f} s at {longest["at"]:.2f} s' in text
-    assert {'BAD_ROWS_DROPPED', 'STAMPS_NOT_RISING'} <= codes(told)
+    assert {'BAD_ROWS_DROPPED', 'STAMPS_NOT_RISING'} <= codes(seen)
 
 
 def test_fixes_that_are_none(tmp_path, capsys):
-    told, text = inspect(ros_bags.write(tmp_path / 'bag', drive(status=-1)), capsys)
-    assert 'FIXES_UNUSABLE' in codes(told)
-    assert topic(told, '/fix')['fix']['status'] == {'-1': 750}
+    seen, text = inspect(ros_bags.write(tmp_path / 'bag', drive(status=-1)), capsys)
+    assert 'FIXES_UNUSABLE' in codes(seen)
+    assert topic(seen, '/fix')['fix']['status'] == {'-1': 750}
     assert '750 no fix' in text
-    told, _ = inspect(ros_bags.write(tmp_path / 'unknown', drive(known=0)), capsys)
-    assert topic(told, '/fix')['fix']['sigma'] is None
-    assert 'COVARIANCE_UNKNOWN' in codes(told)
+    seen, _ = inspect(ros_bags.write(tmp_path / 'unknown', drive(known=0)), capsys)
+    assert topic(seen, '/fix')['fix']['sigma'] is None
+    assert 'COVARIANCE_UNKNOWN' in codes(seen)
     rows = [row for row in drive() if row[0] != '/fix']
-    told, _ = inspect(ros_bags.write(tmp_path / 'without', rows), capsys)
-    assert {'NO_FIX'} <= codes(told)
-    assert [f['text'] for f in told['findings'] if f['code'] == 'NO_FIX'] == [
+    seen, _ = inspect(ros_bags.write(tmp_path / 'without', rows), capsys)
+    assert {'NO_FIX'} <= codes(seen)
+    assert [f['text'] for f in seen['findings'] if f['code'] == 'NO_FIX'] == [
         'no topic for the fixes']
-    assert len(told['standstills']) == 2            # seen without fixes too
+    assert len(seen['standstills']) == 2            # seen without fixes too
 
 
 def test_fixes_off_the_earth(tmp_path, capsys):
@@ -303,8 +303,8 @@ def test_fixes_off_the_earth(tmp_path, capsys):
     rest = [row for row in drive() if row[0] != '/fix']
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        told, _ = inspect(ros_bags.write(tmp_path / 'bag', fixes + rest), capsys)
-    assert topic(told, '/fix')['fix']['positions'] == 750 - 4
+        seen, _ = inspect(ros_bags.write(tmp_path / 'bag', fixes + rest), capsys)
+    assert topic(seen, '/fix')['fix']['positions'] == 750 - 4
 
 
 def test_orientation_as_heading(tmp_path, capsys):
@@ -320,8 +320,8 @@ def test_orientation_as_heading(tmp_path, capsys):
                               ((0, 0, 0.6, 0.8), 0.0, 'has no covariance'),
                               ((0, 0, 0, 1), 0.0, 'publishes no orientation')):   # a default
         path = ros_bags.write(tmp_path / f'{variance}{q[2]}', with_orientation(q, variance))
-        told, _ = inspect(path, capsys)
-        texts = [f['text'] for f in told['findings'] if f['code'] == 'YAW_NOT_SEPARABLE']
+        seen, _ = inspect(path, capsys)
+        texts = [f['text'] for f in seen['findings'] if f['code'] == 'YAW_NOT_SEPARABLE']
         assert bool(texts) == bool(says)
         assert says is None or says in texts[0]
 
@@ -331,33 +331,33 @@ def _xyz(vector):
 
 
 def test_a_loop_is_told_with_its_ends(tmp_path, capsys):
-    told, _ = inspect(ros_bags.write(tmp_path / 'bag', drive(loop=True)), capsys)
-    assert 'CHORD_TOO_SHORT' in codes(told)
-    assert told['legs'][0]['chord'] < 5
+    seen, _ = inspect(ros_bags.write(tmp_path / 'bag', drive(loop=True)), capsys)
+    assert 'CHORD_TOO_SHORT' in codes(seen)
+    assert seen['legs'][0]['chord'] < 5
 
 
 def test_short_slow_and_odd_values(tmp_path, capsys):
     rows = drive(30)
     at = next(i for i, row in enumerate(rows) if i > 5 and row[0] == '/imu/data')
     rows[at] = ('/imu/data', rows[at][1], make.imu(rows[at][1], w=(math.nan, 0, 0)))
-    told, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
-    assert 'LEG_TOO_SHORT' not in codes(told) or told['legs'][0]['way'] < 100
-    assert topic(told, '/imu/data')['imu']['not_finite'] == 1
+    seen, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
+    assert 'LEG_TOO_SHORT' not in codes(seen) or seen['legs'][0]['way'] < 100
+    assert topic(seen, '/imu/data')['imu']['not_finite'] == 1
     nan = [('/speed', T0 + i, make.real(math.nan)) for i in range(5)]
-    told, text = inspect(ros_bags.write(tmp_path / 'nan', nan), capsys)
+    seen, text = inspect(ros_bags.write(tmp_path / 'nan', nan), capsys)
     assert 'no valid value' in text
     single = [row for row in drive(1) if row[1] < T0 + 3]
-    told, _ = inspect(ros_bags.write(tmp_path / 'single', single), capsys)
-    assert told['messages'] == 3
+    seen, _ = inspect(ros_bags.write(tmp_path / 'single', single), capsys)
+    assert seen['messages'] == 3
 
 
 def test_two_wheels_on_two_topics_are_seen(tmp_path, capsys):
     rows = [row for name, ns, m in drive() for row in (
         [('/ticks/left', ns, m), ('/ticks/right', ns, m)] if name == '/odometer'
         else [(name, ns, m)])]
-    told, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
-    assert told['mapping']['odometer_right'] == '/ticks/right'
-    assert told['command'].endswith('--set odometer.left=topic --set odometer.right=topic')
+    seen, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
+    assert seen['mapping']['odometer_right'] == '/ticks/right'
+    assert seen['command'].endswith('--set odometer.left=topic --set odometer.right=topic')
 
 
 def test_topic_named_by_the_user(tmp_path, capsys):
@@ -365,13 +365,13 @@ def test_topic_named_by_the_user(tmp_path, capsys):
                         for i in range(200)]
     rows.sort(key=lambda row: row[1])
     path = ros_bags.write(tmp_path / 'bag', rows)
-    told, _ = inspect(path, capsys)
-    assert told['mapping']['odometer'] == '/odometer'     # a counter before a speed
-    assert '2 topics can be the odometer' in told['open']
-    assert '--odometer-topic /odometer' in told['command']
-    told, _ = inspect(path, capsys, '--odometer-topic', 'speed')
-    assert told['mapping']['odometer'] == '/speed'
-    assert '--odometer-topic /speed' in told['command']
+    seen, _ = inspect(path, capsys)
+    assert seen['mapping']['odometer'] == '/odometer'     # a counter before a speed
+    assert '2 topics can be the odometer' in seen['open']
+    assert '--odometer-topic /odometer' in seen['command']
+    seen, _ = inspect(path, capsys, '--odometer-topic', 'speed')
+    assert seen['mapping']['odometer'] == '/speed'
+    assert '--odometer-topic /speed' in seen['command']
     assert main(['inspect', str(path), '--fix-topic', '/gps']) == 2
     assert ' --fix-topic /gps: no such topic' in capsys.readouterr().err
     assert main(['inspect', str(path), '--imu-topic', '/fix']) == 2

@@ -4,8 +4,8 @@
 """
 The horizontal velocity of the GNSS antenna as rows, docs/method.md (S18).
 
-Derivatives by constants go by means of the interval. Those by samples hold vibration, by which a
-delay and axes look certain, and a lever arm short.
+Derivatives by the rate and force at an instant go by means of the interval. Those by samples
+contain vibration, by which a delay and axes look certain, and a lever arm short.
 """
 
 from dataclasses import dataclass

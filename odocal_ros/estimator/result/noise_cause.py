@@ -38,10 +38,10 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
         still, vary = rest.get(name, 0.0), moving.get(name, 0.0)
         if still and vary > VIBRATION * still:
             vibrating.append(f'{NAMES[name]} samples vary {vary / still:.0f} times as much '
-                          'in motion as at rest')
+                             'in motion as at rest')
         elif not still and vary > VIBRATION * level[name]:
             vibrating.append(f'{NAMES[name]} samples vary {vary / level[name]:.0f} times as '
-                          'much as their means over seconds')
+                             'much as their means over seconds')
         else:       # less at rest than it adds up to: of no single samples
             (own if VIBRATION * still > level[name] else unknown).append(name)
     said = []
