@@ -293,6 +293,7 @@ class LegCompletion:
     def _save(self, calibration: Calibration, asked: bool = False) -> Future:
         """Write the result files in the worker; the future has the answer."""
         inputs = self._recording.inputs
-        return self._filing.save(calibration, self.session.config, inputs.topics,
+        config = replace(self.session.config, output=self._config().output)   # may be new
+        return self._filing.save(calibration, config, inputs.topics,
                                  inputs.by_slot['imu'].frame, self._clock.now().nanoseconds,
                                  asked)

@@ -118,14 +118,15 @@ class Input:
         if frames is not None and frames.other and not self._frame_id:
             return (f'{self.topic} carries several IMUs (frame_id {one_line(frames.frame)!r} and '
                     f'{one_line(frames.other)!r}): set imu.frame_id to the one to use')
-        if len(self.publishers) < 2 or self.reader is None:
+        mixed = [p for p in self.publishers if p.topic_type == self.msgtype]
+        if len(mixed) < 2:
             return ''
         # a node's name comes after its topics
         who = ', '.join(sorted('not known yet' if 'UNKNOWN' in p.node_name
                                else f'{p.node_namespace.rstrip("/")}/{p.node_name}'
-                               for p in self.publishers))
-        return (f'{self.topic} has {len(self.publishers)} publishers ({who}): their messages are '
-                'mixed; stop all but one')
+                               for p in mixed))
+        return (f'{self.topic} has {len(mixed)} publishers ({who}): their messages are mixed; '
+                'stop all but one')
 
     def find(self, config: Config) -> None:
         """Subscribe once the type is known."""
@@ -224,10 +225,11 @@ class Input:
                     + (f', silent for {silent:.0f} s' if self.health.received_ns else
                        '; start the driver or remap ' + self.name)
                     + (f' (did you mean {" or ".join(self.meant)}?)' if self.meant else ''))
-        foreign = {p.topic_type for p in self.publishers} - {self.msgtype}
-        if self.msgtype and foreign and not self.health.received_ns:
-            return (f'{self.topic} is published as {", ".join(sorted(foreign))}; required: '
-                    f'{self.msgtype}')
+        types = {p.topic_type for p in self.publishers}
+        if self.msgtype and self.msgtype not in types:
+            return (f'{self.topic} is published as {", ".join(sorted(types))}; required: '
+                    f'{self.msgtype}. Remap {self.name}'
+                    + ', or restart the node' * (len(self.allowed) != 1))
         offers = ', '.join(sorted({QOS_NAMES.get(p.qos_profile.reliability, 'unknown QoS')
                                    for p in self.publishers}))
         many = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'

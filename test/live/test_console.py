@@ -3,11 +3,13 @@
 
 """What the node says on its console: what it waits for, readiness, silence, faults."""
 
+import time
 from types import SimpleNamespace
 
 from bench import wait_for
 
 from odocal_ros.live.console import Console
+from odocal_ros.live.inputs import LOOK_AROUND_S
 from odocal_ros.live.session import Session, SessionView
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -99,3 +101,22 @@ def test_topics_that_may_be_meant_and_doubled_publishers_are_named(start, connec
     assert 'UNKNOWN' not in node.text
     assert client.call('start_leg').success is False
     wait_for(lambda: '~/start_leg refused: no leg can be started' in node.text, 'the refusal')
+
+
+def test_a_sender_that_returns_with_another_type_is_named(start, connect):
+    from geometry_msgs.msg import TwistStamped
+    from std_msgs.msg import Int64
+    node, client, other = start(), connect(), connect()
+    speed = client.node.create_publisher(TwistStamped, '/odometer', 10)
+    wait_for(speed.get_subscription_count, 'the subscription')
+    sent = TwistStamped()
+    sent.header.stamp.sec = 1
+    speed.publish(sent)
+    other.node.create_publisher(Int64, '/odometer', 10)
+    wait_for(lambda: client.node.count_publishers('/odometer') == 2, 'the second publisher')
+    time.sleep(2 * LOOK_AROUND_S)
+    assert 'their messages are mixed' not in node.text
+    client.node.destroy_publisher(speed)
+    wait_for(lambda: any('/odometer is published as std_msgs/msg/Int64; required: '
+                         'geometry_msgs/msg/TwistStamped. Remap odometer, or restart the node'
+                         in line for line in node.lines), 'the two types')

@@ -76,6 +76,13 @@ def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
     assert true(whole_content(one))
     assert (folder / 'latest').resolve() == one
     assert client.until(save_trouble='')['saved'] == str(one)
+    # the folder of the next save can be set after the leg, too
+    assert client.set(output__directory=str(tmp_path / 'other')).successful
+    answer = client.call('save')
+    assert answer.success, answer.message
+    other, = results(tmp_path / 'other')
+    assert true(whole_content(other))
+    assert len(results(folder)) == 1
     assert node.process.poll() is None
 
 
