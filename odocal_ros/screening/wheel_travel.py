@@ -78,6 +78,8 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     if agree.mean() < same_span_share:
         return None
     rows = rows[agree]
+    if _taken(value, rows) > span + typical:     # rows out of order, two counters
+        return None
     return Span(span, sigma, rows, -np.sign(off[rows]).astype(np.int64))
 
 
@@ -88,10 +90,14 @@ def _running_median(step: Floats) -> Floats:
     return np.median(windows, axis=-1)
 
 
+def _taken(value: Values, rows: Ints) -> float:
+    """Return the range of the values before and after the jumps: within one span."""
+    return float(np.ptp(np.stack([value[rows], value[rows + 1]]).astype(float)))
+
+
 def _measured(value: Values, rows: Ints, middle: float, slack: float) -> tuple[float, float]:
     """Return a span that is no power of two, and its sigma: the roundest number that fits."""
-    ends = np.stack([value[rows], value[rows + 1]]).astype(float)
-    low = ends.max() - ends.min() + 1              # the counter was seen to take so many values
+    low = _taken(value, rows) + 1
     high = max(low, middle + 2 * slack / np.sqrt(len(rows)))
     for unit in (1e6, 1e5, 1e4, 1e3, 1e2):
         span = np.ceil(low / unit) * unit

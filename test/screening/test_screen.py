@@ -125,6 +125,15 @@ def test_a_counter_that_rolls_over_within_its_type_was_not_reset(span):
     np.testing.assert_array_equal(inputs.travel.s, alone.travel.s)
 
 
+def test_jumps_between_values_farther_apart_than_a_span_are_no_rollover():
+    """Each count is sent again 0.4 s later: it jumps back and on by much the same amount."""
+    leg = drive(**STRAIGHT, odometer='counts', scale=0.001).leg()
+    again = replace(leg.odometer, stamp_ns=leg.odometer.stamp_ns + 400_000_001)
+    both = join([leg.odometer, again])
+    _, codes, _ = said(replace(leg, odometer=take(both, np.argsort(both.stamp_ns))))
+    assert Code.COUNTER_ROLLOVER not in codes
+
+
 def test_duplicates_are_used_once(leg):
     twice = join([take(leg.fix, slice(0, 200)), take(leg.fix, slice(150, None))])
     again = take(leg.fix, np.repeat(np.arange(len(leg.fix.stamp_ns)), 2))
