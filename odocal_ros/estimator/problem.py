@@ -46,3 +46,9 @@ class Problem:
         """Return the median stated sigma of a horizontal axis of the fixes, m."""
         out: float = np.sqrt(np.median(self.leg.covariance_n[self.use][:, 0, 0]))
         return out
+
+    @property
+    def height_sigma(self) -> float:
+        """Return the median stated sigma of the heights of the fixes, m."""
+        out: float = np.sqrt(np.median(self.leg.covariance_n[self.use][:, 2, 2]))
+        return out

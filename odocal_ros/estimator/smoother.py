@@ -99,12 +99,13 @@ def _likelier(problem: Problem, config: Config, starts: tuple[Start, Start],
 
 def _first_levels(problem: Problem, start: Start) -> Levels:
     """Return initial levels: fixes no better than their fit to the odometer track."""
-    wide = max(1.0, (start.fix_spread / problem.fix_sigma)**2)
+    wide, wide_up = (max(1.0, (spread / sigma)**2) for spread, sigma in (
+        (start.fix_spread, problem.fix_sigma), (2 * start.fix_spread, problem.height_sigma)))
     time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
     leg = problem.leg
     long = leg.has_accelerometer and leg.t_stop - leg.t_begin > LARGE_SIZE_FROM
     sizes = {'size_fix_error_by_motion': LARGE_SIZE} if long else {}
-    return problem.first_levels.but(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE * wide,
+    return problem.first_levels.but(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE * wide_up,
                                     correlation_time=time, **sizes, **problem.vibrating)
 
 

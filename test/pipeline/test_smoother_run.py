@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import drive, everything_said, seconds, settings
+from drives import drive, everything_said, seconds, settings, TOWN
 import numpy as np
 import pytest
 
@@ -49,6 +49,18 @@ def test_fixes_without_altitude_give_all_three(made):
                               ('yaw_mounting_angle', made.truth.yaw, np.deg2rad(0.25)),
                               ('pitch_mounting_angle', made.truth.pitch, np.deg2rad(0.25))):
         assert abs(found[name].value - true) < SIGMAS * found[name].sigma < SIGMAS * limit, name
+
+
+def test_heights_stated_far_worse_than_the_level_part_leave_a_result():
+    rough = drive(**TOWN, fix_sigma=1.0)
+    leg = rough.leg()
+    # m: of a receiver that states 1 km for a height it does not know
+    covariance = np.broadcast_to(np.diag([0.01, 0.01, 1000.0])**2, leg.fix.covariance_n.shape)
+    found = calibrate(replace(leg, fix=replace(leg.fix, covariance_n=covariance)),
+                      settings(rough, **ASKED)).methods['smoother'].estimates
+    scale, yaw = found['scale_factor'], found['yaw_mounting_angle']
+    assert abs(scale.value / rough.truth.scale - 1) < SIGMAS * scale.sigma / scale.value
+    assert abs(yaw.value - rough.truth.yaw) < SIGMAS * yaw.sigma
 
 
 def test_a_start_within_a_gap_of_the_odometer_is_no_slip(made):
