@@ -236,7 +236,7 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
     """Return of each span its first fix and the first after it, s, and the jump there, m."""
     if len(t) <= SMOOTH_ROWS:
         return []
-    step = max(1, round(COMPARED_EVERY / float(np.median(np.diff(t)))))
+    step = min(max(1, round(COMPARED_EVERY / float(np.median(np.diff(t))))), len(t) - 1)
     t, place, sigma, track = t[::step], place[::step], sigma[::step], track[::step]
     dt, way, moved = np.diff(t), np.diff(track), np.diff(place)
     whole = (np.abs(way) > MOVED_LEAST) & (dt < MISSING_INTERVALS * np.median(dt))

@@ -65,6 +65,14 @@ def test_a_tunnel_is_found_with_its_ends(sigma, length):
     assert found[inside].mean() > 0.8
 
 
+def test_fixes_of_one_moment_are_too_few():
+    t = at_s * 1e-6       # stamps whose nanoseconds the driver divides by 1000
+    with np.errstate(all='raise'):
+        found, why = reckoned(t, received(0.01, (0, 0)), stated(0.01), 1j * driven())
+    assert not found.any()
+    assert not why
+
+
 @pytest.mark.parametrize('sigma', [0.01, 0.05, 0.5])
 def test_noise_and_a_wrong_fix_are_none(sigma):
     fixes = received(sigma, (0, 0))
