@@ -100,6 +100,15 @@ def test_rows_out_of_order_are_no_clock_that_was_set(leg):
     assert (np.diff(inputs.t_imu) > 0).all()
 
 
+@pytest.mark.parametrize('late_s', [0.05, 0.3])
+def test_a_topic_that_arrives_again_later_is_no_clock_that_was_set(leg, late_s):
+    again = replace(leg.fix, received_ns=leg.fix.received_ns + round(late_s * 1e9))
+    both = join([leg.fix, again])
+    inputs, codes, _ = said(replace(leg, fix=take(both, np.argsort(both.received_ns))))
+    assert set(codes) == {Code.STAMPS_NOT_RISING}
+    np.testing.assert_array_equal(inputs.geodetic[:, 0], leg.fix.latitude)
+
+
 @pytest.mark.parametrize('packet', [2, 5])
 def test_imu_packets_with_one_stamp_are_spread_over_their_time(leg, packet):
     n = len(leg.imu.stamp_ns) // packet * packet
