@@ -41,6 +41,7 @@ EARTH_LEFT = 6e-4
 # square over 2; per m: no more, of a direction that is not known
 BEND, MOST_BENT = 3**0.5 / 2, 2.0
 GRAVITY = 9.81    # m/s^2; physical: its last digits tilt nothing
+MOST_FORCE_OFF = 5.0       # m/s^2; physical: half of g, that driving may add over a second or two
 
 
 class Errors:
@@ -114,10 +115,13 @@ class Errors:
         """
         Return the correction, (16,), by the level part of force less acceleration, m/s^2.
 
-        C_nb : (3, 3) over the T s that it is the mean of.   sigma : m/s^2, beside the sensor's.
-        At rest sigma is 0: a force that the errors do not explain then has driving's. None, and
-        nothing is taken, where not even that explains it.
+        off_n : (3,).   C_nb : (3, 3) over the T s that it is the mean of.   sigma : m/s^2, beside
+        the sensor's. At rest sigma is 0: a force that the errors do not explain then has
+        driving's. None, and nothing is taken, where not even that explains it, or the upward part
+        is not that of gravity.
         """
+        if abs(off_n[2]) > MOST_FORCE_OFF:      # in g, without gravity, upside down
+            return None
         H = np.zeros((2, N))
         H[0, 4], H[1, 3] = -GRAVITY, GRAVITY
         H[:, BA] = C_nb[:2]

@@ -221,7 +221,7 @@ class Reckoning:
                 self._C_nb, off_n, T,
                 0.0 if standing and not doubt else np.hypot(SHAKING, noise))
             if by is None:
-                self._take_apart(off_n[:2], velocity, T, w)
+                self._take_apart(off_n, velocity, T, w)
             else:
                 self._apart = 0
                 self._correct(by)
@@ -239,14 +239,14 @@ class Reckoning:
         """
         Increase the variance of the last T s if IMU and odometer disagree.
 
-        off_n : (2,) m/s^2, force less acceleration.   velocity : (3,) m/s.   w : (n, 3) rad/s.
+        off_n : (3,) m/s^2, force less acceleration.   velocity : (3,) m/s.   w : (n, 3) rad/s.
         """
         self._apart += 1
         self._notes.append('specific force and odometer motion differ by '
                           f'{np.linalg.norm(off_n):.3g} m/s^2: IMU or odometer is faulty; not '
                           'used for levelling')
         self.errors.turned(np.eye(3) * np.sum((w.mean(axis=0) - self.bias)**2) * T**2)
-        self.errors.lost(min(float(np.linalg.norm(off_n)) * T**2 / 2,
+        self.errors.lost(min(float(np.linalg.norm(off_n[:2])) * T**2 / 2,
                              float(np.linalg.norm(velocity - self._v_look)) * T))
         length = float(np.linalg.norm(self._dv_n)) / T
         if self._apart >= MOST_APART and abs(length - GRAVITY) < AS_GRAVITY:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.apply.errors import Errors, GRAVITY
+from odocal_ros.apply.errors import Errors, GRAVITY, MOST_FORCE_OFF
 from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
@@ -24,7 +24,6 @@ START_SPAN = 2.0           # s; judgement: of samples that a start is taken from
 GIVEN_TILT_SIGMA = 0.01    # rad; judgement: of an attitude from outside
 ROAD_TILT_SIGMA = 0.1      # rad; physical: a road of 10 %
 START_HOLE = 0.5           # s; judgement: without IMU data, in the samples of a start
-MOST_FORCE_OFF = 5.0       # m/s^2; physical: half of g, that driving may add over START_SPAN
 BRAKING_SIGMA = 2.0        # m/s^2; physical: that a mean over START_SPAN may hold of braking
 
 

@@ -44,6 +44,15 @@ def imu(name, value, rows=1):
     return change
 
 
+def another_imu(turn=1.0, force=1.0):
+    """Return a fault: factors on rates and forces from t = 45 s on."""
+    def change(topics):
+        at = row_at(topics['imu'], 45.0)
+        topics['imu']['w'][at:] *= turn
+        topics['imu']['f'][at:] *= force
+    return change
+
+
 def stamps(name, rows, put=None, add_s=0.0):
     def change(topics):
         at = row_at(topics[name], 45.0)
@@ -66,7 +75,8 @@ FAULTS = {'force of 1e5': imu('f', 1e5), 'force of 1e150': imu('f', 1e150),
           'three rows 29 s ahead': stamps('odometer', 3, add_s=29.0),
           'three imu rows 29 s ahead': stamps('imu', 3, add_s=29.0),
           'odometer clock set by 3 s': stamps('odometer', 10**6, add_s=3.0),
-          'speeds of 69 m/s': speeds}
+          'speeds of 69 m/s': speeds, 'force in g': another_imu(force=1 / 9.81),
+          'upside down': another_imu([1, -1, -1], [1, -1, -1])}
 
 
 @pytest.mark.parametrize('fault', FAULTS)
