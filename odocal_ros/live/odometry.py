@@ -38,7 +38,7 @@ from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 # judgement, all in s: between looks at the odometer, which poses are late by; between turns of the
 # executor, which cost most; before a pose is due, when messages are looked at; between turns
 # without a pose
-LOOK_S, SERVE_S, EARLY_S, SILENT_S = 0.02, 0.1, 0.01, 0.2
+LOOK_S, SERVE_S, EARLY_S, SILENT_S = 0.02, 0.2, 0.01, 0.2
 TWIST_NUMBERS = 42              # format: floats of a twist with its covariance
 SAID_AGAIN_NS = 10 * 10**9      # judgement: between two sentences of one kind
 HELP = """\
