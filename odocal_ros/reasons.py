@@ -56,6 +56,8 @@ class Code(Enum):
     TOPIC_GAP = NOTE, 'Fix the data stream. This section is down-weighted; the leg stays valid.'
     CLOCKS_DIFFER = REJECT, ('Set odometer.time_offset, imu.time_offset or gnss.time_offset, or '
                              'stamp all sensors with one clock.')
+    CLOCK_SET = NOTE, ('No action needed for this leg. Synchronise the clock before a drive (PTP, '
+                       'chrony), and adjust it gradually.')
     CLOCKS_DRIFT = NOTE, ('Synchronise the clocks (PTP, PPS, chrony), or stamp all sensors with '
                           'one clock. The drift matters to all software that combines them.')
     DELAY_SEEN = NOTE, ('Set the time_offset named above, here and in every other program that '

@@ -68,8 +68,11 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'intervals, or the odometer starts late or ends early. Travel across the gap is '
         'interpolated; its uncertainty is part of the sigma.',
         Code.CLOCKS_DIFFER: 'The stamps of a topic differ by more than 0.5 s from the stamps of '
-        'IMU messages that arrived at the same time, or a clock was set during the leg. '
-        'Positions and travel would be combined at wrong times.',
+        'IMU messages that arrived at the same time. Positions and travel would be combined at '
+        'wrong times.',
+        Code.CLOCK_SET: 'The stamps of a topic step by 10 ms or more against their arrival times, '
+        'and stay so: its clock was set. Its other stamps, and the marks, were moved by as much, '
+        'so that the clock runs on.',
         Code.CLOCKS_DRIFT: 'The delay of one sensor changes during the leg by more than three '
         'sigmas and 10 ms: its clock is faster or slower than that of the IMU. Quartz clocks '
         'differ by up to 100 ppm, 0.1 s in 17 minutes. The smoother estimates the rate and '

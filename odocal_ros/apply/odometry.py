@@ -7,6 +7,8 @@ Odometry of a stream: screened samples, a start, and the path from there.
 If the path cannot be continued, it restarts at its origin, with a note.
 """
 
+import math
+
 import numpy as np
 
 from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
@@ -94,9 +96,9 @@ class Odometry:
             self.imu.feed(block)
         self.wheels.zero_ns = self.imu.zero_ns
 
-    def due(self) -> bool:
-        """Return True if the odometer has reached the next pose of the path."""
-        return self._path is not None and self._path.due()
+    def lacking_s(self) -> float:
+        """Return by how many s the odometer has not reached the next pose, inf without a path."""
+        return math.inf if self._path is None else self._path.lacking_s()
 
     def poses(self) -> list[Pose]:
         """Return the poses that what was fed since the last call allows."""

@@ -108,9 +108,9 @@ class Reckoning:
             self._leave_behind(last)
         return out
 
-    def due(self) -> bool:
-        """Return True if the odometer has reached the next pose."""
-        return self.wheels.newest() > self._t_pose + 1 / self.config.publish.rate - 1e-6
+    def lacking_s(self) -> float:
+        """Return by how many s the odometer has not reached the next pose."""
+        return self._t_pose + 1 / self.config.publish.rate - 1e-6 - self.wheels.newest()
 
     def _next(self) -> int | None:
         """Return the row to advance to: a pose is due and all it needs has come; else None."""

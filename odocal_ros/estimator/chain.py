@@ -169,24 +169,38 @@ class JointMarginals:
         return np.concatenate([np.einsum('kii->ki', self._across[rows, :, :n])
                                for rows in blocks(len(self))])
 
-    def variances_of(self, rows: Ints | slice, own: Floats, border: Floats,
-                     ahead: Floats | None = None, of: slice = slice(None)) -> Floats:
+    def variances_of(self, rows: Ints, own: Floats, border: Floats, ahead: Floats | None,
+                     of: slice) -> Floats:
         """
         Return the variances of sums over the unknowns of some intervals: (k, c).
 
         own, border : (k, n, c), (k, m, c) factors of block and border.   ahead : (k, a, c) of the
-        unknowns ``of`` of the next block.
+        unknowns ``of`` of the next block, or None.
         """
         n, across = own.shape[1], self._across[rows]
         by_own = self._own[rows] @ own + 2 * (across[:, :, n:] @ border)
         by_border = self._corner @ border
         if ahead is not None:
-            ends = slice(rows.start + 1, rows.stop + 1) if isinstance(rows, slice) else rows + 1
             by_own += 2 * (across[:, :, :n][:, :, of] @ ahead)
-            by_ahead = self._own[ends][:, of, of] @ ahead
-            by_ahead += 2 * (self._across[ends][:, of, n:] @ border)
+            by_ahead = self._own[rows + 1][:, of, of] @ ahead
+            by_ahead += 2 * (self._across[rows + 1][:, of, n:] @ border)
         out: Floats = (own * by_own).sum(axis=1) + (border * by_border).sum(axis=1)
         return out if ahead is None else out + (ahead * by_ahead).sum(axis=1)
+
+    def spread_of(self, rows: slice, J: Floats) -> Floats:
+        """
+        Return the covariance of rows of some intervals, as a form: (k, r, r).
+
+        J : (k, r, 2n + m).   The form is not symmetric: its quadratic form is the variance.
+        """
+        n, ends = self._own.shape[1], slice(rows.start + 1, rows.stop + 1)
+        across, after = self._across[rows], self._across[ends][:, :, n:]
+        own, end, border = J[:, :, :n], J[:, :, n:2 * n], J[:, :, 2 * n:]
+        by_own = own @ self._own[rows] + 2 * (end @ np.swapaxes(across[:, :, :n], 1, 2))
+        by_border = border @ self._corner + 2 * (own @ across[:, :, n:] + end @ after)
+        out: Floats = by_own @ np.swapaxes(own, 1, 2) + by_border @ np.swapaxes(border, 1, 2)
+        out += end @ self._own[ends] @ np.swapaxes(end, 1, 2)
+        return out
 
     def blocks(self) -> Iterator[Floats]:
         """Yield the covariances of some intervals after others: (k, 2n + m, 2n + m)."""

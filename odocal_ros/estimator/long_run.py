@@ -15,7 +15,6 @@ from odocal_ros.estimator.factors.fixes import Fixes
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.nav.statistics import NORMAL_MEDIAN
-from odocal_ros.settings.levels import REMARK_SIGMAS
 
 # minimum number of spans in a leg: statistical, their variance is then good to 35 %, with two axes
 FEWEST_SPANS = 8
@@ -28,7 +27,7 @@ def long_run(fixes: Fixes, levels: Levels,
     Return the factors, 1 or more, by which correlated errors exceed the model of their steps.
 
     The largest ratio, for spans of 1, 2, 4, ... s, of the mean square of the error differences to
-    its expectation, less REMARK_SIGMAS of its standard deviations.
+    its expectation plus one standard deviation.
 
     fixes : with white and correlated errors.   levels : of the pass.   found : quadratic sum and
     expectation of each level.
@@ -48,7 +47,7 @@ def long_run(fixes: Fixes, levels: Levels,
                             for level in (name, white))
             want = 2 * noise * float(stated[a, columns].mean()) + power * time * grown
             change = error[b, columns] - error[a, columns]
-            chance = 1 + REMARK_SIGMAS * np.sqrt(2 / (spans * change.shape[1]))
+            chance = 1 + np.sqrt(2 / (spans * change.shape[1]))
             out[name] = max(out[name], _mean_square(change) / want / chance)
         span *= 2
     return out

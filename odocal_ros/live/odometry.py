@@ -36,9 +36,8 @@ from odocal_ros.outside.names import said_by
 from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 
 # judgement, all in s: between looks at the odometer, which poses are late by; between turns of the
-# executor, which cost most; before a pose is due, when messages are looked at; between turns
-# without a pose
-LOOK_S, SERVE_S, EARLY_S, SILENT_S = 0.02, 0.1, 0.01, 0.2
+# executor, which cost most; between turns without a pose
+LOOK_S, SERVE_S, SILENT_S = 0.02, 0.2, 0.2
 TWIST_NUMBERS = 42              # format: floats of a twist with its covariance
 SAID_AGAIN_NS = 10 * 10**9      # judgement: between two sentences of one kind
 HELP = """\
@@ -151,7 +150,8 @@ class OdometryNode(SettledNode):
         for pose in poses:
             self._publish(pose)
         if poses:
-            self._due_ns = now_ns + round((1 / self.config.publish.rate - EARLY_S) * 1e9)
+            wait_s = min(self._odometry.lacking_s(), 1 / self.config.publish.rate)
+            self._due_ns = now_ns + round(wait_s * 1e9)
             if not self._begun:
                 self._begun = True
                 self.get_logger().info('odometry starts')
@@ -163,7 +163,7 @@ class OdometryNode(SettledNode):
         for slot, source in self._inputs.items():
             if slot != 'imu':
                 self._pump(source)
-        if not self._odometry.due() and now_ns - self._reckoned_ns < SILENT_S * 1e9:
+        if self._odometry.lacking_s() > 0 and now_ns - self._reckoned_ns < SILENT_S * 1e9:
             return []
         self._reckoned_ns = now_ns
         self._pump(self._inputs['imu'])

@@ -13,6 +13,7 @@ of a series that converges slowly: at 0.6 s in town its next terms are decimetre
 """
 
 import numpy as np
+from scipy.linalg import solve_banded
 
 from odocal_ros.data.arrays import Floats, Ints
 
@@ -104,9 +105,9 @@ class _Track:
         # where two cubics meet, their responses differ by jumps of p'' and p'''
         first = tau**2 * (2 * bend - 6 * tau * twist)
         last = tau**2 * (2 * bend + 6 * (T - tau) * twist)
-        left = np.concatenate([-first[:1], last[:-1] - first[1:]])
-        for m, decay in enumerate(np.exp(-T[:-1] / tau), 1):
-            left[m] += decay * left[m - 1]
+        decay = np.append(-np.exp(-T[:-1, 0] / tau), 0.0)
+        left = solve_banded((1, 0), np.stack([np.ones_like(decay), decay]),
+                            np.concatenate([-first[:1], last[:-1] - first[1:]]))
         k, s, p = self._cubic(at)
         rate = self.velocity[k] + s * (2 * bend[k] + 3 * s * twist[k])
         after = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])

@@ -3,6 +3,8 @@
 
 """Clocks: how far apart the topics' stamps are, and whether one was set during the leg."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
@@ -10,13 +12,13 @@ from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_step, median, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
-from odocal_ros.nav.statistics import GAP_INTERVALS
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_APART
 
 OFFSET_REACH = 1.0     # s, format: what a time_offset setting holds
-CLOCK_SET = 0.02       # s, judgement: a clock set by more than this is named
+# judgement, s: less of a set shows no step among the rows; rows on each side that give the lag
+CLOCK_SET, LAG_NEIGHBOURS = 0.01, 50
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
 TOO_FAR = ('Stamp all sensors with one clock: the difference exceeds the range of time_offset. '
            'If a bag is played, use ros2 bag play --clock at normal speed and start the node '
@@ -39,8 +41,7 @@ def judge_clocks(leg: Leg, config: Config) -> list[Reason]:
     """
     topics = [slot for slot in TOPICS if not (slot == 'fix' and config.reference.points)]
     offset = offsets(config)
-    found = [r for slot in ('imu', *topics) for r in _was_set(
-        leg.rows(slot), INPUTS[slot].label, leg.start_ns)]
+    found: list[Reason] = []
     imu = _stamped(leg.imu)
     if len(imu.stamp_ns) < 2:
         return found
@@ -108,34 +109,52 @@ def _may_be_odd(stamp_ns: Ints) -> Bools:
     return (step <= 0) | (step > CLOCK_SET)
 
 
-def _was_set(samples: Samples, label: str, start_ns: int) -> list[Reason]:
+def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
     """
-    Return a reason if a clock was set during the leg: its stamps step for good, arrivals do not.
+    Return a leg whose clocks run on where they were set during it, and CLOCK_SET of each.
 
-    Rows out of order or with a false stamp step twice, and the lag does not change.
+    leg : as recorded. The stamps of most agreement with the arrivals are kept; the marks move with
+    those of the IMU.
     """
-    samples = _stamped(samples)
-    if not by_step(_may_be_odd, samples.stamp_ns).any():
-        return []
-    step = np.diff(samples.stamp_ns) * 1e-9
-    if len(step) < 3:
-        return []
-    odd = np.flatnonzero((step <= 0) | (step > max(GAP_INTERVALS * np.median(step), CLOCK_SET)))
-    if not len(odd):
-        return []
-    first, last = int(odd[0]), int(odd[-1])
-    lag = _lag(samples)
-    lag_neighbours = 50    # rows on each side that determine the lag
-    before = lag[max(0, first + 1 - lag_neighbours):first + 1]
-    after = lag[last + 1:][:lag_neighbours]
-    moved = float(np.median(before) - np.median(after))      # of the stamps, against arrival
-    at = int(odd[np.argmin(np.abs(step[odd] - moved))])
-    if abs(moved) < CLOCK_SET or abs(step[at] - moved) > 0.3 * abs(moved) + np.median(step):
-        return []
-    first_lag = (lag - (np.median(before) + np.median(after)) / 2) * moved > 0
-    most_exchanged = 0.25    # of all rows: those of topics that arrive twice or shuffled are half
-    if (first_lag != (np.arange(len(lag)) <= at)).mean() > most_exchanged:
-        return []
-    return [Reason(Code.CLOCKS_DIFFER, f'the {label} clock was set by {moved:+.3f} s during the '
-                   f'leg, at t = {(samples.stamp_ns[at] - start_ns) * 1e-9:.2f} s: its stamps '
-                   'before and after are inconsistent')]
+    rows: dict[str, Samples] = {}
+    found: list[Reason] = []
+    for slot in ('imu', *TOPICS):
+        sent = leg.rows(slot)
+        at, moved = _sets(sent)
+        if not len(at):
+            continue
+        piece = np.searchsorted(at, np.arange(len(sent.stamp_ns)))     # a set ends it
+        lag = [abs(np.median(_lag(take(sent, piece == k)))) for k in range(len(at) + 1)]
+        shift = np.append(0, np.cumsum(np.round(moved * 1e9).astype(np.int64)))
+        shift -= shift[int(np.argmin(lag))]
+        rows[slot] = replace(sent, stamp_ns=sent.stamp_ns - shift[piece])
+        found += [Reason(Code.CLOCK_SET, f'the {INPUTS[slot].label} clock was set by {by:+.3f} s '
+                         f'at t = {(sent.stamp_ns[k] - leg.start_ns) * 1e-9:.2f} s: stamps '
+                         f'{"before" if shift[piece[k]] else "after"} it were moved by as much')
+                  for k, by in zip(at, moved, strict=True)]
+        if slot == 'imu':
+            leg = replace(leg, start_ns=leg.start_ns - int(shift[0]),
+                          stop_ns=leg.stop_ns - int(shift[-1]))
+    return leg.with_rows(**rows), found
+
+
+def _sets(samples: Samples) -> tuple[Ints, Floats]:
+    """
+    Return the rows after which a clock was set, and by how much, s: its stamps step for good.
+
+    Their arrivals do not. Rows out of order or with a false stamp step twice, and the lag does not
+    change.
+    """
+    none = np.empty(0, np.int64), np.empty(0)
+    if len(samples.stamp_ns) < 2 * LAG_NEIGHBOURS or not by_step(
+            _may_be_odd, samples.stamp_ns).any():
+        return none
+    step, lag = np.diff(samples.stamp_ns) * 1e-9, _lag(samples)
+    ahead = lag[:-1] - lag[1:]
+    odd = np.flatnonzero((np.abs(step - np.median(step)) > CLOCK_SET)
+                         & (np.abs(ahead) > CLOCK_SET / 2))
+    before, after = (np.array([np.median(lag[max(k + first, 0):k + first + LAG_NEIGHBOURS])
+                               for k in odd]) for first in (1 - LAG_NEIGHBOURS, 1))
+    moved = before - after if len(odd) else np.empty(0)     # of the stamps, against arrival
+    is_set = (np.abs(moved) >= CLOCK_SET) & (np.abs(ahead[odd] - moved) <= 0.3 * np.abs(moved))
+    return odd[is_set], moved[is_set]

@@ -239,23 +239,29 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
     step = min(max(1, round(COMPARED_EVERY / float(np.median(np.diff(t))))), len(t) - 1)
     t, place, sigma, track = t[::step], place[::step], sigma[::step], track[::step]
     dt, way, moved = np.diff(t), np.diff(track), np.diff(place)
-    whole = (np.abs(way) > MOVED_LEAST) & (dt < MISSING_INTERVALS * np.median(dt))
-    both = np.flatnonzero(whole[1:] & whole[:-1])
-    if len(both) <= SMOOTH_ROWS:
+    whole = dt < MISSING_INTERVALS * np.median(dt)
+    moving = whole & (np.abs(way) > MOVED_LEAST)
+    # each with the last one in motion before it, since a jump may come at a standstill
+    before = np.maximum.accumulate(np.where(moving, np.arange(len(way)), -1))[:-1]
+    rows = np.flatnonzero(whole[1:] & (before >= 0)) + 1
+    before = before[rows - 1]
+    off = np.abs(moved[rows] - moved[before] * way[rows] / way[before])
+    driven = moving[rows] & (before == rows - 1)
+    if driven.sum() <= SMOOTH_ROWS:
         return []
-    off = np.abs(moved[both + 1] - moved[both] * way[both + 1] / way[both])
-    usual = float(np.median(off))
-    smooth = off < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
+    usual, at = float(np.median(off[driven])), rows[driven]
+    smooth = off[driven] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
     spans: list[tuple[float, float, float]] = []
     # smaller ones than the stated error are of satellites that come and go
-    least = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[both + 1])
+    least = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[rows])
     for k in np.flatnonzero(off > least):
-        first = _begin(smooth[:k])
+        last = int(np.searchsorted(at, rows[k]))
+        first = _begin(smooth[:last])
         # fixes since the compared one before may be of the tunnel too
-        begin = float(t[max(both[first] - 1, 0)])
+        begin = float(t[max(at[min(first, len(at) - 1)] - 2, 0)])
         # the row after a jump is as far off
-        if first < k and (not spans or begin > spans[-1][1]):
-            spans.append((begin, float(t[both[k] + 2]), float(off[k])))
+        if first < last and (not spans or begin > spans[-1][1]):
+            spans.append((begin, float(t[rows[k] + 1]), float(off[k])))
     return spans
 
 

@@ -21,7 +21,7 @@ from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import judged_axles
-from odocal_ros.screening.clocks import judge_clocks, offsets
+from odocal_ros.screening.clocks import judge_clocks, offsets, without_sets
 from odocal_ros.screening.fix_screen import contradicted, reckoned, usable_fixes
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
@@ -46,7 +46,8 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     found: list[Reason] = [*levelled, *local, *other_imus(leg, config.imu)]
     found += _missing(leg, found)
     if judged:
-        found += judge_clocks(leg, config)
+        leg, sets = without_sets(leg)
+        found += [*sets, *judge_clocks(leg, config)]
     rows = _usable(leg, config, judged, found)
     inputs = _in_base(leg, config, rows, _fixes(leg, config, rows, found))
     inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))

@@ -27,15 +27,16 @@ def turned(t):
     return 0.8 * np.sin(0.03 * np.asarray(t))
 
 
-def driven():
-    """Return the positions of a vehicle at 15 m/s, m: (n,)."""
+def driven(stop=(0, 0)):
+    """Return the positions of a vehicle at 15 m/s that stands from and to a time, m: (n,)."""
     fine = np.arange(0.0, 400.0, 0.01)
-    return np.interp(at_s, fine, np.cumsum(15 * 0.01 * np.exp(1j * turned(fine))))
+    speed = np.where((fine >= stop[0]) & (fine < stop[1]), 0.0, 15.0)
+    return np.interp(at_s, fine, np.cumsum(speed * 0.01 * np.exp(1j * turned(fine))))
 
 
-def received(sigma, tunnel, scale=0.02):
+def received(sigma, tunnel, scale=0.02, stop=(0, 0)):
     """Return what a receiver sends there: (n, 3) m; in the tunnel by its own odometer."""
-    true = driven()
+    true = driven(stop)
     noise = sigma * stream(3, 'fixes').standard_normal((len(at_s), 2)) @ [1, 1j]
     inside = (at_s >= tunnel[0]) & (at_s < tunnel[1])
     if inside.any():
@@ -71,6 +72,18 @@ def test_fixes_of_one_moment_are_too_few():
         found, why = reckoned(t, received(0.01, (0, 0)), stated(0.01), 1j * driven())
     assert not found.any()
     assert not why
+
+
+@pytest.mark.parametrize('sigma', [0.05, 0.5])
+def test_a_tunnel_that_ends_at_a_standstill_is_found(sigma):
+    begin, end, stop = 150, 230, (220, 240)
+    found, why = reckoned(at_s, received(sigma, (begin, end), stop=stop), stated(sigma),
+                          1j * driven(stop))
+    assert [r.code for r in why] == [Code.FIXES_DEAD_RECKONED]
+    assert f'to {end - 1} s' in why[0].text
+    assert not found[at_s < begin - 5].any()
+    assert not found[at_s >= end].any()
+    assert found[begin:end].mean() > 0.8
 
 
 @pytest.mark.parametrize('sigma', [0.01, 0.05, 0.5])

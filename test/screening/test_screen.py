@@ -82,14 +82,28 @@ def test_one_stamp_in_the_future_costs_one_row(leg):
     assert Code.CLOCKS_DIFFER not in codes
 
 
-def test_a_clock_set_back_costs_the_shorter_side_and_is_named(leg):
-    n, at = len(leg.imu.stamp_ns), 4000
-    bad = changed(leg.imu, stamp_ns=lambda a: a.__setitem__(slice(at, None), a[at:] - 2 * 10**9))
-    inputs, _, texts = said(replace(leg, imu=bad))
-    # two seconds of stamps come twice: 100 rows of 50 Hz, those of one side
-    assert n - len(inputs.t_imu) == 100
-    assert (np.diff(inputs.t_imu) > 0).all()
-    assert sum('the IMU clock was set by -2.000 s during the leg' in x for x in texts) == 1
+@pytest.mark.parametrize(('slot', 'by'), [
+    ('imu', -2.0), ('imu', -0.02), ('imu', 0.5), ('odometer', -2.0), ('odometer', 0.02),
+    ('fix', -2.0), ('fix', 0.5)])
+@pytest.mark.parametrize('wrong', ['before', 'after'])
+def test_a_clock_that_was_set_runs_on(leg, slot, by, wrong):
+    sent = leg.rows(slot)
+    at, moved = len(sent.stamp_ns) * 2 // 5, round(by * 1e9)
+    part = slice(at, None) if wrong == 'after' else slice(at)
+    other = changed(sent, stamp_ns=lambda a: a.__setitem__(
+        part, a[part] + (moved if wrong == 'after' else -moved)))
+    marks = {}
+    if slot == 'imu':       # which has its stamps
+        marks = {'stop_ns': leg.stop_ns + moved} if wrong == 'after' else {
+            'start_ns': leg.start_ns - moved}
+    inputs, codes, _ = said(replace(leg.with_rows(**{slot: other}), **marks))
+    alone, *_ = said(leg)
+    assert f'set by {by:+.3f} s' in codes[Code.CLOCK_SET]
+    assert Code.CLOCKS_DIFFER not in codes
+    # arrivals of this leg are exact: what they show is
+    for name in ('t_imu', 't_fix'):
+        np.testing.assert_allclose(getattr(inputs, name), getattr(alone, name), atol=1e-6)
+    np.testing.assert_allclose(inputs.travel.t, alone.travel.t, atol=1e-6)
 
 
 def test_rows_out_of_order_are_no_clock_that_was_set(leg):

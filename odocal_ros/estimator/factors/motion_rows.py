@@ -46,8 +46,8 @@ class MotionRows(Factor):
 
     Weighted are r (K, 18) and whiten (K, 18, 18).
 
-    Unit noises are recomputed when needed, some intervals at a time: stored, they would be the
-    largest memory.
+    Unit noises are recomputed when needed, some intervals at a time: stored, they would take half
+    the memory of the derivatives, and 0.04 less CPU.
     """
 
     name = 'motion'
@@ -107,42 +107,37 @@ class MotionRows(Factor):
         begin, end, constants = self.motion.take(rows).jacobians(self.n)
         if self.signals is not None:
             gyro = (self.noise.columns(rows) * self.roots())[:, :, self.of('gyro')]
-            whiten = self.whiten[rows]
-            found = np.einsum('kic,kij,kj->kc', whiten @ gyro, whiten, self.raw[rows],
-                              optimize=True)
+            found = np.einsum('kic,ki->kc', self.whiten[rows] @ gyro, self.r[rows])
             self.signals.fit(rows, constants, begin[:, :, BG], gyro, found)
         return begin, end, constants
 
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
         n = self.n
-        corner, g_border = ChunkedSum(), ChunkedSum()
         for rows in blocks(len(self.r)):
-            ends = slice(rows.start + 1, rows.stop + 1)
-            J = self.J[rows]
-            H = np.swapaxes(J, 1, 2) @ J
+            ends, J = slice(rows.start + 1, rows.stop + 1), self.J[rows]
+            by = np.swapaxes(J, 1, 2)
+            own, end = by[:, :n] @ J, by[:, n:2 * n] @ J[:, :, n:]
+            border = np.ascontiguousarray(J[:, :, 2 * n:]).reshape(-1, self.m)
             g = -np.einsum('kij,ki->kj', J, self.r[rows])
-            out.diagonal[rows] += H[:, :n, :n]
-            out.diagonal[ends] += H[:, n:2 * n, n:2 * n]
-            out.beside[rows] += H[:, :n, n:2 * n]
-            out.border[rows] += H[:, :n, 2 * n:]
-            out.border[ends] += H[:, n:2 * n, 2 * n:]
-            corner.add(H[:, 2 * n:, 2 * n:])
+            out.diagonal[rows] += own[:, :, :n]
+            out.diagonal[ends] += end[:, :, :n]
+            out.beside[rows] += own[:, :, n:2 * n]
+            out.border[rows] += own[:, :, 2 * n:]
+            out.border[ends] += end[:, :, n:]
+            out.corner += border.T @ border
             out.g[rows] += g[:, :n]
             out.g[ends] += g[:, n:2 * n]
-            g_border.add(g[:, 2 * n:])
-        out.corner += corner.sum
-        out.g_border += g_border.sum
+            out.g_border += g[:, 2 * n:].sum(axis=0)
 
     def cost(self) -> float:
         """Return the sum of squares, in sigmas."""
         out: float = (self.r**2).sum()
         return out
 
-    def _units(self, rows: slice) -> tuple[Floats, Floats]:
-        """Return the whitened unit noises A of some intervals, (k, 18, c), and J' A."""
-        A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
-        return A, np.swapaxes(self.J[rows], 1, 2) @ A
+    def units(self, rows: slice) -> Floats:
+        """Return the whitened unit noises of some intervals: (k, 18, c)."""
+        return self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
 
     def roots(self) -> Floats:
         """Return the standard deviation of each unit noise, (c,), per root second."""
@@ -166,7 +161,7 @@ class MotionRows(Factor):
         square, border = ChunkedSum(), ChunkedSum()
         for rows in blocks(len(self.r)):
             ends = slice(rows.start + 1, rows.stop + 1)
-            A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
+            A = self.units(rows)
             q = (A * np.einsum('kic,ki->kc', A, self.r[rows])[:, None]) @ of
             g = np.swapaxes(self.J[rows], 1, 2) @ q
             out.chain[rows, :, columns] += g[:, :n]
@@ -184,12 +179,11 @@ class MotionRows(Factor):
         """
         if self._found is None or self._found[0]() is not marginals:
             estimates, variances = np.empty((2, len(self.r), len(self.noise.component)))
-            n = self.n
             for rows in blocks(len(self.r)):
-                A, Y = self._units(rows)
+                A = self.units(rows)
                 estimates[rows] = np.einsum('kic,ki->kc', A, self.r[rows])
-                variances[rows] = (A**2).sum(axis=1) - marginals.variances_of(
-                    rows, Y[:, :n], Y[:, 2 * n:], Y[:, n:2 * n])
+                fitted = marginals.spread_of(rows, self.J[rows])
+                variances[rows] = (A * (A - fitted @ A)).sum(axis=1)
             self._found = ref(marginals), estimates, variances
         return self._found[1:]
 
@@ -198,9 +192,9 @@ class MotionRows(Factor):
         units, given = [], []
         for rows, block in zip(blocks(len(self.r)), marginals.blocks(), strict=True):
             cross = self.with_wanted(block)
-            units.append(cross @ self._units(rows)[1])
-            given.append(cross @ np.swapaxes(self.J[rows], 1, 2)
-                         @ (self.whiten[rows] @ self.noise.given[rows]))
+            by_rows = cross @ np.swapaxes(self.J[rows], 1, 2)
+            units.append(by_rows @ self.units(rows))
+            given.append(by_rows @ (self.whiten[rows] @ self.noise.given[rows]))
         X = np.concatenate(units)
         for name in INTERVAL:
             yield NAMES[name], X[:, :, self.of(name)]
