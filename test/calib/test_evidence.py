@@ -30,7 +30,7 @@ def path_n(t):
     return np.stack([np.minimum(s, 500.0), np.maximum(s - 500.0, 0.0), 0.0 * t], -1)
 
 
-def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None, **streams):
+def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None, set_ns=0, **streams):
     """Return evidence of that drive; fixes lie by ``off`` to the east and north of the path."""
     config = config or Config()
     t = np.arange(0.0, END, 0.02)
@@ -45,7 +45,8 @@ def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None, **streams):
         status[row] = -1 if what == 'status' else status[row]
         covariance[row] *= {'sigma': 100.0**2, 'negative': -1.0}.get(what, 1.0)
     stamp = START_NS + np.round(t_fix * 1e9).astype(np.int64)
-    fix = FixSamples(stamp, stamp, np.full(n, 0.8), np.full(n, 0.1), np.zeros(n), covariance,
+    sent = stamp + set_ns * (t_fix > END / 2)
+    fix = FixSamples(sent, stamp, np.full(n, 0.8), np.full(n, 0.1), np.zeros(n), covariance,
                      np.full(n, 2), status)
     leg = Leg(START_NS, START_NS + round(END * 1e9), fix=fix)
     inputs, _ = screen(leg, config)
@@ -169,3 +170,10 @@ def test_pauses_of_imu_and_odometer_are_kept_where_the_vehicle_moves():
     np.testing.assert_allclose([gap[1:] for gap in found.gaps], [(30.0, 32.0), (70.0, 71.0)],
                                atol=0.021)
     assert drive(t_imu=t, travel=Travel(t, t, 0.0)).gaps == ()
+
+
+def test_fixes_of_a_clock_that_was_set_are_those_of_one_that_ran_on():
+    alone, moved = drive(), drive(set_ns=10**9)
+    np.testing.assert_allclose(moved.t_fix, alone.t_fix, atol=1e-6)
+    np.testing.assert_array_equal(moved.fix_status, alone.fix_status)
+    assert moved.excluded == alone.excluded == 0
