@@ -137,6 +137,7 @@ def imperfect_sigmas(grade: Grade) -> Floats:
         'scale_by_speed': 1e-4,                     # s/m at FAST_SPEED
         'scale_by_time': 2.5e-3 / WARM_TIME,        # 1 / s
         'scale_by_force': 4e-3,                     # 1 / (m/s^2)
+        'scale_by_pitching': 1.0,
         'squat': 3e-3, 'sideslip': 5e-3,            # rad per m/s^2
         'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4,    # rad per m/s^3
         'pitch_centre': 1.5}                        # m: a car's 1.4, a truck's 2.5

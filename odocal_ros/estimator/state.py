@@ -54,9 +54,9 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_delay', 'gnss_delay', 'heading_offset', *GYRO_ERRORS, *ACCEL_ERRORS,
              'fix_lag_square', 'fix_error_by_motion', 'gnss_clock_rate', 'odometer_clock_rate',
              'odometer_lag_square',
-             'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking', 'squat',
-             'sideslip', 'squat_by_jerk', 'sideslip_by_jerk', 'pitch_centre',
-             'pitch_centre_of_bumps',
+             'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
+             'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
+             'pitch_centre', 'pitch_centre_of_bumps',
              'fix_motion_time', 'fix_height_drift', 'speed_offset', 'velocity_delay',
              'velocity_lag_square', 'velocity_scale',
              'pressure_offset', 'pressure_drift', 'pressure_by_speed_square', 'pressure_scale')
@@ -95,6 +95,9 @@ FIX_BY_MOTION, FIX_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_moti
 TYRES = constants_from('scale_by_speed', 'scale_by_braking')
 BY_SPEED, BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
 FAST_SPEED = 20.0           # m/s, definition: at which the slope is stated, a country road
+# of the path, by half the mean square of the angle by which the body pitches in an interval: 1 if
+# the axle keeps its direction, 0 if it follows the body, less if bumps are shorter than both
+BY_PITCHING = CONSTANTS.index('scale_by_pitching')
 # of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
 # change, rad per m/s^3: a body reacts late, tyres at once
 LEAN = constants_from('squat', 'sideslip_by_jerk')
@@ -106,8 +109,9 @@ IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre_of_bumps')
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
               'clock_rate': 2, 'odometer_lag_square': 1,
-              'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2, 'squat': 1,
-              'sideslip': 1, 'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 2}
+              'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2,
+              'scale_by_pitching': 1, 'squat': 1, 'sideslip': 1, 'squat_by_jerk': 1,
+              'sideslip_by_jerk': 1, 'pitch_centre': 2}
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECT
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')

@@ -33,6 +33,15 @@ def exp_so3(phi: Floats) -> Floats:
     return C
 
 
+def rotvec(C: Floats) -> Floats:
+    """Return the rotation vector of (..., 3, 3), well below pi."""
+    axis = np.stack([C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0],
+                     C[..., 1, 0] - C[..., 0, 1]], -1) / 2
+    sine = np.linalg.norm(axis, axis=-1)
+    angle = np.arctan2(sine, (np.trace(C, axis1=-2, axis2=-1) - 1) / 2)
+    return axis * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[..., None]
+
+
 def transpose(C: Floats) -> Floats:
     """Return the inverse rotation: (..., 3, 3)."""
     return np.swapaxes(C, -1, -2)
@@ -41,6 +50,13 @@ def transpose(C: Floats) -> Floats:
 def turn(C: Floats, vectors: Floats) -> Floats:
     """Return C @ v row by row: (K, 3, 3), (K, 3)."""
     out: Floats = np.einsum('kij,kj->ki', C, vectors)
+    return out
+
+
+def level_left(forward_n: Floats) -> Floats:
+    """Return the level axes to the left of others in n: (K, 3)."""
+    left = np.stack([-forward_n[:, 1], forward_n[:, 0], np.zeros(len(forward_n))], -1)
+    out: Floats = left / np.linalg.norm(left, axis=1, keepdims=True)
     return out
 
 

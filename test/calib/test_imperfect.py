@@ -6,7 +6,7 @@
 from dataclasses import replace
 import re
 
-from drives import configured
+from drives import configured, settings
 import numpy as np
 import pytest
 from smoother_legs import leg_of, made
@@ -14,10 +14,12 @@ from smoother_legs import leg_of, made
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.result import remarks
 from odocal_ros.estimator.state import CONSTANTS, FAST_SPEED
+from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import grade_as_seen, GRADES
 from odocal_ros.sim.draw import drawn
+from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
 
@@ -50,6 +52,26 @@ def test_of_slow_fixes_an_error_too_small_to_be_told_is_held_too():
         found = result.details[f'accelerometer_scale_{axis}']
         assert abs(found['value'] - grade / 4) < 3.0 * found['sigma']
         assert found['sigma'] < grade / 2
+
+
+@pytest.mark.parametrize('hertz', [0.3, 0.5, 0.7, 1.0])
+def test_a_body_that_sways_on_a_flat_path_does_not_change_the_scale(hertz):
+    """By 3 deg, as an agricultural robot: the path along its axis is 700 ppm shorter."""
+    drive = simulate(SimOptions(scenario='out_and_back', duration=300.0, imu_rate=100.0, seed=4,
+                                imu_grade='industrial', fix_noise='rtk'))
+    imu = drive.imu
+    t = (imu.stamp_ns - imu.stamp_ns[0]) * 1e-9
+    sent = drive.leg()
+    grows = np.convolve(drive.motion.speed(t) > 1.0, np.ones(200) / 200, 'same')
+    angle = np.radians(3.0) * np.sin(2 * np.pi * hertz * t) * grows
+    C_bi = matrix_from_rpy(np.stack([0 * t, angle, 0 * t], -1))     # about the IMU's y
+    w_i = turn(transpose(C_bi), imu.w_i)
+    w_i[:, 1] += np.gradient(angle, t)
+    swaying = replace(sent, imu=replace(imu, w_i=w_i, f_i=turn(transpose(C_bi), imu.f_i)))
+    config = settings(drive, None)
+    scale = smooth(leg_of(swaying, config), config).estimates['scale_factor']
+    assert abs(scale.value - drive.truth.scale) < 3.0 * scale.sigma
+    assert scale.sigma < 7e-4 * drive.truth.scale
 
 
 @pytest.mark.parametrize('noise', ['white', 'correlated'])

@@ -88,7 +88,7 @@ def moved():
     # of the size that there is: derivatives leave out how these change what the others do
     c[SPEED_OFFSET], c[FIX_TIME] = 0.0, np.log(5.0)
     c[IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03, 0.003,
-                     *[0.0] * 6, 1e3, 0.0]
+                     0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0]
     c[FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
     c[VELOCITY_LAG2] = 2.1e-4
     return problem, state.moved(step, c)

@@ -16,12 +16,13 @@ from copy import copy
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.factors.axle import Axle, varies_with
+from odocal_ros.estimator.factors.axle import Axle, varies_with, WALK_SPEED
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import (
     ACCEL,
     BA,
     BG,
+    BY_PITCHING,
     E,
     GYRO,
     LEAN,
@@ -45,7 +46,7 @@ from odocal_ros.estimator.sums import Intervals
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en, gravity
-from odocal_ros.nav.rotations import exp_so3, skew, transpose, turn
+from odocal_ros.nav.rotations import exp_so3, level_left, rotvec, skew, transpose, turn
 
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
 ROWS = D.stop
@@ -53,16 +54,9 @@ ROWS = D.stop
 HILL_INTERVALS = 5
 # of Motion, what each interval has
 EACH = ('T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed',
-        'nose_down', 'from_mean', 'varied', 'travelled', 'residual')
-
-
-def rotvec(C: Floats) -> Floats:
-    """Return the rotation vector of (..., 3, 3), well below pi."""
-    axis = np.stack([C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0],
-                     C[..., 1, 0] - C[..., 0, 1]], -1) / 2
-    sine = np.linalg.norm(axis, axis=-1)
-    angle = np.arctan2(sine, (np.trace(C, axis1=-2, axis2=-1) - 1) / 2)
-    return axis * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[..., None]
+        'nose_down', 'rate_n', 'level_left', 'swung', 'up_n',
+        'shorter', 'from_mean', 'varied', 'travelled',
+        'residual')
 
 
 def gravity_n(position_n: Floats, origin: Origin) -> Floats:
@@ -103,20 +97,21 @@ class Motion:
         W = skew(w)
         dv, dp = turn(self.C, intervals.dv), turn(self.C, intervals.dp)
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
+        p, v = state.p_n, state.v_n
+        moved = p[1:] - p[:-1]
+        self.travelled = moved + (self.C_end - self.C) @ (state.C_bv @ self.arm_v)
         along = self.f + self._vary()
         # the odometer measures the path, in any direction of the body
         along *= state.scale / np.linalg.norm(along, axis=1, keepdims=True)
-        way = turn(intervals.S, along) * self.varied
+        straight = turn(half @ self.C, turn(intervals.S, along))
+        self.rolled = straight * self.varied * self._inclined(straight)[:, None]
         self.faster = self._by_odometer_filter()
-        self.rolled = turn(half @ self.C, way)
         self.way = self.rolled + self.heaved
         self.unsaid = self._by_speed_offset(leg.travel.coarse)
         if self.unsaid is not None:
             self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
         self.dv, self.dp = dv, dp
-        p, v = state.p_n, state.v_n
         g = gravity_n((p[:-1] + p[1:]) / 2, leg.origin)
-        moved = p[1:] - p[:-1]
         r_p = moved - (v[:-1] * T + dp - dp @ W.T * T / 3 + g * T**2 / 2
                        - 2 * (v[:-1] * T**2 / 2 + dp * T / 3 + g * T**3 / 6) @ W.T)
         r_v = v[1:] - (v[:-1] + dv - (dv * T - dp) @ W.T + g * T - 2 * moved @ W.T)
@@ -124,9 +119,6 @@ class Motion:
         r_phi = rotvec(self.C_end @ transpose(predicted))
         e = state.travel_error
         f_n, f_n_end = self.f_n, self.f_n_end
-        swing = turn(self.C_end - self.C,
-                     np.broadcast_to(state.C_bv @ self.arm_v, dv.shape))
-        self.travelled = moved + swing
         r_d = self.travelled - (self.way - f_n_end * e[1:, None] + f_n * e[:-1, None])
         self.residual = np.concatenate(
             [r_p, r_v, r_phi, np.diff(state.gyro_bias, axis=0),
@@ -176,12 +168,45 @@ class Motion:
         self.from_mean = varies_with(
             speed, self.t_middle - state.t[0],
             self.axle.acceleration()) - self.axle.means_by_way(self.sums)
-        self.varied = 1 + self.from_mean @ c[TYRES, None]
+        self.swung = np.maximum(self.left @ self.swings @ self.left, 0.0) / 2
+        self.varied = 1 + self.from_mean @ c[TYRES, None] + self.swung[:, None] * c[BY_PITCHING]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
-        # nose down about a point ahead, the odometer goes up
-        nose_down = (self.sums.mean_rate - state.gyro_bias[:-1]) @ self.left * T[:, 0]
+        # nose down about a point ahead, the odometer goes up; not by turns of a body that rolls
+        self.rate_n = turn(self.C, self.sums.mean_rate - state.gyro_bias[:-1])
+        self.level_left = level_left(self.C @ state.forward)
+        nose_down = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
         self.nose_down = np.stack([nose_down, nose_down - slowly(nose_down)], -1)
         out: Floats = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
+        return out
+
+    def _inclined(self, straight: Floats) -> Floats:
+        """
+        Return the factor that makes a path along the body as long as the one travelled: (K,).
+
+        The odometer counts the path, up and down with the ground, whatever the pitch of a body
+        that sways or spans bumps; along the axis of its noise both are shorter, by the cosine of
+        their angles. straight : (K, 3) the path along the body in n, m.
+        """
+        axis = (self.C + self.C_end) / 2
+        self.up_n, ahead = axis @ self.up, axis @ self.state.forward
+
+        def slope(x: Floats) -> tuple[Floats, Floats]:
+            along = np.einsum('ki,ki->k', x, ahead)
+            size = np.maximum(along**2, (WALK_SPEED * self.T[:, 0])**2)
+            return np.einsum('ki,ki->k', x, self.up_n) * along / size, along / size
+
+        of_body, _ = slope(straight)
+        travelled, per_metre = slope(self.travelled)
+        self.shorter = travelled * per_metre / (1 + travelled**2)
+        out: Floats = np.sqrt((1 + of_body**2) / (1 + travelled**2))
+        return out
+
+    def _by_slope(self, C: Floats, arm_b: Floats, sign: float) -> Floats:
+        """Return derivatives of the path by the position and attitude of an end: (K, 3, 6)."""
+        by_turn = np.cross(C @ self.up, self.travelled) / 2 + sign * np.cross(
+            C @ arm_b, self.up_n)
+        by = np.concatenate([sign * self.up_n, by_turn], axis=1) * self.shorter[:, None]
+        out: Floats = self.rolled[:, :, None] * by[:, None]
         return out
 
     def _by_speed_offset(self, coarse: CoarseSpeed | None) -> Floats | None:
@@ -211,16 +236,24 @@ class Motion:
         gyro = self._by_gyro()
         a[:, :, BG] = gyro[:, :, :3]
         # biases change little over HILL_INTERVALS: none of the faster part
-        a[:, D, BG] += state.constants[PITCH_CENTRE][0] * T * np.outer(
-            C @ self.up, self.left).reshape(K, 3, 3)
+        lift = state.constants[PITCH_CENTRE][0] * T * (C @ self.up)[:, :, None]
+        a[:, D, BG] += lift * turn(transpose(C), self.level_left)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
         a[:, PHI, PHI] = -one
         a[:, BG, BG] = a[:, BA, BA] = -one
         a[:, D, P], a[:, D, PHI] = -one, skew(C @ arm_b + self.way)
+        by_begin, by_end = self._by_slope(C, arm_b, -1.0), self._by_slope(self.C_end, arm_b, 1.0)
+        a[:, D, P] += by_begin[:, :, :3]
+        a[:, D, PHI] += by_begin[:, :, 3:]
+        # a body that tilts about its forward axis has a part of its turn about the level one
+        tilt = self.rate_n[:, 2, None] * level_left(self.level_left)
+        a[:, D, PHI] -= lift * tilt[:, None]
         a[:, D, E] = -self.f_n
         b[:, P, P] = b[:, V, V] = b[:, PHI, PHI] = b[:, BG, BG] = b[:, BA, BA] = one
         b[:, D, P], b[:, D, PHI], b[:, D, E] = one, -skew(self.C_end @ arm_b), self.f_n_end
+        b[:, D, P] += by_end[:, :, :3]
+        b[:, D, PHI] += by_end[:, :, 3:]
         return a, b, self._by_constants(gyro)
 
     def _by_gyro(self) -> Floats:
@@ -237,11 +270,13 @@ class Motion:
         swing = self.C_end - C
         # the lift of the odometer by pitching is in no count
         c[:, D, LN_K] = self.heaved - (self.travelled if self.fitted else self.way)
-        c[:, D, TYRES] = (c[:, D, LN_K] / self.varied)[:, :, None] \
-            * self.from_mean[:, None]
+        by_scale = c[:, D, LN_K] / self.varied
+        c[:, D, TYRES] = by_scale[:, :, None] * self.from_mean[:, None]
+        c[:, D, BY_PITCHING] = by_scale * self.swung[:, None]
         for column, gradient in zip((YAW, PITCH), state.C_bv_gradient, strict=True):
+            tilt = np.einsum('ki,ki->k', self.travelled, (C + self.C_end) @ gradient[:, 2] / 2)
             c[:, D, column] = -(C @ s.S @ (state.scale * gradient[:, 0])) \
-                + swing @ gradient @ self.arm_v
+                + swing @ gradient @ self.arm_v + self.rolled * (tilt * self.shorter)[:, None]
         for i, axis in enumerate((self.up, -self.left)):
             turned = C @ s.S @ (state.scale * axis)
             c[:, D, LEAN.start + i:LEAN.stop:2] = -turned[:, :, None] * self.pushed[:, None, i::2]
@@ -256,6 +291,7 @@ class Motion:
         if self.by_steps:       # only the direction of the path is used; these do not change it
             c[:, D, [LN_K, ODO_DELAY, ODO_CLOCK, ODO_LAG2, SPEED_OFFSET]] = 0.0
             c[:, D, TYRES] = 0.0
+            c[:, D, BY_PITCHING] = 0.0
         c[:, :, GYRO] = gyro[:, :, 3:]
         c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF
         return c

@@ -8,11 +8,10 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import Normal
 from odocal_ros.estimator.factors.factor import add_prior, add_process, Factor, LinearisationPoint
-from odocal_ros.estimator.factors.motion import rotvec
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import PHI, V
-from odocal_ros.nav.rotations import transpose
+from odocal_ros.nav.rotations import rotvec, transpose
 
 # 1 sigma of a vehicle at rest, at each keyframe m/s, and rad/sqrt(s) about east, north, up.
 # Physical, judgement: wind, an engine and people move it on its springs, and tilt it more than

@@ -26,7 +26,6 @@ from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import by_row
 from odocal_ros.estimator.factors.interval_noise import hard_and_turning
-from odocal_ros.estimator.factors.motion import rotvec
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer_filter import as_rolled, stamp_of
 from odocal_ros.estimator.fit import Fit
@@ -43,6 +42,7 @@ from odocal_ros.estimator.state import (
     State,
 )
 from odocal_ros.nav.integral import integral_at
+from odocal_ros.nav.rotations import rotvec
 from odocal_ros.screening.axles import STEER_GRID, steering_path
 
 OWN_DELAY = 0.02        # s, 1 sigma of a wheel's stamps against the others'. Judgement
