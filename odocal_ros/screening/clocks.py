@@ -119,7 +119,7 @@ def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
     rows: dict[str, Samples] = {}
     found: list[Reason] = []
     for slot in ('imu', *TOPICS):
-        sent = leg.rows(slot)
+        sent = _stamped(leg.rows(slot))
         at, moved = _sets(sent)
         if not len(at):
             continue
@@ -127,7 +127,10 @@ def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
         lag = [abs(np.median(_lag(take(sent, piece == k)))) for k in range(len(at) + 1)]
         shift = np.append(0, np.cumsum(np.round(moved * 1e9).astype(np.int64)))
         shift -= shift[int(np.argmin(lag))]
-        rows[slot] = replace(sent, stamp_ns=sent.stamp_ns - shift[piece])
+        whole = leg.rows(slot)
+        stamp_ns = whole.stamp_ns.copy()
+        stamp_ns[stamp_ns > 0] -= shift[piece]
+        rows[slot] = replace(whole, stamp_ns=stamp_ns)
         found += [Reason(Code.CLOCK_SET, f'the {INPUTS[slot].label} clock was set by {by:+.3f} s '
                          f'at t = {(sent.stamp_ns[k] - leg.start_ns) * 1e-9:.2f} s: stamps '
                          f'{"before" if shift[piece[k]] else "after"} it were moved by as much')

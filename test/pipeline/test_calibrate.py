@@ -255,4 +255,5 @@ def test_nothing_raises_and_nothing_wrong_is_accepted(made, town, which, runs):
             assert all(abs(x) < 6 for x in z.values()), (seed, fault.what, z)
     # the faults are such that most legs can still be used
     assert verdicts.count('accepted') > runs / 2, verdicts
-    assert verdicts.count('rejected') > 3
+    # clocks that are set, five of the 30 in town, do not reject
+    assert verdicts.count('rejected') >= 3

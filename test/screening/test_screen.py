@@ -106,6 +106,11 @@ def test_a_clock_that_was_set_runs_on(leg, slot, by, wrong):
     np.testing.assert_allclose(inputs.travel.t, alone.travel.t, atol=1e-6)
 
 
+def test_rows_without_a_stamp_are_no_clock_that_was_set(leg):
+    imu = changed(leg.imu, stamp_ns=lambda a: a.__setitem__(slice(3000, 3200), 0))
+    assert Code.CLOCK_SET not in said(replace(leg, imu=imu))[1]
+
+
 def test_rows_out_of_order_are_no_clock_that_was_set(leg):
     order = np.arange(len(leg.imu.stamp_ns))
     order[3000:3200] = np.random.default_rng(1).permutation(order[3000:3200])
