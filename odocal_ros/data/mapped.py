@@ -9,7 +9,9 @@ once they are large: released data is read again on access. If the disk takes no
 in memory.
 """
 
+from collections.abc import Iterator
 import contextlib
+from itertools import pairwise
 import math
 import mmap
 import os
@@ -24,6 +26,7 @@ from numpy.typing import DTypeLike, NDArray
 ROOM_BYTES = 2**24      # judgement: bytes of an array to work in from which it lies in a file
 # judgement: bytes of all arrays in files up to which they are held, for pages read again cost time
 HELD_BYTES = 2**27
+LET_GO_AFTER = 512      # judgement: rows between releases of mapped memory
 _maps: WeakSet[mmap.mmap] = WeakSet()
 _lock = Lock()
 
@@ -58,3 +61,26 @@ def let_go() -> None:
     if sum(map(len, maps)) > HELD_BYTES:
         for pages in maps:
             pages.madvise(mmap.MADV_DONTNEED)
+
+
+def blocks(n: int) -> Iterator[slice]:
+    """
+    Yield slices of n rows of nearly equal length.
+
+    A slice has more than one row if n has: numpy multiplies a single matrix differently from a
+    stack, and results must not depend on the chunks. Mapped memory is released periodically.
+    """
+    at_a_time = 64      # their matrices stay in the cache
+    edges = np.linspace(0, n, max(1, -(-n // at_a_time)) + 1).astype(int)
+    for first, last in pairwise(edges.tolist()):
+        yield slice(first, last)
+        if last // LET_GO_AFTER > first // LET_GO_AFTER or last == n:
+            let_go()
+
+
+def stepping(numbers: range) -> Iterator[int]:
+    """Yield numbers; mapped memory is released periodically."""
+    for k in numbers:
+        yield k
+        if k % LET_GO_AFTER == 0:
+            let_go()

@@ -15,17 +15,15 @@ memory in turn, which is in mapped files for long legs.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.data.mapped import let_go, room
+from odocal_ros.data.mapped import blocks, room, stepping
 from odocal_ros.errors import OdocalError
 
 Floats = NDArray[np.float64]
-LET_GO_AFTER = 512          # judgement: intervals between releases of mapped memory
 
 
 class NotPositive(OdocalError):
@@ -206,29 +204,6 @@ class JointMarginals:
         """Yield the covariances of some intervals after others: (k, 2n + m, 2n + m)."""
         for rows in blocks(len(self)):
             yield self.of(np.arange(rows.start, rows.stop))
-
-
-def blocks(n: int) -> Iterator[slice]:
-    """
-    Yield slices of n rows of nearly equal length.
-
-    A slice has more than one row if n has: numpy multiplies a single matrix differently from a
-    stack, and results must not depend on the chunks. Mapped memory is released periodically.
-    """
-    at_a_time = 64      # their matrices stay in the cache
-    edges = np.linspace(0, n, max(1, -(-n // at_a_time)) + 1).astype(int)
-    for first, last in pairwise(edges.tolist()):
-        yield slice(first, last)
-        if last // LET_GO_AFTER > first // LET_GO_AFTER or last == n:
-            let_go()
-
-
-def stepping(numbers: range) -> Iterator[int]:
-    """Yield numbers; mapped memory is released periodically."""
-    for k in numbers:
-        yield k
-        if k % LET_GO_AFTER == 0:
-            let_go()
 
 
 def solve(normal: Normal) -> Solved:

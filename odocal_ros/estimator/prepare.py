@@ -122,6 +122,7 @@ def imperfect_sigmas(grade: Grade) -> Floats:
     most have no odometer (SIZE_SPREADS). Clocks differ by 20 ppm.
     Tyres change by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within ten minutes or so, and
     slip by 0.4 % for each m/s^2;
+    the path of an axle and that along its pitching body differ by half the square of the angle;
     a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2, both late by 0.1 s.
     Over a crest it pitches about the middle of its wheelbase.
     """
@@ -137,7 +138,7 @@ def imperfect_sigmas(grade: Grade) -> Floats:
         'scale_by_speed': 1e-4,                     # s/m at FAST_SPEED
         'scale_by_time': 2.5e-3 / WARM_TIME,        # 1 / s
         'scale_by_force': 4e-3,                     # 1 / (m/s^2)
-        'scale_by_pitching': 1.0,
+        'scale_by_pitching': 1.0,                   # of half the square of the angle
         'squat': 3e-3, 'sideslip': 5e-3,            # rad per m/s^2
         'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4,    # rad per m/s^3
         'pitch_centre': 1.5}                        # m: a car's 1.4, a truck's 2.5

@@ -54,7 +54,7 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
             yield client
         return
     ours = {'distributed.scheduler.allowed-failures': tries - 1,
-            # one bag a worker: what ends it takes no other bag with it
+            # beyond two bags a worker, one at a time: what ends it takes no other bag with it
             'distributed.scheduler.worker-saturation': 1.0,
             'distributed.logging.distributed': 'critical',
             'distributed.worker.memory.terminate': False,

@@ -132,8 +132,8 @@ def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
         stamp_ns[stamp_ns > 0] -= shift[piece]
         rows[slot] = replace(whole, stamp_ns=stamp_ns)
         found += [Reason(Code.CLOCK_SET, f'the {INPUTS[slot].label} clock was set by {by:+.3f} s '
-                         f'at t = {(sent.stamp_ns[k] - leg.start_ns) * 1e-9:.2f} s: stamps '
-                         f'{"before" if shift[piece[k]] else "after"} it were moved by as much')
+                         f'at t = {(sent.stamp_ns[k] - leg.start_ns) * 1e-9:.2f} s; '
+                         f'{"earlier" if shift[piece[k]] else "later"} stamps were corrected')
                   for k, by in zip(at, moved, strict=True)]
         if slot == 'imu':
             leg = replace(leg, start_ns=leg.start_ns - int(shift[0]),
@@ -145,19 +145,22 @@ def _sets(samples: Samples) -> tuple[Ints, Floats]:
     """
     Return the rows after which a clock was set, and by how much, s: its stamps step for good.
 
-    Their arrivals do not. Rows out of order or with a false stamp step twice, and the lag does not
-    change.
+    Their arrivals do not, and no stamp beside falls. Rows out of order or with a false stamp step
+    twice.
     """
-    none = np.empty(0, np.int64), np.empty(0)
     if len(samples.stamp_ns) < 2 * LAG_NEIGHBOURS or not by_step(
             _may_be_odd, samples.stamp_ns).any():
-        return none
+        return np.empty(0, np.int64), np.empty(0)
     step, lag = np.diff(samples.stamp_ns) * 1e-9, _lag(samples)
     ahead = lag[:-1] - lag[1:]
     odd = np.flatnonzero((np.abs(step - np.median(step)) > CLOCK_SET)
                          & (np.abs(ahead) > CLOCK_SET / 2))
-    before, after = (np.array([np.median(lag[max(k + first, 0):k + first + LAG_NEIGHBOURS])
-                               for k in odd]) for first in (1 - LAG_NEIGHBOURS, 1))
-    moved = before - after if len(odd) else np.empty(0)     # of the stamps, against arrival
-    is_set = (np.abs(moved) >= CLOCK_SET) & (np.abs(ahead[odd] - moved) <= 0.3 * np.abs(moved))
-    return odd[is_set], moved[is_set]
+    at, moved = [], []
+    for k in odd.tolist():
+        before, after = slice(max(k + 1 - LAG_NEIGHBOURS, 0), k), slice(k + 1, k + LAG_NEIGHBOURS)
+        by = float(np.median(lag[before.start:k + 1]) - np.median(lag[k + 1:after.stop + 1]))
+        if (abs(by) >= CLOCK_SET and abs(ahead[k] - by) <= 0.3 * abs(by)
+                and (step[before] >= 0).all() and (step[after] >= 0).all()):
+            at.append(k)
+            moved.append(by)        # of the stamps, against arrival
+    return np.array(at, np.int64), np.array(moved)

@@ -257,10 +257,12 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
     for k in np.flatnonzero(off > least):
         last = int(np.searchsorted(at, rows[k]))
         first = _begin(smooth[:last])
+        if first == last:
+            continue
         # fixes since the compared one before may be of the tunnel too
-        begin = float(t[max(at[min(first, len(at) - 1)] - 2, 0)])
+        begin = float(t[max(at[first] - 2, 0)])
         # the row after a jump is as far off
-        if first < last and (not spans or begin > spans[-1][1]):
+        if not spans or begin > spans[-1][1]:
             spans.append((begin, float(t[rows[k] + 1]), float(off[k])))
     return spans
 

@@ -106,6 +106,14 @@ def test_a_clock_that_was_set_runs_on(leg, slot, by, wrong):
     np.testing.assert_allclose(inputs.travel.t, alone.travel.t, atol=1e-6)
 
 
+@pytest.mark.parametrize('rows', [10, 50])
+def test_stamps_in_disorder_are_no_clock_that_was_set(leg, rows):
+    rng, order = np.random.default_rng(2), np.arange(len(leg.imu.stamp_ns) // rows * rows)
+    order = rng.permuted(order.reshape(-1, rows), axis=1).ravel()
+    mixed = replace(take(leg.imu, order), received_ns=leg.imu.received_ns[:len(order)])
+    assert Code.CLOCK_SET not in said(replace(leg, imu=mixed))[1]
+
+
 def test_rows_without_a_stamp_are_no_clock_that_was_set(leg):
     imu = changed(leg.imu, stamp_ns=lambda a: a.__setitem__(slice(3000, 3200), 0))
     assert Code.CLOCK_SET not in said(replace(leg, imu=imu))[1]

@@ -12,7 +12,7 @@ change the path length.
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.chain import stepping
+from odocal_ros.data.mapped import stepping
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import FAST_SPEED, ODO_ARM, State
 from odocal_ros.estimator.sums import Intervals

@@ -19,7 +19,8 @@ import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.chain import blocks, JointMarginals, Normal
+from odocal_ros.data.mapped import blocks
+from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem

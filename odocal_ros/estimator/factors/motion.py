@@ -54,9 +54,8 @@ ROWS = D.stop
 HILL_INTERVALS = 5
 # of Motion, what each interval has
 EACH = ('T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed',
-        'nose_down', 'rate_n', 'level_left', 'swung', 'up_n',
-        'shorter', 'from_mean', 'varied', 'travelled',
-        'residual')
+        'nose_down', 'rate_n', 'level_left', 'swung', 'up_n', 'shorter', 'from_mean', 'varied',
+        'travelled', 'residual')
 
 
 def gravity_n(position_n: Floats, origin: Origin) -> Floats:
@@ -185,7 +184,8 @@ class Motion:
 
         The odometer counts the path, up and down with the ground, whatever the pitch of a body
         that sways or spans bumps; along the axis of its noise both are shorter, by the cosine of
-        their angles. straight : (K, 3) the path along the body in n, m.
+        their angles. Also sets what ``_by_slope`` needs. straight : (K, 3) the path along the body
+        in n, m.
         """
         axis = (self.C + self.C_end) / 2
         self.up_n, ahead = axis @ self.up, axis @ self.state.forward
@@ -289,9 +289,8 @@ class Motion:
         c[:, D, [ODO_DELAY, ODO_LAG2]] = -ahead[:, :, None] * self.faster[:, None]
         c[:, D, ODO_CLOCK] = c[:, D, ODO_DELAY] * self.t_middle[:, None] - self.rolled
         if self.by_steps:       # only the direction of the path is used; these do not change it
-            c[:, D, [LN_K, ODO_DELAY, ODO_CLOCK, ODO_LAG2, SPEED_OFFSET]] = 0.0
+            c[:, D, [LN_K, ODO_DELAY, ODO_CLOCK, ODO_LAG2, BY_PITCHING, SPEED_OFFSET]] = 0.0
             c[:, D, TYRES] = 0.0
-            c[:, D, BY_PITCHING] = 0.0
         c[:, :, GYRO] = gyro[:, :, 3:]
         c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF
         return c

@@ -10,8 +10,8 @@ from weakref import ref
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.mapped import room
-from odocal_ros.estimator.chain import blocks, JointMarginals, Normal
+from odocal_ros.data.mapped import blocks, room
+from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import ChunkedSum, Factor, LinearisationPoint
 from odocal_ros.estimator.factors.interval_noise import INTERVAL, interval_noise
 from odocal_ros.estimator.factors.least import LEAST

@@ -15,8 +15,8 @@ from typing import ClassVar
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.mapped import room
-from odocal_ros.estimator.chain import blocks, JointMarginals, Normal
+from odocal_ros.data.mapped import blocks, room
+from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import ChunkedSum, Factor
 from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.chain import blocks, JointMarginals
+from odocal_ros.data.mapped import blocks
+from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.equations import Weighted
 from odocal_ros.estimator.factors.fixes import Fixes
 from odocal_ros.estimator.factors.interval_noise import ABSENT_VARIANCE
