@@ -129,23 +129,6 @@ class Factor:
         return np.concatenate([self.with_wanted(block).copy() for block in marginals.blocks()])
 
 
-class ChunkedSum:
-    """A sum of rows that arrive in chunks; equal to the sum of all rows to the last bit."""
-
-    _sum: np.ndarray | None = None
-
-    @property
-    def sum(self) -> np.ndarray:
-        """Return the sum of the rows so far; a scalar zero before the first."""
-        return np.zeros(()) if self._sum is None else self._sum
-
-    def add(self, rows: Floats) -> None:
-        """Add rows one after the other."""
-        if self._sum is not None:
-            rows = np.concatenate([self._sum[None], rows])
-        self._sum = rows.sum(axis=0)
-
-
 def add_prior(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
          residual: Floats | float, weight: Floats | float = 1.0) -> None:
     """Add priors of single unknowns: columns at keyframes k, a slice or one."""

@@ -12,7 +12,7 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.mapped import blocks, room
 from odocal_ros.estimator.chain import JointMarginals, Normal
-from odocal_ros.estimator.factors.factor import ChunkedSum, Factor, LinearisationPoint
+from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
 from odocal_ros.estimator.factors.interval_noise import INTERVAL, interval_noise
 from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
@@ -158,7 +158,6 @@ class MotionRows(Factor):
         """Add the right-hand sides of its levels."""
         n, columns = self.n, out.at(INTERVAL)
         of = np.eye(len(INTERVAL))[self.noise.component]
-        square, border = ChunkedSum(), ChunkedSum()
         for rows in blocks(len(self.r)):
             ends = slice(rows.start + 1, rows.stop + 1)
             A = self.units(rows)
@@ -166,10 +165,8 @@ class MotionRows(Factor):
             g = np.swapaxes(self.J[rows], 1, 2) @ q
             out.chain[rows, :, columns] += g[:, :n]
             out.chain[ends, :, columns] += g[:, n:2 * n]
-            border.add(g[:, 2 * n:])
-            square.add(np.swapaxes(q, 1, 2) @ q)
-        out.border[:, columns] += border.sum
-        out.square[np.ix_(columns, columns)] += square.sum
+            out.border[:, columns] += g[:, 2 * n:].sum(axis=0)
+            out.square[np.ix_(columns, columns)] += (np.swapaxes(q, 1, 2) @ q).sum(axis=0)
 
     def _noises(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
         """

@@ -17,7 +17,7 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import blocks, room
 from odocal_ros.estimator.chain import JointMarginals, Normal
-from odocal_ros.estimator.factors.factor import ChunkedSum, Factor
+from odocal_ros.estimator.factors.factor import Factor
 from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
@@ -130,26 +130,25 @@ class PointRows(Factor):
 
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
-        n, corner, g_border = self.n, ChunkedSum(), ChunkedSum()
+        n = self.n
         for present, gather in self._intervals():
             J, r = gather(self.J), gather(self.r[:, :, None])
-            H = np.swapaxes(J, 1, 2) @ J
-            g = -(np.swapaxes(J, 1, 2) @ r)[:, :, 0]
-            out.diagonal[present] += H[:, :n, :n]
-            out.border[present] += H[:, :n, n:]
-            corner.add(H[:, n:, n:])
+            by = np.swapaxes(J, 1, 2)
+            own, g = by[:, :n] @ J, -(by @ r)[:, :, 0]
+            border = np.ascontiguousarray(J[:, :, n:]).reshape(-1, self.m)
+            out.diagonal[present] += own[:, :, :n]
+            out.border[present] += own[:, :, n:]
+            out.corner += border.T @ border
             out.g[present] += g[:, :n]
-            g_border.add(g[:, n:])
+            out.g_border += g[:, n:].sum(axis=0)
             if self.J_end is None:
                 continue
             B = gather(self.J_end)
-            X = np.swapaxes(J, 1, 2) @ B
+            X = by @ B
             out.beside[present, :, SLOW] += X[:, :n]
             out.border[present + 1, SLOW] += np.swapaxes(X[:, n:], 1, 2)
             out.diagonal[present + 1, SLOW, SLOW] += np.swapaxes(B, 1, 2) @ B
             out.g[present + 1, SLOW] -= (np.swapaxes(B, 1, 2) @ r)[:, :, 0]
-        out.corner += corner.sum
-        out.g_border += g_border.sum
 
     def _intervals(self) -> Iterator[tuple[Ints, Gather]]:
         """
@@ -197,16 +196,14 @@ class PointRows(Factor):
         q = np.zeros((*self.r.shape, len(columns)))
         for i, own in enumerate(self.levels_of.values()):
             q[:, own, i] = self.r[:, own]
-        border = ChunkedSum()
         for present, gather in self._intervals():
             some = gather(q)
             g = np.swapaxes(gather(self.J), 1, 2) @ some
             out.chain[present[:, None], :, columns] += np.moveaxis(g[:, :self.n], 2, 1)
-            border.add(g[:, self.n:])
+            out.border[:, columns] += g[:, self.n:].sum(axis=0)
             if self.J_end is not None:
                 end = np.swapaxes(gather(self.J_end), 1, 2) @ some
                 out.chain[present[:, None] + 1, SLOW, columns] += np.moveaxis(end, 2, 1)
-        out.border[:, columns] += border.sum
         out.square[columns, columns] += np.einsum('kdi,kdi->i', q, q)
 
     def _taken(self, marginals: JointMarginals, present: Ints, gather: Gather) -> Floats:
