@@ -101,8 +101,9 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
     if len(here) > 4:       # a single outlier is no motion: running median of three
         here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
         t_here = t_here[1:-1]
-    # 10 sigmas: judgement, less is no leg either
-    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(least, 10 * fix_sigma)
+    # 10 sigmas: judgement, less is no leg either. Many receivers state much more than they show
+    sigma = min(fix_sigma, white_noise(here))
+    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(least, 10 * sigma)
     pick = (travel.t >= 0) & (travel.t <= t_stop)
     if pick.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)

@@ -73,6 +73,8 @@ def test_the_rough_scale_of_a_room_is_that_of_its_straights():
     assert rough_scale(travel, t, fixes, 0.01, LOCAL_MOVES) == pytest.approx(1e-4, rel=0.05)
     assert not not_moving(travel, t, fixes, 0.01, 200.0, LOCAL_MOVES)
     assert not_moving(travel, t, fixes, 0.01, 200.0, GNSS_MOVES)
+    # a reference that states a metre, and shows a centimetre
+    assert not not_moving(travel, t, fixes, 1.0, 200.0, LOCAL_MOVES)
 
 
 def test_turns_on_the_spot_are_no_turns_of_the_course():
