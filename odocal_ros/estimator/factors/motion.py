@@ -256,6 +256,12 @@ class Motion:
         b[:, D, PHI] += by_end[:, :, 3:]
         return a, b, self._by_constants(gyro)
 
+    def _ahead(self) -> Floats:
+        """Return the path travelled without sway and heave, noise of the road: (K, 3) m."""
+        share = np.einsum('ki,ki->k', self.travelled, self.rolled) / np.maximum(
+            np.einsum('ki,ki->k', self.rolled, self.rolled), 1e-12)
+        return self.rolled * share[:, None]
+
     def _by_gyro(self) -> Floats:
         """Return derivatives by the gyro's bias and constants: (K, 18, 3 + g)."""
         s, C = self.sums, self.C
@@ -269,7 +275,7 @@ class Motion:
         c = np.zeros((len(self.T), ROWS, M))
         swing = self.C_end - C
         # the lift of the odometer by pitching is in no count
-        c[:, D, LN_K] = self.heaved - (self.travelled if self.fitted else self.way)
+        c[:, D, LN_K] = self.heaved - (self._ahead() if self.fitted else self.way)
         by_scale = c[:, D, LN_K] / self.varied
         c[:, D, TYRES] = by_scale[:, :, None] * self.from_mean[:, None]
         c[:, D, BY_PITCHING] = by_scale * self.swung[:, None]
