@@ -260,7 +260,8 @@ class Motion:
         """Return the path travelled without sway and heave, noise of the road: (K, 3) m."""
         share = np.einsum('ki,ki->k', self.travelled, self.rolled) / np.maximum(
             np.einsum('ki,ki->k', self.rolled, self.rolled), 1e-12)
-        return self.rolled * share[:, None]
+        out: Floats = self.rolled * share[:, None]
+        return out
 
     def _by_gyro(self) -> Floats:
         """Return derivatives by the gyro's bias and constants: (K, 18, 3 + g)."""
