@@ -65,9 +65,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'was carried, as by a ferry: the fixes move by 100 m or more, and the odometer only '
         'counts before and after it.',
         Code.TOPIC_GAP: 'Odometer or fixes are silent for more than five of their usual '
-        'intervals, or the odometer starts late or ends early. Or IMU, odometer or fixes cover only a '
-        'part of a recording without marks (10 s or more are missing): the leg is limited to '
-        'the time that all topics have. Travel across the gap is '
+        'intervals, or the odometer starts late or ends early. Or IMU, odometer or fixes cover '
+        'only a part of a recording without marks (10 s or more are missing): the leg is limited '
+        'to the time that all topics have. Travel across the gap is '
         'interpolated; its uncertainty is part of the sigma.',
         Code.CLOCKS_DIFFER: 'The stamps of a topic differ by more than 0.5 s from the stamps of '
         'IMU messages that arrived at the same time. Positions and travel would be combined at '
