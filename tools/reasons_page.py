@@ -65,7 +65,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'was carried, as by a ferry: the fixes move by 100 m or more, and the odometer only '
         'counts before and after it.',
         Code.TOPIC_GAP: 'Odometer or fixes are silent for more than five of their usual '
-        'intervals, or the odometer starts late or ends early. Travel across the gap is '
+        'intervals, or the odometer starts late or ends early. Or IMU, odometer or fixes cover '
+        'only a part of a recording without marks (10 s or more are missing): the leg is limited '
+        'to the time that all topics have. Travel across the gap is '
         'interpolated; its uncertainty is part of the sigma.',
         Code.CLOCKS_DIFFER: 'The stamps of a topic differ by more than 0.5 s from the stamps of '
         'IMU messages that arrived at the same time. Positions and travel would be combined at '
@@ -118,7 +120,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'of another IMU with other axes or biases. Which one is meant cannot be decided from the '
         'data.',
         Code.IMU_UNITS: 'Gravity is not 9.8 m/s^2, or the gyro shows much larger turns than the '
-        'vehicle can make: the unit is g, deg/s or another one.',
+        'vehicle can make: the unit is g, deg/s or another one. Or gravity has another size in a '
+        'part of the leg.',
         Code.IMU_LOOKS_Z_DOWN: 'Gravity is on -z, as for an IMU with forward-right-down axes. '
         'For this result the IMU was rotated by 180 deg about x.',
         Code.IMU_AXES: 'Gravity is on another axis than z, or accelerations point sideways in '
@@ -171,7 +174,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.TRACK_MISMATCH: 'Even with the calibrated values the track deviates from the fixes '
         'by more than noise, drift and 0.2 % of the distance. There is another error. Or the '
         'direction of travel changes by 180 deg between two sections while the fixes move '
-        'backwards: the vehicle reversed, and the odometer counted up.',
+        'backwards: the vehicle reversed, and the odometer counted up. Or the scale of the '
+        'odometer differs by 5 % or more before and after some point of the drive, and is '
+        'constant on either side of it.',
         Code.CHECK_WORSE: 'In sections of 100 m, 500 m or 1 km, each started at a fix, the '
         'calibrated track ends significantly farther from the fixes than the uncalibrated one. '
         'Both use the same attitude, so the calibrated values are wrong: they include slip, bad '

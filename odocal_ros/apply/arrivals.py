@@ -152,10 +152,15 @@ class Rhythm:
         self._follow(t, step, expected if sure else 0.0)
         self._rows.append((t, self._line if self._count else t, travel))
         if len(self._rows) == 3:
-            self._test(abs(speed), quantum)
+            self._test(quantum)
         at = self._rows[-1][1] if self._in_use() else t
         self._t = max(at, self._t + APART)
         return self._t
+
+    @property
+    def delay_s(self) -> float:
+        """Return the sigma of the constant delay of the times, s: no row is early."""
+        return LATE_SIGMA * self._late if self._in_use() else 0.0
 
     def _in_use(self) -> bool:
         return self._even and self._late > LEAST_JITTER and self._count > FIRST_ROWS
@@ -204,7 +209,7 @@ class Rhythm:
         self._line += math.copysign(round(far / self._interval) or 1, least) * self._interval
         self._off.clear()
 
-    def _test(self, speed: float, quantum: float) -> None:
+    def _test(self, quantum: float) -> None:
         """Compare how even the travel is by arrivals and on the line."""
         (t0, p0, s0), (t1, p1, s1), (t2, p2, s2) = self._rows
         if self._count <= FIRST_ROWS or abs(s2 - s0) <= 2 * SURE_STEP * quantum:
@@ -214,7 +219,7 @@ class Rhythm:
         for k, (a, b, c) in enumerate(((t0, t1, t2), (p0, p1, p2))):
             even = s0 + (s2 - s0) * (b - a) / (c - a) if c > a else s1
             self._uneven[k] += ((s1 - even)**2 - self._uneven[k]) * share
-        self._moved += (speed**2 - self._moved) * share
+        self._moved += (((s2 - s0) / max(p2 - p0, APART))**2 - self._moved) * share
         self._rounding += (quantum**2 / 12 - self._rounding) * share
         limit = AS_EVEN if self._even else EVENER
         known = self._tested > FIRST_ROWS

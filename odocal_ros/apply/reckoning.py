@@ -289,7 +289,8 @@ class Reckoning:
         the path changed of the velocity; a clock that moved shifts the time of the pose too.
         """
         way_n = self._C_nb @ self.vehicle.forward_b * speed - self._swung
-        return np.concatenate([way_n * math.hypot(self._delay_sigma, self._moved),
+        return np.concatenate([way_n * math.hypot(
+            self._delay_sigma, self._moved, self.wheels.delay_s),
                                self._C_nb @ rate_b * self._moved])
 
     def _leave_behind(self, last: int) -> None:

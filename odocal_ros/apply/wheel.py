@@ -24,12 +24,16 @@ SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
 # judgement: s that a burst of stamps may hide; usual jitters of stamps that a row may be off by;
 # rows that determine them
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
+# judgement: usual jitters, and s, that one row counts as at most: one that lost its counts is not
+# late
+LATEST_ROW, LATE_FLOOR = 2.0, 1e-3
 HUNG_JITTERS = 2.0    # judgement: of a counter that stops at once; one that is held shows 3
 # judgement: rows before any is tested; rows in turn, and s, that are refused at least before one
 # is accepted
 SURE_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
 STRANGE_TIME = 1.0    # s; judgement: after it motion may explain a jump of speed
 KEPT_TIME = 60.0    # s; judgement: of rows without a message of the IMU
+HIDDEN = 1e-3    # m; judgement: of travel between two speeds, less is below any road's slip
 MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, usual intervals; judgement: messages are missing
 
 
@@ -55,7 +59,11 @@ class Wheel:
         self._value: int | float | None = None
         self._rows = self._refused = 0
         self._refused_since = 0.0
-        self._jitter = STAMP_BURST / JITTERS      # s, of the stamps, as the rows show it
+        self._change = 0.0             # m/s, between the last two speeds
+        # m by which rows in turn that were refused differ from the speed, and all before them
+        self._owed = self._refused_travel = 0.0
+        # s, of the stamps, as the rows show it; it does not change a speed
+        self._jitter = STAMP_BURST / JITTERS if form.quantity != 'rate' else 0.0
         # after rows that were refused: m/s that nothing explains yet, m it may have misled by, for
         # s, m/s before it
         self._strange = self._strange_travel = self._strange_time = self._sure_speed = 0.0
@@ -96,8 +104,15 @@ class Wheel:
 
     def jitter(self, t: float, T: float) -> float:
         """Return the variance, m^2, of the travel in the T s up to a time by arrival jitter."""
+        if self.form.quantity == 'rate':
+            return 0.0
         off = self._rhythm.error_s * (self.at(t) - self.at(t - T)) / T
         return 2.0 * off**2 * min(1.0, T / self.usual if self.usual else 1.0)**2
+
+    @property
+    def delay_s(self) -> float:
+        """Return the sigma of the delay of the rows by their arrival, s."""
+        return self._rhythm.delay_s
 
     def between(self, t: float) -> float:
         """Return the variance, m^2, of the travel at a time because rows lie only beside it."""
@@ -121,7 +136,9 @@ class Wheel:
             self._add(t, 0.0)
             return
         before = self._value
-        if self.form.quantity != 'rate':
+        if self.form.quantity == 'rate':      # its value does not show which rows are missing
+            self._rhythm.place(t, min(max(value * self.scale, -FASTEST), FASTEST), 0.0, 0.0)
+        else:
             most = FASTEST * STAMP_BURST + self.quantum
             step = min(max(self._step(value, before, 0.0) * self.scale, -most), most)
             t = self._rhythm.place(t, self.s[-1] + step, self.speed, self.quantum)
@@ -136,14 +153,18 @@ class Wheel:
         if self._is_false(t, dt, step, shown, off):
             self.notes.append(f'the counter jumps by {step:+.1f} m in {dt:.2f} s: a reset or an '
                              f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
+            if abs(shown * dt) <= self._most(dt):      # else it is no travel at all
+                self._owed += shown * dt - self.speed * dt
             step = self.speed * dt
             lost = (abs(self.speed) + SPEED_CHANGE * dt) * dt
-            # a counter that hung for a moment catches up
-            lost = max(lost, off) if off < lost + abs(self.speed) * REFUSED_TIME else lost
             self._doubt((lost**2 + self.quantum**2) / 3)
             value = before if self.form.quantity == 'rate' else value
         else:
             self._follow(dt, step, shown, off)
+            if self._owed:
+                self._doubt_refused()
+        if self.form.quantity == 'rate':
+            self._doubt_between((value - before) * self.scale, dt)
         if self._strange:      # refused rows are interpolated at a speed that may be false
             self._doubt_speed(dt)
         self._value = value
@@ -156,7 +177,7 @@ class Wheel:
 
         shown : m/s, of the row.   What stays for a while and is possible at all is accepted.
         """
-        possible = abs(step) <= FASTEST * max(dt, STAMP_BURST) + self.quantum and (
+        possible = abs(step) <= self._most(dt) and (
             self.form.quantity != 'rate' or abs(shown) <= FASTEST)
         usual = off <= self._limit(dt) or self._rows <= SURE_ROWS
         if possible and usual:
@@ -166,6 +187,10 @@ class Wheel:
         return not possible or self._refused <= MOST_REFUSED or (
             t - self._refused_since < REFUSED_TIME)
 
+    def _most(self, dt: float) -> float:
+        """Return the most that a vehicle travels between rows, m."""
+        return FASTEST * max(dt, STAMP_BURST) + self.quantum
+
     def _hangs(self, dt: float, step: float) -> bool:
         """Return True if a counter stops at once: it hangs, or the wheel locks."""
         return not step and not self._strange and self.form.quantity != 'rate' and (
@@ -173,8 +198,9 @@ class Wheel:
 
     def _limit(self, dt: float, change: float = WHEEL_CHANGE, jitters: float = JITTERS) -> float:
         """Return the limit for the deviation of a row from the previous speed, m."""
-        return (change * (dt + self._lag()) * dt + 3 * self.quantum
-                + jitters * self._jitter * abs(self.speed))
+        T = max(dt, self.usual)      # a row of a burst holds the motion of an interval
+        return (change * (T + self._lag()) * T + 3 * self.quantum
+                + (jitters * self._jitter + T - dt) * abs(self.speed))
 
     def _lag(self) -> float:
         """Return the time, s, that the speed is taken over: coarse counts want more."""
@@ -202,9 +228,11 @@ class Wheel:
         elif off > self._limit(dt, SPEED_CHANGE):
             self._doubt(off**2)
         self._refused = 0
-        self._jitter += (min(off / max(abs(self.speed), 1.0), STAMP_BURST)
-                         - self._jitter) / JITTER_ROWS
-        self.speed += (step / dt - self.speed) * min(1.0, dt / self._lag())
+        if self.form.quantity != 'rate':
+            late = min(off / max(abs(self.speed), 1.0), LATEST_ROW * self._jitter + LATE_FLOOR)
+            self._jitter += (late - self._jitter) / JITTER_ROWS
+        change, most = (step / dt - self.speed) * min(1.0, dt / self._lag()), WHEEL_CHANGE * dt
+        self.speed += min(max(change, -most), most)
 
     def _doubt_speed(self, dt: float) -> None:
         """Add variance of the travel in dt s at a speed that nothing explains."""
@@ -214,6 +242,19 @@ class Wheel:
         self._strange_time += dt
         if self._strange_time > STRANGE_TIME:      # motion itself may explain it
             self._strange = max(self._strange - SPEED_CHANGE * dt, 0.0)
+
+    def _doubt_between(self, change: float, dt: float) -> None:
+        """Add variance of the travel between two speeds that differ by m/s, dt s apart."""
+        # a corner of the speed in the middle of the rows
+        hidden, self._change = abs(change - self._change) * dt / 4, change
+        if hidden > HIDDEN:
+            self._doubt(hidden**2)
+
+    def _doubt_refused(self) -> None:
+        """Add variance of the travel of refused rows, which may be true: all of one cause."""
+        before, self._refused_travel = self._refused_travel, self._refused_travel + self._owed
+        self._owed = 0.0
+        self._doubt(max(self._refused_travel**2 - before**2, 0.0))
 
     def _doubt(self, variance: float) -> None:
         """Add variance of the travel, m^2, from the last row on."""

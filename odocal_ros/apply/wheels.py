@@ -86,6 +86,11 @@ class Wheels:
         """Return the variance, m^2, of the travel in the T s up to a time by arrival jitter."""
         return sum(w.jitter(t, T) for w in self._wheels.values()) / len(self._wheels)**2
 
+    @property
+    def delay_s(self) -> float:
+        """Return the sigma of the delay of the travel by its arrival, s."""
+        return max(w.delay_s for w in self._wheels.values())
+
     def between(self, t: float) -> float:
         """Return the variance, m^2, of the travel at a time because rows lie only beside it."""
         return sum(w.between(t) for w in self._wheels.values()) / len(self._wheels)**2

@@ -22,7 +22,7 @@ from odocal_ros.library.asked import (
     topics_of,
 )
 from odocal_ros.library.calibration import Calibration
-from odocal_ros.library.legs import open_ended, OPEN_LEG
+from odocal_ros.library.legs import cut_short, open_ended, OPEN_LEG
 from odocal_ros.library.read_bag import journal_notes, read_bag, readers_of, Recording
 from odocal_ros.outside.names import one_line
 from odocal_ros.pipeline.prepared import Stage
@@ -163,7 +163,8 @@ def _legs_of(bag: Recording, asked: _Asked, received: Notes) -> list[LegResult]:
     if any(not stop for _, stop in marks):
         received.note(f'{bag.name}: {OPEN_LEG}')
     spans = bag.spans(asked.legs)
-    notes = [bag.notes + note for note in open_ended(spans, marks)]
+    limited = cut_short(bag.recorder) if not (marks or asked.legs) else ()
+    notes = [bag.notes + limited + note for note in open_ended(spans, marks)]
     results = _calibrated(bag, spans, notes, asked.holdout, received)
     if bag.config.leg.automatic and not (marks or asked.legs):
         results = _worth_keeping(results, received)

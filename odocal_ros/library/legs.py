@@ -25,6 +25,7 @@ from odocal_ros.settings.config import Config
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
 Stops = tuple[Ints, tuple[Floats, float] | None]     # as ``stops_of`` gives them
 OPENING = 0.2                 # judgement: of the distance; a first stop later splits no leg
+CUT_SHORT_NS = 10 * 10**9     # judgement: drivers and recorders start and stop within it
 STATUS_NAME = 'calibrator: calibration'
 DROPPED = ('cancelled', 'undone')
 OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: it ends at the '
@@ -71,6 +72,22 @@ def open_ended(spans: Spans, marks: Sequence[tuple[int, int]]) -> list[tuple[Rea
     starts = {start for start, stop in marks if not stop}
     return [(Reason(Code.STOP_MARK_MISSING, OPEN_LEG),) if start in starts else ()
             for start, _ in spans]
+
+
+def cut_short(recorder: LegRecorder) -> tuple[Reason, ...]:
+    """Return TOPIC_GAP for topics that begin after the others, or end before them."""
+    ends = _ends(recorder)
+    if not ends:
+        return ()
+    begin, end = min(a for a, _ in ends.values()), max(b for _, b in ends.values())
+    what = [f'{INPUTS[slot].label} {does} {missing * 1e-9:.1f} s {where}'
+            for slot, (a, b) in ends.items()
+            for does, missing, where in (('begins', a - begin, 'after the first topic'),
+                                         ('ends', end - b, 'before the last topic'))
+            if missing > CUT_SHORT_NS]
+    return (Reason(Code.TOPIC_GAP, f'{", ".join(what)}: the leg is limited to the time that all '
+                   'topics have', 'Record all topics from before the drive to its end. If one '
+                   'failed, check its driver, cable and the recorder.'),) if what else ()
 
 
 def dropped_legs(bag: Bag) -> bool:

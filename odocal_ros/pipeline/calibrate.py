@@ -34,6 +34,7 @@ from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
 from odocal_ros.screening.screen import screen
+from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
 
 __all__ = ['calibrate', 'calibrate_parts', 'combine', 'faults', 'Screened', 'screened']
@@ -105,6 +106,7 @@ def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened
         seen = {r.code for r in reasons}
         return Screened(inputs, (*reasons, *(r for r in missing if r.code not in seen)), False)
     sanity, z_down = imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
+    sanity = sanity or unit_changes(inputs)
     reasons += tuple(with_axes(sanity, inputs))
     let_go()
     if z_down:

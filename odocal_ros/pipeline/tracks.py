@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.check import stray, track_check
+from odocal_ros.calib.counter_change import counter_change
 from odocal_ros.calib.evidence import evidence, KEPT_ROWS
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.per_distance import check_worse, per_distance
@@ -74,8 +75,10 @@ def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reas
     more['per_distance'] = per_distance(path_at, off_before, off_after)
     kept, far = near(ready, after, start, between)
     found += (*check_worse(path_at, off_before, off_after, bool(ready.nominal)), *far)
-    return more | {'evidence': evidence(ready.leg, ready.inputs, ready.track, ready.fixes_n, kept,
-                                        start, paths, ready.config, ready.t_fit)}, found
+    seen = evidence(ready.leg, ready.inputs, ready.track, ready.fixes_n, kept, start, paths,
+                    ready.config, ready.t_fit)
+    found += counter_change(seen.sections, seen.t_fix, seen.fix_distance)
+    return more | {'evidence': seen}, found
 
 
 def check_of(ready: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reason, ...]]:

@@ -101,6 +101,40 @@ def test_an_unharmed_stream_is_not_talked_about():
         assert worst_of(drive, [pose for _, pose in poses], {})[0] < SIGMAS
 
 
+def bursts(topics):
+    """Send the rows of half a second at once, without a stamp of their own."""
+    odometer, burst_ns = topics['odometer'], SECOND // 2
+    burst = odometer['stamp'] // burst_ns + 1
+    within = np.arange(len(burst)) - np.searchsorted(burst, burst)
+    odometer['arrival'] = odometer['stamp'] = burst * burst_ns + within * 300_000
+
+
+def once_a_second(topics):
+    topics['odometer'] = {k: v[::25] for k, v in topics['odometer'].items()}
+
+
+def lost_steps(topics):
+    """Lose the travel of a fifth of the rows, or send a speed of zero."""
+    value = topics['odometer']['value']
+    lost = np.random.default_rng(3).random(len(value)) < 0.2
+    if value.max() > 70.0:           # no speed
+        value[:] = np.cumsum(np.where(lost, 0.0, np.diff(value, prepend=value[0])))
+    value[lost & (value.max() < 70.0)] = 0.0
+
+
+@pytest.mark.parametrize(('fault', 'number'), [
+    (bursts, 0), (bursts, 1), (bursts, 2), (once_a_second, 1), (lost_steps, 1), (lost_steps, 5)])
+def test_what_the_rows_do_not_show_of_the_travel_is_in_the_covariance(fault, number):
+    drive = drive_of(number)         # counts, speeds, angles
+    topics = columns_of(drive)
+    fault(topics)
+    odometry, poses, said = published(drive, topics)
+    assert odometry.restarts == 0
+    worst, what = worst_of(drive, [pose for _, pose in poses], topics)
+    assert worst <= SIGMAS, what
+    assert bool(said) or fault is not lost_steps
+
+
 def test_random_faults():
     wrong = [found for found in (stream(20261125, number) for number in range(6, 6 + STREAMS))
              if not found[2] <= SIGMAS]

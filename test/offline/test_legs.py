@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.asked import LegSpan, parse_leg
-from odocal_ros.library.legs import _marked, find_legs, marked_legs, open_ended
+from odocal_ros.library.legs import _marked, cut_short, find_legs, marked_legs, open_ended
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -126,6 +127,25 @@ def test_stamps_without_a_time_in_common(out_and_back):
         find_legs(late, bag, [], [], Config())
     mark = int(out_and_back.truth.start_ns), int(out_and_back.truth.stop_ns)
     assert find_legs(late, bag, [], [mark], Config()) == [mark]
+
+
+@pytest.mark.parametrize('slot', ['imu', 'odometer', 'fix'])
+def test_a_topic_that_covers_half_of_the_recording_is_stated(out_and_back, slot):
+    whole, _ = recorded(out_and_back)
+    assert cut_short(whole) == ()
+    begin, end = out_and_back.imu.stamp_ns[[0, -1]]
+    half_s = (end - begin) / 2 / S
+    for early in (True, False):
+        recorder = LegRecorder()
+        for name in ('imu', 'odometer', 'fix'):
+            rows = whole.rows(name)
+            kept = (rows.stamp_ns < (begin + end) // 2) == early
+            recorder.feed(name, take(rows, kept | (name != slot)))
+        (reason,) = cut_short(recorder)
+        assert reason.code is Code.TOPIC_GAP
+        missing = float(reason.text.split(' s ')[0].split()[-1])
+        assert missing == pytest.approx(half_s, abs=2.0)      # fixes come each second
+        assert f'{"ends" if early else "begins"} {missing}' in reason.text
 
 
 def test_each_stop_splits_where_the_vehicle_stood(out_and_back):

@@ -1,0 +1,36 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""An accelerometer whose unit or range changes during the leg: gravity has another size."""
+
+import numpy as np
+
+from odocal_ros.data.pieces import medians
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.inputs import Inputs
+from odocal_ros.settings.grades import G
+from odocal_ros.settings.levels import GRAVITY_RATIO
+
+PIECES, FEWEST_ROWS = 10, 20       # judgement: of a leg; rows of one
+
+
+def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
+    """
+    Return IMU_UNITS where a tenth of the leg has another gravity than the Earth's.
+
+    No vehicle accelerates so that the median of a tenth of its leg differs from gravity so much.
+    """
+    low, high = GRAVITY_RATIO
+    edges = np.linspace(0, len(inputs.t_imu), PIECES + 1).astype(int)
+    if not inputs.has_accelerometer or edges[1] < FEWEST_ROWS:
+        return ()
+    size = [float(np.linalg.norm(medians(inputs.f_b[a:b])))
+            for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    odd = [k for k, one in enumerate(size) if not low * G < one < high * G]
+    if not odd or len(odd) == PIECES:      # all of it: the unit of the leg
+        return ()
+    begin, end = inputs.t_imu[edges[odd[0]]], inputs.t_imu[edges[odd[-1] + 1] - 1]
+    return (Reason(Code.IMU_UNITS, f'from t = {begin:.0f} to {end:.0f} s the IMU measures a '
+                   f'gravity of {size[odd[0]]:.3g} m/s^2 instead of 9.8 m/s^2', 'Check the IMU '
+                   'driver for a change of unit or range during the drive, or mark a leg on one '
+                   'side of it with --leg.'),)
