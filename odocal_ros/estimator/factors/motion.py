@@ -256,13 +256,6 @@ class Motion:
         b[:, D, PHI] += by_end[:, :, 3:]
         return a, b, self._by_constants(gyro)
 
-    def _ahead(self) -> Floats:
-        """Return the path travelled without sway and heave, noise of the road: (K, 3) m."""
-        share = np.einsum('ki,ki->k', self.travelled, self.rolled) / np.maximum(
-            np.einsum('ki,ki->k', self.rolled, self.rolled), 1e-12)
-        out: Floats = self.rolled * share[:, None]
-        return out
-
     def _by_gyro(self) -> Floats:
         """Return derivatives by the gyro's bias and constants: (K, 18, 3 + g)."""
         s, C = self.sums, self.C
@@ -276,7 +269,11 @@ class Motion:
         c = np.zeros((len(self.T), ROWS, M))
         swing = self.C_end - C
         # the lift of the odometer by pitching is in no count
-        c[:, D, LN_K] = self.heaved - (self._ahead() if self.fitted else self.way)
+        way = self.way
+        if self.fitted:     # as travelled, without sway and heave, which are noise of the road
+            along = self.rolled / np.maximum(np.linalg.norm(self.rolled, axis=1), 1e-6)[:, None]
+            way = along * np.einsum('ki,ki->k', along, self.travelled)[:, None]
+        c[:, D, LN_K] = self.heaved - way
         by_scale = c[:, D, LN_K] / self.varied
         c[:, D, TYRES] = by_scale[:, :, None] * self.from_mean[:, None]
         c[:, D, BY_PITCHING] = by_scale * self.swung[:, None]
