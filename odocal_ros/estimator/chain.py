@@ -234,20 +234,19 @@ def solve(normal: Normal) -> Solved:
     corner = np.zeros((m + 1, m + 1))
     corner[:m, :m] = normal.corner * np.multiply.outer(s_c, s_c)
     corner[:m, m] = corner[m, :m] = normal.g_border * s_c
-    logdet = -2 * np.log(s).sum() - 2 * np.log(s_c).sum()
-    D = diagonal[0]
+    D, roots = diagonal[0], np.empty((N, n))
     for k in stepping(range(N)):
         root, info = dpotrf(D, lower=1)
         if info:
             raise NotPositive(f'keyframe {k} of {N} is not constrained')
         W = wide[k]
         X, _ = dpotrs(root, W, lower=1)
-        logdet += 2 * np.log(root.diagonal().copy()).sum()
+        roots[k] = root.diagonal()
         corner -= W[:, n:].T @ X[:, n:]
         if k + 1 < N:
-            E = W[:, :n].T
-            D = diagonal[k + 1] - E @ X[:, :n]
-            wide[k + 1, :, n:] -= E @ X[:, n:]
+            onward = W[:, :n].T @ X
+            D = diagonal[k + 1] - onward[:, :n]
+            wide[k + 1, :, n:] -= onward[:, n:]
         diagonal[k] = dpotri(root, lower=1)[0]
         W[:] = X
     below = np.tril_indices(n, -1)      # dpotri fills one triangle
@@ -256,7 +255,8 @@ def solve(normal: Normal) -> Solved:
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
         raise NotPositive('the constants are not determined')
-    logdet += 2 * np.log(root.diagonal().copy()).sum() + np.log(normal.absent).sum()
+    logdet = 2 * sum(np.log(x).sum() for x in (roots / s, root.diagonal() / s_c)) \
+        + np.log(normal.absent).sum()
     reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
     c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
     covariance = dpotrs(root, np.eye(m), lower=1)[0]

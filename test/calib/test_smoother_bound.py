@@ -43,8 +43,10 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
         return np.arange(k * n, (k + 1) * n)
 
     border = np.arange(N * n, size)
-    a, b, c = motion.weighed(levels, M).derivatives(slice(None))
-    Q = motion.noise.covariance(levels)
+    every, weighed = slice(None), motion.weighed(levels, M)
+    units = motion.noise.columns(every) * weighed.roots()
+    a, b, c = weighed.derivatives(every, units)
+    Q = motion.noise.covariance(units, every)
     for k in range(N - 1):
         s = 1 / np.sqrt(np.diag(Q[k]))
         root = np.linalg.inv(np.linalg.cholesky(Q[k] * np.outer(s, s))) * s

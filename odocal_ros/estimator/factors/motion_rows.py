@@ -4,7 +4,6 @@
 """The motion factor: IMU and odometer between adjacent keyframes."""
 
 from collections.abc import Iterator
-from functools import cached_property
 from weakref import ref
 
 import numpy as np
@@ -71,17 +70,21 @@ class MotionRows(Factor):
                 | {'up': max(slide, HEAVE**2), 'pitching': PITCHING_LEAST**2})
 
     def weigh(self, levels: Levels) -> None:
-        """Whiten the rows by the Cholesky factor of their covariance."""
+        """Whiten rows and derivatives, J (K, 18, 2n + M), by the covariance's Cholesky factor."""
         self._found: tuple[ref[JointMarginals], Floats, Floats] | None = None
         self.whiten = room(len(self.raw), ROWS, ROWS)
+        self.J = room(*self.raw.shape, 2 * self.n + self.m)
         self.r, logs = np.empty((2, len(self.raw), ROWS))
         for rows in blocks(len(self.raw)):
-            Q = self.noise.covariance(levels, rows)
+            units = self.noise.columns(rows) * self.roots()
+            Q = self.noise.covariance(units, rows)
             scale = 1 / np.sqrt(np.einsum('kii->ki', Q))
             root = np.linalg.cholesky(Q * scale[:, :, None] * scale[:, None, :])
             self.whiten[rows] = np.linalg.inv(root) * scale[:, None, :]
             logs[rows] = np.log(np.einsum('kii->ki', self.whiten[rows]).copy())     # see arctan2
             self.r[rows] = np.einsum('kij,kj->ki', self.whiten[rows], self.raw[rows])
+            self.J[rows] = self.whiten[rows] @ np.concatenate(
+                self.derivatives(rows, units), axis=2)[:, :, :self.J.shape[2]]
         self.log_R = -2 * logs.sum()
 
     def after(self, step: Floats, constants: Floats, reached: State) -> None:
@@ -93,20 +96,11 @@ class MotionRows(Factor):
                 'kij,kj->ki', J[:, :, n:2 * n], step[ends]) + J[:, :, 2 * n:] @ constants[:self.m]
         self.r = r
 
-    @cached_property
-    def J(self) -> Floats:
-        """Return the whitened derivatives: (K, 18, 2n + M)."""
-        J = room(*self.raw.shape, 2 * self.n + self.m)
-        for rows in blocks(len(J)):
-            J[rows] = self.whiten[rows] @ np.concatenate(
-                self.derivatives(rows), axis=2)[:, :, :J.shape[2]]
-        return J
-
-    def derivatives(self, rows: slice) -> tuple[Floats, Floats, Floats]:
+    def derivatives(self, rows: slice, units: Floats) -> tuple[Floats, Floats, Floats]:
         """Return derivatives of some intervals as ``Motion.jacobians``, by fitted signals."""
         begin, end, constants = self.motion.take(rows).jacobians(self.n)
         if self.signals is not None:
-            gyro = (self.noise.columns(rows) * self.roots())[:, :, self.of('gyro')]
+            gyro = units[:, :, self.of('gyro')]
             found = np.einsum('kic,ki->kc', self.whiten[rows] @ gyro, self.r[rows])
             self.signals.fit(rows, constants, begin[:, :, BG], gyro, found)
         return begin, end, constants

@@ -85,8 +85,8 @@ def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
     found: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in OF_INTERVALS}
     T, C, C_end = (getattr(motion.motion, name) for name in ('T', 'C', 'C_end'))
     for some in blocks(len(motion.r)):
-        raw = np.linalg.solve(motion.whiten[some], motion.r[some, :, None])
-        Q = motion.noise.covariance(motion.levels, some)
+        root = np.linalg.inv(motion.whiten[some])
+        raw, Q = root @ motion.r[some, :, None], root @ np.swapaxes(root, 1, 2)
         per_T = 1 / T[some, :, None]
         for name, own, axes in (('odometer', D, motion.noise.axes[some]),
                                 ('gyro', PHI, transpose(C_end[some]) * per_T),
