@@ -48,19 +48,33 @@ def codes(result):
 
 
 @pytest.mark.parametrize(('rate', 'between', 'most'), [
-    (10.0, 0.0, 1.5e-3), (1.0, 0.0, 4e-3), (1.0, 10.0, 5e-3)])
+    (10.0, 0.0, 1.7e-3), (1.0, 0.0, 4e-3), (1.0, 10.0, 5e-3)])
 @pytest.mark.parametrize('how', ['floor', 'round'])
 def test_the_scale_of_a_speed_in_whole_kmh_is_held_by_its_sigma(how, rate, between, most):
     drive, result = calibrated(how, rate, between=between)
     off, sigma = error(drive, result.methods['smoother'])
     assert abs(off) < 3.3 * sigma
-    # as it adds up, truncated, it is 1.4 % off; five minutes hold half the steps of ten
+    # as it adds up, truncated, it is 1.4 % off; five minutes hold half the steps of ten, and a
+    # filter of the speed is an unknown too
     assert sigma < most
     off, sigma = error(drive, result.methods['two_point'])
     assert abs(off) < 2.0 * sigma
     seen = codes(result)
     assert Code.SPEED_COARSE in seen
     assert Code.WHEEL_SLIP not in seen
+
+
+@pytest.mark.parametrize('tau', [0.4, 0.8])
+def test_a_filter_before_the_steps_is_found(tau):
+    drive, result = calibrated(real=Real(speed_step=KMH / 2, speed_rounding='floor',
+                                         speed_filter=tau), odometer_rate=5.0, duration=600.0)
+    method = result.methods['smoother']
+    off, sigma = error(drive, method)
+    assert abs(off) < 3.3 * sigma
+    assert Code.SPEED_FILTERED in codes(result)
+    found = method.details['odometer_lag_square']
+    # 15 % of the time constant: a first-order filter by five speeds
+    assert abs(found['value'] - tau**2) < 0.3 * tau**2 + 3.3 * found['sigma']
 
 
 @pytest.mark.parametrize('how', ['floor', 'round'])

@@ -9,8 +9,8 @@ would use as information, and it would prefer a smaller signal. Once steps are b
 estimated noise is removed: the residual of the axis, and, since gyro noise rotates the force
 within an interval, its effect on gravity.
 
-Heave that odometer and attitude do not predict is noise of the road. The fit has a level for this
-noise, so it is removed as well.
+Sway and heave that odometer and attitude do not predict are noise of the road. The fit has levels
+for this noise, so it is removed as well.
 """
 
 import numpy as np
@@ -31,23 +31,23 @@ from odocal_ros.estimator.state import (
 )
 from odocal_ros.nav.rotations import transpose, turn
 
-# definition: the axis whose force is gravity and heave; signals of a gyro from there on are forces
-UPRIGHT, FORCES = 2, 3
+FORCES = 3      # definition: signals of a gyro from there on are forces
 
 
 class Signals:
     """
     Turn rates and forces of a motion's intervals, as fitted.
 
-    heave : by the noise of the road, (K,) of the vertical velocity of the axle and its integral,
-    m/s and m, in an interval.
+    sway : by the noise of the road, (K, 3) what changes of the velocity of the axle beside its
+    wheels in an interval, and the integral of this, in n, m/s and m.
     """
 
     def __init__(self, motion: Motion) -> None:
         self.motion, state = motion, motion.state
-        noise = motion.axle.v_n[:, 2] - motion.axle.wheel * (state.C_nb @ state.forward)[:, 2]
-        moved = motion.residual[:, D][:, 2] - noise[:-1] * motion.T[:, 0]
-        self.heave = (V, np.diff(noise)), (P, moved)
+        forward_n = state.C_nb @ state.forward
+        noise = across(motion.axle.v_n, forward_n)
+        moved = across(motion.residual[:, D], forward_n[:-1]) - noise[:-1] * motion.T
+        self.sway = (V, np.diff(noise, axis=0)), (P, moved)
 
     def fit(self, rows: slice, constants: Floats, by_bias: Floats, gyro: Floats,
             found: Floats) -> None:
@@ -64,8 +64,8 @@ class Signals:
         k, C = len(part.C), part.C[:, None]
         # of the noise about each axis of b
         of_gyro = ((gyro.reshape(k, ROWS, -1, 3) @ C) * (found.reshape(k, 1, -1, 3) @ C)).sum(2)
-        for axes, heave in self.heave:
-            self._by_forces(part, constants[:, axes, ACCEL], heave[rows] * part.C[:, 2, 2],
+        for axes, sway in self.sway:
+            self._by_forces(part, constants[:, axes, ACCEL], turn(transpose(part.C), sway[rows]),
                             part.residual[:, axes], of_gyro[:, axes])
 
     def _by_rates(self, part: Motion, columns: Floats, by_bias: Floats) -> None:
@@ -77,12 +77,12 @@ class Signals:
             if by < FORCES:
                 columns[:, :, i] += by_bias[:, :, into] * noise[:, by, None]
 
-    def _by_forces(self, part: Motion, columns: Floats, heave: Floats, residual: Floats,
+    def _by_forces(self, part: Motion, columns: Floats, sway: Floats, residual: Floats,
                    of_gyro: Floats) -> None:
         """
         Put the derivatives of velocity, or of place, right that go by forces: columns (k, 3, a).
 
-        heave : (k,) of it what is noise of the road, in b.
+        sway : (k, 3) what is noise of the road, in b.
         of_gyro : (k, 3, 3) what the gyro's noise about each axis of b put into the residual.
         """
         back = transpose(part.C)
@@ -90,10 +90,14 @@ class Signals:
         own = turn(back, residual) - turned.sum(axis=2)
         for i, (into, by) in enumerate(zip(ACCEL_AXIS, ACCEL_SIGNAL, strict=True)):
             noise = np.zeros_like(own)
-            noise[:, into] = own[:, by]
-            if by == UPRIGHT:
-                noise[:, into] -= heave
+            noise[:, into] = own[:, by] - sway[:, by]
             if into == by:      # the force along it, turned about another, toward the third
                 for about, toward in ((into - 1, into - 2), (into - 2, into - 1)):
                     noise[:, toward] += turned[:, toward, about]
             columns[:, :, i] += turn(part.C, noise)
+
+
+def across(x_n: Floats, forward_n: Floats) -> Floats:
+    """Return the parts of vectors at right angles to forward: (k, 3)."""
+    out: Floats = x_n - np.einsum('ki,ki->k', x_n, forward_n)[:, None] * forward_n
+    return out

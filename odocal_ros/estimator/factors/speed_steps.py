@@ -28,6 +28,7 @@ from odocal_ros.estimator.state import (
     ODO_ARM,
     ODO_CLOCK,
     ODO_DELAY,
+    ODO_LAG2,
     PHI,
     PITCH,
     SPEED_OFFSET,
@@ -38,6 +39,11 @@ from odocal_ros.estimator.state import (
 from odocal_ros.nav.coarse_speed import SpeedInstants
 from odocal_ros.nav.rotations import turn
 
+# definition: Gauss and Laguerre's nodes, less the mean delay, and weights of a first-order filter
+FILTER_X, FILTER_W = np.polynomial.laguerre.laggauss(5)[0] - 1, \
+    np.polynomial.laguerre.laggauss(5)[1]
+LEAST_FILTER = 0.2      # s, judgement: speeds closer in time differ by vibration
+
 
 class SpeedSteps(PointRows):
     """Residuals of speeds, by K what the odometer says less that of its point; one component."""
@@ -47,26 +53,30 @@ class SpeedSteps(PointRows):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         leg, state, points = problem.leg, point.state, point.points[self.name]
+        self.state, self.instants = state, _within(problem)
+        k, tau = points.interval, points.tau[:, None]
+        C = state.C_nb[k]
+        C_t, dv, g = C @ points.R, turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
+        v_n, ahead = state.v_n[k] + dv + g * tau, C_t @ state.forward
+        self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
+        arm_b = state.C_bv @ self.arm_v
+        speeds = (np.einsum('ki,ki->k', ahead, v_n) + np.cross(
+            points.rate, arm_b) @ state.forward).reshape(len(FILTER_X) + 1, -1)
+        self.speed = speeds[0]
+        self.by_lag = (FILTER_W @ speeds[1:] - self.speed) / filter_time(state.constants)**2
+        own = np.arange(len(self.speed))
+        self.points, self.C, self.C_t, self.dv, self.v_n, self.ahead, g = points.take(own), *(
+            x[own] for x in (C, C_t, dv, v_n, ahead, g))
+        points = self.points
         super().__init__(points)
-        self.state, self.points, self.instants = state, points, _within(problem)
         self.sigma = self.instants.sigma * leg.rough_scale
         # at an even acceleration the speed is at the same place of its cell again and again
         self.per_effective = problem.per_effective.get(self.name, 1.0)
-        C, tau = state.C_nb[self.k], points.tau[:, None]
-        self.C, self.C_t = C, C @ points.R
-        self.dv = turn(C, points.dv)
-        g = gravity_n(state.p_n[self.k], leg.origin)
-        self.v_n = state.v_n[self.k] + self.dv + g * tau
-        self.ahead = self.C_t @ state.forward
-        self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
-        arm_b = state.C_bv @ self.arm_v
-        swing = np.cross(points.rate, arm_b)
-        self.speed = np.einsum('ki,ki->k', self.ahead, self.v_n) + swing @ state.forward
         self.v_b = turn(np.swapaxes(self.C_t, 1, 2), self.v_n)
         # the forward axis turns too, and the IMU, beside the axle, moves across it
-        self.gained = np.einsum('ki,ki->k', self.ahead, turn(C, points.force) + g) + np.einsum(
-            'ki,ki->k', np.cross(points.rate, state.forward), self.v_b) + np.cross(
-                points.spin, arm_b) @ state.forward
+        self.gained = np.einsum('ki,ki->k', self.ahead, turn(self.C, points.force) + g)\
+            + np.einsum('ki,ki->k', np.cross(points.rate, state.forward), self.v_b)\
+            + np.cross(points.spin, arm_b) @ state.forward
         c = state.constants
         axle = Axle(problem, state)
         self.from_mean = varies_with(
@@ -75,7 +85,7 @@ class SpeedSteps(PointRows):
         self.varied = 1 + self.from_mean @ c[TYRES]
         said = self.instants.value + self.instants.side * c[SPEED_OFFSET]
         self.said = state.scale * self.varied * said
-        self.raw = (self.said - self.speed)[:, None]
+        self.raw = (self.said - self.speed - c[ODO_LAG2] * self.by_lag)[:, None]
 
     @classmethod
     def there(cls, problem: Problem) -> bool:
@@ -84,10 +94,12 @@ class SpeedSteps(PointRows):
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
-        """Return the times of the steps, s."""
-        t = _within(problem).t
-        out: Floats = t - constants[ODO_DELAY] - constants[ODO_CLOCK] * t
-        return out
+        """Return the times of the steps, s, then those of the speeds that a filter takes in."""
+        t, keyframes = _within(problem).t, problem.imu.t[problem.imu.key]
+        at = t - constants[ODO_DELAY] - constants[ODO_CLOCK] * t
+        before = filter_time(constants) * FILTER_X
+        return np.concatenate([at, np.clip(
+            at - before[:, None], keyframes[0], keyframes[-1]).ravel()])
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
@@ -125,6 +137,7 @@ class SpeedSteps(PointRows):
                 rate, gradient @ self.arm_v) @ state.forward
         c[:, ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
         c[:, ODO_DELAY], c[:, ODO_CLOCK] = self.gained, self.gained * self.instants.t
+        c[:, ODO_LAG2] = -self.by_lag
         c[:, ACCEL] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.F)
         return J[:, None], c[:, None]
 
@@ -134,3 +147,8 @@ def _within(problem: Problem) -> SpeedInstants:
     t, coarse = problem.imu.t[problem.imu.key], problem.leg.travel.coarse
     assert coarse is not None, 'by_steps'
     return coarse.instants.between(t[0], t[-1])
+
+
+def filter_time(constants: Floats) -> float:
+    """Return the time constant of a first-order filter with the variance of its delays, s."""
+    return float(np.sqrt(max(constants[ODO_LAG2], LEAST_FILTER**2)))
