@@ -35,7 +35,8 @@ def window_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats) -> Floats:
 def _scale(t: Floats, fix: Floats, dead: Floats, length: float) -> tuple[float, float, int] | None:
     """Return scale - 1, its sigma and the number of windows of a length, half a length apart."""
     begin = np.arange(t[0], t[-1] - length, length / 2) if len(t) else np.empty(0)
-    i, j = np.searchsorted(t, begin), np.searchsorted(t, begin + length)
+    # without the last fix: the end of the last window may be rounded to after it
+    i, j = np.searchsorted(t, begin), np.searchsorted(t[:-1], begin + length)
     near = np.abs(t[j] - t[i] - length) < length / 4     # judgement: else fixes are missing
     i, j = i[near], j[near]
     way = dead[j] - dead[i]

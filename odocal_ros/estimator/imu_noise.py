@@ -19,6 +19,7 @@ from odocal_ros.settings.grades import G, Grade
 # seconds, and slopes of a few per cent over a minute. Judgement
 UNFELT_NOISE, UNFELT_WALK = 5.0, 0.01
 CHI2_3_MEDIAN = 2.366       # statistical: median of chi2 with 3 degrees of freedom
+CHI2_3_QUARTILE = 1.213     # statistical: its lower quartile
 
 
 def sensor_noise(grade: Grade) -> dict[str, float]:
@@ -35,7 +36,7 @@ def without_accelerometer(grade: Grade) -> Grade:
 
 
 def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
-    """Return white noise levels of gyro and accelerometer from standstills."""
+    """Return white noise levels of gyro and accelerometer from standstills; lower limits."""
     turn, force = np.split(imu.over_intervals(imu.signals), 2, axis=1)
     T = np.diff(imu.t[imu.key])[:, None]
     inside = still[:-1] & still[1:]
@@ -47,8 +48,8 @@ def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     both = np.concatenate([np.zeros((2, 0)), *squares], axis=1)
     if both.shape[1] < 15:      # of three axes each: a variance by fewer is good to 30 % at best
         return {}
-    # the median: people get in and out, and a bus kneels
-    found = {name: max(float(np.median(x)) / CHI2_3_MEDIAN, LEAST.imu[name]**2)
+    # people get in and out or load for most of a stop: the quarter that moves least
+    found = {name: max(float(np.quantile(x, 0.25)) / CHI2_3_QUARTILE, LEAST.imu[name]**2)
              for name, x in zip(('gyro', 'accel'), both, strict=True)}
     return found if leg.has_accelerometer else {'gyro': found['gyro']}
 

@@ -3,6 +3,8 @@
 
 """Noise levels the smoother finds are those of the simulation, at rest and in motion."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from smoother_legs import made
@@ -10,6 +12,7 @@ from smoother_legs import made
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.factors.interval_noise import REST_NOISE, rest_noise
 from odocal_ros.estimator.factors.travel_error import once_a_rest
+from odocal_ros.estimator.imu_noise import at_rest
 from odocal_ros.sim.real import Real
 
 pytestmark = pytest.mark.slow
@@ -47,6 +50,20 @@ def test_noise_at_rest_is_measured_where_there_is_rest_to_measure():
     assert rest_noise(way, rest) == pytest.approx(0.0158**2, rel=5 * np.sqrt(2 / 100))
     assert rest_noise(way, rest & (np.arange(200) < 103)) == REST_NOISE**2
     assert rest_noise(np.zeros(200), rest) == REST_NOISE**2
+
+
+@pytest.mark.parametrize(('loaded_s', 'most'), [(0, 1.2), (10, 2.0)])
+def test_a_van_that_rocks_at_its_stops_has_no_noisy_accelerometer(loaded_s, most):
+    """Stops of 20 s: the body is moved for half of each, and for 12 of its 18 differences."""
+    rng = np.random.default_rng(4)
+    signals = 1e-3 * rng.standard_normal((400, 6))
+    signals[np.arange(400) % 40 < loaded_s, 5] += 0.03 * rng.standard_normal(10 * loaded_s)
+    imu = SimpleNamespace(t=np.arange(401.0), key=np.arange(401), signals=None,
+                          over_intervals=lambda _: signals)
+    still = np.arange(401) % 40 <= 20
+    sigma = at_rest(imu, SimpleNamespace(has_accelerometer=True), still)['accel']**0.5
+    # 4 sigma of a quartile from 180 draws
+    assert 0.75 * 1e-3 < sigma < most * 1e-3
 
 
 def test_rounding_that_stands_counts_once():

@@ -55,3 +55,10 @@ def test_a_short_or_empty_leg_has_no_windows():
     _, dead = driven()
     assert window_scale(T[:20], dead[:20], dead[:20])[:, 0].max(initial=0.0) <= 2.0
     assert not len(window_scale(T, dead, np.zeros_like(dead)))
+
+
+def test_a_last_window_may_end_a_rounding_after_the_last_fix():
+    t = 1.203 + np.arange(34.0)
+    t[-1] = 34.203      # the last window, 32.203 to 34.203 s, ends at 34.203000000000003 s
+    even = np.stack([t, t], axis=-1)
+    assert window_scale(t, 1.001 * even, even)[0, 1] == pytest.approx(0.001)
