@@ -10,7 +10,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS, TYRE_SPREAD
 
-SCATTER = 0.25    # judgement: of the change, by which sections on one side of it may differ
+SIDE_SCATTER = 0.25    # judgement: of the change, by which sections on one side of it may differ
 
 
 def counter_change(parts: Sections, t_fix: Floats, fix_distance: Floats) -> tuple[Reason, ...]:
@@ -28,7 +28,7 @@ def counter_change(parts: Sections, t_fix: Floats, fix_distance: Floats) -> tupl
         before, after = (np.median(side) for side in sides)
         apart = max(np.ptp(side) for side in sides)
         doubt = np.hypot(*(sigma[rows].max() for rows in (slice(k), slice(k + 1, None))))
-        if abs(after - before) > max(TYRE_SPREAD, REMARK_SIGMAS * doubt, apart / SCATTER):
+        if abs(after - before) > max(TYRE_SPREAD, REMARK_SIGMAS * doubt, apart / SIDE_SCATTER):
             found.append((apart / abs(after - before), k, float(np.exp(before - after))))
     if not found:
         return ()

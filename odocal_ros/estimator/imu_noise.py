@@ -48,8 +48,9 @@ def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     both = np.concatenate([np.zeros((2, 0)), *squares], axis=1)
     if both.shape[1] < 15:      # of three axes each: a variance by fewer is good to 30 % at best
         return {}
-    # people get in and out or load for most of a stop: the quarter that moves least
-    found = {name: max(float(np.quantile(x, 0.25)) / CHI2_3_QUARTILE, LEAST.imu[name]**2)
+    # people get in and out, or load for most of a stop: then by the quarter that moves least
+    found = {name: max(min(np.median(x) / CHI2_3_MEDIAN, np.quantile(x, 0.25) / CHI2_3_QUARTILE),
+                       LEAST.imu[name]**2)
              for name, x in zip(('gyro', 'accel'), both, strict=True)}
     return found if leg.has_accelerometer else {'gyro': found['gyro']}
 

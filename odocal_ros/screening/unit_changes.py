@@ -11,7 +11,7 @@ from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.grades import G
 from odocal_ros.settings.levels import GRAVITY_RATIO
 
-PIECES, FEWEST_ROWS = 10, 20       # judgement: of a leg; rows of one
+TENTHS, TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
 
 
 def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
@@ -21,13 +21,13 @@ def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
     No vehicle accelerates so that the median of a tenth of its leg differs from gravity so much.
     """
     low, high = GRAVITY_RATIO
-    edges = np.linspace(0, len(inputs.t_imu), PIECES + 1).astype(int)
-    if not inputs.has_accelerometer or edges[1] < FEWEST_ROWS:
+    edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
+    if not inputs.has_accelerometer or edges[1] < TENTH_ROWS:
         return ()
     size = [float(np.linalg.norm(medians(inputs.f_b[a:b])))
             for a, b in zip(edges[:-1], edges[1:], strict=True)]
     odd = [k for k, one in enumerate(size) if not low * G < one < high * G]
-    if not odd or len(odd) == PIECES:      # all of it: the unit of the leg
+    if not odd or len(odd) == TENTHS:      # all of it: the unit of the leg
         return ()
     begin, end = inputs.t_imu[edges[odd[0]]], inputs.t_imu[edges[odd[-1] + 1] - 1]
     return (Reason(Code.IMU_UNITS, f'from t = {begin:.0f} to {end:.0f} s the IMU measures a '
