@@ -80,14 +80,15 @@ def cut_short(recorder: LegRecorder) -> tuple[Reason, ...]:
     if not ends:
         return ()
     begin, end = min(a for a, _ in ends.values()), max(b for _, b in ends.values())
-    what = [f'{INPUTS[slot].label} {does} {missing * 1e-9:.1f} s {where}'
+    what = [f'{INPUTS[slot].label} {does} {missing * 1e-9:.0f} s {where}'
             for slot, (a, b) in ends.items()
             for does, missing, where in (('begins', a - begin, 'after the first topic'),
                                          ('ends', end - b, 'before the last topic'))
             if missing > CUT_SHORT_NS]
     return (Reason(Code.TOPIC_GAP, f'{", ".join(what)}: the leg is limited to the time that all '
-                   'topics have', 'Record all topics from before the drive to its end. If one '
-                   'failed, check its driver, cable and the recorder.'),) if what else ()
+                   'topics have', 'Drive off when all topics are there, the first fix too, and '
+                   'record to the end of the drive. If a topic failed, check its driver, cable '
+                   'and the recorder.'),) if what else ()
 
 
 def dropped_legs(bag: Bag) -> bool:

@@ -23,7 +23,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import ImuConfig
 from odocal_ros.settings.grades import G
-from odocal_ros.settings.levels import GRAVITY_RATIO, RAD_PER_DEG
+from odocal_ros.settings.levels import RAD_PER_DEG
 
 BIN_S = 1.0                        # s, judgement: accelerations are compared as means over it
 FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain is known to a sixth
@@ -175,9 +175,8 @@ def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
         reasons.append(Reason(Code.NO_IMU, 'the acceleration contains no gravity: the IMU '
                               'publishes none or removes gravity, or imu.accel_scale is 0'))
         return tuple(reasons), False
-    low, high = GRAVITY_RATIO
-    if not low * G < size < high * G:
-        if low < size < high:
+    if not 0.85 * G < size < 1.15 * G:
+        if 0.85 < size < 1.15:
             what = (f'the IMU measures {size:.3f} at rest, so its unit is probably g: set '
                     f'imu.accel_scale to {9.80665 * imu.accel_scale:.10g}')
         else:

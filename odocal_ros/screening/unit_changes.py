@@ -9,9 +9,11 @@ from odocal_ros.data.pieces import medians
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.grades import G
-from odocal_ros.settings.levels import GRAVITY_RATIO
 
 TENTHS, TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
+# judgement: of a gravity as measured to the Earth's. Units and ranges differ by a factor of 2 at
+# least; in a bend at 1.2 g all through the force is 1.56 times gravity
+LEAST_RATIO, MOST_RATIO = 0.6, 1.6
 
 
 def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
@@ -20,13 +22,12 @@ def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
 
     No vehicle accelerates so that the median of a tenth of its leg differs from gravity so much.
     """
-    low, high = GRAVITY_RATIO
     edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
     if not inputs.has_accelerometer or edges[1] < TENTH_ROWS:
         return ()
     size = [float(np.linalg.norm(medians(inputs.f_b[a:b])))
             for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    odd = [k for k, one in enumerate(size) if not low * G < one < high * G]
+    odd = [k for k, one in enumerate(size) if not LEAST_RATIO * G < one < MOST_RATIO * G]
     if not odd or len(odd) == TENTHS:      # all of it: the unit of the leg
         return ()
     begin, end = inputs.t_imu[edges[odd[0]]], inputs.t_imu[edges[odd[-1] + 1] - 1]

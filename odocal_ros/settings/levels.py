@@ -19,8 +19,6 @@ FAULT_SIGMAS = 5.0      # statistical: to call a sensor or a setting wrong: once
 OUTLIER_SIGMAS = 5.0
 FASTEST = 100.0         # m/s, physical: no land vehicle is so fast: a counter reset, another unit
 # physical: wear changes a tyre's radius by 2 %, pressure and load by 1 %, another make by 3 %
-# judgement: of a measured gravity to the Earth's; beyond it the unit is false
-GRAVITY_RATIO = 0.85, 1.15
 TYRE_SPREAD = 0.05      # relative, by which scales of one vehicle's wheels, or drives, may differ
 # judgement: of a prior sigma; a posterior one below it says that the data determined the value,
 # at half the data weigh three times the prior

@@ -72,3 +72,11 @@ def test_an_accelerometer_that_changes_its_unit_or_range(town, size):
     (said,) = (r.text for r in result.reasons if r.code is Code.IMU_UNITS)
     assert said.startswith('from t = ')
     assert result.verdict is Verdict.REJECTED
+
+
+def test_a_bend_at_one_g_is_no_change_of_the_unit(town):
+    leg = town.leg()
+    force = leg.imu.f_i.copy()
+    force[leg.imu.stamp_ns > (leg.start_ns + 2 * leg.stop_ns) // 3, 1] += 9.8
+    found = calibrate(replace(leg, imu=replace(leg.imu, f_i=force)), Config()).reasons
+    assert Code.IMU_UNITS not in {r.code for r in found}

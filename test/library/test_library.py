@@ -134,6 +134,17 @@ def test_of_a_method_without_a_fit_the_track_is_left(town):
     assert set(found['sensor']) == {'track', 'track_before'}
 
 
+def test_fixes_that_end_in_the_middle_of_a_bag_are_stated(tmp_path):
+    simulate('town', tmp_path / 'half', duration=200.0, imu_rate=50.0, odometer_rate=20.0,
+             outages=((100.0, 300.0),))
+    half = {'path': tmp_path / 'half', 'config': {'method': 'two_point'}}
+    (said,) = (r.text for r in calibrate_bag(**half).reasons if 'before the last topic' in r.text)
+    assert said.startswith('fix ends')
+    # a leg that somebody asked for is as it was asked for
+    assert not [r for r in calibrate_bag(**half, legs='0:90').reasons
+                if 'before the last topic' in r.text]
+
+
 def test_a_table_has_a_row_for_each_value(calibration):
     pytest.importorskip('pandas', reason='no pandas here: pip install pandas pyarrow')
     table = calibration.to_frame()

@@ -145,7 +145,7 @@ def test_a_topic_that_covers_half_of_the_recording_is_stated(out_and_back, slot)
         assert reason.code is Code.TOPIC_GAP
         missing = float(reason.text.split(' s ')[0].split()[-1])
         assert missing == pytest.approx(half_s, abs=2.0)      # fixes come each second
-        assert f'{"ends" if early else "begins"} {missing}' in reason.text
+        assert f'{"ends" if early else "begins"} {missing:.0f} s' in reason.text
 
 
 def test_each_stop_splits_where_the_vehicle_stood(out_and_back):

@@ -45,8 +45,8 @@ class MotionRows(Factor):
 
     Weighted are r (K, 18) and whiten (K, 18, 18).
 
-    Unit noises are recomputed when needed, some intervals at a time: stored, they would take half
-    the memory of the derivatives, and 0.04 less CPU.
+    Unit noises are recomputed when needed, some intervals at a time: stored, they would take a
+    third of the memory of the derivatives.
     """
 
     name = 'motion'
