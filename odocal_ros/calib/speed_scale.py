@@ -48,7 +48,8 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     if len(t_fix) < FEWEST_CELLS or len(travel.t) < FEWEST_CELLS:
         return SpeedScale(NO_BINS)
     cell = min(LONGEST_CELL, max(SHORTEST_CELL, (t_fix[-1] - t_fix[0]) / WANTED_CELLS))
-    knots = np.unique(np.searchsorted(t_fix, np.arange(t_fix[0], t_fix[-1], cell)))
+    # arange may reach beyond its end by rounding: [:-1] then gives the last fix
+    knots = np.unique(np.searchsorted(t_fix[:-1], np.arange(t_fix[0], t_fix[-1], cell)))
     t = t_fix[knots]
     T, path = np.diff(t), np.diff(distance[knots])
     chord, dead = (np.hypot(*np.diff(p[knots, :2], axis=0).T) for p in (fix_n, dead_n))

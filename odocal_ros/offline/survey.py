@@ -204,7 +204,7 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     # of a usual cell: fix noise of both ends is below 15 % of its length, s and m
     shortest, longer_than_noise = 4.0, 10.0
     cell = max(shortest, longer_than_noise * white_noise(fixes_n) * (t[-1] - t[0]) / path_length)
-    knots = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], cell)))
+    knots = np.unique(np.searchsorted(t[:-1], np.arange(t[0], t[-1], cell)))
     return FixPath(t_ns[knots], np.hypot(*np.diff(fixes_n[knots], axis=0).T),
                    float(np.sqrt(np.median(covariance_n[use][:, 0, 0]))))
 

@@ -138,7 +138,7 @@ def shortened_by_slopes(inputs: Inputs) -> float:
     variance = np.median(np.einsum('kii->ki', inputs.covariance_n[have]), axis=0)
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(place[:, :2], axis=0).T)))
     length = max(SLOPE_LENGTH, HEIGHT_SIGMAS * float(np.sqrt(variance[2])))
-    ends = np.searchsorted(path, np.arange(0.0, path[-1], length))
+    ends = np.searchsorted(path[:-1], np.arange(0.0, path[-1], length))
     run = np.hypot(*np.diff(place[ends, :2], axis=0).T)
     straight = run > length / 2      # judgement: else it turned back, or the path is noise
     slope = np.diff(place[ends, 2])[straight] / run[straight]

@@ -186,7 +186,8 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
     t_fix, geodetic, covariance = t_fix[inside], geodetic[inside], covariance_n[inside]
     if len(t_fix) < 2:
         return ()
-    pick = np.unique(np.searchsorted(t_fix, np.arange(t_fix[0], t_fix[-1], DISPLACEMENT_WINDOW)))
+    pick = np.unique(np.searchsorted(t_fix[:-1], np.arange(t_fix[0], t_fix[-1],
+                                                           DISPLACEMENT_WINDOW)))
     meridian, normal = radii(geodetic[0, 0])
     east, north = (geodetic[pick, 1] * normal * np.cos(geodetic[0, 0]),
                    geodetic[pick, 0] * meridian)

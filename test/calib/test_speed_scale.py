@@ -67,3 +67,11 @@ def test_the_delay_of_a_simulated_odometer():
     found = leg.evidence.by_speed
     assert abs(found.lag[0] - 0.2) < 4 * found.lag[1] < 0.2
     assert abs(found.factor[0] - made.truth.scale) < 4 * found.factor[1]
+
+
+def test_cells_that_end_at_the_last_fix_may_be_rounded_beyond_it():
+    t = (7_369_999_872 + np.arange(496) * 10**9) * 1e-9     # 99 cells of 5 s and 6e-14 s
+    assert np.arange(t[0], t[-1], 5.0)[-1] > t[-1]
+    place = np.stack([10 * t, 0 * t], -1)
+    found = speed_scale(t, place, place, 10 * t, Travel(t, 10 * t / 0.5, 0.0))
+    assert found.bins[:, 1] == pytest.approx(0.5)

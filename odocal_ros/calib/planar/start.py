@@ -79,7 +79,7 @@ def first_values(run: Run, width: float = 0.0) -> First:
 def _rough(z: Complexes, s: Floats) -> float:
     """Return metres per unit: the median over straight lines between positions."""
     step = max(float(s[-1] - s[0]) / 200, 1e-12)
-    at = np.unique(np.searchsorted(s, np.arange(s[0], s[-1], step)))
+    at = np.unique(np.searchsorted(s[:-1], np.arange(s[0], s[-1], step)))
     ratio = np.abs(np.diff(z[at])) / np.diff(s[at])
     return float(np.percentile(ratio, 75))
 
