@@ -22,6 +22,7 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.start import standing
 from odocal_ros.estimator.state import (
     ACCEL,
+    BY_SIGMA,
     FIX_TIME,
     GNSS_ARM,
     GNSS_DELAY,
@@ -168,6 +169,7 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     accel_bias = np.maximum([accel, accel, up], 1e-6)
     centre = np.zeros(M)
     sigma[HEIGHT_DRIFT] = max(height_sigma(leg) / HEIGHT_TIME, NO_ERROR)
+    sigma[BY_SIGMA] = 1.0       # definition: of an error in sigmas
     # physical: receivers with an odometer trust it for 5 to 60 s
     centre[FIX_TIME], sigma[FIX_TIME] = np.log(20.0), 0.7
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)

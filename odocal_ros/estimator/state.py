@@ -57,8 +57,9 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
              'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
              'pitch_centre', 'pitch_centre_of_bumps',
-             'fix_motion_time', 'fix_height_drift', 'speed_offset', 'velocity_delay',
-             'velocity_lag_square', 'velocity_scale',
+             'fix_motion_time', 'fix_height_drift', 'fix_error_east', 'fix_error_north',
+             'fix_error_up', 'speed_offset', 'velocity_delay', 'velocity_lag_square',
+             'velocity_scale',
              'pressure_offset', 'pressure_drift', 'pressure_by_speed_square', 'pressure_scale')
 
 
@@ -82,6 +83,10 @@ ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_yz')
 FIX_LAG2 = CONSTANTS.index('fix_lag_square')
 # m/s: change of the height error, over more time than a leg has
 HEIGHT_DRIFT = CONSTANTS.index('fix_height_drift')
+# error of the fixes in stated sigmas, east, north, up: a receiver converges as they fall (S15a)
+BY_SIGMA = constants_from('fix_error_east', 'fix_error_up')
+# of the errors of the fixes, in this leg alone
+FIX_ERRORS = constants_from('fix_height_drift', 'fix_error_up')
 # relative: by how much the clock of its stamps is faster than that of the IMU
 GNSS_CLOCK, ODO_CLOCK = map(CONSTANTS.index, ('gnss_clock_rate', 'odometer_clock_rate'))
 # s^2, of a low-pass filter on the odometer's speed: square of its time constant

@@ -21,6 +21,7 @@ from odocal_ros.estimator.state import (
     ACCEL,
     BA,
     BG,
+    BY_SIGMA,
     CONSTANTS,
     constants_from,
     E,
@@ -83,7 +84,7 @@ def moved():
     rng = np.random.default_rng(1)
     step = 1e-3 * rng.standard_normal((len(state.t), N))
     step[:, PHI.start:BG.stop] *= 0.1
-    c = 1e-3 * rng.standard_normal(M)
+    c = 1e-3 * np.insert(rng.standard_normal(M - 3), 3 * [BY_SIGMA.start], 1.0)
     # derivatives by biases take these as constant over HILL_INTERVALS: no centre of bumps
     # of the size that there is: derivatives leave out how these change what the others do
     c[SPEED_OFFSET], c[FIX_TIME] = 0.0, np.log(5.0)
@@ -125,6 +126,9 @@ def part_at(problem, state, name):
 @pytest.mark.parametrize('name', LOOSE)
 def test_derivatives_are_those_of_finite_differences(moved, stepping, name):
     problem, state = stepping if name == 'steps' else moved
+    stated = 1 + np.sin(problem.leg.t_fix)[:, None] * [0.3, 0.5, 0.7]     # m, sigmas that change
+    problem = replace(problem, leg=replace(problem.leg,
+                                           covariance_n=stated[:, :, None]**2 * np.eye(3)))
     part = part_at(problem, state, name)
     *ends, constants = part.jacobians(N)
     begin, end = ends if len(ends) == 2 else (*ends, np.zeros_like(ends[0]))

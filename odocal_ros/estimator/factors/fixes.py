@@ -15,6 +15,7 @@ from odocal_ros.estimator.state import (
     BA,
     BARE,
     BG,
+    BY_SIGMA,
     FIX_BY_MOTION,
     FIX_LAG2,
     FIX_TIME,
@@ -73,7 +74,11 @@ class Fixes(PointRows):
         smoothed, self.by_lag = smoothing(*track, state.constants[FIX_LAG2])
         added, self.by_motion, self.by_time = odometer_error(
             *track, state.constants[FIX_BY_MOTION], state.constants[FIX_TIME])
+        stated = np.sqrt(leg.covariance_n[problem.use].diagonal(axis1=1, axis2=2))
+        # a constant error changes no result
+        self.by_sigma = stated - np.median(stated, axis=0)
         raw[:, 2] -= state.constants[HEIGHT_DRIFT] * self.t_fix
+        raw -= state.constants[BY_SIGMA] * self.by_sigma
         self.raw = np.nan_to_num(raw) - smoothed - added
 
     def errors(self) -> Floats:
@@ -105,6 +110,7 @@ class Fixes(PointRows):
         c[:, :, GNSS_DELAY] = self.v_n
         c[:, :, GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
         c[:, 2, HEIGHT_DRIFT] = -self.t_fix
+        c[:, :, BY_SIGMA] = -self.by_sigma[:, :, None] * np.eye(3)
         c[:, :, FIX_LAG2] = -self.by_lag
         c[:, :, FIX_BY_MOTION], c[:, :, FIX_TIME] = -self.by_motion, -self.by_time
         c[:, :, ACCEL] = self.C @ self.points.FF

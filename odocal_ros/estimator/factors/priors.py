@@ -19,6 +19,7 @@ from odocal_ros.estimator.state import (
     BG,
     constants_from,
     FIX_BY_MOTION,
+    FIX_ERRORS,
     FIX_LAG2,
     FIX_TIME,
     GNSS_ARM,
@@ -79,7 +80,7 @@ class PriorRows(Factor):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
-        self.own = problem.own | {'slow_fix_errors': constants_from('fix_height_drift')}
+        self.own = problem.own | {'slow_fix_errors': FIX_ERRORS}
         self.no_heights = bool(np.isnan(problem.leg.fixes_n[:, 2]).all())
         self.shared = {name: where for name, where in SHARED.items()
                        if (problem.priors.constants[where] > NO_ERROR).any()}
