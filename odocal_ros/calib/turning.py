@@ -16,6 +16,9 @@ from odocal_ros.reasons import Code, Reason
 # statistical: correlation of turns by gyro and by course from which they are the same turns, and
 # sigmas of the slope, since of a few courses chance makes some correlated
 SAME_TURNS, SLOPE_SIGMAS = 0.9, 8.0
+# rad^2, judgement: a chord with a U-turn in it, and the next, are off by 0.35 rad each (0.1 to 0.2
+# for a mower whose rows are 1.6 m apart)
+U_TURN = 0.25
 
 
 def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
@@ -44,7 +47,8 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > about])
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)
-    if course @ course < 1.0 or power == 0:     # rad^2: turns of 1 rad in all, by their rms
+    # rad^2: turns of 1 rad in all, by their rms, and what the two chords of a U-turn are off
+    if course @ course < 1.0 + U_TURN * len(about) or power == 0:
         return None
     slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
     alike = slope**2 * power / (course @ course)

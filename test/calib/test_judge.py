@@ -237,6 +237,19 @@ def test_a_vehicle_that_backs_up_turns_no_farther_than_its_gyro():
         assert gyro_reasons(ratio, 1.0) == ()
 
 
+@pytest.mark.parametrize('row', [24.0, 25.0, 26.5, 28.0])
+def test_the_rows_of_a_mower_are_no_wrong_unit(row):
+    """Rows of 1.6 m: 1 m/s, U-turns of radius 0.8 m at 0.7 m/s, to the left and right in turn."""
+    turn = np.pi * 0.8 / 0.7       # s
+    t = np.arange(0.0, 16 * (row + turn), 0.02)
+    number, within = np.divmod(t, row + turn)
+    rate = np.where(within > row, np.pi / turn * (1 - 2 * (number % 2)), 0.0)
+    heading = np.cumsum(rate) * 0.02
+    way = np.cumsum(np.where(within > row, 0.7, 1.0) * np.exp(1j * heading)) * 0.02
+    fixes = np.stack([way.real, way.imag], -1)[::10]
+    assert gyro_reasons(turn_ratio(t, rate, t[::10], fixes, 0.01), 1.0) == ()
+
+
 def test_a_track_that_bends_where_neither_gyro_nor_fixes_do_is_said():
     t = np.arange(0.0, 200.0, 0.5)
     rng, chord = np.random.default_rng(5), np.array([300.0, 400.0, 0.0])
