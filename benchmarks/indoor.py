@@ -22,9 +22,9 @@ the median sigma; verdicts; in how many drives each reason was given.
 Kinds ROBOT_REFERENCE have no IMU: ``wheels`` is the differential robot, ``skid`` slides in turns
 on four wheels, and ``mecanum`` (four wheels) and ``omni`` (three or four) move sideways
 (sim/wheels.py). Their values: width is that on the spot (of the last two the rotation lever), arc
-at a radius of two widths. Kinds fused_REFERENCE are the robots with an IMU, whose reference contains
-its wheels with a scale error of 2 to 5 %, corrected within 5 to 20 s: FIXES_FOLLOW_ODOMETER is true
-there, and false in all others.
+at a radius of two widths. Kinds fused_REFERENCE are the robots with an IMU, and a reference that
+contains their wheels with a scale error of 2 to 5 %, corrected within 5 to 20 s:
+FIXES_FOLLOW_ODOMETER is true there, and false in all others.
 """
 
 from collections import Counter
