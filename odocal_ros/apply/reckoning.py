@@ -45,7 +45,7 @@ CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
 # judgement: corrections in turn that force and motion disagree at, after which the attitude is
 # false; m/s^2 that the force is then as long as gravity to
 MOST_APART, AS_GRAVITY = 10, 1.0
-ROWS_BEHIND = 200         # judgement: of the IMU, before they are dropped; each block copies them
+ROWS_BEHIND = 200         # judgement: of the IMU, before they are dropped
 GROW_PERIOD = 0.05        # s; judgement: in which a covariance hardly grows
 PLAUSIBLE = np.zeros(3)   # rad: no turn is implausible
 TILT_LOST = 0.5           # rad; judgement: sigma beyond which a straight line levels nothing
@@ -63,17 +63,17 @@ class Reckoning:
         self.imu, self.wheels, self.vehicle, self.config = imu, wheels, vehicle, config
         self._notes, self._delay_sigma, self.failed = notes, delay_sigma, ''
         self.q: Quaternion = tuple(start.q_nb.tolist())
-        self.bias, self.errors = start.gyro_bias, start.errors
-        self.accel_bias = np.zeros(3)
+        self.bias: Vector = tuple(start.gyro_bias.tolist())
+        self.accel_bias, self.errors = ZERO, start.errors
         self.position = ZERO      # of the odometer's point, from where it began
         self.imu.drop(start.row)
         self._earth_n, self._forward_b = start.earth_n, vehicle.forward_b.tolist()
-        self._t = self._t_pose = self._t_look = float(self.imu.t[self.imu.at])
+        self._t = self._t_pose = self._t_look = self.imu.rows[self.imu.at].t
         self._s = self._s_pose = self.wheels.at(self._t)
         self._C_nb = np.array(matrix_of(self.q))
         self._turn_b, self._dv_n, self._levels = ZERO, ZERO, True
         self._T_grow, self._way_grow, self._turn_grow = 0.0, ZERO, ZERO
-        self._w_look: list[Floats] = []
+        self._w_look: list[Vector] = []
         self._rested, self._apart, self._strange_turn = False, 0, PLAUSIBLE
         self._v_look = self._velocity_n(self._t)
         # m/s in n, at the start, and what turns added
@@ -94,7 +94,7 @@ class Reckoning:
         self._stays = max(self._stays, stays)
         self._moved = max(self._stays, moved)
         while not self.failed and (last := self._next()) is not None:
-            received = self.imu.t[last] <= self.wheels.newest()
+            received = self.imu.rows[last].t <= self.wheels.newest()
             self._advance(last)
             if self.failed:
                 break
@@ -114,23 +114,20 @@ class Reckoning:
 
     def _next(self) -> int | None:
         """Return the row to advance to: a pose is due and all it needs has come; else None."""
-        t, at = self.imu.t, self.imu.at
-        period = 1 / self.config.publish.rate
-        last = int(np.searchsorted(t, self._t_pose + period - 1e-6))
-        last = max(last, at + 1)
-        if last > len(t) - 2:            # a cubic needs the sample beyond
+        rows, period = self.imu.rows, 1 / self.config.publish.rate
+        last = self.imu.from_time(self._t_pose + period - 1e-6, self.imu.at + 1)
+        if last > len(rows) - 2:            # a cubic needs the sample beyond
             return None
-        if t[last] > self.wheels.newest() and t[-1] - t[last] < ODOMETER_SILENCE:
-            return None
-        return last
+        t = rows[last].t
+        return last if t <= self.wheels.newest() or rows[-1].t - t >= ODOMETER_SILENCE else None
 
     def _advance(self, last: int) -> None:
         """Go to a row of the IMU."""
         imu, at = self.imu, self.imu.at
         low = max(at - 1, 0)      # a cubic needs the sample before and the one beyond
-        t = imu.t[low:last + 2].tolist()
-        w = (imu.w_b[low:last + 2] - self.bias).tolist()
-        f = (imu.f_b[at:last + 1] - self.accel_bias).tolist()
+        t = [row.t for row in imu.rows[low:last + 2]]
+        w = [plus(row.w_b, self.bias, -1.0) for row in imu.rows[low:last + 2]]
+        f = [plus(row.f_b, self.accel_bias, -1.0) for row in imu.rows[at:last + 1]]
         s = [self.wheels.at(one) for one in t[at - low:-1]]
         gaps = [b - a for a, b in zip(t[at - low:-2], t[at - low + 1:-1], strict=True)]
         lost, self._s = abs(s[0] - self._s), s[-1]
@@ -150,13 +147,13 @@ class Reckoning:
         self._grow(T, way_n, turn_n, [gap for gap in gaps if gap > HOLE_INTERVALS * imu.usual],
                    self.wheels.doubt(self._t, t[-2]))
         self._swung = plus(self._swung, cross(turn_n, way_n), 1 / T)
-        self._doubt_turn(imu.strange[at + 1:last + 1], np.array(gaps), self._C_nb)
+        self._doubt_turn([row.strange for row in imu.rows[at + 1:last + 1]], gaps)
         if lost > self.wheels.quantum:
             self.errors.lost(lost)
         calm = self._strange_turn is PLAUSIBLE and max(gaps) <= IMU_HOLE
         self._levels &= calm and math.isfinite(sum(dv_n))
         self._turn_b = plus(self._turn_b, turn_b)
-        self._w_look.append(imu.w_b[at + 1:last + 1])
+        self._w_look += [row.w_b for row in imu.rows[at + 1:last + 1]]
         self._t, imu.at = t[-2], last
 
     def _turn(self, phi: Vector, T: float) -> Matrix:
@@ -178,15 +175,16 @@ class Reckoning:
                              doubt, gaps)
             self._T_grow, self._way_grow, self._turn_grow = 0.0, ZERO, ZERO
 
-    def _doubt_turn(self, strange: Floats, gaps: Floats, C_nb: Floats) -> None:
-        """Add variance for implausible turn rates: (n, 3) rad/s over n gaps of s, in b."""
-        if not strange.any():
+    def _doubt_turn(self, strange: list[Vector], gaps: list[float]) -> None:
+        """Add variance for implausible turn rates of b, rad/s, over gaps of s."""
+        if all(size is ZERO for size in strange):
             self._strange_turn = PLAUSIBLE
             return
+        C_nb = self._C_nb
         if self._strange_turn is PLAUSIBLE:
-            self._notes.append(f'the gyro jumps in one sample by {strange.max():.2g} rad/s, more '
-                              'than a vehicle can turn: the gyro is down-weighted')
-        turn = self._strange_turn + gaps @ strange
+            self._notes.append(f'the gyro jumps in one sample by {np.max(strange):.2g} rad/s, '
+                              'more than a vehicle can turn: the gyro is down-weighted')
+        turn = self._strange_turn + np.array(gaps) @ strange
         self.errors.turned(C_nb @ np.diag(turn**2 - self._strange_turn**2) @ C_nb.T)
         self._strange_turn = turn
         if np.sqrt(self.errors.cov[[3, 4], [3, 4]].max()) > TILT_LOST:
@@ -197,9 +195,8 @@ class Reckoning:
         v, C_nb = self.vehicle, self._C_nb
         moved = self.wheels.at(t) - self.wheels.at(t - SPEED_SPAN)
         arm_b = v.C_vb.T @ self.config.imu.lever_arm + v.arm_b
-        rate = self.imu.w_b[self.imu.at] - self.bias
-        return C_nb @ (
-            v.forward_b * moved / SPEED_SPAN + cross(rate.tolist(), arm_b.tolist()))
+        rate = plus(self.imu.rows[self.imu.at].w_b, self.bias, -1.0)
+        return C_nb @ (v.forward_b * moved / SPEED_SPAN + cross(rate, arm_b.tolist()))
 
     def _look(self) -> None:
         """Correct tilt and gyro bias, a second after the last time."""
@@ -207,7 +204,7 @@ class Reckoning:
         if T < CORRECTION_PERIOD - 1e-6:
             return
         velocity, received = self._velocity_n(self._t), self._t <= self.wheels.newest()
-        w = np.concatenate(self._w_look)
+        w = np.array(self._w_look)
         resting = received and self.wheels.still(self._t_look, self._t) and bool(
             (w.std(axis=0) < REST_TURN).all()
             and (np.abs(w.mean(axis=0) - self.bias) < REST_TURN).all())
@@ -255,8 +252,8 @@ class Reckoning:
     def _correct(self, by: Floats) -> None:
         self.q = product(rotation(by[PHI].tolist()), self.q)
         self._C_nb = np.array(matrix_of(self.q))
-        self.bias = self.bias + by[BG]
-        self.accel_bias = self.accel_bias + by[BA]
+        self.bias = plus(self.bias, by[BG].tolist())
+        self.accel_bias = plus(self.accel_bias, by[BA].tolist())
 
     def _pose(self) -> Pose:
         """Return the pose at the row reached."""
@@ -272,7 +269,7 @@ class Reckoning:
                               'another odometer or unit')
         quantum, jitter = self.wheels.quantum, self.wheels.jitter(self._t, T)
         doubt = self.wheels.doubt(self._t - T, self._t)
-        pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
+        pose = Pose(self.imu.rows[self.imu.at].stamp_ns, self.position + arm_n + self._arm0_n,
                     np.array(product(self.q, v.q_bv.tolist())), velocity, rate,
                     pose_covariance(v, self.errors, C_nb, arm_n, self._late(speed, rate_b),
                                     quantum**2 / 6 + self.wheels.between(self._t) + jitter / 2),

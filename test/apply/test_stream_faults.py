@@ -9,7 +9,7 @@ import pytest
 
 from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
 from odocal_ros.apply.odometry import Odometry
-from odocal_ros.apply.spikes import SpikeScreen
+from odocal_ros.apply.spikes import Row, SpikeScreen
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.apply.wheel import Wheel
 from odocal_ros.data.samples import OdometerForm
@@ -169,15 +169,13 @@ def test_a_step_of_the_gyro_is_doubted_where_it_stands_alone():
     turns = np.minimum(np.maximum(t - 1.0, 0.0) * 2.0, 0.2)        # as a vehicle starts to turn
     for add, odd in ((0.2 * (t >= 1.0), 1), (turns, 0)):
         for block in (1, 7, 200):
-            screen, found, at = SpikeScreen(), [], 1
-            x = np.hstack([w + add[:, None] * [0, 0, 1], np.full((200, 3), 5.0) + w])
-            x[0] = x[1]
-            last = 0
-            while at < len(t):
-                rows = slice(last, min(at + block, len(t)))
-                keep, strange, hold = screen.sift(t[rows], x[rows])
-                found += [k + last for k in np.flatnonzero(strange[1:hold].any(axis=1)) + 1]
-                last, at = last + hold - 1, max(at + block, last + hold)
+            screen, held, kept = SpikeScreen(), [], []
+            z = w[:, 2] + add
+            rows = [Row(t[k], k, (*w[k, :2], z[k]), (5.0, 5.0, 5.0)) for k in range(len(t))]
+            for begin in range(0, len(t), block):
+                new, held = screen.sift(held + rows[begin:begin + block])
+                kept += new
+            found = [row.stamp_ns for row in kept if any(row.strange)]
             assert found[:odd] == [100] * odd
             assert bool(found) is bool(odd)
 
