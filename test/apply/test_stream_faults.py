@@ -238,6 +238,6 @@ def test_a_false_speed_at_rest_is_doubted_from_the_speed_before_all_of_it():
     value = np.where(t > 20.0, -22.1, 0.0)
     wheel = Wheel(OdometerForm('rate', 0, '1'), 1.02)
     for row in range(len(t)):
-        wheel.feed(t[row:row + 1], value[row:row + 1])
+        wheel.feed([float(t[row])], [float(value[row])])
         assert abs(wheel.s[-1]) <= 3 * np.sqrt(wheel.doubt(0.0, t[row])) + 0.02
     assert wheel.s[-1] < -30.0         # false travel, of a vehicle at rest
