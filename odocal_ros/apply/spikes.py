@@ -57,7 +57,7 @@ class Row(NamedTuple):
     strange: Vector = ZERO
 
 
-time_of = itemgetter(0)      # of a row, to search by
+time_of = itemgetter(0)      # definition: of a row, to search by
 Pair = tuple[float, float]
 
 
@@ -110,7 +110,7 @@ class SpikeScreen:
 
     def _alone(self, rows: Sequence[Row]) -> tuple[bool, ...]:
         """
-        Return which rates of a row, and the one after it, come with a step that stands alone.
+        Return a mask of the rates of the first of two rows that follow a step which stands alone.
 
         A vehicle starts to turn over several rows; a sensor fault may start with one step.
         """
@@ -146,7 +146,7 @@ class SpikeScreen:
         return self._strange
 
     def _leaves(self, step: Pair) -> tuple[bool, bool]:
-        """Return whether gyro and force step by more than a vehicle makes them."""
+        """Return a mask of gyro and force: the step is larger than a vehicle's."""
         (turn, force), (usual_turn, usual_force) = step, self._usual
         return (turn > max(1.0, USUAL_STEPS * usual_turn),
                 force > max(1.0, USUAL_STEPS * usual_force))
