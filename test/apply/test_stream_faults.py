@@ -180,6 +180,28 @@ def test_a_step_of_the_gyro_is_doubted_where_it_stands_alone():
             assert bool(found) is bool(odd)
 
 
+def test_the_screen_keeps_the_same_rows_in_blocks_of_any_size():
+    rng, n = np.random.default_rng(3), 600
+    x = np.hstack([0.002 * rng.standard_normal((n, 3)), rng.standard_normal((n, 3)) + 9.8])
+    for at, rows, step in ((100, 1, 3.0), (200, 3, -8.0), (300, 300, 0.2), (400, 80, 5.0)):
+        x[at:at + rows, 2] += step
+    x[150:180] = x[150]      # hangs for longer than STUCK_TIME
+    x[180:, 1] += 0.1
+    rows = [Row(k * 0.01, k, tuple(x[k, :3].tolist()), tuple(x[k, 3:].tolist()))
+            for k in range(n)]
+    found = []
+    for block in (1, 2, 7, n):
+        screen, held, kept = SpikeScreen(), [], []
+        for begin in range(0, n, block):
+            new, held = screen.sift(held + rows[begin:begin + block])
+            kept += new
+        found.append(kept)
+    assert [row.stamp_ns for row in found[0]] == [
+        k for k in range(n) if k not in (100, 200, 201, 202) and not 160 <= k < 180]
+    assert {row.stamp_ns for row in found[0] if any(row.strange)} >= {300, 400}
+    assert all(kept == found[0] for kept in found)
+
+
 def test_a_turn_that_no_vehicle_begins_is_doubted():
     drive = drive_of(0)
     topics = columns_of(drive)
