@@ -54,7 +54,7 @@ def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
     if end >= len(imu.rows) or wheels.newest() < imu.rows[end].t:
         return None
     rows = imu.rows[row:end + 1]
-    t, w, f = (np.array([one[k] for one in rows]) for k in (0, 2, 3))
+    t, w, f = map(np.array, zip(*((one.t, one.w_b, one.f_b) for one in rows), strict=True))
     holes = np.flatnonzero(np.diff(t) > max(START_HOLE, HOLE_INTERVALS * imu.usual))
     if len(holes):
         imu.drop(row + int(holes[-1]) + 1)      # start from the rows after the gap
