@@ -48,13 +48,14 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     if still is not None:
         return None, (*reasons, *still)
     faces = facing(inputs, placed.rough) if inputs.has_accelerometer else None
+    reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop))
+    turning = _turning(inputs, config, placed, faces)
+    if turning:             # a mirrored axis turns the orientation around
+        return None, (*reasons, *turning)
     axes = axes_reasons(faces, config.imu.nominal_yaw)
-    reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop), *with_axes(axes, inputs))
+    reasons = (*reasons, *with_axes(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
         return None, reasons
-    turning = _turning(inputs, config, placed)
-    if turning:
-        return None, (*reasons, *turning)
     prepared = _reckoned(leg, inputs, config, placed, faces, reasons, alignment, holdout)
     return prepared, prepared.reasons
 
@@ -111,14 +112,15 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
     return None
 
 
-def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ...]:
-    """Return the reason for a gyro that does not turn with the fixes or with gravity."""
+def _turning(inputs: Inputs, config: Config, placed: Placed,
+             faces: Facing | None) -> tuple[Reason, ...]:
+    """Return the reason for a gyro that does not turn with the fixes or the accelerometer."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)
     scale_or_sign = gyro_reasons(ratio, config.imu.gyro_scale)
     if any(r.code is Code.GYRO_SIGN for r in scale_or_sign):
         return scale_or_sign
-    return gyro_axes(inputs, placed) or scale_or_sign
+    return gyro_axes(inputs, placed, faces) or scale_or_sign
 
 
 def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,

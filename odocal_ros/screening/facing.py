@@ -54,10 +54,18 @@ class Pushes:
 
 @dataclass(frozen=True)
 class Facing:
-    """Yaw mounting angle by the accelerations, rad, and its sigma."""
+    """
+    Yaw mounting angle by the accelerations, rad, and its sigma.
+
+    inward, inward_sigma : force towards the inside of turns over the centripetal acceleration of
+    gyro and odometer, as a ratio to that of speeding up: 1; -1 if one of gyro and accelerometer
+    has a mirrored axis, nan if unknown.
+    """
 
     yaw: float
     sigma: float
+    inward: float = np.nan
+    inward_sigma: float = np.nan
 
 
 def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
@@ -112,14 +120,15 @@ def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
     gain = inverse @ (A.conj().T @ force)
     rest = force - A @ gain
     # only half of the residual lies across, only every other change (they share bins) is a draw
-    variance = np.vdot(rest, rest).real / len(A) * inverse[0, 0].real
-    sigma = float(np.sqrt(variance) / max(abs(gain[0]), 1e-9))
+    variances = np.vdot(rest, rest).real / len(A) * np.diag(inverse).real
+    sigma, inward_sigma = np.sqrt(variances) / max(abs(gain[0]), 1e-9)
     facing_sigma = np.deg2rad(10.0)    # limit of the 1 sigma of the IMU orientation
     push_gain = 0.5, 2.0    # of the acceleration over that of the wheels: limits of a valid fit
     if sigma > facing_sigma or not push_gain[0] < abs(gain[0]) < push_gain[1]:
         return None
     forward = gain[0].real * found.e1 + gain[0].imag * found.e2
-    return Facing(float(-np.arctan2(forward[1], forward[0])), sigma)
+    return Facing(float(-np.arctan2(forward[1], forward[0])), float(sigma),
+                  float((gain[1] / gain[0]).real), float(inward_sigma))
 
 
 def toward(found: Facing | None, f: Floats) -> Floats:
