@@ -35,6 +35,10 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 from odocal_ros.settings.nominal import nominal_scale
 
+# judgement: no vehicle drives this share of a recording backwards; by a counter that counts down
+# the IMU would seem to look backwards
+MOSTLY = 0.5
+
 
 def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
          findings: list[Reason]) -> list[str]:
@@ -121,11 +125,16 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
 
 def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config: Config,
           found: dict[str, Any], findings: list[Reason]) -> list[str]:
-    """Return the IMU orientation, and whether its gyro turns with the course."""
-    m = mounting(inputs.t_imu, w_i, f_i, inputs.travel, drive.scale or 1.0)
+    """Return settings for odometer sign and IMU orientation; look whether the gyro is right."""
+    set_already = bool(np.any(config.imu.mounting_rpy))
+    travel, step = inputs.travel, np.diff(inputs.travel.s)
+    options = []
+    if not set_already and step.sum() < -MOSTLY * np.abs(step).sum():
+        travel = replace(travel, s=-travel.s)
+        options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
+    m = mounting(inputs.t_imu, w_i, f_i, travel, drive.scale or 1.0)
     if not inputs.has_accelerometer:
         m = replace(m, C_bi=None)      # gravity is made up
-    set_already = bool(np.any(config.imu.mounting_rpy))
     agrees = m.C_bi is not None and np.allclose(
         m.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
     found['mounting'] = {
@@ -141,8 +150,8 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config:
     found['drive']['gyro_over_course'] = ratio
     findings += gyro_reasons(ratio, config.imu.gyro_scale)
     if m.rpy is None or not found['mounting']['needed']:
-        return []
-    return [f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
+        return options
+    return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 
 
 def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, first: int,

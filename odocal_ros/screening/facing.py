@@ -31,6 +31,7 @@ WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters 
 AXES = 'xyz'
 # nothing follows from such an IMU; what is computed all the same says it in other words
 UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
+ROUNDING = 1e-9                 # rad/s, definition: what rotations leave of a rate of zero
 MAX_RATE = 8.0                  # rad/s, physical: no vehicle on wheels turns so fast
 
 
@@ -196,6 +197,12 @@ def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
                               'vehicle can turn, so its unit is probably deg/s: set '
                               f'imu.gyro_scale to {imu.gyro_scale * RAD_PER_DEG!r}'))
     up = mean / size
+    upright = int(np.argmax(np.abs(up @ C_bi)))
+    if not reasons and not any((np.abs(w_b[some] @ C_bi[:, upright]) > ROUNDING).any()
+                               for some in chunks(len(w_b))):
+        reasons.append(Reason(Code.NO_IMU, f'angular_velocity.{AXES[upright]} is always zero: the '
+                              'IMU publishes no turn rate about its upright axis', 'Publish all '
+                              'three turn rates, or use an IMU that measures them.'))
     most_tilt = np.deg2rad(30.0)    # a body frame more tilted than this is not forward-left-up
     if up[2] > np.cos(most_tilt):
         return tuple(reasons), False
