@@ -126,7 +126,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'For this result the IMU was rotated by 180 deg about x.',
         Code.IMU_AXES: 'Gravity is on another axis than z, or accelerations point sideways in '
         'the IMU frame: the body frame is not forward-left-up. Or a level axis of the '
-        'accelerometer has the wrong sign, as the accelerations in turns show.',
+        'accelerometer has the wrong sign, as the accelerations in turns show, or the IMU was '
+        'moved in the vehicle by 45 deg or more.',
         Code.IMU_WORSE_THAN_GRADE: 'IMU errors are larger than its grade. The smoother uses the '
         'noise estimated from the drive instead. Sigmas that only rest on the grade, such as '
         'those of the other methods, are too small.',

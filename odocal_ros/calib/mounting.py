@@ -63,11 +63,12 @@ def remedy(found: Mounting) -> str:
 
 def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
     """Return reasons, IMU_AXES with what to set where the screened inputs show it."""
-    if not any(r.code is Code.IMU_AXES for r in reasons):
+    if not any(r.code is Code.IMU_AXES and not r.do for r in reasons):
         return list(reasons)
     found = mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
                      inputs.travel, 1.0)
-    return [replace(r, do=remedy(found)) if r.code is Code.IMU_AXES else r for r in reasons]
+    return [replace(r, do=r.do or remedy(found)) if r.code is Code.IMU_AXES else r
+            for r in reasons]
 
 
 def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,

@@ -23,8 +23,14 @@ from odocal_ros.pipeline.beyond_model import coarse_reasons
 from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import axles_of
-from odocal_ros.screening.facing import axes_reasons, Facing, facing
+from odocal_ros.screening.facing import (
+    accelerations,
+    axes_reasons,
+    Facing,
+    facing_of,
+)
 from odocal_ros.screening.inputs import Inputs, place, Placed
+from odocal_ros.screening.moved_imu import turned_about
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config
 
@@ -47,9 +53,10 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     still = _standing(inputs, placed)
     if still is not None:
         return None, (*reasons, *still)
-    faces = facing(inputs, placed.rough) if inputs.has_accelerometer else None
+    pushed = accelerations(inputs, placed.rough) if inputs.has_accelerometer else None
+    faces = None if pushed is None else facing_of(pushed)
     reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop))
-    turning = _turning(inputs, config, placed, faces)
+    turning = turned_about(pushed) or _turning(inputs, config, placed, faces)
     if turning:             # a mirrored axis turns the orientation around
         return None, (*reasons, *turning)
     axes = axes_reasons(faces, config.imu.nominal_yaw)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.data.pieces import bin_means, by_row, chunks, lengths, medians
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
@@ -42,7 +42,7 @@ class Pushes:
 
     e1, e2 : (3,) level axes, in the frame of the IMU's data.   force : (m,) m/s^2.
     onward, inward : (m,) of the vehicle, real m/s^2: along; to the left in turns.
-    near : (m,) True if the bin before it is adjacent.
+    near : (m,) True if the bin before it is adjacent.   t : (m,) s, middle of the bin.
     """
 
     e1: NDArray[np.float64]
@@ -51,6 +51,7 @@ class Pushes:
     onward: NDArray[np.float64]
     inward: NDArray[np.float64]
     near: NDArray[np.bool_]
+    t: Floats
 
 
 @dataclass(frozen=True)
@@ -93,15 +94,33 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
     e2 = np.cross(up, e1)
     use = np.flatnonzero(count)
     return Pushes(e1, e2, (f @ e1 + 1j * (f @ e2))[use], onward[use], (speed * turn_rate)[use],
-                  np.diff(use, prepend=-9) == 1)
+                  np.diff(use, prepend=-9) == 1, middle[use])
 
 
-def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
+@dataclass(frozen=True, eq=False)
+class Accelerations:
     """
-    Return the IMU orientation in the vehicle, None if the drive does not determine it.
+    Changes of accelerations from one bin to the next, so that slopes, which change slowly, cancel.
 
-    Changes from bin to bin are compared, so that slopes, which change slowly, cancel. The turns
-    have a factor of their own, so that the sign of the gyro has no effect.
+    e1, e2 : (3,) level axes, frame b.   t : (m,) s.   force, onward, inward : (m,) as in Pushes.
+    """
+
+    e1: Floats
+    e2: Floats
+    t: Floats
+    force: Complexes
+    onward: Floats
+    inward: Floats
+
+    def __getitem__(self, rows: slice) -> 'Accelerations':
+        """Return those of some rows."""
+        return Accelerations(self.e1, self.e2, self.t[rows], self.force[rows], self.onward[rows],
+                             self.inward[rows])
+
+
+def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | None:
+    """
+    Return the accelerations of a leg, None if it is too short.
 
     inputs : in the configured body frame.   metres_per_unit : as for ``pushes``.
     """
@@ -111,9 +130,25 @@ def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
                    metres_per_unit) if size else None
     if found is None:
         return None
-    force, onward, inward = (np.diff(x)[found.near[1:]]
-                             for x in (found.force, found.onward, found.inward))
-    A = np.stack([onward, 1j * inward], -1)
+    near = found.near[1:]
+    return Accelerations(found.e1, found.e2, found.t[1:][near], np.diff(found.force)[near],
+                         np.diff(found.onward)[near], np.diff(found.inward)[near])
+
+
+def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
+    """Return the IMU orientation in the vehicle, None if the drive does not determine it."""
+    found = accelerations(inputs, metres_per_unit)
+    return None if found is None else facing_of(found)
+
+
+def facing_of(found: Accelerations) -> Facing | None:
+    """
+    Return the IMU orientation in the vehicle, None if the accelerations do not determine it.
+
+    The turns have a factor of their own, so that the sign of the gyro has no effect.
+    """
+    force = found.force
+    A = np.stack([found.onward, 1j * found.inward], -1)
     normal = A.conj().T @ A
     if len(A) < FEWEST_BINS_FACING or np.linalg.cond(normal) > 1e9:
         return None
