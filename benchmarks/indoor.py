@@ -22,7 +22,9 @@ the median sigma; verdicts; in how many drives each reason was given.
 Kinds ROBOT_REFERENCE have no IMU: ``wheels`` is the differential robot, ``skid`` slides in turns
 on four wheels, and ``mecanum`` (four wheels) and ``omni`` (three or four) move sideways
 (sim/wheels.py). Their values: width is that on the spot (of the last two the rotation lever), arc
-at a radius of two widths.
+at a radius of two widths. Kinds fused_REFERENCE are the robots with an IMU, and a reference that
+contains their wheels with a scale error of 2 to 5 %, corrected within 5 to 20 s:
+FIXES_FOLLOW_ODOMETER is true there, and false in all others.
 """
 
 from collections import Counter
@@ -41,8 +43,10 @@ REFERENCES = ('mocap', 'total_station', 'slam', 'amcl')
 PLANAR = {'wheels': {}, 'skid': {'drive': 'skid', 'wheels': 4}, 'mecanum': {'drive': 'mecanum'},
           'omni': {'drive': 'omni'}}
 SHORTEST = {'wheels': 30.0, 'skid': 30.0, 'mecanum': 70.0, 'omni': 70.0}     # s
+# two wheels and an IMU; the reference is fused with the uncalibrated wheels
+FUSED = ('fused_slam', 'fused_amcl')
 KINDS = (*REFERENCES, *(f'{robot}_{reference}' for robot in PLANAR
-                        for reference in REFERENCES))
+                        for reference in REFERENCES), *FUSED)
 GRADES = ('consumer', 'industrial')
 IMU_EFFECTS = ('triads', 'g_sensitivity', 'bias', 'temperature', 'vibration', 'imu_stamps')
 SLIP = 1e-3     # m/sqrt(s) of each wheel
@@ -63,9 +67,13 @@ def options_of(seed):
            'imu_lever_arm': tuple(map(float, rng.normal(0, 0.05, 3))),
            'scale': 8.9e-5 * (1 + 0.03 * float(rng.standard_normal()))}
     robot, _, reference = KINDS[e].partition('_') if e >= len(REFERENCES) else ('', '', KINDS[e])
-    if robot == 'omni':
+    if robot == 'fused':
+        side = 1 if k % 4 < 2 else -1       # of both grades
+        own['real'] = {'receiver_odometer': side * float(rng.uniform(0.02, 0.05)),
+                       'receiver_odometer_time': float(rng.uniform(5.0, 20.0))}
+    elif robot == 'omni':
         own['wheels'] = 3 + k % 2
-    if robot:       # the first sideways move of a robot ends within a minute
+    if robot in PLANAR:       # the first sideways move of a robot ends within a minute
         own |= PLANAR[robot] | {'imu': False, 'duration': max(own['duration'], SHORTEST[robot])}
     return drawn(seed, 'indoor', GRADES[k % 2], IMU_EFFECTS, **own, nominal_scale=8.9e-5,
                  slope=0.0, odometer_lever_arm=(0.0, 0.0, 0.0), antenna_lever_arm=(0.0, 0.0, 0.0),

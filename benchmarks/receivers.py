@@ -148,7 +148,7 @@ RUNS = {
                             names=('CLOCKS_DRIFT',)),
     'IMU clock steps by 20 ms': Run(change=stepping, names=('CLOCK_SET',)),
     'aliased vibration': Run(change=aliased, names=('IMU_WORSE_THAN_GRADE',), also=SHAKEN),
-    'saturated IMU': Run({'vibration': 5.0}, change=saturated, names=('IMU_WORSE_THAN_GRADE',),
+    'saturated IMU': Run({'vibration': 5.0}, change=saturated, names=('IMU_SATURATED',),
                          also=SHAKEN),
     'spins by 0.5 m': Run(options=SPINS, kinds=('town',), names=('WHEEL_SLIP',)),
 }

@@ -94,6 +94,8 @@ class Code(Enum):
     IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the other noise '
                                      'settings, to the values of this IMU. A gyro in deg/s also '
                                      'looks like this: then set imu.gyro_scale.')
+    IMU_SATURATED = NOTE, ('Set a larger range in the IMU or its driver, or mount it more softly. '
+                           'The mean of a saturated axis is wrong.')
     IMU_AXES_SKEW = NOTE, ('No action needed: the mounting angles refer to the measurement axes '
                            'of the IMU. To silence this, set imu.misalignment_sigma to the value '
                            'of this IMU.')

@@ -131,6 +131,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.IMU_WORSE_THAN_GRADE: 'IMU errors are larger than its grade. The smoother uses the '
         'noise estimated from the drive instead. Sigmas that only rest on the grade, such as '
         'those of the other methods, are too small.',
+        Code.IMU_SATURATED: 'The largest value of an axis is repeated: the sensor stops at the '
+        'limit of its range, 2 g or 16 g for an accelerometer. Potholes and a hard mount cause '
+        'this. Noise levels are estimated with it.',
         Code.IMU_AXES_SKEW: 'The axes of the IMU deviate more from perpendicular than its grade. '
         'The fit accounts for it; mounting angles measured on the housing differ accordingly.',
         Code.LEVER_ARM_OFF: 'In turns and while leaning, a sensor moves as if it were decimetres '

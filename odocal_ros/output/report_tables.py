@@ -115,7 +115,7 @@ def undetermined(calibration: Calibration) -> list[str]:
 
 def _largest(method: MethodResult | None, name: str) -> str:
     largest, share = tables.largest_source(method, name)
-    return f'{label(largest)} ({share:.0%})' if largest else ''
+    return f'{label(largest)} ({100 * share:.0f} %)' if largest else ''
 
 
 def method_table(methods: dict[str, MethodResult],

@@ -29,6 +29,7 @@ from odocal_ros.screening.inputs import Inputs, place, UsableRows
 from odocal_ros.screening.leg_kind import with_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import topic_gap, usable_rows
+from odocal_ros.screening.saturation import saturated
 from odocal_ros.screening.several_imus import alternating, other_imus
 from odocal_ros.screening.wheel_travel import Wheels, wheels
 from odocal_ros.settings.config import Config, SIDES
@@ -54,6 +55,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     found += _wheel_gaps(leg, rows.wheels)
     if judged:
         found += alternating(rows.imu.w_i, rows.imu.f_i)
+        found += saturated(inputs.t_imu, rows.imu.w_i, rows.imu.f_i, config.imu)
         found += frozen(inputs.t_imu, rows.imu.w_i, rows.wheels.mean, config.leg.max_gap)
         wheels, why = _axles(inputs, rows.wheels)
         inputs = replace(inputs, **_travel(leg, wheels))

@@ -1,0 +1,51 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""An axis of the IMU that stops at the limit of its range."""
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import ImuConfig
+from odocal_ros.settings.grades import G
+
+# physical: no range is smaller, and gravity at rest, also in coarse steps, is below it
+LEAST_GYRO, LEAST_ACCELEROMETER = 1.0, 1.5 * G      # rad/s, m/s^2
+# statistical: coarse steps repeat the largest value too, but more seldom than the next smaller one
+FEWEST_AT_LIMIT, TIMES_NEXT = 5, 3.0
+
+
+def saturated(t_imu: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> tuple[Reason, ...]:
+    """
+    Return IMU_SATURATED for the axis that is at its limit most often.
+
+    t_imu : (n,) s.   w_i, f_i : (n, 3) turn rates and specific forces as sent.
+    """
+    found = []
+    for sensor, x_i, scale, unit, least in (
+            ('gyro', w_i, imu.gyro_scale, 'rad/s', LEAST_GYRO),
+            ('accelerometer', f_i, imu.accel_scale, 'm/s^2', LEAST_ACCELEROMETER)):
+        for axis, x in zip('xyz', x_i.T, strict=True):
+            for limit, following in ((x.max(initial=0.0), _below), (x.min(initial=0.0), _above)):
+                at = x == limit
+                count, size = int(np.count_nonzero(at)), abs(limit * scale)
+                if size < least or count < FEWEST_AT_LIMIT:
+                    continue
+                if count > TIMES_NEXT * np.count_nonzero(x == following(x, limit)):
+                    found.append((count, float(t_imu[at.argmax()]),
+                                  f'{sensor} {axis} stops at {limit * scale:+.4g} {unit}'))
+    if not found:
+        return ()
+    count, t, words = max(found)
+    others = f'; {len(found) - 1} more such limits' if len(found) > 1 else ''
+    return (Reason(Code.IMU_SATURATED, f'{words} in {count} of {len(t_imu)} messages, first at '
+                   f't = {t:.1f} s{others}'),)
+
+
+def _below(x: Floats, limit: float) -> float:
+    return float(x.max(where=x < limit, initial=-np.inf))
+
+
+def _above(x: Floats, limit: float) -> float:
+    return float(x.min(where=x > limit, initial=np.inf))
