@@ -29,6 +29,7 @@ from odocal_ros.screening.facing import imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import settings_by_frame
+from odocal_ros.screening.moved_imu import turned_over
 from odocal_ros.screening.screen import screen
 from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
@@ -101,8 +102,8 @@ def _units(inputs: Inputs, config: Config,
            findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
     """Judge the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_axes(
-        imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
-        or unit_changes(inputs), inputs)
+        turned_over(inputs) or imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi,
+                                          config.imu)[0] or unit_changes(inputs), inputs)
     w_i, f_i = inputs.w_b, inputs.f_b
     if not np.array_equal(inputs.C_bi, np.eye(3)):
         w_i, f_i = w_i @ inputs.C_bi, f_i @ inputs.C_bi

@@ -215,6 +215,14 @@ def test_axes_are_told(tmp_path, capsys, rpy):
     assert not seen['mounting']['needed']
 
 
+def test_an_imu_that_is_turned_over_midway_has_no_wrong_unit(tmp_path, capsys):
+    upright, over = drive(), drive(C_ib=np.diag([1.0, -1.0, -1.0]))
+    half = len(upright) // 2
+    seen, text = inspect(ros_bags.write(tmp_path / 'bag', upright[:half] + over[half:]), capsys)
+    assert 'IMU_UNITS' not in codes(seen)
+    assert 'gravity turns by 180 deg' in text
+
+
 @pytest.mark.parametrize('rpy', [(0, 0, 0), (math.pi, 0, 0)])
 def test_a_counter_that_counts_down_does_not_turn_the_imu(tmp_path, capsys, rpy):
     """Nobody drives a whole recording backwards; the IMU would be set 180 deg off."""
