@@ -5,6 +5,7 @@
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import medians
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
@@ -14,7 +15,8 @@ from odocal_ros.screening.unit_changes import tenths
 
 # judgement, deg: what slopes, bends and the noise of a fit do not make; of its tenths on one side
 LEAST_TURN, SIDE = 45.0, 20.0
-# a part driven backwards by an unsigned counter turns forward by 180 deg
+SAME_SIZE = 1.15    # judgement: ratio of gravity on both sides; a bend that leans it 45 deg: 1.4
+# judgement, deg: driving backwards with an unsigned counter turns forward by 180 deg
 MOST_YAW = 135.0
 YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond LEAST_TURN
 DO = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
@@ -25,17 +27,19 @@ def turned_over(inputs: Inputs) -> tuple[Reason, ...]:
     edges = tenths(inputs)
     if not len(edges):
         return ()
-    up = np.array([medians(inputs.f_b[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)])
-    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
-    for k in range(1, len(up) - 1):
-        sides = up[:k], up[k + 1:]
-        before, after = (side.mean(axis=0) / max(float(np.linalg.norm(side.mean(axis=0))), 1e-9)
-                         for side in sides)
-        apart = _degrees(float(before @ after))
-        if apart > LEAST_TURN and all(_degrees(float((side @ mean).min())) < SIDE for side, mean in
-                                      zip(sides, (before, after), strict=True)):
+    force = np.array([medians(inputs.f_b[a:b])
+                      for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    for k in range(1, len(force) - 1):
+        sides = force[:k], force[k + 1:]
+        before, after = (side.mean(axis=0) for side in sides)
+        # a bend, or another unit, also changes the size
+        size = np.linalg.norm(after) / max(float(np.linalg.norm(before)), 1e-9)
+        if (_apart(before, after) > LEAST_TURN and 1 / SAME_SIZE < size < SAME_SIZE
+                and all(_apart(one, mean) < SIDE for side, mean in zip(
+                    sides, (before, after), strict=True) for one in side)):
             begin, end = inputs.t_imu[edges[k]], inputs.t_imu[edges[k + 1] - 1]
-            return (_moved(f'gravity turns by {apart:.0f} deg', float(begin), float(end)),)
+            return (_moved(f'gravity turns by {_apart(before, after):.0f} deg', float(begin),
+                           float(end)),)
     return ()
 
 
@@ -65,5 +69,7 @@ def _moved(what: str, begin: float, end: float) -> Reason:
                   f'{end:.0f} s: the IMU was moved in the vehicle', DO)
 
 
-def _degrees(cosine: float) -> float:
-    return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+def _apart(one: Floats, other: Floats) -> float:
+    """Return the angle between two vectors, (3,), deg; 0 if one is zero."""
+    sine, cosine = np.linalg.norm(np.cross(one, other)), float(one @ other)
+    return float(np.rad2deg(np.arctan2(sine, cosine)))

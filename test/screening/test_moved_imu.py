@@ -59,3 +59,11 @@ def test_slopes_and_turns_move_no_imu(options):
     inputs, _ = screen(made.leg(), settings(made))
     assert turned_over(inputs) == ()
     assert turned_about(accelerations(inputs, made.options.nominal_scale)) == ()
+
+
+def test_a_bend_of_one_g_moves_no_imu():
+    made = drive(**TOWN)
+    inputs, _ = screen(made.leg(), settings(made))
+    force = inputs.f_b.copy()
+    force[len(force) // 2:] += [0.0, 11.0, 0.0]
+    assert turned_over(replace(inputs, f_b=force)) == ()
