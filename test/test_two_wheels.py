@@ -13,6 +13,7 @@ import pytest
 from odocal_ros.data.samples import OdometerForm, take
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
+from odocal_ros.screening.wheel_travel import unrolled
 
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'seed': 4}
 
@@ -77,6 +78,19 @@ def test_a_span_of_no_round_number_is_taken_with_its_doubt(made, clean):
     doubt = np.linalg.norm(inputs.doubt_sigma)          # of the mean: half the right wheel's
     assert 0 < doubt < 1e-3 * clean.travel.s[-1]
     assert abs(off / 2) < 3 * doubt
+
+
+def test_damaged_counts_are_no_span(made):
+    count = take(made.odometer, slice(1000))
+    value = 10 * np.arange(1000)
+    for row in (200, 400, 600):
+        value[row:row + 2] = 2**63 - 1, -2**63
+    count = changed(count, value=lambda _: value)
+    step = np.diff(value.astype(float))
+    same, found, doubt_t, _ = unrolled(count.stamp_ns * 1e-9, count, step, 'odometer')
+    assert same is count
+    assert not found
+    assert not len(doubt_t)
 
 
 def test_angles_wrapped_at_a_turn_are_unrolled():

@@ -49,7 +49,8 @@ def _scale(t: Floats, fix: Floats, dead: Floats, length: float) -> tuple[float, 
     along = np.clip(along, -most, most)
     block = np.minimum((PARTS * (t[i] - t[0]) / (t[-1] - t[0])).astype(int), PARTS - 1)
     top, bottom = (np.bincount(block, x, PARTS) for x in (size * along, size**2))
-    if (bottom > 0).sum() < PARTS / 2:
+    # without any one block, some weight is left to compare
+    if (bottom > 0).sum() < PARTS / 2 or bottom.max() > bottom.sum() / 2:
         return None
     left = (top.sum() - top) / (bottom.sum() - bottom)
     sigma = np.sqrt((PARTS - 1) / PARTS * ((left - left.mean())**2).sum())

@@ -73,6 +73,8 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
             middle, typical / np.sqrt(3 * len(rows)))
     else:
         return None
+    if whole and span > spans[-1]:       # damaged values: no counter is as wide
+        return None
     agree = np.abs(size - span) <= 2 * slack
     same_span_share = 0.8    # share of the jumps that must agree
     if agree.mean() < same_span_share:

@@ -62,3 +62,9 @@ def test_a_last_window_may_end_a_rounding_after_the_last_fix():
     t[-1] = 34.203      # the last window, 32.203 to 34.203 s, ends at 34.203000000000003 s
     even = np.stack([t, t], axis=-1)
     assert window_scale(t, 1.001 * even, even)[0, 1] == pytest.approx(0.001)
+
+
+def test_a_way_within_one_part_of_the_leg_has_no_scatter():
+    dead = np.zeros((len(T), 2))
+    dead[:, 0] = 1e-9 * T + 1e9 * np.clip(T - 1600.0, 0.0, None)      # all of it, within rounding
+    assert not len(window_scale(T, 1.001 * dead, dead))
