@@ -87,6 +87,8 @@ UNUSABLE = [
     (lambda leg: replace(leg, fix=take(leg.fix, slice(500, 501))), Code.NO_FIX,
      '1 usable fix between the marks'),
     (spoilt('imu', w_i=lambda a: 0 * a), Code.NO_IMU, 'all turn rates are zero'),
+    (spoilt('imu', w_i=lambda a: a * [1.0, 1.0, 0.0]), Code.NO_IMU,
+     'angular_velocity.z is always zero'),
     (spoilt('imu', w_i=sideways, f_i=sideways), Code.IMU_AXES,
      'gravity is on +x (up should be +z)'),
     (lambda leg: replace(leg, stop_ns=leg.start_ns + 14 * 10**9), Code.LEG_TOO_SHORT,

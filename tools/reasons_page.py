@@ -125,7 +125,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.IMU_LOOKS_Z_DOWN: 'Gravity is on -z, as for an IMU with forward-right-down axes. '
         'For this result the IMU was rotated by 180 deg about x.',
         Code.IMU_AXES: 'Gravity is on another axis than z, or accelerations point sideways in '
-        'the IMU frame: the body frame is not forward-left-up.',
+        'the IMU frame: the body frame is not forward-left-up. Or a level axis of the '
+        'accelerometer has the wrong sign, as the accelerations in turns show, or the IMU was '
+        'moved in the vehicle by 45 deg or more.',
         Code.IMU_WORSE_THAN_GRADE: 'IMU errors are larger than its grade. The smoother uses the '
         'noise estimated from the drive instead. Sigmas that only rest on the grade, such as '
         'those of the other methods, are too small.',
@@ -137,7 +139,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.LEVER_ARM_OFF: 'In turns and while leaning, a sensor moves as if it were decimetres '
         'from its configured position. Sliding in turns is not modelled: for a vehicle with skid '
         'steering the estimated point is where it slides least, not the position of the wheel.',
-        Code.GYRO_SIGN: 'The gyro turns opposite to the course of the fixes.',
+        Code.GYRO_SIGN: 'The gyro turns opposite to the course of the fixes, or the accelerations '
+        'in turns are opposite to it.',
         Code.GYRO_AXES: 'One axis of the gyro has the wrong sign, or two are swapped, while the '
         'accelerometer is right. Gravity turns in the frame of the accelerometer when a vehicle '
         'tilts; the gyro must measure that turn. Only slopes, bumps or turns reveal the fault. On '

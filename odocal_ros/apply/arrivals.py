@@ -64,9 +64,10 @@ class Arrivals:
 
     def moved_s(self, rows: int) -> float:
         """Return by how many s the last rows are off the usual lag, 0 if one of them is not."""
-        last = list(self._lags)[-rows:]
-        if len(last) < rows or not self._real_time:
+        if len(self._lags) < rows or not self._real_time or (
+                abs(self._lags[-1] - self._usual_ns) * 1e-9 <= MOVED_S):
             return 0.0
+        last = list(self._lags)[-rows:]
         least = max(min(last) - self._usual_ns, self._usual_ns - max(last)) * 1e-9
         return abs(sum(last) / rows - self._usual_ns) * 1e-9 if least > MOVED_S else 0.0
 

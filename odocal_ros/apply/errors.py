@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.apply.attitude import skewed
+from odocal_ros.apply.attitude import Matrix, plus, skewed, Vector, ZERO
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.settings.grades import Grade
@@ -29,7 +29,7 @@ POSITIONS, ROTATIONS, BIASES, ALL = np.r_[P], np.r_[PHI], np.r_[BG], np.arange(N
 EYE = np.eye(N)
 POSE = np.eye(6, N)       # definition: position and attitude of the IMU in the error state
 # judgement: m/sqrt(m) along, left, up, slip and slide of any road
-ROAD_PER_METRE = np.array([0.005, 0.01, 0.01])
+ROAD_PER_METRE = (0.005, 0.01, 0.01)
 # rad/s, s; judgement: of a turn that may hide in a gap of the IMU; a shorter gap hides its cube
 HIDDEN_IN_GAP, HIDING_GAP = 0.1, 0.1
 # m/s^2; judgement: of driving, that a second of odometer, or more, does not show
@@ -48,7 +48,7 @@ class Errors:
     """
     The covariance of the errors, (16, 16), and its updates by stops and gravity.
 
-    bent : (3,) m in n, what attitude errors do to travel in second order.
+    bent : m in n, what attitude errors do to travel in second order.
     grade : of the IMU.   tilt, bias_sigma : rad, rad/s, sigmas at the start.   earth_left : the
     Earth's turn is in the gyro's bias.
     """
@@ -66,32 +66,31 @@ class Errors:
             np.full(3, grade.accel_bias), [vehicle.scale_sigma, vehicle.pitch_sigma,
                                            vehicle.yaw_sigma, grade.gyro_scale_error]])
         self.cov[ALL, ALL] = sigma**2
-        self.bent = np.zeros(3)
+        self.bent = ZERO
         # x of odom is where the vehicle heads: what the yaw errs by is in the attitude, reversed
         self.cov[5, 5] = vehicle.yaw_sigma**2
         self.cov[5, 14] = self.cov[14, 5] = -vehicle.yaw_sigma**2
 
-    def grow(self, T: float, C_nb: Floats, way_n: Floats, turn_n: Floats, axes_n: Floats,
+    def grow(self, T: float, C_nb: Floats, way_n: Vector, turn_n: Vector, axes_n: Floats,
              doubt: float = 0.0, gaps: Sequence[float] = ()) -> None:
         """
         Carry the errors over an interval.
 
-        T : s.   C_nb : (3, 3) in its middle.   way_n, turn_n : (3,) m, rad.
+        T : s.   C_nb : (3, 3) in its middle.   way_n, turn_n : m, rad.
         axes_n : (3, 3) columns forward, left, up.   doubt : m^2, variance of uncertain travel.
         gaps : s, parts of the interval without IMU data.
         """
         F = EYE.copy()
-        cross = skewed(way_n.tolist())
+        cross = skewed(way_n)
         F[P, PHI], F[P, K], F[P, M] = -cross, way_n, -cross @ C_nb[:, 1:]
-        F[PHI, BG], F[PHI, G] = C_nb * -T, -turn_n
+        F[PHI, BG], F[PHI, G] = C_nb * -T, plus(ZERO, turn_n, -1.0)
         F[P, BG], F[P, G] = cross @ C_nb * (T / 2), cross @ turn_n / 2
         tilts = self.cov[ROTATIONS, ROTATIONS].tolist()
-        self.bent = self.bent + way_n * min(BEND * sum(tilts), MOST_BENT)
+        self.bent = plus(self.bent, way_n, min(BEND * sum(tilts), MOST_BENT))
         cov = F @ self.cov @ F.T
-        road = self.road(math.hypot(*way_n.tolist()))
-        road[0] += doubt
+        along, left, up = self.road(math.hypot(*way_n))
         hidden = sum(HIDDEN_IN_GAP * gap * min(1.0, gap / HIDING_GAP)**2 for gap in gaps)
-        cov[P, P] += axes_n * road @ axes_n.T
+        cov[P, P] += axes_n * [along + doubt, left, up] @ axes_n.T
         if hidden:
             cov[P, P] += cross @ cross.T * hidden**2
         cov[ALL, ALL] += self._walks * T
@@ -99,9 +98,10 @@ class Errors:
         self.cov = cov
 
     @staticmethod
-    def road(path_length: float) -> Floats:
+    def road(path_length: float) -> Vector:
         """Return the variance of travel by slip and sideslip along, left and up, m^2."""
-        return ROAD_PER_METRE**2 * abs(path_length)
+        along, left, up = ROAD_PER_METRE
+        return along**2 * abs(path_length), left**2 * abs(path_length), up**2 * abs(path_length)
 
     def lost(self, path_length: float) -> None:
         """Add travel, m, of unknown direction."""
@@ -154,16 +154,18 @@ class Errors:
         self.cov = keep @ cov @ keep.T + gain @ R @ gain.T
         return gain @ z
 
-    def pose(self, C_nb: Floats, arm_n: Floats) -> Floats:
+    def pose(self, C_nb: Matrix, arm_n: Vector, late: Sequence[float], along_n: Vector) -> Floats:
         """
         Return the covariance of position, m, and rotation of the vehicle, rad, in n: (6, 6).
 
-        arm_n : (3,) m, from the odometer's point to what the position is of.
+        arm_n : m, from the odometer's point to what the position is of.   late : 6 m, rad, sigma
+        of a common cause.   along_n : m, sigma of a count along the path, at this time.
         """
         J = POSE.copy()
-        J[3:, M] = C_nb[:, 1:]
-        J[:3, 3:] = -skewed(arm_n.tolist()) @ J[3:, 3:]
-        cov: Floats = J @ self.cov @ J.T
+        J[3:, M] = [row[1:] for row in C_nb]
+        J[:3, 3:] = -skewed(arm_n) @ J[3:, 3:]
+        off = np.array([late, (*along_n, *ZERO), (*self.bent, *ZERO)])
+        cov: Floats = J @ self.cov @ J.T + off.T @ off
         # two rotations leave half their product about the third axis
         a, b, c = self.cov[ROTATIONS, ROTATIONS].tolist()
         cov[ROTATIONS, ROTATIONS] += [b * c / 4, a * c / 4, a * b / 4]

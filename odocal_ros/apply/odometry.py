@@ -100,6 +100,10 @@ class Odometry:
         """Return by how many s the odometer has not reached the next pose, inf without a path."""
         return math.inf if self._path is None else self._path.lacking_s()
 
+    def wait_s(self) -> float:
+        """Return in how many s the samples of the next pose exist, if they come without delay."""
+        return self.lacking_s() + self.imu.usual
+
     def poses(self) -> list[Pose]:
         """Return the poses that what was fed since the last call allows."""
         apart = self.apart()

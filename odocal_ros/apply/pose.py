@@ -3,6 +3,7 @@
 
 """Poses and twists of the odometry, with their covariances."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import math
@@ -16,7 +17,7 @@ from odocal_ros.settings.levels import SWAY
 
 # definition: in the numbers of a pose, diagonals of both covariances
 VARIANCES = np.r_[7:43:7, 49:85:7]
-AXES, POSITION = np.eye(3), np.arange(3)
+AXES = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,33 +50,22 @@ class Pose:
         return math.isfinite(self.numbers.sum()) and bool(self.numbers[VARIANCES].min() >= 0)
 
 
-def pose_covariance(vehicle: Vehicle, errors: Errors, C_nb: Floats, arm_n: Floats, late: Floats,
-                    along: float) -> Floats:
-    """
-    Return the covariance of position and rotation: (6, 6).
-
-    C_nb, arm_n : as ``Errors.pose`` takes them.   late : (6,) m, rad, sigma of a common cause.
-    along : m^2, of a count along the path, at this time.
-    """
-    off = np.zeros((3, 6))
-    off[0], off[1, :3], off[2, :3] = late, C_nb @ vehicle.forward_b * math.sqrt(along), errors.bent
-    return errors.pose(C_nb, arm_n) + off.T @ off
-
-
-def twist_covariance(vehicle: Vehicle, errors: Errors, speed: float, rate: Floats, T: float,
-                     variance: float) -> Floats:
+def twist_covariance(vehicle: Vehicle, errors: Errors, speed: float, swing: Sequence[float],
+                     T: float, variance: float) -> Floats:
     """
     Return the covariance of a mean twist over T s, of base_link: (6, 6).
 
-    speed : m/s, of the odometer's point.   rate : (3,) rad/s.   variance : m^2, of travel in T
-    beside that of scale and road.
+    speed : m/s, of the odometer's point.   swing : 6 m/s, rad/s, the twist but for the speed.
+    variance : m^2, of travel in T beside that of scale and road.
     """
     B, grade = vehicle.twist_b, errors.grade
     turn_b = errors.cov[BG, BG] + AXES * (grade.gyro_noise**2 / T)
-    off_b = rate @ vehicle.C_vb * grade.gyro_scale_error
-    turn_b += off_b[:, None] * off_b
-    cov: Floats = B @ turn_b @ B.T
+    along, left, up = (variance / T for variance in errors.road(speed))
+    along += (speed * vehicle.scale_sigma)**2 + variance / T**2 + 1e-6
     # a body that turns too much about an arm moves too much
-    along = (speed * vehicle.scale_sigma)**2 + variance / T**2 + 1e-6
-    cov[POSITION, POSITION] += [along, SWAY**2, SWAY**2] + errors.road(speed * T) / T**2
+    off = np.array([[one * grade.gyro_scale_error for one in swing],
+                    [math.sqrt(along), 0.0, 0.0, 0.0, 0.0, 0.0],
+                    [0.0, math.sqrt(left + SWAY**2), 0.0, 0.0, 0.0, 0.0],
+                    [0.0, 0.0, math.sqrt(up + SWAY**2), 0.0, 0.0, 0.0]])
+    cov: Floats = B @ turn_b @ B.T + off.T @ off
     return cov

@@ -29,7 +29,7 @@ from odocal_ros.apply.attitude import (
     ZERO,
 )
 from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
-from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
+from odocal_ros.apply.pose import Pose, twist_covariance
 from odocal_ros.apply.start import Start
 from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle
@@ -45,7 +45,7 @@ CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
 # judgement: corrections in turn that force and motion disagree at, after which the attitude is
 # false; m/s^2 that the force is then as long as gravity to
 MOST_APART, AS_GRAVITY = 10, 1.0
-ROWS_BEHIND = 200         # judgement: of the IMU, before they are dropped; each block copies them
+ROWS_BEHIND = 200         # judgement: of the IMU, before they are dropped
 GROW_PERIOD = 0.05        # s; judgement: in which a covariance hardly grows
 PLAUSIBLE = np.zeros(3)   # rad: no turn is implausible
 TILT_LOST = 0.5           # rad; judgement: sigma beyond which a straight line levels nothing
@@ -63,23 +63,24 @@ class Reckoning:
         self.imu, self.wheels, self.vehicle, self.config = imu, wheels, vehicle, config
         self._notes, self._delay_sigma, self.failed = notes, delay_sigma, ''
         self.q: Quaternion = tuple(start.q_nb.tolist())
-        self.bias, self.errors = start.gyro_bias, start.errors
-        self.accel_bias = np.zeros(3)
+        self.bias: Vector = tuple(start.gyro_bias.tolist())
+        self.accel_bias, self.errors = ZERO, start.errors
         self.position = ZERO      # of the odometer's point, from where it began
         self.imu.drop(start.row)
-        self._earth_n, self._forward_b = start.earth_n, vehicle.forward_b.tolist()
-        self._t = self._t_pose = self._t_look = float(self.imu.t[self.imu.at])
+        self._earth_n, self._forward_b = start.earth_n.tolist(), vehicle.forward_b.tolist()
+        self._arm_b, self._q_bv = vehicle.arm_b.tolist(), vehicle.q_bv.tolist()
+        self._t = self._t_pose = self._t_look = self.imu.rows[self.imu.at].t
         self._s = self._s_pose = self.wheels.at(self._t)
-        self._C_nb = np.array(matrix_of(self.q))
+        self._C_nb = matrix_of(self.q)
         self._turn_b, self._dv_n, self._levels = ZERO, ZERO, True
         self._T_grow, self._way_grow, self._turn_grow = 0.0, ZERO, ZERO
-        self._w_look: list[Floats] = []
+        self._w_look: list[Vector] = []
         self._rested, self._apart, self._strange_turn = False, 0, PLAUSIBLE
         self._v_look = self._velocity_n(self._t)
         # m/s in n, at the start, and what turns added
         self._swung: Vector = tuple(self._v_look.tolist())
         self._moved = self._stays = 0.0      # s, by which a clock moved, and for good
-        self._arm0_n = self._C_nb @ -vehicle.arm_b
+        self._arm0_n = rotated(self._C_nb, self._arm_b)
 
     def poses(self, moved: float = 0.0, stays: float = 0.0) -> list[Pose]:
         """
@@ -94,7 +95,7 @@ class Reckoning:
         self._stays = max(self._stays, stays)
         self._moved = max(self._stays, moved)
         while not self.failed and (last := self._next()) is not None:
-            received = self.imu.t[last] <= self.wheels.newest()
+            received = self.imu.rows[last].t <= self.wheels.newest()
             self._advance(last)
             if self.failed:
                 break
@@ -114,27 +115,24 @@ class Reckoning:
 
     def _next(self) -> int | None:
         """Return the row to advance to: a pose is due and all it needs has come; else None."""
-        t, at = self.imu.t, self.imu.at
-        period = 1 / self.config.publish.rate
-        last = int(np.searchsorted(t, self._t_pose + period - 1e-6))
-        last = max(last, at + 1)
-        if last > len(t) - 2:            # a cubic needs the sample beyond
+        rows, period = self.imu.rows, 1 / self.config.publish.rate
+        last = self.imu.from_time(self._t_pose + period - 1e-6, self.imu.at + 1)
+        if last > len(rows) - 2:            # a cubic needs the sample beyond
             return None
-        if t[last] > self.wheels.newest() and t[-1] - t[last] < ODOMETER_SILENCE:
-            return None
-        return last
+        t = rows[last].t
+        return last if t <= self.wheels.newest() or rows[-1].t - t >= ODOMETER_SILENCE else None
 
     def _advance(self, last: int) -> None:
         """Go to a row of the IMU."""
         imu, at = self.imu, self.imu.at
         low = max(at - 1, 0)      # a cubic needs the sample before and the one beyond
-        t = imu.t[low:last + 2].tolist()
-        w = (imu.w_b[low:last + 2] - self.bias).tolist()
-        f = (imu.f_b[at:last + 1] - self.accel_bias).tolist()
+        t = [row.t for row in imu.rows[low:last + 2]]
+        w = [plus(row.w_b, self.bias, -1.0) for row in imu.rows[low:last + 2]]
+        f = [plus(row.f_b, self.accel_bias, -1.0) for row in imu.rows[at:last + 1]]
         s = [self.wheels.at(one) for one in t[at - low:-1]]
         gaps = [b - a for a, b in zip(t[at - low:-2], t[at - low + 1:-1], strict=True)]
         lost, self._s = abs(s[0] - self._s), s[-1]
-        C_nb, turn_b, way_n, dv_n = self._C_nb.tolist(), ZERO, ZERO, ZERO
+        C_nb, turn_b, way_n, dv_n = self._C_nb, ZERO, ZERO, ZERO
         forward_n, f_n = rotated(C_nb, self._forward_b), rotated(C_nb, f[0])
         for k, T in enumerate(gaps):
             phi = rotation_increment(t, w, at - low + k)
@@ -144,26 +142,26 @@ class Reckoning:
             turn_b = plus(turn_b, phi)
             way_n = plus(way_n, plus(forward_before, forward_n), (s[k + 1] - s[k]) / 2)
             dv_n = plus(dv_n, plus(f_before, f_n), T / 2)
-        self._C_nb = np.array(C_nb)
+        self._C_nb = C_nb
         self.position, self._dv_n = plus(self.position, way_n), plus(self._dv_n, dv_n)
         T, turn_n = t[-2] - self._t, rotated(C_nb, turn_b)
         self._grow(T, way_n, turn_n, [gap for gap in gaps if gap > HOLE_INTERVALS * imu.usual],
                    self.wheels.doubt(self._t, t[-2]))
         self._swung = plus(self._swung, cross(turn_n, way_n), 1 / T)
-        self._doubt_turn(imu.strange[at + 1:last + 1], np.array(gaps), self._C_nb)
+        self._doubt_turn([row.strange for row in imu.rows[at + 1:last + 1]], gaps)
         if lost > self.wheels.quantum:
             self.errors.lost(lost)
         calm = self._strange_turn is PLAUSIBLE and max(gaps) <= IMU_HOLE
         self._levels &= calm and math.isfinite(sum(dv_n))
         self._turn_b = plus(self._turn_b, turn_b)
-        self._w_look.append(imu.w_b[at + 1:last + 1])
+        self._w_look += [row.w_b for row in imu.rows[at + 1:last + 1]]
         self._t, imu.at = t[-2], last
 
     def _turn(self, phi: Vector, T: float) -> Matrix:
         """Turn the attitude by a rotation vector of b, rad, over T s; return its matrix."""
         self.q = product(self.q, rotation(phi))
-        if self._earth_n.any():
-            self.q = product(rotation((-T * self._earth_n).tolist()), self.q)
+        if any(self._earth_n):
+            self.q = product(rotation(plus(ZERO, self._earth_n, -T)), self.q)
         return matrix_of(self.q)
 
     def _grow(self, T: float, way_n: Vector, turn_n: Vector, gaps: list[float],
@@ -173,20 +171,21 @@ class Reckoning:
         self._way_grow = plus(self._way_grow, way_n)
         self._turn_grow = plus(self._turn_grow, turn_n)
         if self._T_grow > GROW_PERIOD - 1e-6 or doubt or gaps:
-            way, turn, axes_n = self._way_grow, self._turn_grow, self._C_nb @ self.vehicle.C_vb.T
-            self.errors.grow(self._T_grow, self._C_nb, np.array(way), np.array(turn), axes_n,
-                             doubt, gaps)
+            C_nb = np.array(self._C_nb)
+            self.errors.grow(self._T_grow, C_nb, self._way_grow, self._turn_grow,
+                             C_nb @ self.vehicle.C_vb.T, doubt, gaps)
             self._T_grow, self._way_grow, self._turn_grow = 0.0, ZERO, ZERO
 
-    def _doubt_turn(self, strange: Floats, gaps: Floats, C_nb: Floats) -> None:
-        """Add variance for implausible turn rates: (n, 3) rad/s over n gaps of s, in b."""
-        if not strange.any():
+    def _doubt_turn(self, strange: list[Vector], gaps: list[float]) -> None:
+        """Add variance for implausible turn rates of b, rad/s, over gaps of s."""
+        if all(size is ZERO for size in strange):
             self._strange_turn = PLAUSIBLE
             return
+        C_nb = np.array(self._C_nb)
         if self._strange_turn is PLAUSIBLE:
-            self._notes.append(f'the gyro jumps in one sample by {strange.max():.2g} rad/s, more '
-                              'than a vehicle can turn: the gyro is down-weighted')
-        turn = self._strange_turn + gaps @ strange
+            self._notes.append(f'the gyro jumps in one sample by {np.max(strange):.2g} rad/s, '
+                              'more than a vehicle can turn: the gyro is down-weighted')
+        turn = self._strange_turn + np.array(gaps) @ strange
         self.errors.turned(C_nb @ np.diag(turn**2 - self._strange_turn**2) @ C_nb.T)
         self._strange_turn = turn
         if np.sqrt(self.errors.cov[[3, 4], [3, 4]].max()) > TILT_LOST:
@@ -194,12 +193,11 @@ class Reckoning:
 
     def _velocity_n(self, t: float) -> Floats:
         """Return the velocity of the IMU in n, by the odometer's last rows."""
-        v, C_nb = self.vehicle, self._C_nb
+        v, C_nb = self.vehicle, np.array(self._C_nb)
         moved = self.wheels.at(t) - self.wheels.at(t - SPEED_SPAN)
         arm_b = v.C_vb.T @ self.config.imu.lever_arm + v.arm_b
-        rate = self.imu.w_b[self.imu.at] - self.bias
-        return C_nb @ (
-            v.forward_b * moved / SPEED_SPAN + cross(rate.tolist(), arm_b.tolist()))
+        rate = plus(self.imu.rows[self.imu.at].w_b, self.bias, -1.0)
+        return C_nb @ (v.forward_b * moved / SPEED_SPAN + cross(rate, arm_b.tolist()))
 
     def _look(self) -> None:
         """Correct tilt and gyro bias, a second after the last time."""
@@ -207,7 +205,7 @@ class Reckoning:
         if T < CORRECTION_PERIOD - 1e-6:
             return
         velocity, received = self._velocity_n(self._t), self._t <= self.wheels.newest()
-        w = np.concatenate(self._w_look)
+        w = np.array(self._w_look)
         resting = received and self.wheels.still(self._t_look, self._t) and bool(
             (w.std(axis=0) < REST_TURN).all()
             and (np.abs(w.mean(axis=0) - self.bias) < REST_TURN).all())
@@ -218,7 +216,7 @@ class Reckoning:
             doubt = self.wheels.doubt(self._t_look, self._t)      # changes the speed in T
             noise = 2 * np.hypot(self.wheels.quantum / SPEED_SPAN / T, np.sqrt(doubt) / T**2)
             by = self.errors.by_gravity(
-                self._C_nb, off_n, T,
+                np.array(self._C_nb), off_n, T,
                 0.0 if standing and not doubt else np.hypot(SHAKING, noise))
             if by is None:
                 self._take_apart(off_n, velocity, T, w)
@@ -229,8 +227,8 @@ class Reckoning:
                 self.errors.turned(np.eye(3) * np.sum(by[PHI]**2)**2 / 4)
         if self.config.levelling and standing:
             variance = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
-            earth_b = self._C_nb.T @ self._earth_n
-            self._correct(self.errors.by_rest(w.mean(axis=0) - self.bias - earth_b, variance))
+            rate_b = w.mean(axis=0) - self.bias - np.transpose(self._C_nb) @ self._earth_n
+            self._correct(self.errors.by_rest(rate_b, variance))
         self._rested = resting
         self._t_look, self._v_look = self._t, self._velocity_n(self._t)
         self._dv_n, self._levels, self._w_look = ZERO, True, []
@@ -254,44 +252,44 @@ class Reckoning:
 
     def _correct(self, by: Floats) -> None:
         self.q = product(rotation(by[PHI].tolist()), self.q)
-        self._C_nb = np.array(matrix_of(self.q))
-        self.bias = self.bias + by[BG]
-        self.accel_bias = self.accel_bias + by[BA]
+        self._C_nb = matrix_of(self.q)
+        self.bias = plus(self.bias, by[BG].tolist())
+        self.accel_bias = plus(self.accel_bias, by[BA].tolist())
 
     def _pose(self) -> Pose:
         """Return the pose at the row reached."""
         v, T, C_nb = self.vehicle, self._t - self._t_pose, self._C_nb
-        arm_n = C_nb @ v.arm_b
-        rate_b = np.array(self._turn_b) / T - C_nb.T @ self._earth_n
-        rate = v.C_vb @ rate_b
+        arm_n, C_bn = rotated(C_nb, self._arm_b), tuple(zip(*C_nb, strict=True))
+        rate_b = plus(plus(ZERO, self._turn_b, 1 / T), rotated(C_bn, self._earth_n), -1.0)
+        swing = (v.twist_b @ rate_b).tolist()
         speed = (self._s - self._s_pose) / T
-        velocity = np.array(cross(v.lever_arm.tolist(), rate.tolist()))
-        velocity[0] += speed
         if abs(speed) > FASTEST:
             self._notes.append(f'{speed:.0f} m/s is implausible: the calibration belongs to '
                               'another odometer or unit')
-        quantum, jitter = self.wheels.quantum, self.wheels.jitter(self._t, T)
+        rounding, jitter = self.wheels.quantum**2 / 6, self.wheels.jitter(self._t, T)
         doubt = self.wheels.doubt(self._t - T, self._t)
-        pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
-                    np.array(product(self.q, v.q_bv.tolist())), velocity, rate,
-                    pose_covariance(v, self.errors, C_nb, arm_n, self._late(speed, rate_b),
-                                    quantum**2 / 6 + self.wheels.between(self._t) + jitter / 2),
-                    twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt
-                                     + jitter))
+        along = math.sqrt(rounding + self.wheels.between(self._t) + jitter / 2)
+        forward_n = rotated(C_nb, self._forward_b)
+        pose = Pose(self.imu.rows[self.imu.at].stamp_ns,
+                    np.array(plus(plus(self.position, arm_n), self._arm0_n, -1.0)),
+                    np.array(product(self.q, self._q_bv)),
+                    np.array((swing[0] + speed, *swing[1:3])), np.array(swing[3:]),
+                    self.errors.pose(C_nb, arm_n, self._late(plus(ZERO, forward_n, speed), rate_b),
+                                     plus(ZERO, forward_n, along)),
+                    twist_covariance(v, self.errors, speed, swing, T, rounding + doubt + jitter))
         self._t_pose, self._s_pose, self._turn_b = self._t, self._s, ZERO
         return pose
 
-    def _late(self, speed: float, rate_b: Floats) -> Floats:
+    def _late(self, velocity_n: Vector, rate_b: Vector) -> tuple[float, ...]:
         """
-        Return by how much a pose is off, (6,) m, rad in n, by the times of odometer and IMU.
+        Return by how much a pose is off, m, rad in n, by the times of odometer and IMU.
 
-        speed : m/s.   rate_b : (3,) rad/s.   A delay shifts travel by what accelerations along
+        velocity_n : m/s.   rate_b : rad/s.   A delay shifts travel by what accelerations along
         the path changed of the velocity; a clock that moved shifts the time of the pose too.
         """
-        way_n = self._C_nb @ self.vehicle.forward_b * speed - self._swung
-        return np.concatenate([way_n * math.hypot(
-            self._delay_sigma, self._moved, self.wheels.delay_s),
-                               self._C_nb @ rate_b * self._moved])
+        delay = math.hypot(self._delay_sigma, self._moved, self.wheels.delay_s)
+        return (*plus(ZERO, plus(velocity_n, self._swung, -1.0), delay),
+                *plus(ZERO, rotated(self._C_nb, rate_b), self._moved))
 
     def _leave_behind(self, last: int) -> None:
         """Forget what lies behind, but for the rows that determine the usual interval."""

@@ -2,15 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Implausible rows of the IMU, detected in a stream.
+Implausible rows of the IMU, detected in a stream, in plain numbers: a block has two or three.
 
 A leg is screened as a whole (``screening/glitches.py``); a stream has its past, and what follows
 within the time that a spike may take. The limits are those of the leg.
 """
 
-import numpy as np
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
+import math
+from operator import itemgetter
+from typing import NamedTuple
 
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.apply.attitude import Vector, ZERO
 from odocal_ros.screening.glitches import (
     BACK_SHARE,
     EQUAL_NEIGHBOURS,
@@ -31,16 +37,34 @@ STUCK_TIME = 0.1          # s; judgement: of rows equal in every bit, after whic
 TURN_CHANGE = 10.0        # rad/s^2; physical: no vehicle starts to turn faster, but over a stone
 STRANGE_TURN_TIME = 1.0        # s; judgement: after which a turn that began so is one
 ALONE_CHANGE = 2.5        # rad/s^2; judgement: of a step that stands alone: turns begin slower
-LARGEST = np.repeat([MOST_TURN, MOST_FORCE], 3)
-IS_FORCE = np.repeat([False, True], 3)
-LEAST_STEPS = np.array([TURN_STEP, FORCE_STEP])
-SINGLES = np.repeat([SINGLE_TURN, SINGLE_FORCE], 3)
+SINGLES = (SINGLE_TURN,) * 3 + (SINGLE_FORCE,) * 3
+SINGLE_ROWS = ROWS_BESIDE + 4      # definition: rows that ``is_single`` looks at
+MISSING = (math.nan, math.nan, math.nan)      # definition: m/s^2, where no force is sent
 
 
-def beyond_sensor(x_b: Floats) -> Bools:
-    """Return a mask of impossible rows: (n, 6) rad/s and m/s^2; a force of NaN is missing."""
-    odd: Bools = (~(np.abs(x_b) <= LARGEST) & ~(np.isnan(x_b) & IS_FORCE)).any(axis=1)
-    return odd
+class Row(NamedTuple):
+    """
+    A row of the IMU.
+
+    t : s since the first.   w_b, f_b : rad/s, m/s^2, MISSING: no force is sent.
+    strange : rad/s, size of an implausible turn rate.
+    """
+
+    t: float
+    stamp_ns: int
+    w_b: Vector
+    f_b: Vector
+    strange: Vector = ZERO
+
+
+time_of = itemgetter(0)      # definition: of a row, to search by
+Pair = tuple[float, float]
+
+
+def is_possible(w_b: Vector, f_b: Vector) -> bool:
+    """Return True if a sensor can show a turn rate, rad/s, and a force, m/s^2 or MISSING."""
+    return all(abs(w) <= MOST_TURN for w in w_b) and (
+        f_b is MISSING or all(abs(f) <= MOST_FORCE for f in f_b))
 
 
 class SpikeScreen:
@@ -52,154 +76,125 @@ class SpikeScreen:
     """
 
     def __init__(self) -> None:
-        self._usual = np.zeros(2)           # of steps from row to row, in LEAST_STEPS: gyro, force
+        self._usual = 0.0, 0.0              # of steps from row to row, as ``_step`` has them
         self._since = 0.0                   # s, since when the rows are equal
-        self._w: Floats = np.empty((0, 3))       # rad/s, of the rows before the last one
-        self._strange = np.zeros(3)         # rad/s, step of the gyro that no vehicle makes
-        self._before = np.zeros(3)          # rad/s, rate before it
+        self._kept: deque[Row] = deque(maxlen=ROWS_BESIDE + 1)
+        self._dropped = False               # a row since the last one kept
+        self._strange = ZERO                # rad/s, step of the gyro that no vehicle makes
+        self._before = ZERO                 # rad/s, rate before it
         self._until = 0.0                   # s
 
-    def sift(self, t: Floats, x: Floats) -> tuple[Bools, Floats, int]:
+    def sift(self, rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+        """Return the rows to keep, with their implausible rates, and the rows to hold."""
+        kept, k = [], 0
+        while k < len(rows):
+            row, last = rows[k], self._kept[-1] if self._kept else rows[k]
+            step, alone, back = _step(last, row), self._alone(rows[k:k + 2]), None
+            if any(self._leaves(step)) and not self._is_over(row):
+                within = bisect_right(rows, last.t + GLITCH_TIME, key=time_of)
+                back = self._back(last, rows[k + 1:within], step)
+                if back is None and within == len(rows):
+                    break
+            if any(alone) and k + 1 == len(rows) and back is None:
+                break                  # the next row shows whether it is alone
+            self._learn(step)
+            if any(step) or not any(row.w_b) or not self._kept:      # a gyro may have a dead band
+                self._since = row.t
+            self._dropped = back is not None or row.t - self._since > STUCK_TIME
+            if not self._dropped:
+                strange = self._strange_of(last, row, alone)
+                kept.append(row if strange is ZERO else row._replace(strange=strange))
+                self._kept.append(row)
+            k += 1 + (back or 0)
+        return kept, list(rows[k:])
+
+    def _alone(self, rows: Sequence[Row]) -> tuple[bool, ...]:
         """
-        Return masks of rows to keep and to hold, and the implausible part of their rates.
-
-        t : (n,) s, the first row is the last one kept.   x : (n, 6) rad/s and m/s^2.
-        Returns (n,) bool, (n, 3) rad/s, 0 where the rate is plausible, and the
-        index of the first row to hold, n for none.
-        """
-        alone = self._alone(t, x[:, :3])
-        keep, strange, hold = self._sifted(t, x, alone)
-        self._w = np.concatenate([self._w, x[:hold, :3][keep[:hold]]])[-ROWS_BESIDE - 1:-1]
-        return keep, strange, hold
-
-    def _sifted(self, t: Floats, x: Floats, alone: Bools) -> tuple[Bools, Floats, int]:
-        keep, strange = np.ones(len(t), bool), np.zeros((len(t), 3))
-        if not alone.any() and self._calm(t, x):
-            return keep, strange, len(t)
-        last, j = 0, 1
-        while j < len(t):
-            step = _size(x[j] - x[last])
-            back = None
-            if (step > self._allowed()).any() and not self._is_over(t[j], x[j, :3]):
-                within = int(np.searchsorted(t, t[last] + GLITCH_TIME, side='right'))
-                back = self._back(x[j + 1:within] - x[last], step)
-                if back is None and within == len(t):
-                    return keep, strange, j
-            if alone[j].any() and j + 1 == len(t) and back is None:
-                return keep, strange, j        # the next row shows whether it is alone
-            self._learn(step[None])
-            if back is not None:
-                keep[j:j + 1 + back] = False
-                j += 1 + back
-                continue
-            if step.any() or not x[j, :3].any():      # a gyro may have a dead band
-                self._since = t[j]
-            keep[j] = t[j] - self._since <= STUCK_TIME
-            strange[j] = self._strange_of(t[j], x[j, :3], t[last], x[last, :3],
-                                          alone[j] & (last == j - 1))
-            last, j = (j, j + 1) if keep[j] else (last, j + 1)
-        return keep, strange, len(t)
-
-    def _is_over(self, t: float, w: Floats) -> bool:
-        """Return True if the gyro is back at its value before an implausible step."""
-        return bool(self._strange.any()) and (t > self._until or bool(
-            (np.abs(w - self._before) <= BACK_SHARE * np.abs(self._strange)).all(
-                where=self._strange != 0)))
-
-    def _alone(self, t: Floats, w: Floats) -> Bools:
-        """
-        Return a mask of rates after a step that stands alone: (n, 3) rad/s to (n, 3) bool.
+        Return a mask of the rates of the first of two rows that follow a step which stands alone.
 
         A vehicle starts to turn over several rows; a sensor fault may start with one step.
         """
-        rows = np.concatenate([self._w, w])
-        size = np.abs(rows[1:] - rows[:-1])
-        out = np.zeros(w.shape, bool)
-        if len(size) <= ROWS_BESIDE or size.max() <= SINGLE_TURN:
-            return out
-        beside = np.zeros(size.shape)
-        beside[:-1] = size[1:]
-        for k in range(1, ROWS_BESIDE + 1):
-            np.maximum(beside[k:], size[:-k], out=beside[k:])
-        least = np.maximum(SINGLE_TURN, ALONE_CHANGE * np.diff(t)[:, None])
-        new = slice(len(self._w), None)
-        out[1:] = size[new] > np.maximum(least, SINGLE_TIMES * beside[new])
-        out[:max(0, ROWS_BESIDE + 1 - len(self._w))] = False      # too few rows before
-        return out
+        kept = self._kept
+        if self._dropped or len(kept) <= ROWS_BESIDE or (
+                _largest(kept[-1].w_b, rows[0].w_b) <= SINGLE_TURN):
+            return ()
+        steps = [[abs(b - a) for a, b in zip(one.w_b, other.w_b, strict=True)]
+                 for one, other in pairwise((*kept, *rows))]
+        own = steps.pop(ROWS_BESIDE)
+        least = max(SINGLE_TURN, ALONE_CHANGE * (rows[0].t - kept[-1].t))
+        return tuple(size > max(least, SINGLE_TIMES * max(beside))
+                     for size, *beside in zip(own, *steps, strict=True))
 
-    def _strange_of(self, t: float, w: Floats, t_last: float, w_last: Floats,
-                    alone: Bools) -> Floats:
-        """
-        Return the implausible part of a rate, (3,) rad/s, from the step where it started.
+    def _is_over(self, row: Row) -> bool:
+        """Return True if the gyro is back at its value before an implausible step."""
+        return self._strange is not ZERO and (row.t > self._until or all(
+            abs(w - before) <= BACK_SHARE * size for w, before, size in zip(
+                row.w_b, self._before, self._strange, strict=True) if size))
 
-        alone : (3,) bool, the axes whose step stands alone.
-        """
-        if self._is_over(t, w):
-            self._strange = np.zeros(3)
-            return self._strange
-        step = np.abs(w - w_last)
-        most = max(TURN_CHANGE * (t - t_last), USUAL_STEPS * TURN_STEP * self._usual[0])
-        odd = (step > most) | alone
-        if not self._strange.any() and odd.any():
-            self._strange, self._before = np.where(odd, step, 0.0), w_last
-            self._until = t + STRANGE_TURN_TIME
+    def _strange_of(self, last: Row, row: Row, alone: Sequence[bool]) -> Vector:
+        """Return the implausible part of a rate, rad/s, from the step where it started."""
+        if self._is_over(row):
+            self._strange = ZERO
+        elif self._strange is ZERO:
+            most = max(TURN_CHANGE * (row.t - last.t), USUAL_STEPS * TURN_STEP * self._usual[0])
+            if any(alone) or _largest(last.w_b, row.w_b) > most:
+                steps = (abs(b - a) for a, b in zip(last.w_b, row.w_b, strict=True))
+                x, y, z = (size if odd or size > most else 0.0
+                           for size, odd in zip(steps, alone or ZERO, strict=True))
+                self._strange, self._before = (x, y, z), last.w_b
+                self._until = row.t + STRANGE_TURN_TIME
         return self._strange
 
-    def _calm(self, t: Floats, x: Floats) -> bool:
-        """Return True if no row of a block needs a closer check."""
-        if len(x) < 2:
-            return True
-        sizes = _size(x[1:] - x[:-1])
-        turn, force = self._allowed().tolist()
-        turn = min(turn, TURN_CHANGE / TURN_STEP * float((t[1:] - t[:-1]).min()))
-        largest, force_largest = sizes.max(axis=0).tolist()
-        calm = not (largest > turn or force_largest > force or self._strange.any()) and bool(
-            sizes.any(axis=1).all())
-        if calm:
-            self._learn(sizes)
-            self._since = t[-1]
-        return calm
+    def _leaves(self, step: Pair) -> tuple[bool, bool]:
+        """Return a mask of gyro and force: the step is larger than a vehicle's."""
+        (turn, force), (usual_turn, usual_force) = step, self._usual
+        return (turn > max(1.0, USUAL_STEPS * usual_turn),
+                force > max(1.0, USUAL_STEPS * usual_force))
 
-    def _allowed(self) -> Floats:
-        return np.maximum(1.0, USUAL_STEPS * self._usual)
+    def _learn(self, step: Pair) -> None:
+        """Let the usual step follow; one spike hardly changes it."""
+        (turn, force), (usual_turn, usual_force) = step, self._usual
+        self._usual = (
+            usual_turn + (min(turn, 4 * usual_turn + 1 / USUAL_STEPS) - usual_turn) / USUAL_ROWS,
+            usual_force + (min(force, 4 * usual_force + 1 / USUAL_STEPS) - usual_force)
+            / USUAL_ROWS)
 
-    def _learn(self, steps: Floats) -> None:
-        most = 4 * self._usual + 1 / USUAL_STEPS       # one spike hardly changes the usual size
-        share = 1 - (1 - 1 / USUAL_ROWS)**len(steps)
-        mean = np.minimum(steps, most).sum(axis=0) / len(steps)
-        self._usual = self._usual + (mean - self._usual) * share
-
-    def _back(self, away: Floats, step: Floats) -> int | None:
+    def _back(self, last: Row, rows: Sequence[Row], step: Pair) -> int | None:
         """Return at which of the rows after a step the values are back, None if at none."""
-        bound = step > self._allowed()
-        for k, row in enumerate(away):
-            if (_size(row)[bound] <= BACK_SHARE * step[bound]).all():
+        leaves = self._leaves(step)
+        for k, row in enumerate(rows):
+            if all(left <= BACK_SHARE * size for left, size, bound in zip(
+                    _step(last, row), step, leaves, strict=True) if bound):
                 return k
         return None
 
 
-def _size(step: Floats) -> Floats:
-    """Return sizes of steps, (..., 6), of gyro and force in LEAST_STEPS, (..., 2); NaN is 0."""
-    size: Floats = np.abs(step).reshape(*step.shape[:-1], 2, 3).max(axis=-1) / LEAST_STEPS
-    return np.fmax(size, 0.0)
+def _largest(a: Vector, b: Vector) -> float:
+    """Return the largest difference of two vectors, NaN of MISSING."""
+    (x, y, z), (u, v, w) = a, b
+    return max(abs(u - x), abs(v - y), abs(w - z))
 
 
-def single(x: Floats) -> Bools:
+def _step(last: Row, row: Row) -> Pair:
+    """Return the steps of gyro and force, 1 where a vehicle hardly makes it; 0 of MISSING."""
+    force = _largest(last.f_b, row.f_b) / FORCE_STEP
+    return _largest(last.w_b, row.w_b) / TURN_STEP, force if force == force else 0.0
+
+
+def is_single(rows: Sequence[Row]) -> bool:
     """
-    Return a mask of isolated outliers: (n, 6) to (n,) bool, never the last row.
+    Return True if the row before the last of SINGLE_ROWS is an isolated outlier.
 
     As ``screening.glitches.single`` has it, but by the rows before: those after are still to come.
     """
-    off = np.zeros(len(x), bool)
-    if len(x) < ROWS_BESIDE + 3:
-        return off
-    far = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)       # of row k + 1
-    if not (far[ROWS_BESIDE + 1:] > SINGLES).any():
-        return off
-    for k in range(ROWS_BESIDE + 1, len(far)):
-        at = far[k]
-        beside = far[k - ROWS_BESIDE - 1:k - 1].max(axis=0)
-        apart = np.abs(x[k + 2] - x[k])
-        off[k + 1] = ((at > np.maximum(SINGLES, SINGLE_TIMES * beside))
-                      & (apart < EQUAL_NEIGHBOURS * at)).any()
-    return off
+    if len(rows) < SINGLE_ROWS:
+        return False
+    values = [(*row.w_b, *row.f_b) for row in rows[-3:]]
+    for k, (a, b, c, least) in enumerate(zip(*values, SINGLES, strict=True)):
+        far = abs(b - (a + c) / 2)
+        if far > least and abs(c - a) < EQUAL_NEIGHBOURS * far:
+            x = [(*row.w_b, *row.f_b)[k] for row in rows[:-2]]
+            if all(far > SINGLE_TIMES * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
+                   for i in range(1, len(x) - 1)):
+                return True
+    return False

@@ -45,20 +45,20 @@ class Start:
 def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
           grade: Grade) -> Start | None:
     """Return the start, None while too little has come."""
-    if not wheels.ready() or not len(imu.t):
+    if not wheels.ready() or not imu.rows:
         return None
-    row = int(np.searchsorted(imu.t, wheels.oldest()))
+    row = imu.from_time(wheels.oldest())
     if config.start.attitude:
-        return _given(row, vehicle, config, grade) if len(imu.t) > row else None
-    end = int(np.searchsorted(imu.t, imu.t[row] + START_SPAN)) if row < len(imu.t) else row
-    if end >= len(imu.t) or wheels.newest() < imu.t[end]:
+        return _given(row, vehicle, config, grade) if len(imu.rows) > row else None
+    end = imu.from_time(imu.rows[row].t + START_SPAN) if row < len(imu.rows) else row
+    if end >= len(imu.rows) or wheels.newest() < imu.rows[end].t:
         return None
-    holes = np.flatnonzero(np.diff(imu.t[row:end + 1]) > max(
-        START_HOLE, HOLE_INTERVALS * imu.usual))
+    rows = imu.rows[row:end + 1]
+    t, w, f = map(np.array, zip(*((one.t, one.w_b, one.f_b) for one in rows), strict=True))
+    holes = np.flatnonzero(np.diff(t) > max(START_HOLE, HOLE_INTERVALS * imu.usual))
     if len(holes):
         imu.drop(row + int(holes[-1]) + 1)      # start from the rows after the gap
         return None
-    t, w, f = imu.t[row:end + 1], imu.w_b[row:end + 1], imu.f_b[row:end + 1]
     resting = wheels.still(t[0], t[-1]) and bool(
         (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
     if not resting and np.linalg.norm(_tilting(w.mean(axis=0), f.mean(axis=0))) > MOST_TILTING:

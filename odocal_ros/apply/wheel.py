@@ -10,10 +10,10 @@ only its past, and a scale that is known: what no vehicle does in the time is no
 
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Sequence
 import math
 
 from odocal_ros.apply.arrivals import Rhythm
-from odocal_ros.data.arrays import Floats, Values
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.levels import FASTEST
 
@@ -74,9 +74,9 @@ class Wheel:
         whole = isinstance(self._value, int) and self.form.quantity != 'rate'
         return abs(self.scale) if whole else 0.0
 
-    def feed(self, t: Floats, value: Values) -> None:
+    def feed(self, t: Sequence[float], value: Sequence[float]) -> None:
         """Take rows: times, s, and values as sent; what has no time or value is passed over."""
-        for row in zip(t.tolist(), value.tolist(), strict=True):
+        for row in zip(t, value, strict=True):
             if math.isfinite(row[1]) and row[0] > self._arrival:
                 self._arrival = row[0]
                 self._take(*row)

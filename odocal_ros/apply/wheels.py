@@ -5,8 +5,6 @@
 
 import math
 
-import numpy as np
-
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheel import Wheel
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
@@ -49,8 +47,9 @@ class Wheels:
             self._wheels[slot] = Wheel(form, self._vehicle.scale, self._reversed)
             self._scale(form)
         wheel = self._wheels[slot]
-        stamp = block.stamp_ns + self._offset_ns
-        wheel.feed(np.asarray((stamp - self.zero_ns) * 1e-9, float), block.value)
+        since_ns = self._offset_ns - self.zero_ns
+        wheel.feed([(stamp + since_ns) * 1e-9 for stamp in block.stamp_ns.tolist()],
+                   block.value.tolist())
         self._notes += wheel.notes
         wheel.notes.clear()
 

@@ -5,7 +5,10 @@
 Gyro axes against the accelerometer and against the course of the fixes.
 
 A rotation of the whole IMU (imu.mounting_rpy) turns gyro and accelerometer together. Here the gyro
-alone has an axis with the wrong sign, or two axes swapped: no rotation corrects that.
+alone has an axis with the wrong sign, or two axes swapped, or the accelerometer has an axis with
+the wrong sign: no rotation corrects that. To an accelerometer whose first level axis has the
+wrong sign, the gyro looks as if its second level axis and its upright axis had it: in mirrored
+axes, turn rates have these signs.
 """
 
 from typing import TYPE_CHECKING
@@ -17,6 +20,7 @@ from odocal_ros.calib.turning import turn_ratio
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.facing import Facing
 from odocal_ros.screening.gravity_turn import gravity_fit
 from odocal_ros.screening.inputs import Placed
 
@@ -28,6 +32,7 @@ SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a sound gyro
 TURNED = np.array([1.0, -1.0, 1j, -1j])      # definition: of axes mirrored or swapped
 # statistical: all four must hold. False in 0 of 384 zoo drives; detection: docs/zoo.md
 LARGEST_SIGMA, FAR_SIGMAS, NEAR_TURNED, FEWEST_SEGMENTS = 0.2, 5.0, 0.4, 4.0
+INVERTED = -0.5     # judgement: 1 is due; a vehicle that leans into its turns has 0
 
 
 def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
@@ -49,11 +54,12 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
     return axes, [_name(axis) for axis in (first, second, np.sign(up[k]) * np.eye(3)[k])]
 
 
-def gyro_axes(inputs: 'Inputs', placed: Placed) -> tuple[Reason, ...]:
+def gyro_axes(inputs: 'Inputs', placed: Placed, faces: Facing | None) -> tuple[Reason, ...]:
     """
-    Return GYRO_AXES where an axis of the gyro is mirrored, or two are swapped.
+    Return a reason where an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
 
-    inputs : a screened leg.   placed : its fixes in metres and approximate scale.
+    inputs : a screened leg.   placed : its fixes in metres and approximate scale.   faces : its
+    accelerations.
 
     Returns
     -------
@@ -66,7 +72,12 @@ def gyro_axes(inputs: 'Inputs', placed: Placed) -> tuple[Reason, ...]:
     axes, names = sensor_axes(up / np.linalg.norm(up))
     found = by_course(inputs, placed, w_i, axes, names)
     if not found and inputs.has_accelerometer:
+        inverted = faces and faces.inward < min(INVERTED, -FAR_SIGMAS * faces.inward_sigma)
+        if inverted:            # the yaw rate as the accelerometer has it
+            w_i = w_i - 2 * np.outer(w_i @ axes[2], axes[2])
         found = by_gravity(inputs, placed, w_i, f_i, axes, names)
+        if faces and inverted:
+            return _inverted_turns(faces, found, names)
     if not found:
         return ()
     do = ', '.join(f'negate angular_velocity.{sent}' if sent == true[-1] else
@@ -77,6 +88,24 @@ def gyro_axes(inputs: 'Inputs', placed: Placed) -> tuple[Reason, ...]:
     return (Reason(Code.GYRO_AXES, '; '.join(text for *_, text in found),
                    f'Correct the IMU driver: {do}. imu.mounting_rpy cannot correct this: it '
                    'rotates gyro and accelerometer together.'),)
+
+
+def _inverted_turns(faces: Facing, found: Found, names: list[str]) -> tuple[Reason, ...]:
+    """Return the reason for accelerations to the outside of turns."""
+    seen = (f'accelerations in turns are opposite to turn rate and speed (ratio {faces.inward:.2f}'
+            f' ± {faces.inward_sigma:.2f} instead of 1)')
+    level = [name[-1] for name in names[:2]]
+    wrong = [axis for axis in level if len(found) == 1 and found[0][:2] != (axis, '-' + axis)]
+    if len(wrong) == 1:
+        return (Reason(Code.IMU_AXES, f'{seen}, and the turn of gravity about {found[0][0]} is '
+                       f'opposite to the gyro: linear_acceleration.{wrong[0]} has the wrong sign',
+                       f'Correct the IMU driver: negate linear_acceleration.{wrong[0]}. '
+                       'imu.mounting_rpy cannot correct this: it rotates gyro and accelerometer '
+                       'together.'),)
+    return (Reason(Code.GYRO_SIGN, f'{seen}: the sign of angular_velocity.{names[2][-1]}, or of '
+                   f'linear_acceleration.{level[0]} or {level[1]}, is wrong',
+                   'Correct the sign in the IMU driver. imu.mounting_rpy cannot: it rotates gyro '
+                   'and accelerometer together.'),)
 
 
 def by_course(inputs: 'Inputs', placed: Placed, w_i: Floats, axes: Floats,

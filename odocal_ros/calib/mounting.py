@@ -10,7 +10,7 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.data.pieces import medians
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
@@ -63,11 +63,12 @@ def remedy(found: Mounting) -> str:
 
 def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
     """Return reasons, IMU_AXES with what to set where the screened inputs show it."""
-    if not any(r.code is Code.IMU_AXES for r in reasons):
+    if not any(r.code is Code.IMU_AXES and not r.do for r in reasons):
         return list(reasons)
     found = mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
                      inputs.travel, 1.0)
-    return [replace(r, do=remedy(found)) if r.code is Code.IMU_AXES else r for r in reasons]
+    return [replace(r, do=r.do or remedy(found)) if r.code is Code.IMU_AXES else r
+            for r in reasons]
 
 
 def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
@@ -103,26 +104,33 @@ def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
     Return the forward axis (level, unit) and its sigma, rad; None where it is not seen.
 
     In the level plane, as complex numbers, f = e^(i theta) (dv/dt + i v w_up) + bias: speeding up
-    pushes forward, turning pushes to the inside. One least-squares angle fits both.
+    pushes forward, turning pushes to the inside. One least-squares angle fits both. If none does,
+    turns are inverted: a mirrored axis of gyro or accelerometer, which is judged later, does that.
     """
     found = pushes(t, w_i, f_i, up_i, travel, metres_per_unit)
     if found is None:
         return None, np.pi
     A, F = found.onward + 1j * found.inward, found.force
+    fits = _angle(A, F), _angle(A.conj(), F)
+    theta, sigma = next((fit for fit in fits if fit[1] <= MEANT_AXIS / 2), fits[0])
+    if sigma > MEANT_AXIS / 2:
+        return None, sigma
+    return np.cos(theta) * found.e1 + np.sin(theta) * found.e2, sigma
+
+
+def _angle(A: Complexes, F: Complexes) -> tuple[float, float]:
+    """Return the angle from accelerations A to forces F and its sigma, rad; pi if unknown."""
     A, F = A - A.mean(), F - F.mean()
     power = float(np.vdot(A, A).real)
     if len(A) < FEWEST_BINS_FACING or power < 1e-3 * len(A) * 0.05:     # hardly a push anywhere
-        return None, np.pi
+        return 0.0, np.pi
     gain = np.vdot(A, F) / power
     if not gain:            # of no accelerometer
-        return None, np.pi
+        return 0.0, np.pi
     rest = F - gain * A
     # half the residual lies across the axis; neighbours share noise, so count every third bin
     sigma = float(np.sqrt(np.vdot(rest, rest).real / (2 * len(A) / 3) / power) / abs(gain))
-    if sigma > MEANT_AXIS / 2:
-        return None, sigma
-    theta = np.angle(gain)
-    return np.cos(theta) * found.e1 + np.sin(theta) * found.e2, sigma
+    return float(np.angle(gain)), sigma
 
 
 def _quarter_turns() -> Iterator[Floats]:

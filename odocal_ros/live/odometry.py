@@ -35,8 +35,8 @@ from odocal_ros.messages.sensor_types import types_of
 from odocal_ros.outside.names import said_by
 from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 
-# judgement, all in s: between looks at the odometer, which poses are late by; between turns of the
-# executor, which cost most; between turns without a pose
+# judgement, all in s: between looks for a pose that is due, which poses are late by; between turns
+# of the executor, which cost most; between turns without a pose
 LOOK_S, SERVE_S, SILENT_S = 0.02, 0.2, 0.2
 TWIST_NUMBERS = 42              # format: floats of a twist with its covariance
 SAID_AGAIN_NS = 10 * 10**9      # judgement: between two sentences of one kind
@@ -122,8 +122,9 @@ class OdometryNode(SettledNode):
         self.destroy_timer(self._timer)      # for executors of others
         serve_at = 0.0
         while self.context.ok():
-            until = time.monotonic() + LOOK_S
+            look_at = time.monotonic() + LOOK_S
             self._turn()
+            until = max(look_at, min(self._due_ns * 1e-9, serve_at))
             if any(one.waiting.gate.is_open for one in self._inputs.values()):
                 while (left := until - time.monotonic()) > 0:      # it carries the messages
                     executor.spin_once(timeout_sec=left)
@@ -150,7 +151,7 @@ class OdometryNode(SettledNode):
         for pose in poses:
             self._publish(pose)
         if poses:
-            wait_s = min(self._odometry.lacking_s(), 1 / self.config.publish.rate)
+            wait_s = min(self._odometry.wait_s(), 1 / self.config.publish.rate)
             self._due_ns = now_ns + round(wait_s * 1e9)
             if not self._begun:
                 self._begun = True

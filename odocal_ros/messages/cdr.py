@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32': '<i4',
          'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8', 'float32': '<f4', 'float64': '<f8'}
-# format: of struct, by numpy's
-CODES = dict(zip(KINDS.values(), 'bBhHiIqQfd', strict=True))
 INDEXED = re.compile(r'(.+)\[(\d+)\]')
 
 
@@ -81,13 +79,12 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 
 
 class Run(NamedTuple):
-    """Values of one kind side by side: bytes, kind, kind of all as one item, number, reader."""
+    """Values of one kind side by side: bytes, kind, kind of all as one item, number."""
 
     place: slice
     dtype: np.dtype[Any]
     together: np.dtype[Any]
     width: int
-    packed: struct.Struct
 
 
 @dataclass
@@ -142,11 +139,18 @@ class Layout:
             -1, run.width) for run in runs]
         return values[0] if len(values) == 1 else np.concatenate(values, axis=1)
 
-    def row(self, raw: bytes, paths: Sequence[str]) -> list[Any] | None:
-        """Return the values at some paths of one message of this layout, None as ``columns``."""
-        runs = self._places(tuple(paths))
-        return None if runs is None else [value for run in runs for value in
-                                          run.packed.unpack_from(raw, run.place.start)]
+    def record(self, columns: Sequence[Sequence[str] | None]) -> np.dtype[Any] | None:
+        """
+        Return the type of a message of this layout whose fields are the values at some paths.
+
+        None where a path is missing, or where the paths of a field are not side by side.
+        """
+        runs = [self._places(tuple(paths)) if paths else None for paths in columns]
+        one = [found[0] for found in runs if found is not None and len(found) == 1]
+        return None if len(one) < len(runs) else np.dtype({
+            'names': [str(k) for k in range(len(one))], 'itemsize': self.size,
+            'formats': [(run.dtype, (run.width,)) for run in one],
+            'offsets': [run.place.start for run in one]})
 
     def fits(self, raw: bytes) -> bool:
         """Return True if a message has this layout."""
@@ -170,8 +174,7 @@ def _side_by_side(places: Sequence[tuple[int, str] | None]) -> list[Run] | None:
         else:
             found.append((offset, dtype, 1))
     return [Run(slice(first, first + count * np.dtype(kind).itemsize), np.dtype(kind),
-                np.dtype((np.void, count * np.dtype(kind).itemsize)), count,
-                struct.Struct(f'<{count}{CODES[kind]}'))
+                np.dtype((np.void, count * np.dtype(kind).itemsize)), count)
             for first, kind, count in found]
 
 

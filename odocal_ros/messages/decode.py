@@ -58,6 +58,8 @@ class Reader:
         self.trouble = ''
         self.frames: FrameFilter | None = None      # of an IMU
         self._plan = plan
+        self._layout: cdr.Layout | None = None      # the last one of a few messages
+        self._record: np.dtype[Any] | None = None      # as which they are read
 
     @property
     def form(self) -> OdometerForm | None:
@@ -130,18 +132,19 @@ class Reader:
         return plan.build(received, out) if len(received) else []
 
     def _few(self, raws: Sequence[bytes]) -> list[NDArray[Any]]:
-        """Return the columns of a few ordinary messages; none where one of them needs more."""
-        out: list[NDArray[Any]] = []
-        if len(raws) > FEW_ROWS:
-            return out
-        layouts = [cdr.layout_of(self.msgtype, raw) for raw in raws]
-        for column in self._plan.columns:
-            rows = [column.of_raw(layout, raw) if layout else None
-                    for layout, raw in zip(layouts, raws, strict=True)]
-            if None in rows:
-                return []
-            out.append(np.array(rows, column.dtype))
-        return out
+        """Return the columns of a few messages of one layout; none where one needs more."""
+        layout = cdr.layout_of(self.msgtype, raws[0])
+        if len(raws) > FEW_ROWS or layout is None or not all(map(layout.fits, raws)):
+            return []
+        columns = self._plan.columns
+        if layout is not self._layout:
+            self._layout = layout
+            self._record = layout.record([column.pick(layout) for column in columns])
+        if self._record is None:
+            return []
+        table = np.frombuffer(b''.join([raw[:layout.size] for raw in raws]), self._record)
+        return [table[name].astype(column.dtype) for name, column in zip(
+            self._record.names or (), columns, strict=True)]
 
     def _values(self, layout: cdr.Layout, table: Table) -> list[NDArray[Any]] | None:
         """Return the columns of messages of one layout; None where one is not there."""

@@ -105,20 +105,12 @@ class Column:
         paths = self.pick(layout)
         return layout.columns(table, paths) if paths else None
 
-    def of_raw(self, layout: cdr.Layout, raw: bytes) -> list[Any] | None:
-        """Return the same values of one message of a layout."""
-        paths = self.pick(layout)
-        return self._of_type(layout.row(raw, paths)) if paths else None
-
     def of_message(self, view: MessageView) -> list[Any] | None:
         """Return the same values of one message."""
-        paths = self.pick(view)
-        return self._of_type([view.value(path) for path in paths]) if paths else None
-
-    def _of_type(self, values: list[Any] | None) -> list[Any] | None:
-        if values and self.dtype is np.int64:
-            return [(int(v) + 2**63) % 2**64 - 2**63 for v in values]   # uint64 as int64 bits
-        return values
+        values = [view.value(path) for path in self.pick(view) or ()]
+        if self.dtype is np.int64:
+            values = [(int(v) + 2**63) % 2**64 - 2**63 for v in values]   # uint64 as int64 bits
+        return values or None
 
 
 def fixed(dtype: type, *paths: str) -> Column:

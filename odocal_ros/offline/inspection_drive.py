@@ -29,11 +29,16 @@ from odocal_ros.screening.facing import imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import settings_by_frame
+from odocal_ros.screening.moved_imu import turned_over
 from odocal_ros.screening.screen import screen
 from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 from odocal_ros.settings.nominal import nominal_scale
+
+# judgement: no vehicle drives this share of a recording backwards; by a counter that counts down
+# the IMU would seem to look backwards
+MOSTLY = 0.5
 
 
 def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
@@ -97,8 +102,8 @@ def _units(inputs: Inputs, config: Config,
            findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
     """Judge the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_axes(
-        imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0]
-        or unit_changes(inputs), inputs)
+        turned_over(inputs) or imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi,
+                                          config.imu)[0] or unit_changes(inputs), inputs)
     w_i, f_i = inputs.w_b, inputs.f_b
     if not np.array_equal(inputs.C_bi, np.eye(3)):
         w_i, f_i = w_i @ inputs.C_bi, f_i @ inputs.C_bi
@@ -121,11 +126,16 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
 
 def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config: Config,
           found: dict[str, Any], findings: list[Reason]) -> list[str]:
-    """Return the IMU orientation, and whether its gyro turns with the course."""
-    m = mounting(inputs.t_imu, w_i, f_i, inputs.travel, drive.scale or 1.0)
+    """Return settings for odometer sign and IMU orientation; look whether the gyro is right."""
+    set_already = bool(np.any(config.imu.mounting_rpy))
+    travel, step = inputs.travel, np.diff(inputs.travel.s)
+    options = []
+    if not set_already and step.sum() < -MOSTLY * np.abs(step).sum():
+        travel = replace(travel, s=-travel.s)
+        options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
+    m = mounting(inputs.t_imu, w_i, f_i, travel, drive.scale or 1.0)
     if not inputs.has_accelerometer:
         m = replace(m, C_bi=None)      # gravity is made up
-    set_already = bool(np.any(config.imu.mounting_rpy))
     agrees = m.C_bi is not None and np.allclose(
         m.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
     found['mounting'] = {
@@ -141,8 +151,8 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config:
     found['drive']['gyro_over_course'] = ratio
     findings += gyro_reasons(ratio, config.imu.gyro_scale)
     if m.rpy is None or not found['mounting']['needed']:
-        return []
-    return [f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
+        return options
+    return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 
 
 def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, first: int,

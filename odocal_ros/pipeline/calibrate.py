@@ -32,6 +32,7 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.facing import imu_sanity, UNUSABLE
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
+from odocal_ros.screening.moved_imu import turned_over
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
 from odocal_ros.screening.screen import screen
 from odocal_ros.screening.unit_changes import unit_changes
@@ -106,7 +107,8 @@ def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened
         seen = {r.code for r in reasons}
         return Screened(inputs, (*reasons, *(r for r in missing if r.code not in seen)), False)
     sanity, z_down = imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
-    sanity = sanity or unit_changes(inputs)
+    moved = turned_over(inputs)     # or else its mean gravity is judged, which it never measures
+    sanity, z_down = (moved, False) if moved else (sanity or unit_changes(inputs), z_down)
     reasons += tuple(with_axes(sanity, inputs))
     let_go()
     if z_down:

@@ -23,8 +23,14 @@ from odocal_ros.pipeline.beyond_model import coarse_reasons
 from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import axles_of
-from odocal_ros.screening.facing import axes_reasons, Facing, facing
+from odocal_ros.screening.facing import (
+    accelerations,
+    axes_reasons,
+    Facing,
+    facing_of,
+)
 from odocal_ros.screening.inputs import Inputs, place, Placed
+from odocal_ros.screening.moved_imu import turned_about
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config
 
@@ -47,14 +53,16 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     still = _standing(inputs, placed)
     if still is not None:
         return None, (*reasons, *still)
-    faces = facing(inputs, placed.rough) if inputs.has_accelerometer else None
+    pushed = accelerations(inputs, placed.rough) if inputs.has_accelerometer else None
+    faces = None if pushed is None else facing_of(pushed)
+    reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop))
+    turning = turned_about(pushed) or _turning(inputs, config, placed, faces)
+    if turning:             # a mirrored axis turns the orientation around
+        return None, (*reasons, *turning)
     axes = axes_reasons(faces, config.imu.nominal_yaw)
-    reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop), *with_axes(axes, inputs))
+    reasons = (*reasons, *with_axes(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
         return None, reasons
-    turning = _turning(inputs, config, placed)
-    if turning:
-        return None, (*reasons, *turning)
     prepared = _reckoned(leg, inputs, config, placed, faces, reasons, alignment, holdout)
     return prepared, prepared.reasons
 
@@ -111,14 +119,15 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
     return None
 
 
-def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ...]:
-    """Return the reason for a gyro that does not turn with the fixes or with gravity."""
+def _turning(inputs: Inputs, config: Config, placed: Placed,
+             faces: Facing | None) -> tuple[Reason, ...]:
+    """Return the reason for a gyro that does not turn with the fixes or the accelerometer."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)
     scale_or_sign = gyro_reasons(ratio, config.imu.gyro_scale)
     if any(r.code is Code.GYRO_SIGN for r in scale_or_sign):
         return scale_or_sign
-    return gyro_axes(inputs, placed) or scale_or_sign
+    return gyro_axes(inputs, placed, faces) or scale_or_sign
 
 
 def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,

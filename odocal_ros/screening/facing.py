@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.data.pieces import bin_means, by_row, chunks, lengths, medians
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
@@ -31,6 +31,7 @@ WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters 
 AXES = 'xyz'
 # nothing follows from such an IMU; what is computed all the same says it in other words
 UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
+ROUNDING = 1e-9                 # rad/s, definition: what rotations leave of a rate of zero
 MAX_RATE = 8.0                  # rad/s, physical: no vehicle on wheels turns so fast
 
 
@@ -41,7 +42,7 @@ class Pushes:
 
     e1, e2 : (3,) level axes, in the frame of the IMU's data.   force : (m,) m/s^2.
     onward, inward : (m,) of the vehicle, real m/s^2: along; to the left in turns.
-    near : (m,) True if the bin before it is adjacent.
+    near : (m,) True if the bin before it is adjacent.   t : (m,) s, middle of the bin.
     """
 
     e1: NDArray[np.float64]
@@ -50,14 +51,23 @@ class Pushes:
     onward: NDArray[np.float64]
     inward: NDArray[np.float64]
     near: NDArray[np.bool_]
+    t: Floats
 
 
 @dataclass(frozen=True)
 class Facing:
-    """Yaw mounting angle by the accelerations, rad, and its sigma."""
+    """
+    Yaw mounting angle by the accelerations, rad, and its sigma.
+
+    inward, inward_sigma : force towards the inside of turns over the centripetal acceleration of
+    gyro and odometer, as a ratio to that of speeding up: 1; -1 if one of gyro and accelerometer
+    has a mirrored axis, nan if unknown.
+    """
 
     yaw: float
     sigma: float
+    inward: float = np.nan
+    inward_sigma: float = np.nan
 
 
 def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
@@ -84,15 +94,33 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
     e2 = np.cross(up, e1)
     use = np.flatnonzero(count)
     return Pushes(e1, e2, (f @ e1 + 1j * (f @ e2))[use], onward[use], (speed * turn_rate)[use],
-                  np.diff(use, prepend=-9) == 1)
+                  np.diff(use, prepend=-9) == 1, middle[use])
 
 
-def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
+@dataclass(frozen=True, eq=False)
+class Accelerations:
     """
-    Return the IMU orientation in the vehicle, None if the drive does not determine it.
+    Changes of accelerations from one bin to the next, so that slopes, which change slowly, cancel.
 
-    Changes from bin to bin are compared, so that slopes, which change slowly, cancel. The turns
-    have a factor of their own, so that the sign of the gyro has no effect.
+    e1, e2 : (3,) level axes, frame b.   t : (m,) s.   force, onward, inward : (m,) as in Pushes.
+    """
+
+    e1: Floats
+    e2: Floats
+    t: Floats
+    force: Complexes
+    onward: Floats
+    inward: Floats
+
+    def __getitem__(self, rows: slice) -> 'Accelerations':
+        """Return those of some rows."""
+        return Accelerations(self.e1, self.e2, self.t[rows], self.force[rows], self.onward[rows],
+                             self.inward[rows])
+
+
+def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | None:
+    """
+    Return the accelerations of a leg, None if it is too short.
 
     inputs : in the configured body frame.   metres_per_unit : as for ``pushes``.
     """
@@ -102,9 +130,25 @@ def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
                    metres_per_unit) if size else None
     if found is None:
         return None
-    force, onward, inward = (np.diff(x)[found.near[1:]]
-                             for x in (found.force, found.onward, found.inward))
-    A = np.stack([onward, 1j * inward], -1)
+    near = found.near[1:]
+    return Accelerations(found.e1, found.e2, found.t[1:][near], np.diff(found.force)[near],
+                         np.diff(found.onward)[near], np.diff(found.inward)[near])
+
+
+def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
+    """Return the IMU orientation in the vehicle, None if the drive does not determine it."""
+    found = accelerations(inputs, metres_per_unit)
+    return None if found is None else facing_of(found)
+
+
+def facing_of(found: Accelerations) -> Facing | None:
+    """
+    Return the IMU orientation in the vehicle, None if the accelerations do not determine it.
+
+    The turns have a factor of their own, so that the sign of the gyro has no effect.
+    """
+    force = found.force
+    A = np.stack([found.onward, 1j * found.inward], -1)
     normal = A.conj().T @ A
     if len(A) < FEWEST_BINS_FACING or np.linalg.cond(normal) > 1e9:
         return None
@@ -112,14 +156,15 @@ def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
     gain = inverse @ (A.conj().T @ force)
     rest = force - A @ gain
     # only half of the residual lies across, only every other change (they share bins) is a draw
-    variance = np.vdot(rest, rest).real / len(A) * inverse[0, 0].real
-    sigma = float(np.sqrt(variance) / max(abs(gain[0]), 1e-9))
+    variances = np.vdot(rest, rest).real / len(A) * np.diag(inverse).real
+    sigma, inward_sigma = np.sqrt(variances) / max(abs(gain[0]), 1e-9)
     facing_sigma = np.deg2rad(10.0)    # limit of the 1 sigma of the IMU orientation
     push_gain = 0.5, 2.0    # of the acceleration over that of the wheels: limits of a valid fit
     if sigma > facing_sigma or not push_gain[0] < abs(gain[0]) < push_gain[1]:
         return None
     forward = gain[0].real * found.e1 + gain[0].imag * found.e2
-    return Facing(float(-np.arctan2(forward[1], forward[0])), sigma)
+    return Facing(float(-np.arctan2(forward[1], forward[0])), float(sigma),
+                  float((gain[1] / gain[0]).real), float(inward_sigma))
 
 
 def toward(found: Facing | None, f: Floats) -> Floats:
@@ -187,6 +232,12 @@ def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
                               'vehicle can turn, so its unit is probably deg/s: set '
                               f'imu.gyro_scale to {imu.gyro_scale * RAD_PER_DEG!r}'))
     up = mean / size
+    upright = int(np.argmax(np.abs(up @ C_bi)))
+    if not reasons and not any((np.abs(w_b[some] @ C_bi[:, upright]) > ROUNDING).any()
+                               for some in chunks(len(w_b))):
+        reasons.append(Reason(Code.NO_IMU, f'angular_velocity.{AXES[upright]} is always zero: the '
+                              'IMU publishes no turn rate about its upright axis', 'Publish all '
+                              'three turn rates, or use an IMU that measures them.'))
     most_tilt = np.deg2rad(30.0)    # a body frame more tilted than this is not forward-left-up
     if up[2] > np.cos(most_tilt):
         return tuple(reasons), False

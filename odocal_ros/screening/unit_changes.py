@@ -4,6 +4,7 @@
 """An accelerometer whose unit or range changes during the leg: gravity has another size."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from odocal_ros.data.pieces import medians
 from odocal_ros.reasons import Code, Reason
@@ -16,19 +17,23 @@ TENTHS, TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
 LEAST_RATIO, MOST_RATIO = 0.6, 1.6
 
 
+def tenths(inputs: Inputs) -> NDArray[np.intp]:
+    """Return the edges of the tenths of the accelerometer's rows, (11,); (0,) without enough."""
+    edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
+    return edges if inputs.has_accelerometer and edges[1] >= TENTH_ROWS else edges[:0]
+
+
 def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
     """
     Return IMU_UNITS where a tenth of the leg has another gravity than the Earth's.
 
     No vehicle accelerates so that the median of a tenth of its leg differs from gravity so much.
     """
-    edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
-    if not inputs.has_accelerometer or edges[1] < TENTH_ROWS:
-        return ()
+    edges = tenths(inputs)
     size = [float(np.linalg.norm(medians(inputs.f_b[a:b])))
             for a, b in zip(edges[:-1], edges[1:], strict=True)]
     odd = [k for k, one in enumerate(size) if not LEAST_RATIO * G < one < MOST_RATIO * G]
-    if not odd or len(odd) == TENTHS:      # all of it: the unit of the leg
+    if not odd or len(odd) == len(size):      # all of it: the unit of the leg
         return ()
     begin, end = inputs.t_imu[edges[odd[0]]], inputs.t_imu[edges[odd[-1] + 1] - 1]
     return (Reason(Code.IMU_UNITS, f'from t = {begin:.0f} to {end:.0f} s the IMU measures a '

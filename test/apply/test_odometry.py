@@ -237,3 +237,19 @@ def test_speeds_that_are_multiplied_as_sent_have_their_own_factor():
     vehicle = vehicle_of(sent, ApplyConfig())
     assert vehicle.scale == 0.995
     assert vehicle.scale_sigma == pytest.approx(4e-4 / 0.995)
+
+
+@pytest.mark.core
+def test_after_the_wait_the_next_pose_has_all_it_needs():
+    made = simulate(SimOptions(scenario='straight', duration=180.0, imu_rate=100.0,
+                               odometer_rate=100.0, imu_grade='tactical'))
+    odometry, blocks = odometry_of(made, publish__rate=20.0), samples_of(made)
+    fed_ns, now_ns = 0, int(made.imu.stamp_ns[0]) + 5 * 10**9
+    for looks in range(101):
+        for slot, block in blocks.items():
+            inside = (block.stamp_ns > fed_ns) & (block.stamp_ns <= now_ns)
+            if inside.any():
+                odometry.feed(slot, take(block, inside), made.form)
+        poses = odometry.poses()
+        assert len(poses) == 1 if looks else poses
+        fed_ns, now_ns = now_ns, now_ns + round((odometry.wait_s() + 1e-3) * 1e9)

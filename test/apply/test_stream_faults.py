@@ -9,7 +9,7 @@ import pytest
 
 from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
 from odocal_ros.apply.odometry import Odometry
-from odocal_ros.apply.spikes import SpikeScreen
+from odocal_ros.apply.spikes import Row, SpikeScreen
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.apply.wheel import Wheel
 from odocal_ros.data.samples import OdometerForm
@@ -169,17 +169,37 @@ def test_a_step_of_the_gyro_is_doubted_where_it_stands_alone():
     turns = np.minimum(np.maximum(t - 1.0, 0.0) * 2.0, 0.2)        # as a vehicle starts to turn
     for add, odd in ((0.2 * (t >= 1.0), 1), (turns, 0)):
         for block in (1, 7, 200):
-            screen, found, at = SpikeScreen(), [], 1
-            x = np.hstack([w + add[:, None] * [0, 0, 1], np.full((200, 3), 5.0) + w])
-            x[0] = x[1]
-            last = 0
-            while at < len(t):
-                rows = slice(last, min(at + block, len(t)))
-                keep, strange, hold = screen.sift(t[rows], x[rows])
-                found += [k + last for k in np.flatnonzero(strange[1:hold].any(axis=1)) + 1]
-                last, at = last + hold - 1, max(at + block, last + hold)
+            screen, held, kept = SpikeScreen(), [], []
+            z = w[:, 2] + add
+            rows = [Row(t[k], k, (*w[k, :2], z[k]), (5.0, 5.0, 5.0)) for k in range(len(t))]
+            for begin in range(0, len(t), block):
+                new, held = screen.sift(held + rows[begin:begin + block])
+                kept += new
+            found = [row.stamp_ns for row in kept if any(row.strange)]
             assert found[:odd] == [100] * odd
             assert bool(found) is bool(odd)
+
+
+def test_the_screen_keeps_the_same_rows_in_blocks_of_any_size():
+    rng, n = np.random.default_rng(3), 600
+    x = np.hstack([0.002 * rng.standard_normal((n, 3)), rng.standard_normal((n, 3)) + 9.8])
+    for at, rows, step in ((100, 1, 3.0), (200, 3, -8.0), (300, 300, 0.2), (400, 80, 5.0)):
+        x[at:at + rows, 2] += step
+    x[150:180] = x[150]      # hangs for longer than STUCK_TIME
+    x[180:, 1] += 0.1
+    rows = [Row(k * 0.01, k, tuple(x[k, :3].tolist()), tuple(x[k, 3:].tolist()))
+            for k in range(n)]
+    found = []
+    for block in (1, 2, 7, n):
+        screen, held, kept = SpikeScreen(), [], []
+        for begin in range(0, n, block):
+            new, held = screen.sift(held + rows[begin:begin + block])
+            kept += new
+        found.append(kept)
+    assert [row.stamp_ns for row in found[0]] == [
+        k for k in range(n) if k not in (100, 200, 201, 202) and not 160 <= k < 180]
+    assert {row.stamp_ns for row in found[0] if any(row.strange)} >= {300, 400}
+    assert all(kept == found[0] for kept in found)
 
 
 def test_a_turn_that_no_vehicle_begins_is_doubted():
@@ -240,6 +260,6 @@ def test_a_false_speed_at_rest_is_doubted_from_the_speed_before_all_of_it():
     value = np.where(t > 20.0, -22.1, 0.0)
     wheel = Wheel(OdometerForm('rate', 0, '1'), 1.02)
     for row in range(len(t)):
-        wheel.feed(t[row:row + 1], value[row:row + 1])
+        wheel.feed([float(t[row])], [float(value[row])])
         assert abs(wheel.s[-1]) <= 3 * np.sqrt(wheel.doubt(0.0, t[row])) + 0.02
     assert wheel.s[-1] < -30.0         # false travel, of a vehicle at rest

@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.gyro_axes import sensor_axes
+from odocal_ros.calib.mounting import mounting
+from odocal_ros.data.samples import take
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code
 from odocal_ros.screening.gravity_turn import gravity_fit
+from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import with_settings
 
 SOUND = np.array([1.0, 1j, 0.0])
@@ -49,6 +52,43 @@ def test_a_wrong_axis_rejects_the_leg_and_its_correction_is_named(name):
     result = calibrate(leg, settings(made))
     assert rejecting(result) == {Code.GYRO_AXES} == set(everything_said(result))
     assert f': {DO[name]}' in next(r.do for r in result.reasons)
+
+
+@pytest.mark.parametrize('axis', ['x', 'y'])
+def test_a_mirrored_axis_of_the_accelerometer_is_not_blamed_on_the_gyro(axis):
+    made, M = town(), np.diag([-1.0 if axis == one else 1.0 for one in 'xyz'])
+    leg = replace(made.leg(), imu=changed(made.imu, f_i=lambda f: f @ M))
+    result = calibrate(leg, settings(made))
+    assert rejecting(result) == {Code.IMU_AXES} == set(everything_said(result))
+    assert f'negate linear_acceleration.{axis}' in next(r.do for r in result.reasons)
+
+
+def test_turns_the_fixes_do_not_show_still_show_a_mirrored_gyro():
+    """Where the course of few fixes says nothing, the accelerometer does."""
+    made = town()
+    few = np.linspace(0, len(made.fix.stamp_ns) - 1, 5).astype(int)
+    said = {}
+    for name, sign in (('sound', 1.0), ('mirrored', -1.0)):
+        leg = replace(made.leg(), fix=take(made.fix, few),
+                      imu=changed(made.imu, w_i=lambda w, s=sign: w * [1.0, 1.0, s]))
+        said[name] = {r.code: r.text for r in faults(
+            leg, screened(leg, settings(made)), settings(made))}
+    assert Code.GYRO_SIGN not in said['sound']
+    assert 'accelerations in turns' in said['mirrored'][Code.GYRO_SIGN]
+
+
+@pytest.mark.parametrize(('sensor', 'wrong', 'yaw'), [
+    ('w_i', [1.0, 1.0, -1.0], 0.0), ('f_i', [1.0, -1.0, 1.0], 0.0),
+    ('f_i', [-1.0, 1.0, 1.0], np.pi)])
+def test_a_mirrored_axis_does_not_hide_the_mounting(sensor, wrong, yaw):
+    """Else only the orientation is asked for, and the fault not named."""
+    made, C = town(), matrix_from_rpy((np.pi / 2, 0.0, np.pi / 2))
+    sent = {name: getattr(made.imu, name) for name in ('w_i', 'f_i')}
+    sent[sensor] = sent[sensor] * wrong
+    inputs, _ = screen(made.leg(), settings(made))
+    found = mounting(inputs.t_imu, sent['w_i'] @ C, sent['f_i'] @ C, inputs.travel,
+                     made.options.nominal_scale)
+    assert found.C_bi == pytest.approx(matrix_from_rpy((0.0, 0.0, yaw)) @ C, abs=1e-9)
 
 
 def test_axes_are_those_of_the_messages_whatever_the_mounting():

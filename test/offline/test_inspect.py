@@ -215,6 +215,25 @@ def test_axes_are_told(tmp_path, capsys, rpy):
     assert not seen['mounting']['needed']
 
 
+def test_an_imu_that_is_turned_over_midway_has_no_wrong_unit(tmp_path, capsys):
+    upright, over = drive(), drive(C_ib=np.diag([1.0, -1.0, -1.0]))
+    half = len(upright) // 2
+    seen, text = inspect(ros_bags.write(tmp_path / 'bag', upright[:half] + over[half:]), capsys)
+    assert 'IMU_UNITS' not in codes(seen)
+    assert 'gravity turns by 180 deg' in text
+
+
+@pytest.mark.parametrize('rpy', [(0, 0, 0), (math.pi, 0, 0)])
+def test_a_counter_that_counts_down_does_not_turn_the_imu(tmp_path, capsys, rpy):
+    """Nobody drives a whole recording backwards; the IMU would be set 180 deg off."""
+    C_bi = matrix_from_rpy(rpy)
+    rows = [(name, ns, make.whole(-message.data) if name == '/odometer' else message)
+            for name, ns, message in drive(C_ib=C_bi.T)]
+    seen, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
+    assert matrix_from_rpy(seen['mounting']['rpy']) == pytest.approx(C_bi, abs=1e-9)
+    assert 'odometer.reversed=true' in seen['command']
+
+
 def test_a_forward_axis_that_nothing_shows_is_assumed_or_left_open():
     t = np.arange(0, 100, 0.02)
     travel = Travel(t, 10.0 * t, 0.0)               # steady: no push anywhere

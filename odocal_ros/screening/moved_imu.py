@@ -1,0 +1,75 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""An IMU that is moved in the vehicle during the leg: gravity or forward changes direction."""
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import medians
+from odocal_ros.nav.angles import wrap
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.facing import Accelerations, facing_of
+from odocal_ros.screening.inputs import Inputs
+from odocal_ros.screening.unit_changes import tenths
+
+# judgement, deg: what slopes, bends and the noise of a fit do not make; of its tenths on one side
+LEAST_TURN, SIDE = 45.0, 20.0
+SAME_SIZE = 1.15    # judgement: ratio of gravity on both sides; a bend that leans it 45 deg: 1.4
+# judgement, deg: driving backwards with an unsigned counter turns forward by 180 deg
+MOST_YAW = 135.0
+YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond LEAST_TURN
+DO = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
+
+
+def turned_over(inputs: Inputs) -> tuple[Reason, ...]:
+    """Return IMU_AXES where gravity has one direction before, and another after, a tenth."""
+    edges = tenths(inputs)
+    if not len(edges):
+        return ()
+    force = np.array([medians(inputs.f_b[a:b])
+                      for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    for k in range(1, len(force) - 1):
+        sides = force[:k], force[k + 1:]
+        before, after = (side.mean(axis=0) for side in sides)
+        # a bend, or another unit, also changes the size
+        size = np.linalg.norm(after) / max(float(np.linalg.norm(before)), 1e-9)
+        if (_apart(before, after) > LEAST_TURN and 1 / SAME_SIZE < size < SAME_SIZE
+                and all(_apart(one, mean) < SIDE for side, mean in zip(
+                    sides, (before, after), strict=True) for one in side)):
+            begin, end = inputs.t_imu[edges[k]], inputs.t_imu[edges[k + 1] - 1]
+            return (_moved(f'gravity turns by {_apart(before, after):.0f} deg', float(begin),
+                           float(end)),)
+    return ()
+
+
+def turned_about(found: Accelerations | None) -> tuple[Reason, ...]:
+    """Return IMU_AXES where forward has one direction before, and another after, a tenth."""
+    if found is None:
+        return ()
+    edges = np.linspace(0, len(found.t), 11).astype(int)
+    seen = []
+    for a, b in zip(edges[1:-2], edges[2:-1], strict=True):
+        sides = facing_of(found[:a]), facing_of(found[b:])
+        if sides[0] is None or sides[1] is None:
+            continue
+        apart = float(np.rad2deg(wrap(sides[1].yaw - sides[0].yaw)))
+        sigma = float(np.rad2deg(np.hypot(sides[0].sigma, sides[1].sigma)))
+        if LEAST_TURN + YAW_SIGMAS * sigma < abs(apart) < MOST_YAW:
+            seen.append((sigma, -apart, float(found.t[a]), float(found.t[b])))
+    if not seen:
+        return ()
+    sigma, apart, begin, end = min(seen)
+    return (_moved(f'the forward direction turns by {apart:+.0f} ± {max(sigma, 1.0):.0f} deg',
+                   begin, end),)
+
+
+def _moved(what: str, begin: float, end: float) -> Reason:
+    return Reason(Code.IMU_AXES, f'{what} in the IMU frame at about t = {begin:.0f} to '
+                  f'{end:.0f} s: the IMU was moved in the vehicle', DO)
+
+
+def _apart(one: Floats, other: Floats) -> float:
+    """Return the angle between two vectors, (3,), deg; 0 if one is zero."""
+    sine, cosine = np.linalg.norm(np.cross(one, other)), float(one @ other)
+    return float(np.rad2deg(np.arctan2(sine, cosine)))
