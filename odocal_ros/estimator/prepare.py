@@ -169,7 +169,9 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     accel_bias = np.maximum([accel, accel, up], 1e-6)
     centre = np.zeros(M)
     sigma[HEIGHT_DRIFT] = max(height_sigma(leg) / HEIGHT_TIME, NO_ERROR)
-    sigma[BY_SIGMA] = 1.0       # definition: of an error in sigmas
+    stated = leg.covariance_n.diagonal(axis1=1, axis2=2)
+    # definition: of an error in sigmas; a constant one has no effect
+    sigma[BY_SIGMA] = np.where((stated != stated[:1]).any(axis=0), 1.0, NO_ERROR)
     # physical: receivers with an odometer trust it for 5 to 60 s
     centre[FIX_TIME], sigma[FIX_TIME] = np.log(20.0), 0.7
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)

@@ -41,13 +41,18 @@ def steps_of(view: SmootherLeg, spacing: float) -> ImuSteps:
 
 
 def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
-    """Return the start from the last fit, extended to new keyframes; None if keyframes differ."""
+    """
+    Return the start from the last fit, extended to new keyframes.
+
+    None if keyframes differ, or constants that the fit needs: a sensor has begun to send.
+    """
     t, old = problem.imu.t[problem.imu.key], last.state.t
     rounding = 1e-6     # s
     at = np.clip(np.searchsorted(old, t - rounding), 0, len(old) - 1)
     same = np.abs(old[at] - t) < rounding
     n = len(t) if same.all() else int(np.argmin(same))
-    if n < 2 or t[n - 1] < old[-1] - 3.0:       # s at the end, where rows may have come late
+    # s at the end, where rows may have come late
+    if n < 2 or t[n - 1] < old[-1] - 3.0 or last.priors.in_use != problem.priors.in_use:
         return None
     at = at[:n]
     state = replace(last.state, **{
