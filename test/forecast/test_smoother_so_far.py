@@ -160,6 +160,10 @@ def test_keyframes_stay_where_they_are(config, looks):
     assert len(going_on.state.t) == len(going_on.spread) + 1 == len(times[1])
     other = problem_of(views[1], config, steps_of(views[1], 0.7))
     assert carried(so_far._growing._last, other) is None
+    # a constant joins: the error by the stated sigma, which was constant
+    stated = views[1].covariance_n * np.linspace(1.0, 2.0, len(views[1].t_fix))[:, None, None]
+    other = problem_of(replace(views[1], covariance_n=stated), config, second)
+    assert carried(so_far._growing._last, other) is None
 
 
 def test_the_state_is_reckoned_on_to_where_the_vehicle_is(drive, config, looks):
