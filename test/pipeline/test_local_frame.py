@@ -201,6 +201,7 @@ def test_a_pose_that_contains_the_wheels_is_reported():
     config = settings(made, **SMOOTHER, leg__min_distance=20.0)
     result = calibrate(posed(made), config).methods['smoother']
     said, = (r for r in result.reasons if r.code is Code.FIXES_FOLLOW_ODOMETER)
+    assert 'accounted for in part' in said.text
     assert 'positions fused with a wheel speed' in said.text
     assert all(word in said.remedy for word in ('SLAM', 'AMCL', 'robot_localization', 'lidar'))
     plain = calibrate(posed(drive(**CAR)), settings(drive(**CAR), **SMOOTHER))

@@ -108,7 +108,8 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[R
     """Return reasons: filtered signals, a varying scale, deviations from configured values."""
     c = fit.state.constants
     said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
-            *odometer_reasons(c[FIX_BY_MOTION], sigma[FIX_BY_MOTION], c[FIX_TIME]),
+            *odometer_reasons(c[FIX_BY_MOTION], sigma[FIX_BY_MOTION], c[FIX_TIME],
+                              bool(problem.leg.origin.local)),
             *(reason for name, i in CLOCKS.items()
               for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
             *_varies(fit, sigma)]
