@@ -10,6 +10,7 @@ import numpy as np
 from odocal_ros.calib.result import Estimate
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import SCALE_LIMIT
 
 # ratio to the nominal scale, by unit of the scale: what sends such a number. Physical, definitions
 MISTAKEN = {
@@ -40,7 +41,10 @@ def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
     if scale.value is not None:
         relative = 0.0 if scale.sigma is None else scale.sigma / scale.value
         limit = config.verdict.max_scale_sigma
-        if relative > limit:
+        if relative > SCALE_LIMIT:
+            reasons.append(Reason(Code.SCALE_NOT_DETERMINED, 'scale uncertainty is '
+                                  f'{100 * relative:.0f} %, too large to state a value'))
+        elif relative > limit:
             # in the unit of the uncertainty
             shown = f'{100 * limit:.3g} %' if relative >= PER_CENT_FROM else share(limit)
             reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, 'scale uncertainty is '

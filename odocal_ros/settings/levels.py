@@ -20,6 +20,7 @@ OUTLIER_SIGMAS = 5.0
 FASTEST = 100.0         # m/s, physical: no land vehicle is so fast: a counter reset, another unit
 # physical: wear changes a tyre's radius by 2 %, pressure and load by 1 %, another make by 3 %
 TYRE_SPREAD = 0.05      # relative, by which scales of one vehicle's wheels, or drives, may differ
+SCALE_LIMIT = 0.05      # judgement: relative sigma, a scale no better is not known
 # judgement: of a prior sigma; a posterior one below it says that the data determined the value,
 # at half the data weigh three times the prior
 INFORMED_SHARE = 0.5

@@ -69,6 +69,13 @@ def test_a_scale_that_a_mistaken_unit_makes_names_it(kmh, unit, nominal, word, w
         assert f'odometer.nominal_scale to {wanted:.6g}' in reason.remedy
 
 
+def test_a_scale_of_no_use_is_rejected():
+    reason, = judge(estimates(relative=12.0), 0.0, CONFIG)
+    assert reason.code is Code.SCALE_NOT_DETERMINED
+    assert reason.code.gravity.value == 'rejected'
+    assert '1200 %, too large to state' in reason.text
+
+
 def test_what_is_not_determined_is_not_judged():
     assert judge({'scale_factor': Estimate(None, None, 'm/pulse'),
                   'yaw_mounting_angle': Estimate(None, None, 'rad')}, 0.02, CONFIG) == ()

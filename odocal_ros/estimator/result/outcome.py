@@ -64,9 +64,8 @@ from odocal_ros.estimator.state import (
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.levels import INFORMED_SHARE
+from odocal_ros.settings.levels import INFORMED_SHARE, SCALE_LIMIT
 
-SCALE_LIMIT = 0.05      # relative sigma: a scale no better is not known. Judgement
 AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 SCALES = range(GYRO.start, VELOCITY.start)    # errors of IMU, receiver, tyres, body
 
