@@ -61,8 +61,8 @@ class Inputs:
 
     @property
     def up_b(self) -> Floats:
-        """Return the direction of the usual specific force: (3,) unit vector."""
-        return self.usual_f_b / np.linalg.norm(self.usual_f_b)
+        """Return the direction of the usual specific force: (3,) unit vector, 0 of no force."""
+        return self.usual_f_b / max(float(np.linalg.norm(self.usual_f_b)), 1e-9)
 
     @property
     def least_motion(self) -> float:

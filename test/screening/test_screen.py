@@ -236,6 +236,12 @@ def test_an_empty_leg_screens_to_nothing_without_a_fault():
     assert len(inputs.t_imu) == len(inputs.travel.t) == len(inputs.t_fix) == 0
 
 
+@pytest.mark.filterwarnings('error')
+def test_a_force_that_is_scaled_to_nothing_has_no_direction(leg):
+    inputs, _ = screen(leg, with_settings(Config(), {'imu.accel_scale': 0.0}))
+    assert not inputs.up_b.any()
+
+
 def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
     def lost(fix, rows):
         return changed(fix, status=lambda a: a.__setitem__(rows, -1),
