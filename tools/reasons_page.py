@@ -201,7 +201,7 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.FIXES_FOLLOW_ODOMETER: 'The scale of the fixes over seconds differs from their '
         'scale over minutes. This happens if the receiver fuses the fixes with a wheel speed of '
         'its own. Limits: 5 sigmas of this difference and 0.05 %. For SLAM and AMCL with wheels '
-        'the correction is incomplete: the scale can be several of its sigmas off.',
+        'the scale is known as from so many samples as the leg has time constants.',
         Code.FIXES_DEAD_RECKONED: 'The fixes of some seconds are smooth, as odometer and gyro '
         'predict them, and a jump follows: the receiver had no satellites, as in a tunnel. '
         'These fixes contain errors of its own odometer and are not used.',

@@ -201,7 +201,12 @@ def test_a_pose_that_contains_the_wheels_is_reported():
     config = settings(made, **SMOOTHER, leg__min_distance=20.0)
     result = calibrate(posed(made), config).methods['smoother']
     said, = (r for r in result.reasons if r.code is Code.FIXES_FOLLOW_ODOMETER)
-    assert 'accounted for in part' in said.text
+    assert 'with an uncertainty of the scale of' in said.text
+    doubt, = (s.effects for s in result.sources if s.name == 'wheels_in_positions')
+    scale = result.estimates['scale_factor']
+    # 3 % wrong, known as from 300 s / 20 s samples, within a factor of two
+    assert 0.5 < doubt[0, 0] / (0.03 * (20 / 300)**0.5) < 2.0
+    assert scale.sigma > doubt[0, 0] * scale.value
     assert 'positions fused with a wheel speed' in said.text
     assert all(word in said.remedy for word in ('SLAM', 'AMCL', 'robot_localization', 'lidar'))
     plain = calibrate(posed(drive(**CAR)), settings(drive(**CAR), **SMOOTHER))

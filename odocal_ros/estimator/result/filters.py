@@ -20,22 +20,32 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
                    f'{time:.2f} s; accounted for'),)
 
 
-def odometer_reasons(share: float, sigma: float, log_time: float,
-                     local: bool) -> tuple[Reason, ...]:
-    """
-    Return FIXES_FOLLOW_ODOMETER, where so; of the error of the receiver's own odometer.
-
-    local : the positions are in a local frame. The drift of a SLAM that is filtered with the
-    wheels is not modelled: scales of 40 indoor runs are up to 9 sigmas off (docs/honesty.md).
-    """
+def follows_odometer(share: float, sigma: float) -> bool:
+    """Return True if the receiver has an odometer of its own, of this error."""
     worth = 5e-4    # relative: less changes no scale by more than its sigma
-    if abs(share) <= max(FAULT_SIGMAS * sigma, worth):
+    return bool(abs(share) > max(FAULT_SIGMAS * sigma, worth))
+
+
+def odometer_reasons(share: float, sigma: float, log_time: float,
+                     by_map: float) -> tuple[Reason, ...]:
+    """Return FIXES_FOLLOW_ODOMETER, where so; by_map: sigma of ln K, 0 of no map."""
+    if not follows_odometer(share, sigma):
         return ()
     return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes contain an odometer with a scale error '
                    f'of {100 * share:+.2f} % ± {100 * sigma:.2f} % (time constant '
                    f'{np.exp(log_time):.0f} s), as positions fused with a wheel speed do; '
-                   + ('accounted for in part: the scale can be several sigmas off' if local
-                      else 'accounted for')),)
+                   'accounted for' + (f', with an uncertainty of the scale of {100 * by_map:.2g} %'
+                                      if by_map else '')),)
+
+
+def by_map_drift(share: float, log_time: float, duration: float) -> float:
+    """
+    Return the sigma of ln K by a map whose drift is filtered together with the wheels.
+
+    This drift is not modelled. It looks like the wheels' error for as long as the filter's time
+    constant, so that error is known as from so many samples as the leg, s, has time constants.
+    """
+    return float(abs(share) * np.sqrt(np.exp(log_time) / duration))
 
 
 def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:

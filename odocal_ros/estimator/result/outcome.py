@@ -36,6 +36,7 @@ from odocal_ros.estimator.result.remarks import (
     level_pitch,
     MODEL_FLOOR,
     remarks,
+    wheels_in_map,
 )
 from odocal_ros.estimator.result.shares import shares
 from odocal_ros.estimator.result.slip import (
@@ -77,6 +78,8 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     count = leg.travel.quantum * fit.state.scale
     state, c = fit.state, fit.state.constants
     covariance = floored(fit.covariance * widen**2)
+    by_map = wheels_in_map(problem, c, np.sqrt(np.diag(covariance)))
+    covariance[LN_K, LN_K] += by_map**2
     sigma = np.sqrt(np.diag(covariance))
     filtered = filter_reasons(c[ODO_LAG2], sigma[ODO_LAG2])
     slips, slip_said = _slips(leg, fit, near, count, filtered=bool(filtered))
@@ -111,6 +114,10 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     reasons += judge(found, leg.nominal_scale, config)
     sources = [*(_widened(s, widen) for s in shares(fit, near)),
                Source('model', np.diag(MODEL_FLOOR))]
+    border = border_of(fit, configured(leg)).widened(widen)
+    if by_map:
+        sources.append(Source('wheels_in_positions', np.array([[by_map], [0.0], [0.0]])))
+        border = border.loosened({CONSTANTS[LN_K]: by_map})
     grade = problem.grade if leg.has_accelerometer else None
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
@@ -121,7 +128,7 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
                            'beside': beside(c, covariance, grade)}
                         | ({} if grade is None else {
                             'level_pitch_angle': level_pitch(fit, near, widen)}),
-                        border_of(fit, configured(leg)).widened(widen))
+                        border)
 
 
 def _slips(leg: SmootherLeg, fit: Fit, near: JointMarginals, count: float, *,

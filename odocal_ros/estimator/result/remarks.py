@@ -14,7 +14,13 @@ from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import imperfect_sigmas
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.result.filters import clock_reasons, lag_reasons, odometer_reasons
+from odocal_ros.estimator.result.filters import (
+    by_map_drift,
+    clock_reasons,
+    follows_odometer,
+    lag_reasons,
+    odometer_reasons,
+)
 from odocal_ros.estimator.state import (
     BA,
     BY_SPEED,
@@ -104,12 +110,20 @@ def level_pitch(fit: Fit, near: JointMarginals, widen: float) -> dict[str, Any]:
             'sigma': float(np.sqrt(row @ C @ row) * widen), 'unit': 'rad'}
 
 
+def wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
+    """Return the sigma of ln K by positions in a local frame that contain the wheels."""
+    if not problem.leg.origin.local or not follows_odometer(c[FIX_BY_MOTION],
+                                                            sigma[FIX_BY_MOTION]):
+        return 0.0
+    return by_map_drift(c[FIX_BY_MOTION], c[FIX_TIME], problem.leg.t_stop - problem.leg.t_begin)
+
+
 def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[Reason]:
     """Return reasons: filtered signals, a varying scale, deviations from configured values."""
     c = fit.state.constants
     said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
             *odometer_reasons(c[FIX_BY_MOTION], sigma[FIX_BY_MOTION], c[FIX_TIME],
-                              bool(problem.leg.origin.local)),
+                              wheels_in_map(problem, c, sigma)),
             *(reason for name, i in CLOCKS.items()
               for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
             *_varies(fit, sigma)]
