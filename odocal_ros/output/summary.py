@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A calibration in words: one screen for a terminal, one sentence for an answer."""
+"""A calibration as text: one screen for a terminal, one sentence for an answer."""
 
 from datetime import datetime, UTC
 import math
@@ -52,12 +52,12 @@ ORDER = list(Verdict)
 def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
            rows: int | None = None) -> str:
     """
-    Return everything a person needs to judge a calibration, as plain text.
+    Return the complete summary of a calibration as plain text.
 
     calibration : of all legs.   styled : the verdict in bold and in colour, for a terminal.
-    width : columns; below 98 what is said twice or is of less use is left out.   rows : lines
-    there are. Where they do not do, small errors, notes and the whole budget, in this order, are
-    left to the report: verdict, values and what to do are not.
+    width : columns; below 98 redundant or less useful parts are omitted.   rows : lines of the
+    screen. If they are too few, small errors, notes and the whole budget are omitted, in this
+    order; verdict, values and actions are not.
     """
     for small, notes, budget in ((True, True, True), (False, True, True), (False, False, True),
                                  (False, False, False)):
@@ -81,7 +81,7 @@ def sentence(calibration: Calibration) -> str:
 
 
 def values_in_words(estimates: dict[str, Estimate]) -> str:
-    """Return scale, angles and, where they are known, those of two wheels, with sigmas."""
+    """Return scale, angles and, if known, wheel factors and track width, with sigmas."""
     scale = known(estimates, 'scale_factor')
     parts = []
     if scale.value is None:
@@ -155,12 +155,12 @@ def _values(calibration: Calibration, width: int) -> list[str]:
 
 
 def _angles_of(estimates: dict[str, Estimate]) -> dict[str, str]:
-    """Return the mounting angles that the method can have: the planar one has none."""
+    """Return the mounting angles that the method estimates: the planar one none."""
     return {} if known(estimates, 'scale_factor').method == PLANAR else ANGLES
 
 
 def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
-    """Return a line for each of more than two wheels, and what is in it: by name of estimate."""
+    """Return estimate -> line of its wheel, with '' for its position, for more than two wheels."""
     lines: dict[str, str] = {}
     for name in wheel_factors(estimates):
         wheel = name.removeprefix(FACTOR)
@@ -174,7 +174,7 @@ def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
 
 
 def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
-    """Return the median ratio of fixes and odometer beside the scale factor, '' without one."""
+    """Return the line with the mean path ratio of the legs, weighted by distance; or ''."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     way = sum(distance for _, distance in ratios)
     if not scale.value or not way:
@@ -250,7 +250,7 @@ def _leg_table(legs: tuple[LegResult, ...], width: int) -> list[str]:
 
 
 def _method_table(calibration: Calibration) -> list[str]:
-    """Return the methods side by side, nothing for one."""
+    """Return the table of methods, empty for a single one."""
     methods = calibration.methods
     if len(methods) < 2:
         return []
