@@ -74,7 +74,7 @@ def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
 
 
 def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str, str]:
-    """Return which quantities of a result meet their limits; none of a rejected one."""
+    """Return yes, no or unknown for each quantity of a result; no yes for a rejected one."""
     doubted = {ABOUT[r.code] for r in calibration.reasons
                if r.code in ABOUT and r.code.gravity is not Verdict.ACCEPTED}
     return of_estimates(calibration.estimates, config, two_wheels,
@@ -84,7 +84,7 @@ def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -
 def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
                  doubted: Set[str] = frozenset()) -> dict[str, str]:
     """
-    Return which quantities are within their limits: yes, no or unknown.
+    Return yes, no or unknown for each quantity: within its limit.
 
     valid : False: no value is usable.   doubted : names of estimates with a reason against
     their use.

@@ -69,7 +69,7 @@ class Inputs:
         return imu if leads else self.by_slot['odometer']
 
     def missing(self, config: Config) -> list[str]:
-        """Return why a leg cannot start, one line per missing topic."""
+        """Return the causes that prevent a leg, one line per missing topic."""
         return [one.why() for one in self.required(config) if not one.flowing()]
 
     def begin_leg(self) -> None:
