@@ -162,7 +162,8 @@ def manoeuvres(now: SessionView) -> list[str]:
         return []
     wants, least = [], now.leg.min_speed
     if now.max_speed < least:
-        wants.append(f'{DRIVE}faster than {least:.3g} m/s ({KMH * least:.0f} km/h)')
+        wants.append(f'{DRIVE}faster than leg.min_speed, {least:.3g} m/s '
+                     f'({KMH * least:.0f} km/h)')
     if now.config.reference.points and len(now.session.marks_of_leg()) < FEWEST_MARKS:
         wants.append('call ~/mark at rest on each point')
     if now.two_wheels and 'smoother' in deciding(now.session.config.method):

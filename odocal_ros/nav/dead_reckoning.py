@@ -152,22 +152,28 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
     if not np.any(inside):
         return None
     s, p = travel.at(t_fix[inside]), fixes_n[inside, :2]
-    scale = _by_sections(s, p, max(least, 8 * sigma))
+    scale = section_ratio(s, s[:, None], p, max(least, 8 * sigma))
     if scale is None or len(s) < 5:
         return scale
     # third differences of white noise have 20 times its variance
     noise = robust_sigma(np.diff(p, 3, axis=0)) / np.sqrt(20)
-    short = _by_sections(s, p, max(SHORT_SECTION, 8 * sigma, 8 * noise))
+    short = section_ratio(s, s[:, None], p, max(SHORT_SECTION, 8 * sigma, 8 * noise))
     return short if short is not None and short > FOLDED * scale else scale
 
 
-def _by_sections(s: Floats, p: Floats, least: float) -> float | None:
-    """Return the median of chord over travel in the shortest sections with chords of ``least``."""
+def section_ratio(s: Floats, path: Floats, p: Floats, least: float) -> float | None:
+    """
+    Return the median of distance between fixes over distance on a path, None if no section does.
+
+    s, path, p : (n,) travel, (n, k) path in its units, (n, 2) fixes, m, all at their times. The
+    sections are equal in travel, as short as possible with a median of ``least`` m between fixes.
+    """
     path_length = np.append(0.0, np.cumsum(np.abs(np.diff(s))))
     pieces = len(s) // 2
     while pieces and path_length[-1] > 0:
         k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], pieces + 1)))
-        chord, run = np.hypot(*np.diff(p[k], axis=0).T), np.abs(np.diff(s[k]))
+        chord = np.hypot(*np.diff(p[k], axis=0).T)
+        run = np.sqrt((np.diff(path[k], axis=0)**2).sum(axis=1))
         onward = run > 0
         if onward.any() and np.median(chord[onward]) >= least:
             return float(np.median(chord[onward] / run[onward]))

@@ -33,9 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the robot stands on a point of reference.points at T seconds from the first '
         'message; repeatable, in the order of the points')
     add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
-    add('--export', metavar='FILES', default='', help='time series files, separated by commas: '
-        'trajectory.tum, states.csv, residuals.parquet, track.kml, scale_by_speed.png, '
-        'debug.mcap, drive.rrd ...')
+    add('--export', metavar='FILES', action='append', default=[],
+        help='time series files, separated by commas or repeatable: trajectory.tum, states.csv, '
+        'residuals.parquet, track.kml, scale_by_speed.png, debug.mcap, drive.rrd ...')
     add('--force', action='store_true', help='replace an existing calibration.json')
     add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     if args.marks:
         config['reference.marks'] = tuple(args.marks)
     legs_of(args.leg)
-    series = [name.strip() for name in args.export.split(',') if name.strip()]
+    series = [name.strip() for name in ','.join(args.export).split(',') if name.strip()]
     if series:
         from odocal_ros.library.export import check_names
         check_names(series)

@@ -125,7 +125,7 @@ def _values(calibration: Calibration, width: int) -> list[str]:
     sent = known(estimates, AS_SENT)
     if sent.value is not None:
         lines.append(_line('  of speed as sent', _scale_text(sent)))
-    lines.append(_path_ratio(calibration, scale))
+    lines.append(_path_ratio(calibration, scale, sent))
     for name, word in _angles_of(estimates).items():
         lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name), width)))
     lines += _largest_errors(calibration, width)
@@ -173,17 +173,18 @@ def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
     return lines
 
 
-def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
-    """Return the line with the mean path ratio of the legs, weighted by distance; or ''."""
+def _path_ratio(calibration: Calibration, scale: Estimate, sent: Estimate) -> str:
+    """Return the line that compares the path ratio of the legs with the factor it belongs to."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     way = sum(distance for _, distance in ratios)
-    if not scale.value or not way:
+    factor, word = (scale, 'scale factor') if sent.value is None else (sent, 'factor as sent')
+    if not factor.value or not way:
         return ''
     ratio = sum(r * distance for r, distance in ratios) / way
     unit = '' if scale.unit == '1' else f' {scale.unit}'
     plain = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'  # 4 digits
     return _line('  path ratio', f'{plain}{unit}   fixes / odometer, '
-                 f'{100 * (ratio / scale.value - 1):+.1f} % from the scale factor')
+                 f'{100 * (ratio / factor.value - 1):+.1f} % from the {word}')
 
 
 def _gyro_scale(calibration: Calibration) -> str:

@@ -149,10 +149,10 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     estimates, _ = choose(methods, asked)
     scale = estimates.get('scale_factor')
     paths = None if scale is None else runs[scale.method].paths
-    plain = None if prepared.rough == prepared.nominal else prepared.rough
     if scale is None or paths is None:
         return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
-                          distance=prepared.distance, deciding=deciding(asked), path_ratio=plain)
+                          distance=prepared.distance, deciding=deciding(asked),
+                          path_ratio=prepared.path_ratio)
     distance_sigma = 0.05    # largest relative sigma of a scale for the distance
     # more accurate than the approximate scale; the travel is that of the uncorrected speed
     if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
@@ -165,8 +165,8 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
             methods[name] = replace(run.result, details=run.result.details | check)
             found += said
     return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
-                      distance=prepared.distance, deciding=deciding(asked), path_ratio=plain,
-                      **shown)
+                      distance=prepared.distance, deciding=deciding(asked),
+                      path_ratio=prepared.path_ratio, **shown)
 
 
 def _once(found: Sequence[Reason]) -> list[Reason]:

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from math import nan
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
+from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, section_ratio, Track
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.strapdown import attitude
@@ -135,6 +136,18 @@ class PreparedLeg(Placed):
             lambda w_b: (w_b - self.alignment.gyro_bias) @ inputs.up_b, inputs.w_b))
         path = level_track(self.track.s, turned)
         return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
+
+    @cached_property
+    def path_ratio(self) -> float | None:
+        """
+        Return metres per unit of travel by the fixes against ``level_path``, None if they stand.
+
+        Its distances turn and reverse as those of the fixes do, unlike the rough scale's.
+        """
+        t, travel = self.inputs.t_fix, self.inputs.travel
+        k = (t >= max(travel.t[0], self.track.t[0])) & (t <= min(travel.t[-1], self.track.t[-1]))
+        return section_ratio(travel.at(t[k]), self.level_path(t[k]), self.fixes_n[k, :2],
+                             max(self.inputs.least_motion, 8 * self.fix_sigma))
 
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
         """

@@ -25,7 +25,7 @@ FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
 
 def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimate]) -> Floats:
     """
-    Return f = K0 d0 of the settings, (3,) m per unit of travel.
+    Return f = K0 d0 of the settings, (3,) m per unit of travel; without K0 the path ratio's.
 
     f : as estimated; its angles are kept if ``estimates`` has no value of them.
     """
@@ -33,7 +33,7 @@ def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimat
     determined = {name for name, e in estimates.items() if e.value is not None}
     angles = [0.0 if name in determined else angle for name, angle in zip(
         ('yaw_mounting_angle', 'pitch_mounting_angle'), found, strict=True)]
-    return (ready.nominal or ready.rough) * forward_b(*angles)
+    return (ready.nominal or ready.path_ratio or ready.rough) * forward_b(*angles)
 
 
 def near(ready: PreparedLeg, path: Path, pin: MarkFix,

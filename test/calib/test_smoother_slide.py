@@ -27,8 +27,8 @@ pytestmark = pytest.mark.slow
 
 def said(method):
     """Tell whether the result says that a road's noise was assumed."""
-    return any(r.code is Code.PARAMETER_NOT_DETERMINED and 'is assumed' in r.text
-               for r in method.reasons)
+    return any(r.code is Code.PARAMETER_NOT_DETERMINED and 'turns faster than 3 deg/s add up'
+               in r.text and 'is assumed' in r.text for r in method.reasons)
 
 
 def straight(**options):

@@ -476,8 +476,8 @@ def test_the_hint_says_what_is_enough_and_what_more_it_takes(forecast, still_s, 
 
 def test_the_least_leg_comes_first():
     assert said(Forecast(GOOD, YAW), distance_m=60.0, max_speed=1.0) == (
-        'drive 40 m more, faster than 2.78 m/s (10 km/h); then stand still 10 s and call '
-        '~/stop_leg')
+        'drive 40 m more, faster than leg.min_speed, 2.78 m/s (10 km/h); then stand still 10 s '
+        'and call ~/stop_leg')
 
 
 def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():

@@ -223,3 +223,13 @@ def test_the_plain_ratio_of_path_lengths_stands_beside_the_scale(good):
     line = next(x for x in screen(replace(good, legs=legs)).splitlines() if 'path ratio' in x)
     assert line.split()[2:4] == ['0.05070', 'm/pulse']
     assert line.endswith('fixes / odometer, +1.4 % from the scale factor')
+
+
+def test_the_ratio_of_a_truncated_speed_is_beside_the_factor_of_what_is_sent(good):
+    """The path over whole km/h is 0.9947: the factor as sent, 0.8 % above the exact speed's."""
+    estimates = {'scale_factor': Estimate(0.9867, 3e-4, '1'),
+                 'scale_factor_as_sent': Estimate(0.9947, 3e-4, '1')}
+    text = screen(replace(good, estimates=good.estimates | estimates,
+                          legs=(replace(good.legs[0], path_ratio=0.9947, distance=1000.0),)))
+    line = next(x for x in text.splitlines() if 'path ratio' in x)
+    assert line.endswith('0.9947   fixes / odometer, +0.0 % from the factor as sent')
