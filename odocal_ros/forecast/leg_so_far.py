@@ -80,7 +80,7 @@ def screened_in_cells(leg: Leg, config: Config) -> Screened:
 
 def faults_in_cells(leg: Leg, config: Config) -> tuple[Reason, ...]:
     """Return the faults of a leg whose IMU rows are means over cells of time."""
-    return faults(leg, screened_in_cells(leg, config), _with_cells(leg, config))
+    return faults(screened_in_cells(leg, config), _with_cells(leg, config))
 
 
 def _with_cells(leg: Leg, config: Config) -> Config:

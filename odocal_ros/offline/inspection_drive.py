@@ -24,13 +24,13 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
 from odocal_ros.pipeline.calibrate import missing_data
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.clock_offset import screen_aligned
 from odocal_ros.screening.clocks import TOO_FAR
 from odocal_ros.screening.facing import imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.moved_imu import turned_over
-from odocal_ros.screening.screen import screen
 from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
@@ -58,7 +58,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
         findings.append(Reason(Code.CLOCKS_DIFFER, str(error), TOO_FAR))
         return []
     config = settings_by_frame(leg.fix, config)
-    inputs, reasons = screen(leg, config)
+    leg, inputs, reasons = screen_aligned(leg, config)
     findings += [r for r in reasons if r.code is not Code.NO_FIX or 'fix' in found['mapping']]
     if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:
         known = {reason.code for reason in findings}

@@ -154,8 +154,9 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
     for name, (late, sigma) in seen.items():
         metres = abs(late) * speed
         worth = max(least_delay_path, hidden_by_fix * prepared.fix_sigma)
-        if not (abs(late) > REMARK_SIGMAS * sigma and metres > worth):
-            continue
+        if name in prepared.inputs.aligned or not (
+                abs(late) > REMARK_SIGMAS * sigma and metres > worth):
+            continue        # the first is reported: this is the rest of it
         set_to = getattr(prepared.config, name).time_offset
         notes.append(Reason(
             Code.DELAY_SEEN, f'{WHAT[name]} stamps are {abs(late):.3f} s (± {sigma:.3f} s) '

@@ -29,12 +29,12 @@ from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.clock_offset import screen_aligned
 from odocal_ros.screening.facing import imu_sanity, UNUSABLE
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.moved_imu import turned_over
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
-from odocal_ros.screening.screen import screen
 from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
 
@@ -44,8 +44,9 @@ NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX
 
 
 class Screened(NamedTuple):
-    """Inputs of a leg, their reasons, and True if it can be calibrated."""
+    """A leg with its clocks aligned, its inputs, reasons, and True if it can be calibrated."""
 
+    leg: Leg
     inputs: Inputs
     reasons: tuple[Reason, ...]
     usable: bool
@@ -67,7 +68,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     if is_planar(leg, config):
         return planar_leg(leg, config, notes, progress)
     seen = screened(leg, config, notes)
-    inputs = seen.inputs
+    leg, inputs = seen.leg, seen.inputs
 
     def result_of(inputs: Inputs, reasons: Sequence[Reason]) -> LegResult:
         prepared, found = prepare(leg, inputs, config, reasons, alignment, holdout)
@@ -83,7 +84,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
         *seen.reasons, *said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)))
 
 
-def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
+def faults(seen: Screened, config: Config) -> tuple[Reason, ...]:
     """
     Return the reasons of a leg as in ``calibrate``, without those of its methods.
 
@@ -92,7 +93,8 @@ def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
     """
     reasons = seen.reasons
     if seen.usable:
-        _, reasons = prepare(leg, seen.inputs, settings_by_frame(leg.fix, config), reasons)
+        config = settings_by_frame(seen.leg.fix, config)
+        _, reasons = prepare(seen.leg, seen.inputs, config, reasons)
     return tuple(r for r in reasons
                  if r.code.gravity is not Verdict.ACCEPTED and r.code not in NOT_YET)
 
@@ -100,12 +102,13 @@ def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
 def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
     """Return the inputs of a leg, z up."""
     config = settings_by_frame(leg.fix, config)
-    inputs, found = screen(leg, config)
+    leg, inputs, found = screen_aligned(leg, config)
     reasons = (*notes, *found)
     missing = missing_data(leg, inputs)
     if missing or not len(inputs.t_fix):
         seen = {r.code for r in reasons}
-        return Screened(inputs, (*reasons, *(r for r in missing if r.code not in seen)), False)
+        return Screened(leg, inputs, (*reasons, *(r for r in missing if r.code not in seen)),
+                        False)
     sanity, z_down = imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
     moved = turned_over(inputs)     # or else its mean gravity is judged, which it never measures
     sanity, z_down = (moved, False) if moved else (sanity or unit_changes(inputs), z_down)
@@ -113,7 +116,7 @@ def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened
     let_go()
     if z_down:
         inputs = _turned_over(inputs)
-    return Screened(inputs, reasons, not UNUSABLE & {r.code for r in sanity})
+    return Screened(leg, inputs, reasons, not UNUSABLE & {r.code for r in sanity})
 
 
 def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:

@@ -4,7 +4,7 @@
 """A leg as the methods use it: screened rows, fixes in metres, metres per count."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -53,6 +53,8 @@ class Inputs:
     scale_unit: str
     has_accelerometer: bool = True     # False: f_b is made up
     local: bool = False                # True: fixes are positions in a local frame
+    # clocks that were seconds from the IMU's, by group of settings: s, > 0 late; moved and said
+    aligned: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def usual_f_b(self) -> Floats:

@@ -73,7 +73,7 @@ def test_what_is_set_already_is_counted_in():
 def test_it_must_be_there_and_matter(late, sigma, fix_sigma, is_said):
     t = np.arange(0.0, 60.0, 0.1)
     run = SimpleNamespace(config=Config(), fix_sigma=fix_sigma, inputs=SimpleNamespace(
-        travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0))       # 10 m/s
+        travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0, aligned={}))       # 10 m/s
     assert bool(delay_notes(run, {'gnss': (late, sigma)}, scale=0.5)) == is_said
 
 

@@ -124,6 +124,12 @@ def test_rows_without_a_stamp_or_out_of_order_are_no_clock_that_was_set(leg):
     assert (np.diff(inputs.t_imu) > 0).all()
 
 
+def test_the_clock_of_the_recorder_is_not_that_of_the_sender(leg):
+    lost = take(leg.imu, np.arange(len(leg.imu.stamp_ns)) != 4000)
+    set_by = changed(lost, received_ns=lambda a: a.__setitem__(slice(4000), a[:4000] - 10**18))
+    assert Code.CLOCK_SET not in said(replace(leg, imu=set_by))[1]
+
+
 @pytest.mark.parametrize('late_s', [0.05, 0.3])
 def test_a_topic_that_arrives_again_later_is_no_clock_that_was_set(leg, late_s):
     again = replace(leg.fix, received_ns=leg.fix.received_ns + round(late_s * 1e9))
