@@ -145,16 +145,16 @@ def _sets(samples: Samples) -> tuple[Ints, Floats]:
     """
     Return the rows after which a clock was set, and by how much, s: its stamps step for good.
 
-    Their arrivals do not, and no stamp beside falls. Rows out of order or with a false stamp step
-    twice.
+    Their arrivals do not (where these alone step, the recorder's clock was set), and no stamp
+    beside falls. Rows out of order or with a false stamp step twice.
     """
     if len(samples.stamp_ns) < 2 * LAG_NEIGHBOURS or not by_step(
             _may_be_odd, samples.stamp_ns).any():
         return np.empty(0, np.int64), np.empty(0)
     step, lag = np.diff(samples.stamp_ns) * 1e-9, _lag(samples)
     ahead = lag[:-1] - lag[1:]
-    odd = np.flatnonzero((np.abs(step - np.median(step)) > CLOCK_SET)
-                         & (np.abs(ahead) > CLOCK_SET / 2))
+    stamps = np.abs(step - np.median(step)) > np.maximum(CLOCK_SET, np.abs(ahead) / 4)
+    odd = np.flatnonzero(stamps & (np.abs(ahead) > CLOCK_SET / 2))
     at, moved = [], []
     for k in odd.tolist():
         before, after = slice(max(k + 1 - LAG_NEIGHBOURS, 0), k), slice(k + 1, k + LAG_NEIGHBOURS)

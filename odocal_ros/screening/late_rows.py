@@ -74,7 +74,9 @@ def intervals(t: Floats) -> list[float]:
     interval_span = 5.0    # s over which means are taken
     n = max(1, int(interval_span * (len(t) - 1) / max(t[-1] - t[0], interval_span)))
     step = np.diff(t)
-    usual, mean = median(step), median(t[n:] - t[:-n]) / n
+    # where most rows have one stamp the mean by parts is zero
+    usual = median(step)
+    mean = median(t[n:] - t[:-n]) / n or float(t[-1] - t[0]) / len(step)
     steady_share = 0.005    # by which they differ: rows are lost, or all are late by chance
     if abs(mean - usual) < steady_share * mean:
         return [mean]

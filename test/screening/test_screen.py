@@ -119,6 +119,12 @@ def test_rows_without_a_stamp_are_no_clock_that_was_set(leg):
     assert Code.CLOCK_SET not in said(replace(leg, imu=imu))[1]
 
 
+def test_the_clock_of_the_recorder_is_not_that_of_the_sender(leg):
+    lost = take(leg.imu, np.arange(len(leg.imu.stamp_ns)) != 4000)
+    set_by = changed(lost, received_ns=lambda a: a.__setitem__(slice(4000), a[:4000] - 10**18))
+    assert Code.CLOCK_SET not in said(replace(leg, imu=set_by))[1]
+
+
 def test_rows_out_of_order_are_no_clock_that_was_set(leg):
     order = np.arange(len(leg.imu.stamp_ns))
     order[3000:3200] = np.random.default_rng(1).permutation(order[3000:3200])

@@ -6,7 +6,7 @@ Lower limits of sideslip and vertical motion, by the turns of the leg.
 
 Sideslip is observable in turns: a leg with turns uses its own estimate. On a straight leg a
 constant sideslip cannot be separated from the mounting yaw: the noise of an ordinary road is the
-lower limit, whatever the residuals of single seconds.
+lower limit, even if the residuals of single seconds are smaller.
 """
 
 import numpy as np
