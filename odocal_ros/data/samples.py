@@ -175,7 +175,7 @@ def columns_of(samples: Samples) -> list[NDArray[Any]]:
 def of_columns(kind: type[SomeSamples], *columns: NDArray[Any]) -> SomeSamples:
     """Return samples from checked arrays without other references, without a copy."""
     samples = object.__new__(kind)
-    for name, array in zip(kind.__dataclass_fields__, columns, strict=True):
+    for array in columns:
         array.setflags(write=False)
-        object.__setattr__(samples, name, array)
+    vars(samples).update(zip(kind.__dataclass_fields__, columns, strict=True))
     return samples

@@ -24,6 +24,8 @@ FIX = 'sensor_msgs/msg/NavSatFix'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, samples.Samples]]
 Build = Callable[..., samples.Samples]        # of stamps, arrivals and a slot's columns
+# format: bits of -1 (REP-145), which are compared without a warning of a signalling NaN
+NONE_SENT = np.float64(-1).view(np.int64)
 # format: block of the position in a 6 x 6 covariance, row by row
 _COVARIANCE = array('pose.covariance', 0, 1, 2, 6, 7, 8, 12, 13, 14)
 # columns of each type: position, and its covariance if the type has one
@@ -63,8 +65,7 @@ class SensorPlan:
 
 def _imu(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw: Floats, w_i: Floats,
          f_i: Floats, of_force: Floats) -> samples.ImuSamples:
-    with np.errstate(invalid='ignore'):      # a signalling NaN
-        none = of_force[:, 0] == -1          # REP-145: no accelerations
+    none = of_force.view(np.int64)[:, 0] == NONE_SENT
     if none.any():
         f_i[none] = np.nan
     return samples.of_columns(samples.ImuSamples, stamps, received, w_i, f_i, q_ni,
@@ -78,8 +79,8 @@ def _heading(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw
 
 def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
     """Return covariance[8]; NaN without orientation (REP-145's -1 or an all-zero quaternion)."""
-    some = across(np.logical_or, q_ni != 0)
-    return np.where(~some | (of_roll[:, 0] == -1), np.nan, of_yaw[:, 0])
+    some = across(np.logical_or, q_ni) & (of_roll.view(np.int64)[:, 0] != NONE_SENT)
+    return np.where(some, of_yaw[:, 0], np.nan)
 
 
 def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
