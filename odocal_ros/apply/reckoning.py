@@ -7,8 +7,8 @@ Dead reckoning with the strapdown of the calibration, corrected at stops.
 From one IMU sample to the next attitude is turned by the calibration's rotation increments
 (``apply/attitude.py``) and travel summed by the trapezoid rule along the calibrated forward axis,
 as ``nav/dead_reckoning.py`` has it: with ``levelling`` off the path of equal samples, start
-attitude and bias is that of a replay. With it, the accelerometer holds the tilt, and stops the
-gyro bias; the position never jumps.
+attitude and bias is that of a replay. With it, the accelerometer holds the tilt, stops the gyro
+bias; the position never jumps.
 """
 
 from collections.abc import Sequence
@@ -30,6 +30,7 @@ from odocal_ros.apply.attitude import (
     Vector,
     ZERO,
 )
+from odocal_ros.apply.delay import DelaySearch
 from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
 from odocal_ros.apply.pose import covariances, numbers_of, Pose, velocity_variances
 from odocal_ros.apply.start import Start
@@ -41,8 +42,8 @@ from odocal_ros.nav.standstill import REST_TURN
 from odocal_ros.settings.levels import FASTEST
 from odocal_ros.settings.node_configs import ApplyConfig
 
-# judgement, all in s: between corrections; that a speed is taken over; without odometer, after
-# which attitude continues alone; without IMU, that hide motion
+# judgement, all in s: between corrections; of a speed; without odometer, until attitude continues
+# alone; without IMU, that hide motion
 CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
 # judgement: corrections in turn that force and motion disagree at, after which the attitude is
 # false; m/s^2 that the force is then as long as gravity to
@@ -64,7 +65,8 @@ class Reckoning:
     def __init__(self, start: Start, imu: ImuStream, wheels: Wheels, vehicle: Vehicle,
                  config: ApplyConfig, notes: list[str], delay_sigma: float) -> None:
         self.imu, self.wheels, self.vehicle, self.config = imu, wheels, vehicle, config
-        self._notes, self._delay_sigma, self.failed = notes, delay_sigma, ''
+        self._notes, self.failed = notes, ''
+        self._delay = DelaySearch(SPEED_SPAN, delay_sigma, notes)
         self.q: Quaternion = tuple(start.q_nb.tolist())
         self.bias: Vector = tuple(start.gyro_bias.tolist())
         self.accel_bias, self.errors = ZERO, start.errors
@@ -111,7 +113,9 @@ class Reckoning:
                     break
                 out.append(pose)
             self._look()
-            self._leave_behind(last)
+            if last > ROWS_BEHIND:      # those that determine the usual interval are kept
+                self.imu.drop(last - INTERVAL_ROWS)
+                self.wheels.forget(self._t - 2 * CORRECTION_PERIOD)
         return out
 
     def lacking_s(self) -> float:
@@ -234,6 +238,9 @@ class Reckoning:
             variance = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
             rate_b = w.mean(axis=0) - self.bias - np.transpose(self._C_nb) @ self._earth_n
             self._correct(self.errors.by_rest(rate_b, variance))
+        self.errors.changed |= self._delay.take(
+            rotated(self._C_nb, self._forward_b),
+            velocity - self._v_look if received and self._levels else None, self._dv_n, T)
         self._rested = resting
         self._t_look, self._v_look = self._t, self._velocity_n(self._t)
         self._dv_n, self._levels, self._w_look = ZERO, True, []
@@ -253,14 +260,13 @@ class Reckoning:
 
     def _correct(self, by: Floats) -> None:
         self.q = product(rotation(by[PHI].tolist()), self.q)
-        self._C_nb = matrix_of(self.q)
-        self.bias = plus(self.bias, by[BG].tolist())
+        self._C_nb, self.bias = matrix_of(self.q), plus(self.bias, by[BG].tolist())
         self.accel_bias = plus(self.accel_bias, by[BA].tolist())
 
     def _pose(self) -> Pose:
         """Return the pose at the row reached."""
-        T, C_nb = self._t - self._t_pose, self._C_nb
-        arm_n, C_bn = rotated(C_nb, self._arm_b), tuple(zip(*C_nb, strict=True))
+        T, C_bn = self._t - self._t_pose, tuple(zip(*self._C_nb, strict=True))
+        arm_n = rotated(self._C_nb, self._arm_b)
         rate_b = plus(plus(ZERO, self._turn_b, 1 / T), rotated(C_bn, self._earth_n), -1.0)
         swing, speed = self.vehicle.swing(rate_b), (self._s - self._s_pose) / T
         if abs(speed) > FASTEST:
@@ -283,7 +289,7 @@ class Reckoning:
         clock that moved shifts the time of the pose too.
         """
         forward_n = rotated(self._C_nb, self._forward_b)
-        delay = math.hypot(self._delay_sigma, self._moved, self.wheels.delay_s)
+        delay = math.hypot(self._delay.sigma_s, self._moved, self.wheels.delay_s)
         late = (*plus(ZERO, plus(self._swung, forward_n, -speed), delay),
                 *plus(ZERO, rotated(self._C_nb, rate_b), self._moved))
         now, since = self.wheels.variances(self._t, T)
@@ -292,9 +298,3 @@ class Reckoning:
             plus(ZERO, forward_n, math.sqrt(now)),
             [self.errors.grade.gyro_scale_error * one for one in swing],
             velocity_variances(self.vehicle, speed, T, since + self._doubt))
-
-    def _leave_behind(self, last: int) -> None:
-        """Forget what lies behind, but for the rows that determine the usual interval."""
-        if last > ROWS_BEHIND:
-            self.imu.drop(last - INTERVAL_ROWS)
-            self.wheels.forget(self._t - 2 * CORRECTION_PERIOD)

@@ -1,0 +1,87 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Delay of the IMU's stamps relative to the odometer's, estimated while driving."""
+
+from collections import deque
+
+import numpy as np
+
+from odocal_ros.apply.attitude import Vector
+from odocal_ros.apply.errors import GRAVITY
+from odocal_ros.data.arrays import Floats
+
+# judgement: rows of a second, at least and at most; s over which residuals are correlated
+LEAST_DELAY_ROWS, MOST_DELAY_ROWS, LAGS = 60, 300, 4
+# tuned by benchmarks/stream_faults.py: s and sigmas of a delay that is reported. 168 streams
+# without a delay show up to 0.028 s and 2.5 sigmas, four of five with 0.1 s more than these
+LEAST_DELAY, DELAY_SIGMAS = 0.04, 4.0
+# tuned by benchmarks/stream_faults.py: a central difference over two seconds is smaller than the
+# change within one
+CHANGE_SMOOTHED = 1.2
+
+
+class DelaySearch:
+    """
+    Regression of force minus acceleration on the change of acceleration, one row per second.
+
+    The velocity of an IMU that is tau s late is that of tau s earlier: its change in a second
+    differs by -tau times the change of acceleration. A constant (tilt, bias) is estimated too.
+
+    span_s : the odometer's speeds are means over that time, and late by half of it.   sigma_s : of
+    the delay as configured; ``sigma_s`` grows with the delay found.   notes : list that takes the
+    sentence.
+    """
+
+    def __init__(self, span_s: float, sigma_s: float, notes: list[str]) -> None:
+        self.sigma_s, self._notes, self._own_s, self._found_s = sigma_s, notes, span_s / 2, 0.0
+        self._last: deque[tuple[float, float]] = deque(maxlen=3)
+        self._rows: deque[tuple[float, float]] = deque(maxlen=MOST_DELAY_ROWS)
+
+    def take(self, forward_n: Vector, change_n: Floats | None, dv_n: Vector, T: float) -> bool:
+        """
+        Take a second; return True if ``sigma_s`` has grown.
+
+        forward_n : forward axis.   change_n, dv_n : (3,) m/s, change of velocity by the odometer,
+        None if not usable, and integral of the specific force, over T s.
+        """
+        if change_n is None:
+            self._last.clear()
+            return False
+        force_n = dv_n - np.array([0.0, 0.0, GRAVITY * T])
+        self._last.append((float(forward_n @ change_n), float(forward_n @ force_n)))
+        if len(self._last) < 3:
+            return False
+        (before, _), (own, by_force), (after, _) = self._last
+        self._rows.append(((after - before) / 2, by_force - own))
+        delay, sigma = self._delay()
+        delay += self._own_s
+        if abs(delay) < max(LEAST_DELAY, DELAY_SIGMAS * sigma, self._found_s):
+            return False
+        self._notes.append(f'IMU stamps are {abs(delay):.2f} s (± {sigma:.2f} s) '
+                           f'{"late" if delay > 0 else "early"} relative to the odometer: add '
+                           f'{-delay:+.2f} to imu.time_offset; sigma increased')
+        self._found_s = abs(delay) + 2 * sigma
+        self.sigma_s = max(self.sigma_s, self._found_s)
+        return True
+
+    def _delay(self) -> tuple[float, float]:
+        """Return the delay of the IMU, s, and its sigma, infinite while there are too few rows."""
+        if len(self._rows) < LEAST_DELAY_ROWS:
+            return 0.0, np.inf
+        x, y = np.array(self._rows).T
+        X = np.stack([x, np.ones_like(x)], 1)
+        N = X.T @ X
+        if np.linalg.cond(N) > 1e6:      # no acceleration changes
+            return 0.0, np.inf
+        fit = np.linalg.solve(N, X.T @ y)
+        scores = X * (y - X @ fit)[:, None]
+        # residuals are correlated: the sum of products over some lags (Newey-West)
+        middle = scores.T @ scores
+        for lag in range(1, LAGS):
+            product = scores[lag:].T @ scores[:-lag] * (1 - lag / LAGS)
+            middle += product + product.T
+        C = np.linalg.inv(N)
+        white = np.sum((y - X @ fit)**2) / (len(y) - 2) * C[0, 0]
+        variance = max(white, (C @ middle @ C)[0, 0])
+        return float(-fit[0]) / CHANGE_SMOOTHED, float(np.sqrt(variance)) / CHANGE_SMOOTHED
