@@ -38,7 +38,7 @@ def searched(late, bias=0.1, seconds=200):
 @pytest.mark.parametrize('late', [0.1, -0.2])
 def test_a_delay_is_found_beside_a_bias(late):
     """
-    Of a sine of w the slope is the exact one by w / sin(w), and CHANGE_SMOOTHED of it is taken off.
+    Of a sine of w the slope is off by w / sin(w), of which CHANGE_SMOOTHED is taken off.
 
     w = 2 pi / 9 a second: 1.09 for 1.2; to first order in w late.
     """
