@@ -99,8 +99,8 @@ FAULTS: dict = {
                                 'imu.grade': 'navigation',
                                 'alignment.heading_source': 'gyrocompass',
                                 'method': 'two_point'}, None),
-    'CLOCKS_DIFFER': ('fixes in GPS time, 18 s', 'town', {}, {}, {},
-                      lambda leg, rng: replace(leg, fix=shifted(leg.fix, 18.0))),
+    'CLOCKS_DIFFER': ('fixes of a clock 120 s apart', 'town', {}, {}, {},
+                      lambda leg, rng: replace(leg, fix=shifted(leg.fix, 120.0))),
     'IMU_UNITS': ('force in g', 'town', {}, {}, {}, of_imu(f_i=lambda f: f / 9.81)),
     'IMU_AXES': ('IMU turned by 90 deg', 'town', {}, {}, {}, of_imu(
         w_i=lambda w: w[:, [1, 0, 2]] * [1, -1, 1], f_i=lambda f: f[:, [1, 0, 2]] * [1, -1, 1])),

@@ -14,7 +14,8 @@ the first run. Rows go to the file line by line: an interrupted run continues wh
 Printed by row, as a table of docs/honesty.md: drives with a scale that are not rejected; share
 within 1.96 sigma, rms and largest of scale error over sigma; accepted drives, and how many of them
 are beyond 4 sigma; median sigma; in how many drives a reason of ``names`` is given, and of those
-whose scale is off by more than its sigma; false WHEEL_SLIP. Then yaw and pitch, and all reasons.
+whose scale the effect moves by more than the stated sigma: against the same drive calibrated
+without it; false WHEEL_SLIP. Then yaw and pitch, and all reasons.
 Last, by reason: false alarms, in all rows whose effect it does not name (``names``, ``also``).
 Drives of spins in which no wheel spins are left out.
 """
@@ -156,11 +157,20 @@ RUNS = {
 
 def run_drive(seed):
     """Draw, drive, calibrate; return a row."""
+    e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
+    name, run = list(RUNS.items())[e]
+    row = {'seed': seed, 'run': name, **driven(seed, k, run)}
+    if run.names and 'scale_error' in row and (run.real or run.change):
+        without = driven(seed, k, replace(run, real={}, change=None, effects=()))
+        row['effect'] = row['scale_error'] - without.get('scale_error', np.nan)
+    return row
+
+
+def driven(seed, k, run):
+    """Return the outcome of drive k of a row."""
     from odocal_ros.pipeline.calibrate import calibrate, combine
     from odocal_ros.sim.draw import drawn
     from odocal_ros.sim.scenarios import simulate
-    e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
-    name, run = list(RUNS.items())[e]
     kind, (grade, fixes) = run.kinds[k // 2 % len(run.kinds)], VEHICLES[k % len(VEHICLES)]
     made, _ = drawn(seed, kind, grade, run.effects, real=run.real,
                     **{'duration': 300.0, **fixes, **run.options})
@@ -169,7 +179,7 @@ def run_drive(seed):
     if run.change:
         leg = run.change(drive, leg, np.random.default_rng(seed))
     calibration = combine([calibrate(leg, config)], config)
-    return {'seed': seed, 'run': name, 'kind': kind, 'grade': grade,
+    return {'kind': kind, 'grade': grade,
             'holds': bool(made.slip_events) and not spins_of(made, drive),
             **outcome(calibration, drive.truth)}
 
@@ -198,8 +208,8 @@ def print_row(name, own):
     given = [row for row in own if 'scale_sigma' in row and row['verdict'] != 'rejected']
     z = {row['seed']: abs(row['scale_error']) / row['scale_sigma'] for row in given}
     accepted = [z[row['seed']] for row in given if row['verdict'] == 'accepted']
-    off = [row for row in given if z[row['seed']] > 1.0]
-    named = (f'{share(own, names)}, beyond a sigma {share(off, names)}') if names else ''
+    moved = [row for row in given if abs(row.get('effect', 0.0)) > row['scale_sigma']]
+    named = f'{share(own, names)}, moved {share(moved, names)}' if names else ''
     slip = '' if 'WHEEL_SLIP' in names else sum('WHEEL_SLIP' in row['codes'] for row in own)
     every = np.array(list(z.values()) or [np.nan])
     print(f'| {name} | {len(given)} of {len(own)} | {100 * (every <= WITHIN).mean():.0f} % '

@@ -22,14 +22,12 @@ def linter(name):
     return import_module(f'{name}.main')
 
 
-@pytest.mark.slow
 def test_flake8():
     profile = str(Path(__file__).with_name('ament_flake8.ini'))
     code, errors = linter('ament_flake8').main_with_errors(argv=['--config', profile, *CODE])
     assert code == 0, '\n'.join(errors)
 
 
-@pytest.mark.slow
 def test_pep257(capsys):
     assert linter('ament_pep257').main(argv=CODE) == 0, capsys.readouterr()
 

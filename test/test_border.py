@@ -108,17 +108,11 @@ def test_help_and_usage_errors_import_not_even_numpy():
     subprocess.run([sys.executable, '-c', probe], stdout=subprocess.DEVNULL, check=True)
 
 
-def test_ros_is_imported_in_live_only():
+def test_ros_rosbags_and_the_reproductions_are_imported_where_they_belong():
     users = {_part(p) for p in _modules() for name in _imports(p) if name.split('.')[0] in ROS}
     assert users == {'live'}
-
-
-def test_the_reproductions_are_not_imported():
     assert not {name for path in _modules() for name in _imports(path)
                 if name.startswith('odocal_reproductions')}
-
-
-def test_rosbags_is_imported_in_bagio_only():
     users = {_part(p) for p in _modules() for name in _imports(p)
              if name.split('.')[0] == 'rosbags'}
     assert users == {'bagio'}

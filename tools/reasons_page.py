@@ -82,9 +82,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.DELAY_SEEN: 'While the vehicle accelerates and brakes, the stamps of one sensor are '
         'late or early relative to the others, by more than three sigmas and by enough to matter '
         'at this speed. The smoother estimates the delay and accounts for it; other software '
-        'that combines these sensors does not. Without an estimated delay, this reason names an '
-        'odometer that would look like a slipping wheel only because it is late or low-pass '
-        'filtered.',
+        'that combines these sensors does not. An offset of 1 to 90 s (clocks of two computers) '
+        'is found by comparing the motion of IMU, odometer and fixes; the stamps are corrected '
+        'before the fit. Without an estimated delay, this reason names an odometer that would '
+        'look like a slipping wheel only because it is late or low-pass filtered.',
         Code.ODOMETER_LATE: 'Odometer messages stopped for a moment and then arrived in a burst '
         'with the missing travel: they were delayed in transport, and their stamps, taken at '
         "arrival, are late. They were moved to the sender's rhythm, or to the times that match "

@@ -73,7 +73,7 @@ class Arrivals:
 
     def usable(self, stamp_ns: Ints, received_ns: Ints) -> Bools:
         """Return a mask of rows of the next block with a usable stamp: (n,)."""
-        good = np.zeros(len(stamp_ns), bool)
+        good = [False] * len(stamp_ns)
         self.odd_from = self.dropped = 0
         for k, (stamp, received) in enumerate(zip(stamp_ns.tolist(), received_ns.tolist(),
                                                   strict=True)):
@@ -98,7 +98,7 @@ class Arrivals:
             if not self._odd:
                 self._follow(lag)
         self._take_rate(int(received_ns[-1]) if len(received_ns) else 0)
-        return good
+        return np.array(good, bool)
 
     def _follow(self, lag: int) -> None:
         """Take a lag, ns, and let the usual one follow slowly, as two clocks drift."""

@@ -26,7 +26,7 @@ K, M, G, N = 12, slice(13, 15), 15, 16    # m: about the y and z axis of b
 BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # observable by it, of a body nearly level: no heading
 BY_REST = np.r_[3:9]
 POSITIONS, ROTATIONS, BIASES, ALL = np.r_[P], np.r_[PHI], np.r_[BG], np.arange(N)
-EYE = np.eye(N)
+EYE, AXES = np.eye(N), np.eye(3)
 POSE = np.eye(6, N)       # definition: position and attitude of the IMU in the error state
 # judgement: m/sqrt(m) along, left, up, slip and slide of any road
 ROAD_PER_METRE = (0.005, 0.01, 0.01)
@@ -48,7 +48,8 @@ class Errors:
     """
     The covariance of the errors, (16, 16), and its updates by stops and gravity.
 
-    bent : m in n, what attitude errors do to travel in second order.
+    bent : m in n, what attitude errors do to travel in second order.   changed : since
+    ``pose_and_twist``.
     grade : of the IMU.   tilt, bias_sigma : rad, rad/s, sigmas at the start.   earth_left : the
     Earth's turn is in the gyro's bias.
     """
@@ -66,7 +67,7 @@ class Errors:
             np.full(3, grade.accel_bias), [vehicle.scale_sigma, vehicle.pitch_sigma,
                                            vehicle.yaw_sigma, grade.gyro_scale_error]])
         self.cov[ALL, ALL] = sigma**2
-        self.bent = ZERO
+        self.bent, self.changed = ZERO, True
         # x of odom is where the vehicle heads: what the yaw errs by is in the attitude, reversed
         self.cov[5, 5] = vehicle.yaw_sigma**2
         self.cov[5, 14] = self.cov[14, 5] = -vehicle.yaw_sigma**2
@@ -95,7 +96,7 @@ class Errors:
             cov[P, P] += cross @ cross.T * hidden**2
         cov[ALL, ALL] += self._walks * T
         cov[ROTATIONS, ROTATIONS] += hidden**2
-        self.cov = cov
+        self.cov, self.changed = cov, True
 
     @staticmethod
     def road(path_length: float) -> Vector:
@@ -106,10 +107,12 @@ class Errors:
     def lost(self, path_length: float) -> None:
         """Add travel, m, of unknown direction."""
         self.cov[POSITIONS, POSITIONS] += path_length**2
+        self.changed = True
 
     def turned(self, variance: Floats) -> None:
         """Add the variance of an unknown turn, (3, 3) rad^2 in n."""
         self.cov[PHI, PHI] += variance / max(1.0, float(np.trace(variance)) / np.pi**2)
+        self.changed = True
 
     def by_gravity(self, C_nb: Floats, off_n: Floats, T: float, sigma: float) -> Floats | None:
         """
@@ -151,22 +154,25 @@ class Errors:
         gain = np.zeros((N, len(z)))
         gain[observed] = np.linalg.solve(S, H @ cov)[:, observed].T
         keep = np.eye(N) - gain @ H
-        self.cov = keep @ cov @ keep.T + gain @ R @ gain.T
+        self.cov, self.changed = keep @ cov @ keep.T + gain @ R @ gain.T, True
         return gain @ z
 
-    def pose(self, C_nb: Matrix, arm_n: Vector, late: Sequence[float], along_n: Vector) -> Floats:
+    def pose_and_twist(self, C_nb: Matrix, arm_n: Vector, twist_b: Floats, T: float) -> Floats:
         """
-        Return the covariance of position, m, and rotation of the vehicle, rad, in n: (6, 6).
+        Return the covariances of pose and twist of the vehicle by the errors: (2, 6, 6).
 
-        arm_n : m, from the odometer's point to what the position is of.   late : 6 m, rad, sigma
-        of a common cause.   along_n : m, sigma of a count along the path, at this time.
+        Of the pose those of position, m, and rotation, rad, in n.   arm_n : m, from the odometer's
+        point to what the position is of.   twist_b : (6, 3), from a turn rate in b to the twist,
+        the mean over T s.
         """
-        J = POSE.copy()
+        J, out = POSE.copy(), np.empty((2, 6, 6))
         J[3:, M] = [row[1:] for row in C_nb]
         J[:3, 3:] = -skewed(arm_n) @ J[3:, 3:]
-        off = np.array([late, (*along_n, *ZERO), (*self.bent, *ZERO)])
-        cov: Floats = J @ self.cov @ J.T + off.T @ off
+        out[0] = J @ self.cov @ J.T
+        out[0, :3, :3] += np.outer(self.bent, self.bent)
         # two rotations leave half their product about the third axis
         a, b, c = self.cov[ROTATIONS, ROTATIONS].tolist()
-        cov[ROTATIONS, ROTATIONS] += [b * c / 4, a * c / 4, a * b / 4]
-        return cov
+        out[0, ROTATIONS, ROTATIONS] += [b * c / 4, a * c / 4, a * b / 4]
+        out[1] = twist_b @ (self.cov[BG, BG] + AXES * (self.grade.gyro_noise**2 / T)) @ twist_b.T
+        self.changed = False
+        return out

@@ -78,7 +78,9 @@ class Odometry:
     def feed(self, slot: str, block: ImuSamples | OdometerSamples,
              form: OdometerForm | None = None) -> None:
         """Take a block of 'imu', 'odometer' or 'odometer_right', the latter with their form."""
-        arrivals = self._arrivals.setdefault(slot, Arrivals())
+        if slot not in self._arrivals:
+            self._arrivals[slot] = Arrivals()
+        arrivals = self._arrivals[slot]
         usable = arrivals.usable(block.stamp_ns, block.received_ns)
         if arrivals.anew:
             self.begin_anew(f'the stamps of the {slot} jump by {arrivals.off_s:+.3g} s')

@@ -5,19 +5,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 import math
 
 import numpy as np
 
-from odocal_ros.apply.errors import BG, Errors
+from odocal_ros.apply.attitude import Quaternion, Vector
+from odocal_ros.apply.errors import Errors
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import SWAY
 
-# definition: in the numbers of a pose, diagonals of both covariances
-VARIANCES = np.r_[7:43:7, 49:85:7]
-AXES = np.eye(3)
+# definition: in the numbers of a pose: how many, diagonals of both covariances
+NUMBERS, VARIANCES = 85, np.r_[7:43:7, 49:85:7]
+NONE = (0.0,) * 6      # definition
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,47 +25,80 @@ class Pose:
     """
     Pose of the vehicle, and mean motion since the previous pose.
 
-    stamp_ns : of the IMU.   position : (3,) m of base_link in odom.   q : (4,) x y z w of
-    base_link in odom.   velocity, rate : (3,) m/s, rad/s in base_link, of base_link.
-    pose_cov, twist_cov : (6, 6); of the pose position and rotation about the axes of odom.
+    stamp_ns : of the IMU.   numbers : (85,) all floats of a nav_msgs/Odometry in its order; its
+    twist's are the last 42.
     """
 
     stamp_ns: int
-    position: Floats
-    q: Floats
-    velocity: Floats
-    rate: Floats
-    pose_cov: Floats
-    twist_cov: Floats
+    numbers: Floats
 
-    @cached_property
-    def numbers(self) -> Floats:
-        """Return all floats of a nav_msgs/Odometry in its order; its twist's are the last 42."""
-        return np.concatenate([
-            self.position, self.q, self.pose_cov.ravel(), self.velocity, self.rate,
-            self.twist_cov.ravel()])
+    @property
+    def position(self) -> Floats:
+        """Return the position of base_link in odom, m: (3,)."""
+        return self.numbers[:3]
+
+    @property
+    def q(self) -> Floats:
+        """Return the attitude of base_link in odom, x y z w: (4,)."""
+        return self.numbers[3:7]
+
+    @property
+    def pose_cov(self) -> Floats:
+        """Return the covariance of position and rotation about the axes of odom: (6, 6)."""
+        return self.numbers[7:43].reshape(6, 6)
+
+    @property
+    def velocity(self) -> Floats:
+        """Return the velocity of base_link in base_link, m/s: (3,)."""
+        return self.numbers[43:46]
+
+    @property
+    def rate(self) -> Floats:
+        """Return the turn rate of base_link in base_link, rad/s: (3,)."""
+        return self.numbers[46:49]
+
+    @property
+    def twist_cov(self) -> Floats:
+        """Return the covariance of velocity and rate: (6, 6)."""
+        return self.numbers[49:].reshape(6, 6)
 
     def sound(self) -> bool:
         """Return True if all values are finite and no variance is negative."""
-        return math.isfinite(self.numbers.sum()) and bool(self.numbers[VARIANCES].min() >= 0)
+        return math.isfinite(self.numbers.dot(self.numbers)) and (
+            min(self.numbers[VARIANCES].tolist()) >= 0)
 
 
-def twist_covariance(vehicle: Vehicle, errors: Errors, speed: float, swing: Sequence[float],
-                     T: float, variance: float) -> Floats:
+def numbers_of(position: Vector, q: Quaternion, twist: Sequence[float],
+               covariances: Floats) -> Floats:
+    """Return the numbers of a pose: m, x y z w, 6 m/s, rad/s, (2, 36)."""
+    numbers = np.empty(NUMBERS)
+    numbers[:7], numbers[43:49] = (*position, *q), twist
+    numbers[1:].reshape(2, 42)[:, 6:] = covariances
+    return numbers
+
+
+def covariances(by_errors: Floats, late: Sequence[float], along_n: Sequence[float],
+                swing: Sequence[float], variances: Sequence[float]) -> Floats:
     """
-    Return the covariance of a mean twist over T s, of base_link: (6, 6).
+    Return the covariances of pose and twist: (2, 36).
 
-    speed : m/s, of the odometer's point.   swing : 6 m/s, rad/s, the twist but for the speed.
-    variance : m^2, of travel in T beside that of scale and road.
+    by_errors : (2, 6, 6).   late, swing : 6 each, sigmas of a common cause of a pose, of a twist.
+    along_n : (3,) m, of another, of the position.   variances : 3, of the velocity, (m/s)^2.
     """
-    B, grade = vehicle.twist_b, errors.grade
-    turn_b = errors.cov[BG, BG] + AXES * (grade.gyro_noise**2 / T)
-    along, left, up = (variance / T for variance in errors.road(speed))
-    along += (speed * vehicle.scale_sigma)**2 + variance / T**2 + 1e-6
-    # a body that turns too much about an arm moves too much
-    off = np.array([[one * grade.gyro_scale_error for one in swing],
-                    [math.sqrt(along), 0.0, 0.0, 0.0, 0.0, 0.0],
-                    [0.0, math.sqrt(left + SWAY**2), 0.0, 0.0, 0.0, 0.0],
-                    [0.0, 0.0, math.sqrt(up + SWAY**2), 0.0, 0.0, 0.0]])
-    cov: Floats = B @ turn_b @ B.T + off.T @ off
-    return cov
+    x, y, z = map(math.sqrt, variances)
+    off = np.array([[late, (*along_n, *NONE[3:]), NONE, NONE],
+                    [swing, (x, *NONE[1:]), (0.0, y, *NONE[2:]), (0.0, 0.0, z, *NONE[3:])]])
+    covs: Floats = by_errors + off.swapaxes(1, 2) @ off
+    return covs.reshape(2, 36)
+
+
+def velocity_variances(vehicle: Vehicle, speed: float, T: float, travel: float) -> Vector:
+    """
+    Return the variances of a mean velocity over T s, of base_link, (m/s)^2.
+
+    speed : m/s, of the odometer's point.   travel : m^2, its variance in T beside that of scale
+    and road.
+    """
+    along, left, up = (variance / T for variance in Errors.road(speed))
+    along += (speed * vehicle.scale_sigma)**2 + travel / T**2 + 1e-6
+    return along, left + SWAY**2, up + SWAY**2

@@ -11,6 +11,8 @@ attitude and bias is that of a replay. With it, the accelerometer holds the tilt
 gyro bias; the position never jumps.
 """
 
+from collections.abc import Sequence
+from itertools import pairwise
 import math
 
 import numpy as np
@@ -29,7 +31,7 @@ from odocal_ros.apply.attitude import (
     ZERO,
 )
 from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
-from odocal_ros.apply.pose import Pose, twist_covariance
+from odocal_ros.apply.pose import covariances, numbers_of, Pose, velocity_variances
 from odocal_ros.apply.start import Start
 from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle
@@ -46,7 +48,8 @@ CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
 # false; m/s^2 that the force is then as long as gravity to
 MOST_APART, AS_GRAVITY = 10, 1.0
 ROWS_BEHIND = 200         # judgement: of the IMU, before they are dropped
-GROW_PERIOD = 0.05        # s; judgement: in which a covariance hardly grows
+# judgement: s in which a covariance hardly grows; share that an interval may differ by meanwhile
+GROW_PERIOD, AS_LONG = 0.05, 0.1
 PLAUSIBLE = np.zeros(3)   # rad: no turn is implausible
 TILT_LOST = 0.5           # rad; judgement: sigma beyond which a straight line levels nothing
 
@@ -77,9 +80,9 @@ class Reckoning:
         self._w_look: list[Vector] = []
         self._rested, self._apart, self._strange_turn = False, 0, PLAUSIBLE
         self._v_look = self._velocity_n(self._t)
-        # m/s in n, at the start, and what turns added
-        self._swung: Vector = tuple(self._v_look.tolist())
+        self._swung: Vector = tuple(self._v_look.tolist())      # m/s in n, at the start, by turns
         self._moved = self._stays = 0.0      # s, by which a clock moved, and for good
+        self._doubt = self._T_cov = 0.0      # m^2, of the travel since the last pose; s
         self._arm0_n = rotated(self._C_nb, self._arm_b)
 
     def poses(self, moved: float = 0.0, stays: float = 0.0) -> list[Pose]:
@@ -93,7 +96,9 @@ class Reckoning:
             self._notes.append(f'stamps moved by {stays:.2g} s against their arrival times: a '
                                'clock was set, or messages are late; sigma increased')
         self._stays = max(self._stays, stays)
-        self._moved = max(self._stays, moved)
+        moved = max(self._stays, moved)
+        self.errors.changed |= moved != self._moved
+        self._moved = moved
         while not self.failed and (last := self._next()) is not None:
             received = self.imu.rows[last].t <= self.wheels.newest()
             self._advance(last)
@@ -115,22 +120,22 @@ class Reckoning:
 
     def _next(self) -> int | None:
         """Return the row to advance to: a pose is due and all it needs has come; else None."""
-        rows, period = self.imu.rows, 1 / self.config.publish.rate
-        last = self.imu.from_time(self._t_pose + period - 1e-6, self.imu.at + 1)
-        if last > len(rows) - 2:            # a cubic needs the sample beyond
-            return None
-        t = rows[last].t
-        return last if t <= self.wheels.newest() or rows[-1].t - t >= ODOMETER_SILENCE else None
+        rows, due = self.imu.rows, self._t_pose + 1 / self.config.publish.rate - 1e-6
+        last = self.imu.from_time(due, self.imu.at + 1)
+        return last if last < len(rows) - 1 and (      # a cubic needs the sample beyond
+            rows[last].t <= self.wheels.newest()
+            or rows[-1].t - rows[last].t >= ODOMETER_SILENCE) else None
 
     def _advance(self, last: int) -> None:
         """Go to a row of the IMU."""
         imu, at = self.imu, self.imu.at
         low = max(at - 1, 0)      # a cubic needs the sample before and the one beyond
-        t = [row.t for row in imu.rows[low:last + 2]]
-        w = [plus(row.w_b, self.bias, -1.0) for row in imu.rows[low:last + 2]]
-        f = [plus(row.f_b, self.accel_bias, -1.0) for row in imu.rows[at:last + 1]]
-        s = [self.wheels.at(one) for one in t[at - low:-1]]
-        gaps = [b - a for a, b in zip(t[at - low:-2], t[at - low + 1:-1], strict=True)]
+        rows = imu.rows[low:last + 2]
+        own = rows[at - low:-1]
+        t, w = [row.t for row in rows], [plus(row.w_b, self.bias, -1.0) for row in rows]
+        f = [plus(row.f_b, self.accel_bias, -1.0) for row in own]
+        s = [self.wheels.at(row.t) for row in own]
+        gaps = [b.t - a.t for a, b in pairwise(own)]
         lost, self._s = abs(s[0] - self._s), s[-1]
         C_nb, turn_b, way_n, dv_n = self._C_nb, ZERO, ZERO, ZERO
         forward_n, f_n = rotated(C_nb, self._forward_b), rotated(C_nb, f[0])
@@ -142,19 +147,19 @@ class Reckoning:
             turn_b = plus(turn_b, phi)
             way_n = plus(way_n, plus(forward_before, forward_n), (s[k + 1] - s[k]) / 2)
             dv_n = plus(dv_n, plus(f_before, f_n), T / 2)
-        self._C_nb = C_nb
-        self.position, self._dv_n = plus(self.position, way_n), plus(self._dv_n, dv_n)
+        self._C_nb, self.position = C_nb, plus(self.position, way_n)
+        self._dv_n = plus(self._dv_n, dv_n)
         T, turn_n = t[-2] - self._t, rotated(C_nb, turn_b)
         self._grow(T, way_n, turn_n, [gap for gap in gaps if gap > HOLE_INTERVALS * imu.usual],
                    self.wheels.doubt(self._t, t[-2]))
         self._swung = plus(self._swung, cross(turn_n, way_n), 1 / T)
-        self._doubt_turn([row.strange for row in imu.rows[at + 1:last + 1]], gaps)
+        self._doubt_turn([row.strange for row in own[1:]], gaps)
         if lost > self.wheels.quantum:
             self.errors.lost(lost)
         calm = self._strange_turn is PLAUSIBLE and max(gaps) <= IMU_HOLE
         self._levels &= calm and math.isfinite(sum(dv_n))
         self._turn_b = plus(self._turn_b, turn_b)
-        self._w_look += [row.w_b for row in imu.rows[at + 1:last + 1]]
+        self._w_look += [row.w_b for row in own[1:]]
         self._t, imu.at = t[-2], last
 
     def _turn(self, phi: Vector, T: float) -> Matrix:
@@ -167,7 +172,7 @@ class Reckoning:
     def _grow(self, T: float, way_n: Vector, turn_n: Vector, gaps: list[float],
               doubt: float) -> None:
         """Carry the errors over T s, at once where data are uncertain, else every GROW_PERIOD."""
-        self._T_grow += T
+        self._T_grow, self._doubt = self._T_grow + T, self._doubt + doubt
         self._way_grow = plus(self._way_grow, way_n)
         self._turn_grow = plus(self._turn_grow, turn_n)
         if self._T_grow > GROW_PERIOD - 1e-6 or doubt or gaps:
@@ -234,11 +239,7 @@ class Reckoning:
         self._dv_n, self._levels, self._w_look = ZERO, True, []
 
     def _take_apart(self, off_n: Floats, velocity: Floats, T: float, w: Floats) -> None:
-        """
-        Increase the variance of the last T s if IMU and odometer disagree.
-
-        off_n : (3,) m/s^2, force less acceleration.   velocity : (3,) m/s.   w : (n, 3) rad/s.
-        """
+        """Increase the variance of the last T s: force less acceleration, m/s^2, is too large."""
         self._apart += 1
         self._notes.append('specific force and odometer motion differ by '
                           f'{np.linalg.norm(off_n):.3g} m/s^2: IMU or odometer is faulty; not '
@@ -258,38 +259,39 @@ class Reckoning:
 
     def _pose(self) -> Pose:
         """Return the pose at the row reached."""
-        v, T, C_nb = self.vehicle, self._t - self._t_pose, self._C_nb
+        T, C_nb = self._t - self._t_pose, self._C_nb
         arm_n, C_bn = rotated(C_nb, self._arm_b), tuple(zip(*C_nb, strict=True))
         rate_b = plus(plus(ZERO, self._turn_b, 1 / T), rotated(C_bn, self._earth_n), -1.0)
-        swing = (v.twist_b @ rate_b).tolist()
-        speed = (self._s - self._s_pose) / T
+        swing, speed = self.vehicle.swing(rate_b), (self._s - self._s_pose) / T
         if abs(speed) > FASTEST:
             self._notes.append(f'{speed:.0f} m/s is implausible: the calibration belongs to '
                               'another odometer or unit')
-        rounding, jitter = self.wheels.quantum**2 / 6, self.wheels.jitter(self._t, T)
-        doubt = self.wheels.doubt(self._t - T, self._t)
-        along = math.sqrt(rounding + self.wheels.between(self._t) + jitter / 2)
-        forward_n = rotated(C_nb, self._forward_b)
-        pose = Pose(self.imu.rows[self.imu.at].stamp_ns,
-                    np.array(plus(plus(self.position, arm_n), self._arm0_n, -1.0)),
-                    np.array(product(self.q, self._q_bv)),
-                    np.array((swing[0] + speed, *swing[1:3])), np.array(swing[3:]),
-                    self.errors.pose(C_nb, arm_n, self._late(plus(ZERO, forward_n, speed), rate_b),
-                                     plus(ZERO, forward_n, along)),
-                    twist_covariance(v, self.errors, speed, swing, T, rounding + doubt + jitter))
-        self._t_pose, self._s_pose, self._turn_b = self._t, self._s, ZERO
-        return pose
+        if self.errors.changed or abs(T - self._T_cov) > AS_LONG * self._T_cov:
+            self._T_cov, self._covariances = T, self._uncertainty(T, speed, arm_n, rate_b, swing)
+        self._t_pose, self._s_pose, self._turn_b, self._doubt = self._t, self._s, ZERO, 0.0
+        return Pose(self.imu.rows[self.imu.at].stamp_ns, numbers_of(
+            plus(plus(self.position, arm_n), self._arm0_n, -1.0), product(self.q, self._q_bv),
+            (swing[0] + speed, *swing[1:]), self._covariances))
 
-    def _late(self, velocity_n: Vector, rate_b: Vector) -> tuple[float, ...]:
+    def _uncertainty(self, T: float, speed: float, arm_n: Vector, rate_b: Vector,
+                     swing: Sequence[float]) -> Floats:
         """
-        Return by how much a pose is off, m, rad in n, by the times of odometer and IMU.
+        Return the covariances of pose and twist after T s: (2, 36).
 
-        velocity_n : m/s.   rate_b : rad/s.   A delay shifts travel by what accelerations along
-        the path changed of the velocity; a clock that moved shifts the time of the pose too.
+        speed : m/s.   arm_n : m.   rate_b : rad/s.   swing : 6 m/s, rad/s, twist by turns.
+        A delay shifts travel by what accelerations along the path changed of the velocity; a
+        clock that moved shifts the time of the pose too.
         """
+        forward_n = rotated(self._C_nb, self._forward_b)
         delay = math.hypot(self._delay_sigma, self._moved, self.wheels.delay_s)
-        return (*plus(ZERO, plus(velocity_n, self._swung, -1.0), delay),
+        late = (*plus(ZERO, plus(self._swung, forward_n, -speed), delay),
                 *plus(ZERO, rotated(self._C_nb, rate_b), self._moved))
+        now, since = self.wheels.variances(self._t, T)
+        return covariances(
+            self.errors.pose_and_twist(self._C_nb, arm_n, self.vehicle.twist_b, T), late,
+            plus(ZERO, forward_n, math.sqrt(now)),
+            [self.errors.grade.gyro_scale_error * one for one in swing],
+            velocity_variances(self.vehicle, speed, T, since + self._doubt))
 
     def _leave_behind(self, last: int) -> None:
         """Forget what lies behind, but for the rows that determine the usual interval."""

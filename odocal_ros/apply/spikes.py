@@ -63,8 +63,13 @@ Pair = tuple[float, float]
 
 def is_possible(w_b: Vector, f_b: Vector) -> bool:
     """Return True if a sensor can show a turn rate, rad/s, and a force, m/s^2 or MISSING."""
-    return all(abs(w) <= MOST_TURN for w in w_b) and (
-        f_b is MISSING or all(abs(f) <= MOST_FORCE for f in f_b))
+    return _within(w_b, MOST_TURN) and (f_b is MISSING or _within(f_b, MOST_FORCE))
+
+
+def _within(a: Vector, most: float) -> bool:
+    """Return True if no element of a vector is larger; False of NaN."""
+    x, y, z = a
+    return abs(x) <= most and abs(y) <= most and abs(z) <= most
 
 
 class SpikeScreen:

@@ -3,13 +3,15 @@
 
 """What a calibration says of a vehicle, as dead reckoning takes it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import math
+from typing import Any
 
 import numpy as np
 
-from odocal_ros.apply.attitude import skewed
+from odocal_ros.apply.attitude import cross, rotated, skewed, Vector
 from odocal_ros.calib.result import Estimate
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
@@ -65,6 +67,16 @@ class Vehicle:
     def twist_b(self) -> Floats:
         """Return the matrix from a turn rate in b to the twist of base_link: (6, 3)."""
         return np.concatenate([skewed(self.lever_arm.tolist()), np.eye(3)]) @ self.C_vb
+
+    def swing(self, rate_b: Vector) -> tuple[float, ...]:
+        """Return the twist of base_link by a turn rate in b, rad/s, as ``twist_b`` gives it."""
+        C_vb, lever_v = self._plain
+        rate_v = rotated(C_vb, rate_b)
+        return *cross(lever_v, rate_v), *rate_v
+
+    @cached_property
+    def _plain(self) -> Sequence[Any]:
+        return self.C_vb.tolist(), self.lever_arm.tolist()
 
     @cached_property
     def q_bv(self) -> Floats:

@@ -47,6 +47,7 @@ class Wheel:
     def __init__(self, form: OdometerForm, scale: float, reversed_counts: bool = False) -> None:
         self.form = form
         self.scale = -scale if reversed_counts else scale      # m per unit, signed
+        self.quantum = 0.0             # m, size of a count, 0 for values that are no counts
         self.speed = 0.0               # m/s, over the last rows
         self.usual = 0.0               # s between rows
         self.hung = False              # it stopped at once, and has not moved since
@@ -68,12 +69,6 @@ class Wheel:
         # s, m/s before it
         self._strange = self._strange_travel = self._strange_time = self._sure_speed = 0.0
 
-    @property
-    def quantum(self) -> float:
-        """Return the size of a count, m, 0 for values that are no counts."""
-        whole = isinstance(self._value, int) and self.form.quantity != 'rate'
-        return abs(self.scale) if whole else 0.0
-
     def feed(self, t: Sequence[float], value: Sequence[float]) -> None:
         """Take rows: times, s, and values as sent; what has no time or value is passed over."""
         for row in zip(t, value, strict=True):
@@ -87,6 +82,7 @@ class Wheel:
         """Take another factor, m per unit, for what was rolled too."""
         factor = scale / abs(self.scale)
         self.scale *= factor
+        self.quantum *= factor
         self.speed *= factor
         self.s = deque(s * factor for s in self.s)
 
@@ -133,6 +129,8 @@ class Wheel:
     def _take(self, t: float, value: float) -> None:
         if self._value is None:
             self._value = value
+            whole = isinstance(value, int) and self.form.quantity != 'rate'
+            self.quantum = abs(self.scale) if whole else 0.0
             self._add(t, 0.0)
             return
         before = self._value

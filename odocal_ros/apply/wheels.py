@@ -31,6 +31,7 @@ class Wheels:
         self._waiting: list[Rows] = []       # blocks from before the first IMU message
         self._wheels: dict[str, Wheel] = {}
         self.zero_ns = 0
+        self.quantum = 0.0                   # m, size of a count of the travel
 
     def feed(self, slot: str, block: OdometerSamples, form: OdometerForm) -> None:
         """Take rows of a slot."""
@@ -52,6 +53,7 @@ class Wheels:
                    block.value.tolist())
         self._notes += wheel.notes
         wheel.notes.clear()
+        self.quantum = math.hypot(*(w.quantum for w in self._wheels.values())) / len(self._wheels)
 
     def _scale(self, form: OdometerForm) -> None:
         """Give each of two wheels its own factor."""
@@ -81,23 +83,17 @@ class Wheels:
         """Return the variance of the travel between two times, m^2, beside that of the scale."""
         return sum(w.doubt(t_from, t_to) for w in self._wheels.values()) / len(self._wheels)**2
 
-    def jitter(self, t: float, T: float) -> float:
-        """Return the variance, m^2, of the travel in the T s up to a time by arrival jitter."""
-        return sum(w.jitter(t, T) for w in self._wheels.values()) / len(self._wheels)**2
+    def variances(self, t: float, T: float) -> tuple[float, float]:
+        """Return the variances of the travel at a time, and of that in the T s up to it, m^2."""
+        wheels, n = self._wheels.values(), len(self._wheels)**2
+        rounding = self.quantum**2 / 6
+        jitter = sum(w.jitter(t, T) for w in wheels) / n      # of arrivals
+        return rounding + sum(w.between(t) for w in wheels) / n + jitter / 2, rounding + jitter
 
     @property
     def delay_s(self) -> float:
         """Return the sigma of the delay of the travel by its arrival, s."""
         return max(w.delay_s for w in self._wheels.values())
-
-    def between(self, t: float) -> float:
-        """Return the variance, m^2, of the travel at a time because rows lie only beside it."""
-        return sum(w.between(t) for w in self._wheels.values()) / len(self._wheels)**2
-
-    @property
-    def quantum(self) -> float:
-        """Return the size of a count of the travel, m."""
-        return math.hypot(*(w.quantum for w in self._wheels.values())) / len(self._wheels)
 
     def still(self, t_from: float, t_to: float) -> bool:
         """Return True if no wheel turned between two times, and none hangs."""

@@ -1,4 +1,4 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags read and written, whole or damaged: the only place of rosbags."""
+"""Reading (also of damaged bags) and writing of bags; only this package imports rosbags."""

@@ -21,11 +21,11 @@ FORMATS = {'ros2msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl'}
 
 
 class FileBytes:
-    """The bytes that a file has when it is opened, by offset."""
+    """The bytes of a file at the time of opening, by offset."""
 
     def __init__(self, path: Path) -> None:
-        # glibc gives a block of memory back to the system, and has all its pages made again for
-        # the next, unless a larger one was released earlier
+        # glibc returns a released block of memory to the system, and allocates all its pages again
+        # for the next one, unless a larger block was released earlier
         np.empty(LET_GO, np.uint8)
         self._path = path
         self._file = path.open('rb')
@@ -93,7 +93,7 @@ class Recording:
         raise NotImplementedError
 
     def _count(self) -> None:
-        """Count what is there, message by message."""
+        """Count the messages that are in the file, one by one."""
         counts: Counter[int] = Counter()
         start_ns, end_ns = 2**63 - 1, 0
         for key, time_ns in self._scan():
@@ -122,7 +122,7 @@ def possible(time_ns: int) -> bool:
 
 
 def overlapping(items: Iterable[Any]) -> Iterator[list[Any]]:
-    """Yield those that overlap in time together; their ``start_ns`` rises."""
+    """Yield groups of items that overlap in time; the items are in order of ``start_ns``."""
     together: list[Any] = []
     end_ns = 0
     for item in items:

@@ -4,8 +4,8 @@
 """
 Write mcap files chunk by chunk (mcap.dev/spec), without rosbags: fast, and flushed to the disk.
 
-A chunk holds messages of one topic as they will stand in every file that it is part of, so
-joining files copies chunks and packs nothing again.
+A chunk contains messages of one topic in the form of the file, so that joining files copies chunks
+without packing them again.
 """
 
 from collections import Counter
@@ -36,7 +36,7 @@ from odocal_ros.bagio.mcap_records import (
 from odocal_ros.outside.limits import zstd_module
 from odocal_ros.outside.whole import whole_file, WholeFile
 
-HEADER, DATA_END = 1, 15      # format: opcodes, beside those of mcap_records: mcap.dev/spec
+HEADER, DATA_END = 1, 15      # format: opcodes not in mcap_records: mcap.dev/spec
 MESSAGE_HEAD = struct.Struct('<BQHIQQ')
 
 
@@ -45,7 +45,7 @@ class Chunk:
     """
     Messages of one channel, packed.
 
-    ``record`` and ``index`` are the records as they stand in a file, times in ns.
+    ``record`` and ``index`` are the records of the file; times in ns.
     """
 
     channel: int
@@ -62,7 +62,7 @@ class Chunk:
 
 
 def pack(channel: int, times_ns: Sequence[int], raws: Sequence[bytes], sequence: int = 0) -> Chunk:
-    """Return messages of a channel (one or more) as a chunk; the first has this number."""
+    """Return messages of a channel (one or more) as a chunk, numbered from ``sequence``."""
     head = MESSAGE_HEAD.pack
     parts: list[bytes] = []
     for number, (time_ns, raw) in enumerate(zip(times_ns, raws, strict=True), sequence):
@@ -98,7 +98,7 @@ def _packed(records: bytes) -> tuple[str, bytes]:
 
 
 class Written(NamedTuple):
-    """A file that was written: bytes, first and last time, messages by channel."""
+    """A written file: bytes, first and last time, messages by channel."""
 
     size: int
     start_ns: int
@@ -108,9 +108,9 @@ class Written(NamedTuple):
 
 def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> Written:
     """
-    Write an mcap file, whole or not at all, safe on the disk when this returns.
+    Write an mcap file completely or not at all; it is on the disk when this returns.
 
-    Raises OSError: it cannot be written; nothing is left of it.
+    Raises OSError: it cannot be written; no part of it remains.
     """
     with whole_file(path) as file:
         return _fill(file, channels, chunks)
@@ -150,7 +150,7 @@ def _chunk_index(chunk: Chunk, at: int) -> bytes:
 
 
 def _chunk_body(record: bytes) -> tuple[int, int, int, int, str, int]:
-    """Return start, end, size unpacked, CRC, compression and size packed of a chunk record."""
+    """Return start, end, unpacked size, CRC, compression and packed size of a chunk record."""
     start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(record, 9)
     form, at = text_at(record, 9 + CHUNK_HEAD.size)
     (packed,) = struct.unpack_from('<Q', record, at)

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Samples to serialised ROS 2 messages (CDR, little endian), many at once in numpy.
+Encoding of samples as ROS 2 messages (CDR, little endian), many at once in numpy.
 
 Messages of one topic all have the same length (one frame_id, one set of joint names), so a block
-of them is one structured array; no message object is made.
+of them is one structured array; no message objects are created.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ class Topic:
     A topic to be written.
 
     time_ns : (n,) int64 bag times, in the order to be written.
-    pack    : gives the serialised messages of a slice of rows as a structured array.
+    pack    : returns the serialised messages of a slice of rows as a structured array.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Topic:
 
 
 class _Layout:
-    """Collects the fields of a message with the padding that CDR puts before them."""
+    """Collects the fields of a message, with the padding of CDR before them."""
 
     def __init__(self) -> None:
         self._fields: list[tuple[Any, ...]] = [('cdr', 'u1', 4)]
@@ -78,7 +78,7 @@ class _Layout:
 
     def packer(self, fill: Callable[[NDArray[Any], slice], None],
                n: int) -> Callable[[slice], NDArray[Any]]:
-        """Return a function that packs a slice of n rows, ``fill`` setting the fields."""
+        """Return a function that packs a slice of n rows; ``fill`` sets the fields."""
         dtype, texts = np.dtype(self._fields), self._texts
 
         def pack(rows: slice) -> NDArray[Any]:
@@ -92,7 +92,7 @@ class _Layout:
 
     def topic(self, name: str, msgtype: str, samples: Samples,
               fill: Callable[[NDArray[Any], slice], None]) -> Topic:
-        """Return the topic of stamped samples, ``fill`` setting the fields but the stamp."""
+        """Return the topic of stamped samples; ``fill`` sets the fields except the stamp."""
         def stamped(out: NDArray[Any], rows: slice) -> None:
             out['sec'], out['nanosec'] = np.divmod(samples.stamp_ns[rows], 10**9)
             fill(out, rows)
@@ -112,9 +112,9 @@ def _imu_layout(frame: str) -> _Layout:
 def imu(name: str, samples: ImuSamples, frame: str = 'imu_link', w_variance: Floats | None = None,
         f_variance: Floats | None = None) -> Topic:
     """
-    Return sensor_msgs/Imu of ImuSamples; no orientation where the yaw variance is NaN.
+    Return sensor_msgs/Imu of ImuSamples; without orientation if the yaw variance is NaN.
 
-    w_variance, f_variance : (n, 3), optional, of turn rates and forces; else zeros: unknown.
+    w_variance, f_variance : (n, 3), optional, of turn rates and forces; default zeros: unknown.
     """
     def fill(out: NDArray[Any], rows: slice) -> None:
         out['w'], out['f'] = samples.w_i[rows], samples.f_i[rows]
@@ -213,7 +213,7 @@ def pose_with_covariance(name: str, samples: FixSamples, position: Floats,
 
 def _positions(name: str, kind: str, samples: FixSamples, position: Floats,
                layout: _Layout) -> Topic:
-    """Return a topic of positions, with what else the layout has: a rotation, a covariance."""
+    """Return a topic of positions, with rotation and covariance if the layout has them."""
     def fill(out: NDArray[Any], rows: slice) -> None:
         fields = out.dtype.names or ()
         out['place'] = position[rows]
@@ -247,7 +247,7 @@ def pressure(name: str, samples: ScalarSamples, frame: str = 'imu') -> Topic:
 
 
 def camera(name: str, times_ns: Sequence[int], size: int, rng: np.random.Generator) -> Topic:
-    """Return sensor_msgs/CompressedImage of ``size`` random bytes each, to make a bag heavy."""
+    """Return sensor_msgs/CompressedImage of ``size`` random bytes each, for a large bag."""
     time_ns = np.asarray(times_ns, dtype=np.int64)
     layout = (_Layout().header('camera').text('format', 'jpeg').add('bytes', '<u4')
               .add('data', ('u1', size)))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An mcap file: by its index, or record by record where that is gone or wrong."""
+"""An mcap file, read by its index, or record by record if that is missing or invalid."""
 
 from collections.abc import Iterator, Mapping, Sequence
 import heapq
@@ -46,7 +46,7 @@ class McapFile(Recording):
     A file of messages in chunks.
 
     The size, the checksum (if any), the channels and the times of each chunk are checked. A chunk
-    with any error is left out completely, since other errors in it may not show; of a chunk
+    with any error is left out completely, since other errors in it may be undetected; of a chunk
     truncated by the end of the file, complete messages are used.
     """
 
@@ -55,7 +55,7 @@ class McapFile(Recording):
         self._allowance = allowance
         self._schemas: dict[int, tuple[str, tuple[str, str]]] = {}
         self._places: list[Place] = []
-        self._counted = ''         # the damage known when messages were counted
+        self._counted = ''         # known damage when messages were counted
         self._file = FileBytes(path)
         try:
             self._open()
@@ -118,7 +118,7 @@ class McapFile(Recording):
         self._recount()
 
     def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
-        """Return the same in batches; None if the index is missing or of other chunks."""
+        """Return the messages in batches; None if the index is missing or of other chunks."""
         wanted = self._wanted(topics)
         places = [place for place in self._places
                   if not place.channels or place.channels & wanted.keys()]
@@ -153,26 +153,26 @@ class McapFile(Recording):
         self.damage = self.damage or str(damage)
 
     def _recount(self) -> None:
-        """Count the messages again if some that the index counted are lost."""
+        """Count the messages again if some of those in the index are lost."""
         if self.damage != self._counted:
             self._count()
             self._counted = self.damage
 
     def _by_time(self, wanted: Mapping[int, Channel]) -> Iterator[Entry]:
-        """Yield the messages of the chunks in the index, those of chunks that overlap merged."""
+        """Yield the messages of the chunks in the index; overlapping chunks are merged."""
         for together in overlapping(place for place in self._places
                                     if not place.channels or place.channels & wanted.keys()):
             yield from self._merged(together, wanted)
 
     def _merged(self, places: list[Place], wanted: Mapping[int, Channel]) -> Iterator[Entry]:
         def lazily(place: Place) -> Iterator[Entry | tuple[int]]:
-            yield (place.start_ns,)        # the chunk is unpacked when its turn has come
+            yield (place.start_ns,)        # the chunk is unpacked at its start time
             yield from self._of(place, wanted)
         return (entry for entry in heapq.merge(*map(lazily, places), key=itemgetter(0))
                 if len(entry) > 1)
 
     def _of(self, place: Place, wanted: Mapping[int, Channel]) -> list[Entry]:
-        """Return the messages of a chunk of the index, sorted; none of one that is damaged."""
+        """Return the messages of a chunk of the index, sorted; [] if it is damaged."""
         try:
             (chunk,) = self._read([place])
             if isinstance(chunk, Damaged):
@@ -241,7 +241,7 @@ class McapFile(Recording):
                     self._learn(op, records[at + 9:stop])
                 except (struct.error, UnicodeDecodeError):
                     raise Damaged(CHUNK_DAMAGED) from None
-            else:       # nothing else may stand in a chunk
+            else:       # not allowed in a chunk
                 raise Damaged(CHUNK_DAMAGED)
             at = stop
         if at != end and not cut:

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Messages of an mcap file as columns: a block of chunks at a time, no step for a single message.
+Messages of an mcap file as columns: a block of chunks at a time, without a loop over messages.
 
-Where the records of a chunk begin is taken from the message index behind it
-(mcap.dev/spec#message-index-op0x07), and then proved: each must be a message (op 0x05) that ends
-where the next one begins, the last of them with the chunk, as a walk over the records would find
-them. A chunk that is not so goes through the walk.
+The offsets of the records in a chunk are from the message index after it
+(mcap.dev/spec#message-index-op0x07), and are verified: each must be a message (op 0x05) that ends
+at the begin of the next one, the last of them at the end of the chunk, as in a sequential scan of
+the records. Other chunks are read by such a scan.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -26,11 +26,11 @@ from odocal_ros.outside.limits import Damaged, LATEST_NS
 BLOCK = 2**21          # judgement: bytes of chunks unpacked at a time
 HEAD = np.dtype([('op', 'u1'), ('size', '<i8'), ('channel', '<u2'), ('sequence', '<u4'),
                  ('time_ns', '<i8'), ('published_ns', '<i8')])
-BODY = 22              # format: of those bytes, what a record's size counts: mcap.dev/spec
+BODY = 22              # format: bytes of HEAD in a record's size: mcap.dev/spec
 
 
 class Columns(NamedTuple):
-    """Messages: when, of which channel, and their bytes."""
+    """Messages: their times, channels and bytes."""
 
     time_ns: Ints
     channel: NDArray[np.uint16]
@@ -41,7 +41,7 @@ class Columns(NamedTuple):
 
 
 Block = list[Chunk | Damaged]
-Read = Callable[[Sequence[Place]], Block]                     # of chunks side by side
+Read = Callable[[Sequence[Place]], Block]                     # of adjacent chunks
 Walk = Callable[[Chunk], Sequence[tuple[int, int, bytes]]]    # time, channel, message; or Damaged
 Note = Callable[[Damaged], None]
 
@@ -51,12 +51,12 @@ def batches(places: Sequence[Place], wanted: Mapping[int, Channel], known: Colle
     """
     Yield the messages of some channels by time, many at a time.
 
-    places : chunks by the times they state.   known : all channels of the file.
-    walk   : gives the messages of a chunk one by one.   note : receives the loss by damage.
+    places : chunks in order of their stated times.   known : all channels of the file.
+    walk   : returns the messages of a chunk one by one.   note : called with each damage.
     """
     mine, all_known = _table(wanted), _table(known)
-    late: Columns | None = None          # messages that one of a chunk to come may precede
-    at, size = 0, 1                      # the first block is one chunk: often no more is needed
+    late: Columns | None = None          # messages that may be later than those of the next chunk
+    at, size = 0, 1                      # the first block is one chunk, which is often sufficient
     while at < len(places):
         block, at = _block(places, at, size, read)
         found = _columns(block, all_known, walk, note)
@@ -72,7 +72,7 @@ def batches(places: Sequence[Place], wanted: Mapping[int, Channel], known: Colle
 
 
 def _block(places: Sequence[Place], at: int, size: int, read: Read) -> tuple[Block, int]:
-    """Read chunks from one on, of so many bytes or more; return them and which comes next."""
+    """Read chunks from number ``at``, of ``size`` bytes or more; return them and the next one."""
     block: Block = []
     end_ns, first, beside = 0, at, 0
     while at < len(places) and (size > 0 or places[at].start_ns < end_ns and size > -BLOCK):
@@ -102,7 +102,7 @@ def _columns(block: Block, known: Bools, walk: Walk, note: Note) -> Columns:
 
 
 def _table(keys: Collection[int]) -> Bools:
-    """Return for each number a channel may have whether it is one of these."""
+    """Return a table of all channel numbers, True for those in ``keys``."""
     table = np.zeros(2**16, bool)
     table[list(keys)] = True
     return table
@@ -139,7 +139,7 @@ def _gathered(chunks: Sequence[Chunk], known: Bools) -> Columns | None:
 
 
 def _in_one(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
-    """Return chunks whose records lie in one piece of memory."""
+    """Return chunks whose records are in one buffer."""
     if len({id(chunk.data) for chunk in chunks}) <= 1:
         return chunks
     data, at, found = b''.join([chunk.records for chunk in chunks]), 0, []

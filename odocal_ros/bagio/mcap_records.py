@@ -20,7 +20,7 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS 
 USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
 INDEX_DAMAGED = 'a damaged index'
 CHUNK_DAMAGED = 'a damaged chunk'
-MOST_CUT = 2**26        # judgement: bytes taken of a chunk that the file ends in
+MOST_CUT = 2**26        # judgement: bytes used of a chunk that is truncated by the end of the file
 RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
 INDEX_HEAD, TIMES = struct.Struct('<QQQQ'), struct.Struct('<QQ')
 END = 9 + 20 + len(MAGIC)      # format: of the footer
@@ -30,8 +30,8 @@ class Place(NamedTuple):
     """
     Index entry of a chunk: times, position of its record, channels.
 
-    ``index_size`` is that of the message index behind it, as far as it is to be trusted;
-    ``unpacked`` is how many bytes the chunk is said to hold.
+    ``index_size`` is that of the message index after it, limited by ``apart`` to the space before
+    the next chunk; ``unpacked`` is its stated unpacked size, bytes.
     """
 
     start_ns: int
@@ -44,20 +44,20 @@ class Place(NamedTuple):
 
 
 def records_of(data: bytes | FileBytes, at: int = 0) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield the records of a section, up to the footer, and whether they are whole."""
+    """Yield the records of a section, up to the footer: op, content, True if complete."""
     while at + 9 <= len(data):
         op, size = RECORD.unpack(data[at:at + 9])
         if op == FOOTER:
             return
         stop = at + 9 + size
         whole = stop <= len(data)
-        if op in USED and whole or op == CHUNK:      # the last chunk too where the file is cut off
+        if op in USED and whole or op == CHUNK:      # also a truncated last chunk
             yield op, data[at + 9:min(stop, at + 9 + MOST_CUT) if not whole else stop], whole
         at = stop
 
 
 def place_of(body: bytes) -> Place:
-    """Return the chunk that a record of the index names."""
+    """Return the chunk described by a record of the index."""
     start_ns, end_ns, at, size = INDEX_HEAD.unpack_from(body)
     (length,) = struct.unpack_from('<I', body, INDEX_HEAD.size)
     stop = INDEX_HEAD.size + 4 + length
@@ -70,9 +70,9 @@ def place_of(body: bytes) -> Place:
 
 def apart(places: Sequence[Place], end: int) -> list[Place]:
     """
-    Return the chunks of an index by time, none of which lies in another, nor behind ``end``.
+    Return the chunks of an index by time; they do not overlap in the file or exceed ``end``.
 
-    Raises Damaged where one does: a file would hold more than its bytes.
+    Raises Damaged if one does: the file would unpack to more than its content.
     """
     places, found, at = sorted(places, key=attrgetter('at')), [], len(MAGIC)
     for place, after in zip(places, [*(p.at for p in places[1:]), end], strict=True):
@@ -90,16 +90,16 @@ def statistics_of(body: bytes) -> tuple[int, int, int, dict[int, int]]:
 
 
 def text_at(body: Bytes, at: int) -> tuple[str, int]:
-    """Return a text of a record and where it ends."""
+    """Return a text of a record and the offset of its end."""
     (size,) = struct.unpack_from('<I', body, at)
     return bytes(body[at + 4:at + 4 + size]).decode(), at + 4 + size
 
 
 class Chunk(NamedTuple):
     """
-    Position of its records, stated times, and the message index behind it, unverified.
+    Position of its records, stated times, and the message index after it, unverified.
 
-    ``data`` may hold more than ``data[at:stop]``: several chunks that were read in one go.
+    ``data`` may contain more than ``data[at:stop]``: several chunks that were read at once.
     """
 
     data: Bytes
@@ -111,15 +111,15 @@ class Chunk(NamedTuple):
 
     @property
     def records(self) -> memoryview:
-        """Return its records."""
+        """Return the records of the chunk."""
         return memoryview(self.data)[self.at:self.stop]
 
 
 def unpacked(data: Bytes, at: int, stop: int, allowance: Allowance, cut: bool = False) -> Chunk:
     """
-    Return the chunk that a record holds; or Damaged.
+    Return the chunk of a record, or raise Damaged.
 
-    at, stop : where in the data the record's content lies.   cut : the file ends in it.
+    at, stop : of the record's content in the data.   cut : it is truncated by the end of the file.
     """
     body = memoryview(data)[at:stop]
     try:
@@ -130,7 +130,7 @@ def unpacked(data: Bytes, at: int, stop: int, allowance: Allowance, cut: bool = 
         records = allowance.unpack(packing, packed, size)
     except (LimitReached, MemoryError):
         raise
-    except Exception:    # each compression has its own error; what is lost is lost
+    except Exception:    # each compression has its own error
         raise Damaged(CHUNK_DAMAGED) from None
     if not cut and (len(records) != size or crc and zlib.crc32(records) != crc):
         raise Damaged(CHUNK_DAMAGED)

@@ -21,7 +21,7 @@ from odocal_ros.errors import BadBag
 from odocal_ros.messages.raws import Raws
 from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
 
-BLOCK = 20_000         # judgement: messages taken at a time
+BLOCK = 20_000         # judgement: messages in a batch
 ZSTD = b'\x28\xb5\x2f\xfd'
 
 
@@ -59,7 +59,7 @@ class Part:
             yield batch
 
     def stream(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
-        """Yield the same one by one in order of time, for merging; slower."""
+        """Yield the messages one by one in order of time, for merging; slower."""
         channels = {c.topic: c for c in self.channels}
         for batch in self.batches(topics):
             lists = ([(time_ns, i, channels[topic], raw) for i, (time_ns, raw) in enumerate(
@@ -76,7 +76,7 @@ class Part:
         return self._unpacked(stream) if _packed(first[2]) else stream
 
     def _unpacked(self, stream: Iterator[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:
-        """Yield messages unpacked; b'' where that fails, for readers to count."""
+        """Yield messages unpacked; b'' if that fails, which readers count as unreadable."""
         for channel, time_ns, raw in stream:
             try:
                 raw = self._allowance.unpack('zstd', raw)
@@ -98,7 +98,7 @@ def _packed(raw: bytes) -> bool:
 
 def group(stream: Iterator[tuple[Any, ...]]) -> Batch:
     """Return the next messages (connection or Channel, time, raw) by topic; {} at the end."""
-    # lists of bytes and numbers only, which the garbage collector does not look at (a list of
+    # lists of bytes and numbers only, which the garbage collector does not traverse (a list of
     # tuples takes as long as the reading itself)
     found: dict[str, tuple[list[int], list[bytes]]] = {}
     messages, size = BLOCK, 2**24      # bytes of them

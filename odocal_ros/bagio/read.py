@@ -23,7 +23,7 @@ from odocal_ros.messages.decode import Feed, RowReader
 from odocal_ros.outside.limits import is_file
 from odocal_ros.reasons import Code, Reason
 
-MISSING = 0.5   # s, judgement: less is not worth a word
+MISSING = 0.5   # s, judgement: shorter losses are not reported
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Bag:
     An open bag: its topics and its messages.
 
     ``start_ns`` and ``end_ns`` are the bag times of the first and the last message. ``notes`` are
-    what a user should know: sentences, and reasons where a result is concerned.
+    messages for the user: sentences, and reasons if they concern a result.
     """
 
     def __init__(self, source: Source, parts: list[Part], types: Types) -> None:
@@ -73,7 +73,7 @@ class Bag:
         return (*self._sentences, *self._cut(), *self._reader_notes)
 
     def _cut(self) -> list[Reason | str]:
-        """Return the note on missing data, in seconds if metadata or the next file give them."""
+        """Return notes on missing data, with its duration if metadata or the next file give it."""
         found: list[Reason | str] = []
         known = self._source.known
         for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
@@ -131,7 +131,7 @@ class Bag:
             self._add_notes(topic, reader, used[topic])
 
     def _add_notes(self, topic: str, reader: RowReader, used: int) -> None:
-        """Note messages that gave no row; raise where none gave one."""
+        """Add a note on messages without a row; raise BadData if none has a row."""
         if not reader.unreadable:
             return
         count = self.topics[topic].count
@@ -142,12 +142,12 @@ class Bag:
             f'skipped: {reader.trouble}'))
 
     def messages(self, topic: str) -> Iterator[tuple[int, object]]:
-        """Yield (bag time ns, deserialised message) of a topic; empty if it is not there."""
+        """Yield (bag time ns, deserialised message) of a topic; empty without that topic."""
         if topic in self.topics:
             yield from self._each(topic, self._types.deserializer(self.topics[topic].msgtype))
 
     def frame(self, topic: str) -> str:
-        """Return the frame_id that the first message of a topic has; '' if there is none."""
+        """Return the frame_id of the first readable message of a topic; '' if there is none."""
         msgtype = self.topics[topic].msgtype
         deserialize = self._types.deserializer(msgtype)
 
@@ -157,7 +157,7 @@ class Bag:
         return next((frame for _, frame in self._each(topic, frame_of)), '')
 
     def _each(self, topic: str, read: Callable[[bytes], Any]) -> Iterator[tuple[int, Any]]:
-        """Yield bag time and what a function makes of each message that it can read."""
+        """Yield bag time and the result of ``read`` for each message that it can read."""
         for batch in self._batches({topic}):
             times, raws = batch[topic]
             for time_ns, raw in zip(times.tolist(), raws, strict=True):
@@ -165,7 +165,7 @@ class Bag:
                     message = read(raw)
                 except (OdocalError, MemoryError):
                     raise
-                except Exception:   # one damaged message is no reason to lose the others
+                except Exception:   # a damaged message is skipped
                     continue
                 yield time_ns, message
 
@@ -177,7 +177,7 @@ class Bag:
 
 
 def _merged(parts: list[Part], topics: Mapping[str, str]) -> Iterator[Batch]:
-    """Yield the batches of files that overlap in time, merged; of one file as they are."""
+    """Yield the batches of files that overlap in time, merged; those of one file unchanged."""
     if len(parts) == 1:
         yield from parts[0].batches(topics)
         return
@@ -189,9 +189,9 @@ def _merged(parts: list[Part], topics: Mapping[str, str]) -> Iterator[Batch]:
 @contextmanager
 def open_bag(path: Path | str) -> Iterator[Bag]:
     """
-    Open a bag: a folder or a file, of any kind that ``sources`` knows. Use it in ``with``.
+    Open a bag: a folder or a file, of any kind that ``sources`` supports. Use it in ``with``.
 
-    Raises BadBag: missing, unreadable, empty, or nothing usable left in it.
+    Raises BadBag: missing, unreadable, empty, or without usable content.
     """
     with ExitStack() as stack:
         try:
@@ -239,7 +239,7 @@ def bag_sha256(bag: Bag) -> str:
     """
     Return the SHA-256 of a bag.
 
-    Of one file it is what sha256sum prints; of several that of sha256sum's own output for them.
+    For one file it is that of sha256sum; for several files that of sha256sum's output for them.
     """
     sums = [(_file_sha256(path), path.name) for path in bag.files]
     if len(sums) == 1:

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A rosbag1 file, through rosbags: with bounds on what its index and its chunks may claim."""
+"""A rosbag1 file, read by rosbags, with limits on the sizes stated in its index and chunks."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -21,8 +21,8 @@ class Rosbag1File(Recording):
     """
     A file of ROS 1.
 
-    rosbags takes as much for its index, and from each chunk, as the file says; what it reads of
-    the index is counted here, and its decompressors are replaced.
+    rosbags allocates the sizes that the file states for index and chunks. Here the bytes read for
+    the index are counted, and its decompressors are replaced by limited ones.
     """
 
     def __init__(self, path: Path, allowance: Allowance, convert: Callable[..., Any]) -> None:
@@ -32,7 +32,7 @@ class Rosbag1File(Recording):
             self._reader = self._opened(path)
         except (PermissionError, MemoryError, BadBag):
             raise
-        except Exception as error:   # rosbags and what it stands on fail in many ways
+        except Exception as error:   # rosbags and its dependencies raise many exceptions
             raise self._unreadable(error) from None
         found = self._reader.connections
         self._channels = {c.id: Channel(c.topic, c.msgtype, c.msgcount, 'ros1', (
@@ -59,7 +59,7 @@ class Rosbag1File(Recording):
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
         """Yield the messages of some topics (name -> type) by time, as CDR."""
         connections = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
-        if not connections:      # rosbags would take none as all
+        if not connections:      # for rosbags an empty list means all
             return
         self._allowance.again()
         stream = self._reader.messages(connections=connections)
@@ -91,27 +91,27 @@ def _decompressors() -> dict[str, Callable[..., Any]]:
 
 
 def _reader(path: Path) -> Any:
-    """Return a reader of rosbags whose index holds no more than the file."""
+    """Return a reader of rosbags whose index is limited to the size of the file."""
     with rosbags_for('a rosbag1 file'):
         from rosbags.rosbag1 import Reader
     most = path.stat().st_size
 
     class Bounded(io.BufferedReader):
-        """Asks for no memory that the file cannot fill."""
+        """File whose reads are limited to the size of the file."""
 
         def read(self, size: int | None = -1) -> bytes:
-            """Return so many bytes, or as many as a file has."""
+            """Return ``size`` bytes, at most those of the file."""
             return super().read(min(size, most) if size and size > 0 else size)
 
     class File(type(Path())):     # type: ignore[misc]
-        """A path whose file is so bounded."""
+        """A path that opens a Bounded file."""
 
         def open(self, *_: str) -> io.BufferedReader:
             """Open the file for reading."""
             return Bounded(io.FileIO(self))
 
     class Counted(Reader):
-        """Counts what it reads of the index."""
+        """Reader that limits the bytes read for the index."""
 
         left = most
 

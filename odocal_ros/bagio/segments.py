@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A bag that grows by closed files, so that a kill at any moment leaves all but the newest second.
+A bag that grows by closed files, so that a kill at any moment only loses the newest second.
 
-While it grows it is a folder of numbered files without metadata.yaml; sixty of them are joined
-into one now and then, all of them at the end. A file that joins others is complete before they
-go, and its name lists them: a reader that finds both takes the joined one.
+While it grows it is a folder of numbered files without metadata.yaml; sixty of them are repeatedly
+joined into one, all of them at the end. A joined file is complete before the single files are
+removed, and its name has their numbers: a reader that finds both uses the joined one.
 """
 
 from collections import Counter
@@ -21,27 +21,27 @@ from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file, Written
 from odocal_ros.outside.whole import disk, write_text
 
-JOURNAL = 'journal.yaml'     # beside the files: the folder is a journal, and its settings
+JOURNAL = 'journal.yaml'     # marks the folder as a journal, and has its settings
 NUMBERED = re.compile(r'part_(\d+)(?:-(\d+))?\.mcap')
-TOGETHER = 60        # judgement: files joined while the bag grows: an hour is then 60 + 60
+TOGETHER = 60        # judgement: files joined while the bag grows: an hour has then 60 + 60
 
 
 def part_name(first: int, last: int) -> str:
-    """Return the name of a file that holds the segments of some numbers."""
+    """Return the name of a file with the segments ``first`` to ``last``."""
     return f'part_{first:06}.mcap' if first == last else f'part_{first:06}-{last:06}.mcap'
 
 
 def whole_name(folder: Path, number: int = 0) -> str:
-    """Return the name of the file that holds all segments (0), or of one added to it later."""
+    """Return the name of the file with all segments (0), or of one added to it later."""
     return f'{folder.name}_{number}.mcap'
 
 
 def without_joined(files: Sequence[Path]) -> list[Path]:
-    """Return the files of a journal without those whose messages are in another file too."""
+    """Return the files of a journal without those whose messages are also in another file."""
     numbers = {path: NUMBERED.fullmatch(path.name) for path in files}
     others = [path for path, match in numbers.items() if match is None]
     if any(path.name.endswith('_0.mcap') for path in others):
-        return others      # all was joined, and metadata.yaml was still to come
+        return others      # all are joined, and metadata.yaml was not yet written
     spans = [(int(m[1]), int(m[2])) for m in numbers.values() if m and m[2]]
     return [path for path, m in numbers.items() if not m or m[2] or not any(
         first <= int(m[1]) <= last for first, last in spans)]
@@ -49,7 +49,7 @@ def without_joined(files: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class Segment:
-    """A file of the bag, and the numbers it covers."""
+    """A file of the bag, and its first and last segment number."""
 
     path: Path
     first: int
@@ -61,27 +61,27 @@ class SegmentedBag:
     """
     Writes a bag into a folder of its own, segment by segment.
 
-    Every method that writes may raise OSError; what was written before stays whole.
+    Every method that writes may raise OSError; files written before stay valid.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.channels: dict[int, Channel] = {}   # by number, as chunks name them
+        self.channels: dict[int, Channel] = {}   # by number, as in chunks
         self.segments: list[Segment] = []
         self.extra: list[Segment] = []           # added to the finished bag
 
     @property
     def size(self) -> int:
-        """Return the bytes that its files take."""
+        """Return the size of its files, bytes."""
         return _size((*self.segments, *self.extra))
 
     @property
     def loose_size(self) -> int:
-        """Return the bytes of the files that are joined next."""
+        """Return the size of the files that are joined next, bytes."""
         return _size(self._loose())
 
     def _loose(self) -> list[Segment]:
-        # the first is as large as the pre-roll: it is copied once only
+        # the first has the size of the pre-roll: it is only copied once
         return [s for s in self.segments[1:] if s.first == s.last]
 
     def append(self, chunks: Sequence[Chunk]) -> None:
@@ -90,7 +90,7 @@ class SegmentedBag:
         self.segments.append(self._write(part_name(number, number), number, number, chunks))
 
     def join_some(self) -> None:
-        """Join the newest segments where there are enough of them."""
+        """Join the newest segments if there are enough of them."""
         single = self._loose()
         if len(single) >= TOGETHER:
             self._join(single)
@@ -99,7 +99,7 @@ class SegmentedBag:
         """
         Join all segments into one file and write metadata.yaml; return the file.
 
-        Where ``room``, in bytes, or the disk does not allow the copy, the segments stay as the
+        If ``room``, in bytes, or the disk is too small for the copy, the segments remain the
         files of the bag.
         """
         if room is None or self.size <= room:
@@ -153,7 +153,7 @@ def _chunks_of(segments: Iterable[Segment]) -> Iterator[Chunk]:
 
 
 def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
-    """Return the text of metadata.yaml, version 9, as rosbag2 of Jazzy writes it."""
+    """Return the text of metadata.yaml, version 9, as written by rosbag2 of Jazzy."""
     import yaml
     every = [f.written for f in files]
     counts: Counter[int] = sum((one.counts for one in every), Counter())

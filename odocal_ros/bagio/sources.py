@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The files of a bag from the path that a user gives, decompressed if necessary."""
+"""The files of a bag from a path of the user, decompressed if necessary."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,14 +19,14 @@ from odocal_ros.outside.yaml_files import loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}
-# judgement: bytes at a time: after each zstd frame, of 9 bytes at least, what is left is copied
+# judgement: bytes at a time: after each zstd frame, of 9 bytes at least, the rest is copied
 FRAMES_READ = 2**13
 ENDINGS = ('.mcap', '.db3', '.bag', '.mcap.zstd', '.db3.zstd')
 
 
 @dataclass(frozen=True)
 class Span:
-    """What metadata.yaml says of a bag or one of its files."""
+    """Content of metadata.yaml on a bag or one of its files."""
 
     end_ns: int
     count: int
@@ -35,9 +35,9 @@ class Span:
 @dataclass(frozen=True)
 class Known:
     """
-    What metadata.yaml says of a bag.
+    Content of metadata.yaml on a bag.
 
-    foreign : a serialization format that is not cdr.   trouble : why it cannot be used.
+    foreign : serialization formats, if none is cdr.   trouble : reason why it cannot be used.
     """
 
     names: tuple[str, ...] = ()
@@ -49,7 +49,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Source:
-    """The files of a bag, in the order they were recorded, and what metadata.yaml says."""
+    """The files of a bag, in the order of recording, and the content of metadata.yaml."""
 
     name: str
     files: tuple[Path, ...]
@@ -59,9 +59,9 @@ class Source:
 
 def find(path: Path) -> Source:
     """
-    Return the source that a path names: a folder, its metadata.yaml, or a file of a bag.
+    Return the source at a path: a folder, its metadata.yaml, or a file of a bag.
 
-    Raises BadBag: nothing there, or nothing that is a bag.
+    Raises BadBag: the path does not exist, or is not a bag.
     """
     path = Path(path)
     if not path.exists():
@@ -106,7 +106,7 @@ def _folder(path: Path) -> Source:
 
 
 def _distinct(files: list[Path]) -> list[Path]:
-    """Return the files without links to one that is before them: each is read once."""
+    """Return the files without links to an earlier one, so that each is read once."""
     found: dict[tuple[int, int], Path] = {}
     for file in files:
         about = file.stat()
@@ -122,7 +122,7 @@ def _hint(path: Path) -> str:
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
-    """Sort bag_2 before bag_10."""
+    """Return a sort key that places bag_2 before bag_10."""
     return [(int(part), '') if part.isdigit() else (0, part)
             for part in re.split(r'(\d+)', path.name)]
 
@@ -145,7 +145,7 @@ def _read_metadata(path: Path) -> Known:
         raise
     except limits.LimitReached as error:
         return Known(trouble=f'{error}; it is ignored')
-    except Exception as error:      # of any kind: types, numbers, nesting, encoding
+    except Exception as error:      # any error: types, numbers, nesting, encoding
         why = ' '.join(str(error).split())[:100] or type(error).__name__
         return Known(trouble=f'{path}: cannot be parsed ({why}) and is ignored')
 
@@ -180,8 +180,8 @@ def unpack(path: Path, folder: Path, total: int) -> tuple[Path, str]:
     """
     Return a plain file with a bag's content, and its kind ('.mcap', '.db3', '.bag').
 
-    Compressed files, and databases with changes still in a -wal file beside them, are unpacked
-    into ``folder``; the user's files stay as they are. ``total`` is the size of the whole bag.
+    Compressed files, and databases with changes in a separate -wal file, are unpacked into
+    ``folder``; the user's files are not changed. ``total`` is the size of the whole bag, bytes.
     """
     kind = kind_of(path)
     if kind == '.zstd':
@@ -212,12 +212,12 @@ def kind_of(path: Path) -> str:
 
 
 def _decompressed(path: Path, folder: Path, allowance: limits.Allowance) -> Path:
-    """Decompress as much of a file as is there."""
+    """Return the decompressed file, as far as it is complete and undamaged."""
     zstd = limits.zstd_module()
     target = folder / path.name.removesuffix('.zstd')
     with path.open('rb') as packed, target.open('wb') as out:
         frames = 1
-        frame, data = zstd.ZstdDecompressor(), b''   # gives what there is of a file cut off
+        frame, data = zstd.ZstdDecompressor(), b''   # also decompresses a truncated file
         while data or not (frame.needs_input or frame.eof) or (data := packed.read(FRAMES_READ)):
             if frame.eof:
                 frames += 1
@@ -225,7 +225,7 @@ def _decompressed(path: Path, folder: Path, allowance: limits.Allowance) -> Path
                 frame = zstd.ZstdDecompressor()
             try:
                 piece = frame.decompress(data, 2**20)
-            except zstd.ZstdError:     # damaged: what came out is recovered like a cut file
+            except zstd.ZstdError:     # damaged: the output is used like a truncated file
                 return target
             allowance.take(len(piece))
             out.write(piece)
@@ -234,7 +234,7 @@ def _decompressed(path: Path, folder: Path, allowance: limits.Allowance) -> Path
 
 
 def _with_wal(path: Path, wal: Path, folder: Path) -> Path:
-    """Return a copy of a database with the changes that its -wal file holds."""
+    """Return a copy of a database with the changes in its -wal file."""
     target = folder / path.name
     shutil.copyfile(path, target)
     shutil.copyfile(wal, target.with_name(target.name + '-wal'))
@@ -243,7 +243,7 @@ def _with_wal(path: Path, wal: Path, folder: Path) -> Path:
         db.execute('PRAGMA wal_checkpoint(TRUNCATE)').fetchall()
         db.close()
     except sqlite3.DatabaseError:
-        shutil.copyfile(path, target)     # a -wal of another file: without it, then
+        shutil.copyfile(path, target)     # a -wal of another file: not used
     return target
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A sqlite3 bag, read by SQL; from its leaf pages where those above them are damaged."""
+"""A sqlite3 bag, read by SQL, or from its leaf pages if inner pages are damaged."""
 
 from collections.abc import Callable, Container, Iterator, Mapping
 from functools import partial
@@ -22,7 +22,7 @@ INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}      # format: bytes
 READS = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ}
 TABLES = {'messages', 'topics', 'message_definitions'}
 AS_STORED = 'SELECT rowid, topic_id, timestamp, data FROM messages ORDER BY rowid'
-# sorts numbers of rows, not rows with all their data; without LIMIT sqlite ignores that order
+# sorts row numbers, not rows with their data; without LIMIT sqlite ignores that order
 BY_TIME = ('SELECT m.rowid, topic_id, timestamp, data FROM (SELECT rowid AS row FROM messages '
            'ORDER BY timestamp LIMIT -1) CROSS JOIN messages AS m ON m.rowid = row')
 TEXTS = ('name', 'type', 'serialization_format')
@@ -56,21 +56,21 @@ class Leaves:
     def rows(self, keys: Container[int] | None, last: int = -1
              ) -> Iterator[tuple[int, int, bytes]]:
         """
-        Yield (topic_id, timestamp, data) of some topics in the order they were written.
+        Yield (topic_id, timestamp, data) of some topics in the order of writing.
 
-        keys : topics, None: of all, without their data.   last : rows up to it are skipped.
+        keys : topics; None: all, without their data.   last : rows up to this one are skipped.
         """
-        left = 2 * len(self._map)            # bytes: no two rows share a page for large ones
+        left = 2 * len(self._map)            # bytes: large rows do not share overflow pages
         for page in self._pages:
             for row, key, time_ns, payload in self._rows_of(page):
-                if row <= last:              # a stale copy of a page holds rows seen already
+                if row <= last:              # a stale copy of a page has earlier rows
                     continue
                 data = b''
                 if keys is not None and key in keys:
                     try:
                         data = payload()
                     except (ValueError, IndexError, struct.error):
-                        continue             # its overflow pages are gone
+                        continue             # its overflow pages are missing
                     left -= len(data)
                     if left < 0:
                         return
@@ -122,7 +122,7 @@ class Leaves:
 
 
 def _record(data: bytes, at: int) -> tuple[int, int, int]:
-    """Return topic, time and where the data begin in a row of messages; ValueError if not one."""
+    """Return topic, time and offset of the data in a row of messages; ValueError if not one."""
     length, pos = _varint(data, at)
     if length > 10 * COLUMNS:      # a varint has nine bytes at most
         raise ValueError('not a message')
@@ -177,12 +177,12 @@ class SqliteFile(Recording):
             raise
 
     def _guard(self) -> None:
-        """Let sqlite only read rows of tables, each no larger than file and limit."""
+        """Restrict sqlite to reading rows of tables, each no larger than file and limit."""
         db = self._db
         db.text_factory = lambda raw: raw.decode(errors='replace')
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH,
                     min(max(self._size, 100_000), int(min(MESSAGE * factor(), 2**30))))
-        # else sqlite refuses at once a file shorter than its header says
+        # without it, sqlite refuses a file that is shorter than stated in its header
         db.execute('PRAGMA writable_schema=ON')
         db.execute('PRAGMA trusted_schema=OFF')
         db.set_authorizer(lambda action, *_: sqlite3.SQLITE_OK if action in READS
@@ -190,8 +190,8 @@ class SqliteFile(Recording):
 
     def _query(self, sql: str, *values: Any) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query, or raise Damaged."""
-        steps = 10_000    # of sqlite's machine between two looks at how many it took
-        # for any file, and more for each byte: a row of ten takes about 30 to read
+        steps = 10_000    # of sqlite's virtual machine between two checks of their number
+        # for any file, plus a number for each byte: reading a row of ten bytes takes about 30
         left = int((20_000_000 + 20 * self._size) * factor()) // steps
 
         def stop() -> bool:
@@ -236,7 +236,7 @@ class SqliteFile(Recording):
                 if all(isinstance(x, str) for x in (msgtype, form, text))}
 
     def _to_leaves(self, error: Damaged) -> None:
-        """Continue with the leaf pages: inner pages, which SQL needs, are damaged or missing."""
+        """Switch to the leaf pages: inner pages, which SQL needs, are damaged or missing."""
         try:
             self._leaves = Leaves(self.path)
         except (ValueError, struct.error, IndexError) as second:
@@ -254,13 +254,13 @@ class SqliteFile(Recording):
                 yield key, time_ns
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
-        """Yield the messages of some topics (name -> type) by time; as written where damaged."""
+        """Yield the messages of some topics (name -> type) by time; as written if damaged."""
         wanted, last = self._wanted(topics), -1
         if not self._leaves:
             try:
                 for row, key, time_ns, raw in self._query(AS_STORED if self._sorted else BY_TIME):
                     if key in wanted and possible(time_ns):
-                        # text and numbers are no messages: readers count what is none
+                        # text and numbers are not messages: readers count b'' as unreadable
                         yield wanted[key], time_ns, raw if isinstance(raw, bytes) else b''
                     last = row
                 self._refuse_if_changed()

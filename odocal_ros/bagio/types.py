@@ -29,7 +29,7 @@ def rosbags_for(what: str) -> Iterator[None]:
 
 
 def parsed(msgtype: str, form: str, text: str) -> dict[str, Any]:
-    """Return the fields of a type and those it stands on; form is 'msg' or 'idl'."""
+    """Return the fields of a type and of the types in it; form is 'msg' or 'idl'."""
     with rosbags_for('a non-standard message type'):
         from rosbags.typesys import get_types_from_idl, get_types_from_msg
     if form == 'msg':
@@ -44,9 +44,9 @@ def parsed(msgtype: str, form: str, text: str) -> dict[str, Any]:
 
 def bare(text: str) -> str:
     """
-    Return IDL without comments and annotations, which say nothing of a layout and parse slowly.
+    Return IDL without comments and annotations, which do not affect a layout and parse slowly.
 
-    Raises ValueError for constants that are computed: messages have none, and 1 << 2**40 is large.
+    Raises ValueError for computed constants: messages have none, and 1 << 2**40 is large.
     """
     kept, depth, annotated = [], 0, False
     for token in TOKEN.findall(text):
@@ -69,7 +69,7 @@ def bare(text: str) -> str:
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Raise TimeoutError in what runs longer; without effect in other threads than the main."""
+    """Raise TimeoutError if the block runs longer; only has an effect in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -86,25 +86,25 @@ def within(seconds: float) -> Iterator[None]:
 
 
 class Types:
-    """Deserialises messages; a type is looked up when its first message is."""
+    """Deserialises messages; a type is loaded with its first message."""
 
     def __init__(self) -> None:
         self._store: Any = None
         self._definitions: dict[str, tuple[str, str]] = {}
 
     def define(self, msgtype: str, definition: tuple[str, str]) -> None:
-        """Remember a definition ('msg' or 'idl', text) that a bag holds."""
+        """Store a definition ('msg' or 'idl', text) of a bag."""
         if definition[0]:
             self._definitions.setdefault(msgtype, definition)
 
     def deserializer(self, msgtype: str) -> Callable[[bytes], Any]:
-        """Return the function that turns CDR bytes of a type into an object."""
+        """Return a function that converts CDR bytes of a type to an object."""
         def deserialize(raw: bytes) -> Any:
             store = self._with(msgtype)
             try:
                 return store.deserialize_cdr(raw, msgtype)
             except Exception:
-                # bytes behind the message, as rclpy's serialize_message leaves them, are no fault
+                # bytes after the message, as left by rclpy's serialize_message, are allowed
                 if raw[:2] != b'\x00\x01':
                     raise
                 kind = store.get_msgdef(msgtype)
@@ -117,7 +117,7 @@ class Types:
         return cdr
 
     def _with(self, msgtype: str) -> Any:
-        """Return the store once it knows a type, or raise BadData."""
+        """Return the type store with a type registered, or raise BadData."""
         if self._store is None:
             with rosbags_for(msgtype):
                 from rosbags.typesys import get_typestore, Stores
@@ -151,7 +151,7 @@ class Types:
 
 def _elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> int:
     """Return the minimum number of values in the fixed arrays of a message."""
-    deepest = 50    # of messages in messages
+    deepest = 50    # largest nesting of messages
     if depth > deepest:
         raise ValueError('it contains itself')
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write bags: topics merged by time, whole or not at all."""
+"""Write bags: topics merged by time, completely or not at all."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ BLOCK = 20_000         # judgement: messages packed at a time, to bound memory
 
 
 def drive_topics(drive: Any) -> list[Topic]:
-    """Return a simulated drive's topics under the names that the node listens to."""
+    """Return a simulated drive's topics, with the names of the node's inputs."""
     reference = drive.reference
     position = () if reference.encoder == 'fix' else (drive.positions(),)
     topics = [encode.imu('/imu/data', drive.imu)] if len(drive.imu.stamp_ns) else []
@@ -54,9 +54,9 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
     """
     Write topics as one bag, messages in order of bag time; return its path.
 
-    ``storage`` mcap and sqlite3 give a rosbag2 folder, rosbag1 a file. ``progress`` receives the
-    share written. The bag appears under its name only when it is complete; ``force`` replaces
-    one that is there.
+    ``storage`` mcap and sqlite3 give a rosbag2 folder, rosbag1 a file. ``progress`` is called with
+    the share written. The bag gets its name only when it is complete; ``force`` replaces an
+    existing one.
 
     Raises BadUsage: the path exists and ``force`` is not set; its folder cannot be written; an
     unknown storage or a compression the storage does not have.
@@ -83,7 +83,7 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
 
 
 def check_target(path: Path, storage: str, compression: str, force: bool) -> None:
-    """Raise BadUsage where write_bag would, before any work is done."""
+    """Raise BadUsage as write_bag does, before any work is done."""
     if storage not in STORAGES:
         raise BadUsage(f'--storage {storage}: required: one of {", ".join(STORAGES)}')
     if compression not in COMPRESSIONS:
@@ -136,7 +136,7 @@ def _write(path: Path, topics: Sequence[Topic], storage: str, compression: str,
 
 
 def _with_checksums(storage: Any) -> None:
-    """Have rosbags' mcap storage, which writes zeros, give each chunk its checksum."""
+    """Add the checksum of each chunk to rosbags' mcap storage, which writes zeros."""
     close_chunk = storage.close_chunk
 
     def close_with_checksum() -> None:

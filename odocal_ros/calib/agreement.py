@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Methods on one leg held against each other: a difference beyond the sigmas has a cause."""
+"""Comparison of methods on one leg: differences beyond the sigmas, with their likely cause."""
 
 from itertools import combinations
 import math
@@ -13,7 +13,7 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-# sigmas of the difference, as if independent: methods that share data differ less
+# differences are tested as if methods were independent: methods that share data differ less
 NAMES = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 CAUSES = {
     'scale_factor': {
@@ -28,7 +28,7 @@ CAUSES = {
 
 def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
     """
-    Compare what the methods say of one leg.
+    Compare the estimates of the methods on one leg.
 
     methods : by name; rejected ones are left out.
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The information of a leg's data on the constants of the vehicle, no prior in it."""
+"""Information of a leg's data on the constants of the vehicle, without priors."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,15 +17,15 @@ SCATTER_POINTS = 11     # judgement: of the grid over the scatter between legs
 @dataclass(frozen=True, eq=False)
 class Border:
     """
-    The data of a leg as a quadratic in the constants x, all else of the leg eliminated.
+    Log likelihood of a leg as a quadratic in the constants x, its other unknowns eliminated.
 
-    Their log likelihood is pull (x - value) - (x - value)' information (x - value) / 2, but for a
-    constant, docs/method.md (S33). Constants go by their names; ln K, rad, m, s.
+    It is pull (x - value) - (x - value)' information (x - value) / 2, up to a constant,
+    docs/method.md (S33). Constants are identified by name; ln K, rad, m, s.
 
-    names : of the constants.   value : (m,) where the leg was linearised, as settings have it:
-    a lever arm is the whole one.   information : (m, m), semidefinite.   pull : (m,).
-    centre, sigma : (m,) of the priors, inf where there is none.   used : (m,) the sigmas, those
-    widened that the leg contradicts, and those of imperfections by the sizes it found.
+    names : of the constants.   value : (m,) linearisation point, defined as the settings are: a
+    lever arm is the full one.   information : (m, m), semidefinite.   pull : (m,).
+    centre, sigma : (m,) of the priors, sigma inf: no prior.   used : (m,) the sigmas as used:
+    widened if the leg contradicts them, scaled by the estimated size for imperfections.
     evidence : of combined legs, by name: log likelihood of the scatter between them (S38), (g,).
     """
 
@@ -43,7 +43,7 @@ class Border:
         return replace(self, information=self.information / factor**2, pull=self.pull / factor**2)
 
     def plus(self, other: 'Border') -> 'Border':
-        """Return the sum of both, of the same constants, at this one's linearisation point."""
+        """Return the sum with a border of the same constants, at this one's ``value``."""
         pull = other.pull - other.information @ (self.value - other.value)
         return replace(self, information=self.information + other.information,
                        pull=self.pull + pull, sigma=np.maximum(self.sigma, other.sigma),
@@ -53,8 +53,8 @@ class Border:
         """
         Return the border of a leg whose constants differ from the vehicle's by errors of its own.
 
-        sigmas : by name, of each constant's own error d, inf: the leg then says nothing of it.
-        The data see x + d; d is taken out, docs/method.md (S34).
+        sigmas : by name, of each constant's own error d; inf: no information on it remains.
+        The data depend on x + d; d is eliminated, docs/method.md (S34).
         """
         at = [self.names.index(name) for name in sigmas]
         (D,), (pull,) = loosened(self.information[None], self.pull[None], at,
@@ -63,9 +63,9 @@ class Border:
 
     def doubted(self, effects: Floats) -> 'Border':
         """
-        Return the border by which, with the priors used, x is as it is and its covariance larger.
+        Return the border that gives, with the priors used, the same x and a larger covariance.
 
-        effects : (m, L), whose squares are what the covariance grows by, docs/method.md (S33a).
+        effects : (m, L) E; the covariance increases by E E', docs/method.md (S33a).
         """
         weight = 1 / self.used**2
         G = (self.information + np.diag(weight)) @ effects
@@ -76,7 +76,7 @@ class Border:
                        pull=self.pull - taken @ (effects.T @ (self.pull + weight * off)))
 
     def only(self, names: Sequence[str]) -> 'Border':
-        """Return the information on some constants, the others taken out with their priors."""
+        """Return the information on some constants, the others eliminated with their priors."""
         at = np.isin(self.names, names)
         free = self.loosened({n: s for n, s in zip(self.names, self.used, strict=True)
                               if n not in names})
@@ -87,7 +87,7 @@ class Border:
                       {n: evidence for n, evidence in self.evidence.items() if n in names})
 
     def turned(self, name: str, about: float) -> 'Border':
-        """Return the border with an angle, rad, given within half a turn of another."""
+        """Return the border with an angle, rad, wrapped to within half a turn of ``about``."""
         value, i = self.value.copy(), self.names.index(name)
         value[i] = about + wrap(value[i] - about)
         return replace(self, value=value)
@@ -105,13 +105,13 @@ class Border:
 
 def loosened(D: Floats, pull: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats]:
     """
-    Return information and pull of legs with errors of their own taken out, (S34).
+    Return information and pull of legs, with the own errors of constants eliminated, (S34).
 
-    D, pull : (J, m, m), (J, m).   at, sigmas : (k,) constants and sigmas of their errors, inf:
-    not bounded.
+    D, pull : (J, m, m), (J, m).   at, sigmas : (k,) indices of the constants, and sigmas of their
+    errors; inf: unbounded.
     """
     known, own = np.isfinite(sigmas), np.diagonal(D, axis1=1, axis2=2)[:, at]
-    # a column of any length will do for what is not bounded
+    # the column of an unbounded error may have any length
     size = np.where(known, sigmas, np.where(own > 0, 1 / np.sqrt(np.maximum(own, 1e-300)), 0.0))
     A = np.eye(D.shape[1])[:, at] * size[:, None]
     DA, A_t = D @ A, np.swapaxes(A, 1, 2)
@@ -125,9 +125,9 @@ def directions(D: Floats, unit: Floats, least: float = 0.0) -> Iterator[tuple[Fl
     """
     Yield size (r,) and direction (m, r) of the information of each leg, in ``unit``.
 
-    D : (J, m, m).   unit : (m,).   least : of a size; directions of but rounding are left out.
+    D : (J, m, m).   unit : (m,).   least : limit of the size. Rounding errors are left out.
     """
     for size, V in zip(*np.linalg.eigh(D * np.multiply.outer(unit, unit)), strict=True):
-        rounding = 1e-12 * size[-1]       # of doubles, times what elimination loses
+        rounding = 1e-12 * size[-1]       # of doubles, times the loss by elimination
         keep = size > max(rounding, least, 1e-300)
         yield size[keep], V[:, keep]

@@ -27,8 +27,8 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import A
 from odocal_ros.nav.rotations import matrix_from_quat, quat_conjugate, quat_multiply, skew
 
-# m, 1 sigma of the height of fixes that have none, which are put on the ellipsoid. Physical: roads
-# lie up to 2 km above it, most below 500 m; it makes 80 ppm of the scale
+# m, 1 sigma of the height of fixes without one, which are set on the ellipsoid. Physical: roads
+# are up to 2 km above it, most below 500 m; its effect on the scale is 80 ppm
 HEIGHT_UNKNOWN = 500.0
 PARAMETERS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
@@ -37,7 +37,7 @@ def parameter_gradient(f: Floats) -> Floats:
     """Return the derivative G of (ln K, yaw, pitch) by f, (3, 3): docs/method.md (T8)."""
     K = np.linalg.norm(f)
     x, y, z = f
-    level = np.hypot(x, z) * (-1.0 if x < 0 else 1.0)      # as mounting_from_forward has it
+    level = np.hypot(x, z) * (-1.0 if x < 0 else 1.0)      # as in mounting_from_forward
     return np.array([f / K**2,
                      [x * y / level / K**2, -level / K**2, z * y / level / K**2],
                      [-z / level**2, 0.0, x / level**2]])
@@ -61,10 +61,10 @@ def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> d
     # e = integral of (C_nb db) x r
     turn = by_step(_turn, r, q_nb)
     bias = np.einsum('nij,n->ij', turn, dt) * alignment.gyro_bias_sigma
-    # an axis j that is off shows a share of the turn about each axis k
+    # a misaligned axis j measures a share of the turn about each axis k
     axes = np.einsum('nij,nk->ijk', turn, by_step(_turned, q_nb)).reshape(3, 9)
     scale, off = np.eye(3, dtype=bool).ravel(), ~np.eye(3, dtype=bool).ravel()
-    # R(u): what is left of the integral of r from u on; a step of the bias at u turns all of it
+    # R(u): integral of r from u to the end; a bias step at u acts on all of it
     slices = (r[:-1] + r[1:]) / 2 * dt[:, None]
     R = np.concatenate([np.cumsum(slices[::-1], axis=0)[::-1], np.zeros((1, 3))])
     return {f'gyro_bias_{axis}': bias[:, i:i + 1] for i, axis in enumerate('xyz')} | {
@@ -109,8 +109,8 @@ def _late_odometer(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix
     """
     Return the change of the chord by an odometer delay of 1 s, (3,) m/s.
 
-    Travel is then put on attitudes that come after it: the integral of dC/dt f ds, less what the
-    track has at one end and lacks at the other, v(end) - v(start).
+    Travel is then combined with later attitudes: the integral of dC/dt f ds. Minus
+    v(end) - v(start), because the travel between the marks is shifted by the delay.
     """
     def middle_and_change(q_nb: Floats) -> Floats:
         C_nb = matrix_from_quat(q_nb)
@@ -139,16 +139,16 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     """
     Return the sources of error of (ln K, yaw, pitch): docs/method.md (T9) to (T12).
 
-    The fixes' own vertical errors are part of fix_start and fix_end; ``height`` is the error that
-    both ends share, which makes the Earth, and so the chord, larger. ``projection`` is listed
-    although it is zero: the chord is in space, not in a plane.
+    The fixes' own vertical errors are part of fix_start and fix_end; ``height`` is the height
+    error common to both ends, which scales the chord as a larger Earth would. ``projection`` is
+    listed although it is zero: the chord is in space, not in a plane.
 
     f : (3,) solution, m per unit of travel, in b.   M : (3, 3) attitude summed over travel.
     start, end : reference positions.   t, D, q_nb : the track, as in drift_sources, from the
     alignment or the start mark to the end mark.   alignment : level, heading and gyro sigmas.
     quantum : size of an odometer count, m.   fix_scale : (3,) factor on the stated fix sigmas by
     the residuals, east, north, up.   time_sigma : unknown latency of fixes, s.
-    velocity_change : (3,) velocity at the end mark less that at the start, m/s; zero between
+    velocity_change : (3,) velocity at the end mark minus that at the start, m/s; zero between
     standing marks.   lever_arm_sigma : m, each axis.   odometer_time_sigma : unknown latency of
     the odometer, s.
     """
@@ -182,7 +182,7 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
 
 
 def _height_sigma(start: MarkFix, end: MarkFix) -> float:
-    """Return the sigma of the height that both ends share, m."""
+    """Return the sigma of the height error common to both ends, m."""
     if not (start.height_known and end.height_known):
         return HEIGHT_UNKNOWN
     return float(np.sqrt((start.covariance_n[2, 2] + end.covariance_n[2, 2]) / 2))
@@ -192,9 +192,8 @@ def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: f
     """
     Return the second-order error of the scale: docs/method.md (T12).
 
-    Half the distance-weighted variance of a drifting attitude, for a gyro bias
-    and noise of the size of their sigmas, and half the square of the false tilt due to
-    height errors of the fixes.
+    Half the distance-weighted variance of the attitude drift, for a gyro bias and noise of one
+    sigma, and half the square of the false tilt by height errors of the fixes.
     """
     share = np.linalg.norm(np.diff(D, axis=0), axis=1)
     share = share / max(share.sum(), 1e-12)

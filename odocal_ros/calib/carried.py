@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Prior of a vehicle from its earlier legs, without the legs: for days to come, over a restart."""
+"""Prior of a vehicle from its earlier legs, without their data: for later days and restarts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -19,10 +19,10 @@ NOTHING = {'sigma': np.inf, 'used': np.inf}      # for a null in a file
 @dataclass(frozen=True, eq=False)
 class Carried:
     """
-    The border of all legs so far, the scale as the last of them has it.
+    Border of all legs so far, with the scale at the last leg.
 
-    unit : of the scale.   first_ns, last_ns : when the first and the last of them began.
-    legs : how many.
+    unit : of the scale.   first_ns, last_ns : start times of the first and of the last leg.
+    legs : number of legs.
     """
 
     border: Border
@@ -39,14 +39,14 @@ class Carried:
         """
         Return the information on some constants.
 
-        keeps : of each prior sigma, the share by which it may have changed until it is used.
+        keeps : share of its prior sigma by which each constant may have changed until use.
         """
         border = self.border.only(names)
         return replace(self, border=border.loosened(
             dict(zip(border.names, (keeps * border.used).tolist(), strict=True))))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as calibration.json has it."""
+        """Return the content for calibration.json."""
         border = {f.name: np.asarray(getattr(self.border, f.name)).tolist() for f in NUMBERS}
         border |= {'names': list(self.border.names),
                    'evidence': {n: x.tolist() for n, x in self.border.evidence.items()}}
@@ -56,12 +56,12 @@ class Carried:
 
 def carried_from(content: dict[str, Any]) -> Carried:
     """
-    Return the Carried from the dict of ``as_dict``; null stands for values that are not finite.
+    Return the Carried from the dict of ``as_dict``; null: a value that is not finite.
 
     Raises
     ------
     ValueError
-        It is not that.
+        The content is not valid.
 
     """
     try:

@@ -1,11 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What makes a scale change, in words: for the comparison of results and for legs on their own."""
+"""Likely causes of a scale change as text, for the comparison of results and for single legs."""
 
 from odocal_ros.settings.levels import TYRE_SPREAD
 
-ANOTHER_SCALE = 2 * TYRE_SPREAD    # relative change of a scale beyond any tyres: physical
+ANOTHER_SCALE = 2 * TYRE_SPREAD    # relative change larger than tyres cause: physical
 TYRES = 'tyre pressure, wear, load or another tyre'
 OTHER = 'another vehicle, gear, counter or unit: tyres do not change this much'
 
@@ -16,7 +16,7 @@ def cause_of_change(relative: float) -> str:
 
 
 def change_in_words(relative: float) -> str:
-    """Return a relative change as people read it."""
+    """Return a relative change as text, in ppm or per cent."""
     if abs(relative) < 1e-3:
         return f'{1e6 * relative:+.0f} ppm'
     return f'{100 * relative:+.3g} %'

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The check: dead reckoning against every fix, before and after the correction; and sanity."""
+"""Comparison of the dead-reckoned track with all fixes, before and after the correction."""
 
 from collections.abc import Sequence
 
@@ -15,11 +15,11 @@ from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
-# ratio of two measures of one motion, ways or turns, by track and by fixes. Physical: no error of
-# scale, skid or lean is so large; fixes that only jump go as far as they like
+# limits of path length, or turn, by the track relative to the fixes. Physical: errors of scale,
+# skid or lean are smaller; fixes that only jump have any path length
 ONE_MOTION_RATIO = 0.6, 1.6
-# factor on stated fix sigmas below which they stand. Statistical: by the median of 30 fixes chance
-# alone makes 1.25 of 1 once in 30 legs
+# smallest factor applied to stated fix sigmas. Statistical: by the median of 30 fixes, chance
+# alone gives 1.25 instead of 1 once in 30 legs
 NOISIER_WORTH = 1.25
 
 
@@ -27,15 +27,15 @@ def stray(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.
 
-    path : t (n,) to the antenna's path, (n, 3) m, but for a constant.   pin : where the path is
-    pinned.   fixes : (t, position_n) within the leg.
+    path : t (n,) to the antenna's path, (n, 3) m, up to a constant.   pin : mark whose position
+    the path is set to.   fixes : (t, position_n) within the leg.
     """
     t, position_n = fixes
     return pin.position_n + path(t) - path(np.array(pin.t)) - position_n
 
 
 def track_check(residual: Floats, distance: float) -> TrackCheck:
-    """Return the patent's criteria (max, mean) and more of the residuals, m."""
+    """Return the statistics of horizontal residuals, m: the patent's (max, mean) and others."""
     d = np.hypot(*residual.T[:2])
     return TrackCheck(float(np.sqrt((d**2).mean())), float(d.max()), float(d.mean()),
                       float(d[-1]), float(100 * d[-1] / distance) if distance else 0.0)
@@ -44,14 +44,14 @@ def track_check(residual: Floats, distance: float) -> TrackCheck:
 def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
                      marks: Sequence[MarkFix] = ()) -> Floats:
     """
-    Return the factors on stated fix sigmas that residuals ask for, east, north, up: (3,).
+    Return the factors on stated fix sigmas by the residuals, east, north, up: (3,).
 
-    residual : (n, 3) corrected track less fixes, m; NaN up where no height is known.
-    covariance_n : (n, 3, 3) as stated, m^2.   drift : what the gyros may have bent the track by,
-    m: taken out of the residuals. What is left may still hold errors of the track, so this errs on
-    the wide side; below NOISIER_WORTH the stated sigmas stand.   marks : the two that the track is
-    pinned to: it has their errors, in proportion to the path a third of the variance of each, and
-    the factor is theirs too.
+    residual : (n, 3) corrected track minus fixes, m; NaN up where no height is known.
+    covariance_n : (n, 3, 3) stated, m^2.   drift : possible track error by gyro drift, m, whose
+    square is subtracted. The rest may include other track errors, so the factors tend to be too
+    large; below NOISIER_WORTH they are 1.   marks : the two that the track is pinned to. Their
+    errors act in proportion to the path, on average a third of each variance; the factor applies
+    to them as well.
     """
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
     level2 = np.median((residual[:, :2]**2).sum(axis=1)) / np.log(2)     # mean of an exponential
@@ -87,20 +87,19 @@ def mismatch(check: TrackCheck, fix_sigma: float, drift: float,
 def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: float,
          distance: float) -> tuple[Reason, ...]:
     """
-    Return MODEL_MISMATCH where a pinned track bends as neither its gyros nor the fixes would.
+    Return MODEL_MISMATCH if a pinned track bends more than gyro drift and fix errors explain.
 
-    The ends alone show neither a false nor a missing turn in between.
-    Means over windows show it, across the chord; how far slow errors of the fixes may take them
-    is what they do along it.
+    The ends alone do not show a false or missing turn between them. Means of the residuals over
+    windows do, across the chord; the means along it show the size of slow fix errors.
 
-    t, residual : (n,), (n, 3) times, s, and corrected track less fixes, m.   chord_n : (3,) from
-    mark to mark, m.   fix_sigma, drift : of a fix, and what the gyros may have bent the track by,
-    m.   distance : of the leg, m.
+    t, residual : (n,), (n, 3) times, s, and corrected track minus fixes, m.   chord_n : (3,) from
+    mark to mark, m.   fix_sigma, drift : sigma of a fix, and possible track error by gyro drift,
+    m.   distance : path length of the leg, m.
     """
     x, y = chord_n[:2] / np.hypot(*chord_n[:2])
     count, _, (along, across) = window_means(t, *(residual[:, :2] @ axis
                                                   for axis in ((x, y), (-y, x))))
-    if len(count) < 3:      # two windows have no bend between them
+    if len(count) < 3:      # two windows show no bend
         return ()
     sigma = np.sqrt((along**2).mean() + fix_sigma**2 / np.median(count) + drift**2)
     allowed, most = _believable(sigma, distance), np.abs(across).max()
@@ -115,13 +114,13 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
 
 def steady(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
     """
-    Return the fixes that are no outliers beside their neighbours, and their noise.
+    Return the fixes that are no outliers relative to their neighbours, and their noise.
 
-    residual : (n, 2 or more) corrected track less fixes, m, whatever is wrong with the track.
+    residual : (n, 2 or more) corrected track minus fixes, m; the track may have large errors.
 
     Returns
     -------
-    (n,) bool, and the sigma of a fix against the next, m, no less than fix_sigma.
+    (n,) bool, and the sigma of a fix by differences of consecutive ones, m, at least fix_sigma.
 
     """
     level = residual[:, :2]

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which method gives which value: the first in order whose verdict allows it."""
+"""Selection of the method for each value: the first in order that is not rejected."""
 
 from collections.abc import Iterable, Mapping
 
@@ -11,8 +11,8 @@ from odocal_ros.reasons import Code, Reason, Verdict
 ORDER = ('smoother', 'two_point')
 PLANAR = 'planar'        # the only method of legs that the others cannot compute
 ALWAYS = 'two_point'     # the operator's own marks: computed and shown for every setting
-BY = {'patent': 'smoother', 'wheels': 'smoother'}     # asked for: the method that decides then
-# what the smoother refuses end points do not know either: they have but the accelerometer's level
+BY = {'patent': 'smoother', 'wheels': 'smoother'}     # requested: the method that gives the values
+# not taken from end points if the smoother refuses it: they have only the accelerometer's level
 REFUSED_FOR_ALL = 'smoother', 'pitch_mounting_angle'
 # value that a reason is about: left out if another method gives the value
 ABOUT = {
@@ -29,9 +29,9 @@ ABOUT = {
 
 def deciding(asked: str | tuple[str, ...], shown: bool = False) -> tuple[str, ...]:
     """
-    Return the methods whose figures may be the result, the first choice first.
+    Return the methods whose values may be the result, the first choice first.
 
-    asked : the setting ``method``, or such methods.   shown : with those only shown beside it.
+    asked : the setting ``method``, or such methods.   shown : add methods shown for comparison.
     """
     if not isinstance(asked, str):
         return asked
@@ -46,14 +46,14 @@ def choose(methods: Mapping[str, MethodResult],
     """
     Take each parameter from the first method that has it and is not rejected.
 
-    methods : by name.   asked : the setting ``method``, or the methods that may give.
+    methods : by name.   asked : the setting ``method``, or the methods that may give values.
 
     Returns
     -------
     estimates : dict of Estimate
         Each with the method it is from; value None where no method has it.
     giving : tuple of str
-        The methods that gave any, or all selected ones where none is usable.
+        The methods that gave a value; if none did, the first usable one.
 
     """
     found = [methods[name] for name in dict.fromkeys((*deciding(asked), PLANAR))
@@ -74,15 +74,15 @@ def choose(methods: Mapping[str, MethodResult],
 def passed_over(methods: Mapping[str, MethodResult], asked: str | tuple[str, ...],
                 said: Iterable[Code] = ()) -> list[Reason]:
     """
-    Return METHOD_REJECTED of each method that is rejected while one behind it gives.
+    Return METHOD_REJECTED for each rejected method that precedes a usable one.
 
-    asked : as for ``choose``.   said : codes that the leg says itself.
+    asked : as for ``choose``.   said : codes that the leg reports itself.
     """
     found = [methods[name] for name in deciding(asked) if name in methods]
     sound = [i for i, m in enumerate(found) if m.verdict is not Verdict.REJECTED]
     why = [(m.name, next(r for r in m.reasons if r.code.gravity is Verdict.REJECTED))
            for m in found[:max(sound, default=0)] if m.verdict is Verdict.REJECTED]
-    # one that lacks its data (a second wheel) had nothing to go by
+    # a method without its data (a second wheel) is not reported
     return [Reason(Code.METHOD_REJECTED, f'{name} is not used, because of {r.code.name}: {r.text}')
             for name, r in why if r.code not in (Code.NO_METHOD, *said)]
 
@@ -94,6 +94,6 @@ def leg_estimates(leg: LegResult) -> dict[str, Estimate]:
 
 def worth_saying(reasons: Iterable[Reason], method: str,
                  estimates: Mapping[str, Estimate]) -> tuple[Reason, ...]:
-    """Return a method's reasons without those about values that are another method's to give."""
+    """Return a method's reasons, without those about values that another method gives."""
     return tuple(r for r in reasons if r.code not in ABOUT or (
         given := estimates.get(ABOUT[r.code])) is None or given.method == method)

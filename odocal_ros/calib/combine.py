@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Several legs of one vehicle to one result: own errors average down, shared ones do not.
+Combination of several legs of one vehicle: own errors average down, shared ones do not.
 
 The equations are those of docs/method.md, (T15) and (T16).
 """
@@ -20,21 +20,21 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 
-DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: one a power-up, not one a vehicle
+DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: changes with each power-up
 
 
 def combine_method(name: str, results: Sequence[MethodResult],
                    walked: Floats | None = None) -> MethodResult:
     """
-    Combine what one method says of several legs.
+    Combine the results of one method on several legs.
 
     name : the method.   results : one a leg, at least one.   walked : (J,) variance of the random
-    walk of ln K from each leg to the last; None: it stays.
+    walk of ln K from each leg to the last; None: constant.
 
     Returns
     -------
-    MethodResult: each parameter the mean with the least variance, a scale as the last leg has it;
-    the sigma holds what is shared once. A spread beyond the sigmas widens them (LEGS_DISAGREE).
+    MethodResult: means with the least variance, a scale at the time of the last leg. The sigma
+    includes shared errors once. Scatter beyond the sigmas widens them (LEGS_DISAGREE).
 
     """
     if len(results) == 1:
@@ -69,8 +69,8 @@ def newest(results: Sequence[MethodResult],
     """
     Return the values of a single leg (gyro bias) from the last leg that has them.
 
-    Legs with one counter have no estimates of two wheels. The heading error, which older results
-    hold, is each leg's own at its start: of several there is none.
+    Legs with one counter have no estimates of two wheels. The heading error in older results
+    applies to the start of a leg: a combination has none.
     """
     found: dict[str, Estimate] = {}
     for name, e in (item for r in results for item in r.estimates.items()):
@@ -84,7 +84,7 @@ def newest(results: Sequence[MethodResult],
 
 def _details(sources: Sequence[Source], parameters: Sequence[str],
              estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    """Return budget and correlation of a combination, as a leg's result has them."""
+    """Return budget and correlation of a combination, in the format of a leg's result."""
     known = [i for i, p in enumerate(parameters) if estimates[p].value is not None]
     if not known:
         return {}
@@ -115,7 +115,7 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
     mean = weight @ y
     shared = {n: weight @ g for n, g in by_leg.items()}
     variance = weight @ own @ weight
-    # what legs may differ by: their own errors, and shared ones that act differently
+    # allowed differences: own errors of the legs, and shared errors with different effects
     apart = own + np.diag(sum((((g if n in DRAWN_ANEW else g - shared[n])**2).sum(axis=1)
                                for n, g in by_leg.items()), np.zeros(len(y))))
     freedom = len(y) - 1
@@ -134,8 +134,8 @@ def _weights(covariance: Floats) -> Floats:
     """
     Return the weights, none below zero, of the mean with the least variance: (T15).
 
-    By own errors alone, a leg that a shared error hardly touches would count for little beside
-    one that it rules, and the mean would be worse than that leg.
+    Weights by own errors alone ignore that a shared error may dominate one leg and hardly affect
+    another; the mean would be worse than the latter.
     """
     from scipy.optimize import nnls
     root = np.linalg.cholesky(covariance / np.trace(covariance))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A counter that has another scale from some point of the drive on: decoding, unit or gear."""
+"""Change of the odometer scale during a drive, by a change of decoding, unit or gear."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS, TYRE_SPREAD
 
-SIDE_SCATTER = 0.25    # judgement: of the change, by which sections on one side of it may differ
+SIDE_SCATTER = 0.25    # judgement: share of the change by which sections on one side may differ
 
 
 def counter_change(parts: Sections, t_fix: Floats, fix_distance: Floats) -> tuple[Reason, ...]:
     """
-    Return TRACK_MISMATCH where the scale of sections changes once, and is constant beside it.
+    Return TRACK_MISMATCH if the scale of sections changes once and is constant otherwise.
 
-    parts : scale by section.   t_fix, fix_distance : (k,) s, m driven at each fix. The section of
-    the change itself may have any scale.
+    parts : scale by section.   t_fix, fix_distance : (k,) times of the fixes, s, and path length
+    there, m. The section with the change may have any scale.
     """
     known = np.flatnonzero(np.isfinite(parts.ratio) & (parts.ratio > 0))
     log, sigma = np.log(parts.ratio[known]), parts.sigma[known]

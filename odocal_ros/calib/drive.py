@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks of the drive: long, fast and straight enough, and in motion."""
+"""Checks of the drive: length, speed, straightness, and motion of wheels and fixes."""
 
 import numpy as np
 
@@ -15,12 +15,12 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST, TYRE_SPREAD
 
-FURTHEST_SLIDE = 100.0   # m, physical: no wheel slides and no fix deviates so far
+FURTHEST_SLIDE = 100.0   # m, physical: wheel slides and errors of fixes are smaller
 
 
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
-    """Return path length, m, and the reasons against a drive between the marks."""
+    """Return the path length between the marks, m, and the reasons against the drive."""
     distance, found = judge_way(track, t_stop, metres_per_unit, leg)
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
@@ -29,7 +29,7 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
     step, yaw = np.abs(np.diff(s)), np.unwrap(yaw_from_quat(track.q_nb[inside]))
     turning = np.abs(rate_over_second(t, yaw)) > leg.max_yaw_rate
     share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
-    if share > 0.1:     # judgement: a manoeuvre at either end is less
+    if share > 0.1:     # judgement: manoeuvres at the ends are shorter
         found += (Reason(Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven '
                          f'in turns above {leg.max_yaw_rate:g} rad/s'),)
     return distance, found
@@ -38,9 +38,9 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
 def judge_way(track: Track, t_stop: float, metres_per_unit: float,
               leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """
-    Return the path length between the marks, and reasons if it or the speed is too small.
+    Return the path length between the marks, and reasons if it or the speed is too low.
 
-    track : dead reckoned.   t_stop : the stop mark, s.   metres_per_unit : rough scale.   leg :
+    track : dead reckoned.   t_stop : stop mark, s.   metres_per_unit : approximate scale.   leg :
     limits.
 
     Returns
@@ -76,7 +76,7 @@ def rate_over_second(t: Floats, x: Floats) -> Floats:
 def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
     """Return a reason if the odometer begins after the start mark or ends before the stop mark."""
     late, early = float(travel.t[0]), float(t_stop - travel.t[-1])
-    # s worth saying, of a topic that comes seldom half as much again as it takes anyway
+    # s, shortest reported; for slow topics 1.5 times the interval of their messages
     edge = max(0.5, 1.5 * float(np.median(np.diff(travel.t))) if len(travel.t) > 1 else 0.0)
     what = [f'begins {late:.1f} s after the start mark'] * (late > edge)
     what += [f'ends {early:.1f} s before the stop mark'] * (early > edge)
@@ -91,7 +91,7 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
     """
     Return the reasons if wheels or fixes show no motion, empty if both do.
 
-    least : distance over which fixes surely move, m.
+    least : smallest motion of fixes that is significant, m.
     """
     rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
     t_here, here = t_fix[rows], fixes_n[rows, :2]
@@ -101,7 +101,7 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
     if len(here) > 4:       # a single outlier is no motion: running median of three
         here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
         t_here = t_here[1:-1]
-    # 10 sigmas: judgement, less is no leg either. Many receivers state much more than they show
+    # 10 sigmas: judgement, a leg is longer. Many receivers state far more than their noise
     sigma = min(fix_sigma, white_noise(here))
     fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(least, 10 * sigma)
     pick = (travel.t >= 0) & (travel.t <= t_stop)
@@ -117,9 +117,9 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
 
 
 def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Reason, ...]:
-    """Return a reason if a counter stood while (k, 2) fixes at (k,) s moved by ``least`` m."""
+    """Return a reason if the fixes, (k, 2) at (k,) s, move ``least`` m without counts."""
     far, since, until = max(_without_counts(travel, t, fixes, least), default=(0.0, 0.0, 0.0))
-    # of the path: a counter that lacks less is within the spread of tyres, and found elsewhere
+    # smaller shares of the path are within the tolerance of tyres, and are found elsewhere
     if far < least or far < TYRE_SPREAD * way_and_chord(t, fixes)[0]:
         return ()
     return (Reason(Code.ODOMETER_STILL, f'the fixes move by {far:.0f} m from t = {since:.0f} s '
@@ -128,7 +128,7 @@ def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Re
 
 def _without_counts(travel: Travel, t: Floats, fixes: Floats,
                     least: float) -> list[tuple[float, float, float]]:
-    """Return the distances of the fixes, m, and the ends, s, of intervals without a count."""
+    """Return motion of the fixes, m, begin and end, s, of each interval without counts."""
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
@@ -138,9 +138,9 @@ def _without_counts(travel: Travel, t: Floats, fixes: Floats,
 
 def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
     """
-    Return the intervals in which a vehicle was carried, as by a ferry: (k, 2) s.
+    Return the intervals in which a vehicle was carried, for example by a ferry: (k, 2) s.
 
-    The fixes move without counts, and the odometer counts again after it.
+    The fixes move without counts, and the odometer counts again afterwards.
     """
     least = max(FURTHEST_SLIDE, 10 * fix_sigma)
     spans = []
@@ -160,9 +160,9 @@ def _gone(fixes: Floats, least: float) -> float:
     """
     Return the significant motion of (k, 2) fixes from begin to end, m, 0 below ``least``.
 
-    A single jump is no motion, nor is noise, nor an outlier episode.
+    Single jumps, noise and outlier episodes are not motion.
     """
-    stretches = 20      # so many that motion is in more than two of them
+    stretches = 20      # enough that motion extends over more than two of them
     if len(fixes) < stretches:
         return 0.0
     parts = np.array_split(fixes, stretches)
@@ -170,7 +170,7 @@ def _gone(fixes: Floats, least: float) -> float:
         return 0.0
     middle = np.array([np.median(part, axis=0) for part in parts])
     steps = np.sort(np.hypot(*np.diff(middle, axis=0).T))
-    # a jump is one step, or two where it is within a stretch: they count as the one after them
+    # a jump is one step, or two if inside a stretch: limit steps to the third largest
     return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(middle[-1] - middle[0]))))
 
 
@@ -179,9 +179,9 @@ def way_and_chord(t_fix: Floats, fixes_n: Floats,
     """
     Return path length and distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 
-    The path connects fixes at least ten times their white noise apart: nearer ones would
-    add it up. Fixes that no vehicle reaches are left out.   least : distance over which fixes
-    surely move, m.
+    The path connects fixes at least ten times their white noise apart: with closer ones noise
+    would accumulate. Fixes out of reach of a vehicle are left out.   least : smallest motion of
+    fixes that is significant, m.
     """
     p = fixes_n[within_reach(t_fix, fixes_n), :2]
     if len(p) < 2:
@@ -192,10 +192,10 @@ def way_and_chord(t_fix: Floats, fixes_n: Floats,
 
 
 def within_reach(t_fix: Floats, fixes_n: Floats) -> Bools:
-    """Return the fixes that a vehicle reaches from the middle one, fix by fix: (k,) bool."""
+    """Return the fixes that a vehicle can reach from the median one, in sequence: (k,) bool."""
     p = fixes_n[:, :2]
     steps = np.hypot(*np.diff(p, axis=0).T)
-    astray = 50.0       # m by which any fix may be off: physical, multipath in a street
+    astray = 50.0       # m, possible error of any fix: physical, multipath in a street
     if len(p) < 2 or (steps <= FASTEST * np.diff(t_fix) + astray).all():
         return np.ones(len(p), bool)
     amid = int(np.argmin(np.hypot(*(p - np.median(p, axis=0)).T)))
@@ -219,9 +219,9 @@ def white_noise(fixes_n: Floats) -> float:
 
 
 def knots_of(fixes_n: Floats, least: float) -> list[int]:
-    """Return fixes at least so far apart, m: indices of (k, 2 or more), from the first on."""
+    """Return indices of fixes, (k, 2 or more), at least ``least`` m apart, from the first."""
     knots, p = [0] if len(fixes_n) else [], fixes_n[:, :2]
-    begin, ahead = 1, 64       # fixes looked at at a time: the next knot is wont to be among them
+    begin, ahead = 1, 64       # fixes searched at a time: the next knot is usually among them
     while begin < len(p):
         far = np.hypot(*(p[begin:begin + ahead] - p[knots[-1]]).T) >= least
         if far.any():

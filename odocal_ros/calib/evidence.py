@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a person looks at to trust a leg: tracks, residuals, speed, scale by section, fixes."""
+"""Plot data of a leg for the report: tracks, residuals, speed, scale by section, fixes."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,15 +25,15 @@ from odocal_ros.screening.fix_screen import sigma_limit
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
-KEPT_ROWS = 5000       # of each kind kept in a result, more than a screen has columns: judgement
+KEPT_ROWS = 5000       # kept of each series in a result, more than a screen has columns: judgement
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """
-    One leg as it can be drawn; t are seconds since the start mark, positions are in n.
+    Plot data of one leg; t are seconds since the start mark, positions are in n.
 
-    Residuals are dead-reckoned less fixed, along the vehicle's forward axis and to its left.
+    Residuals are dead-reckoned minus fixed positions, along the vehicle's forward axis and left.
     """
 
     t: NDArray[np.float64]               # (m,)
@@ -55,8 +55,8 @@ class Evidence:
     fixes: int                           # before decimation
     excluded: int
     gaps: tuple[tuple[str, float, float], ...] = ()   # of IMU and odometer: which, begin, end
-    t_fit: float = np.inf                # s: what comes after it was kept back from the fit
-    by_speed: SpeedScale = SpeedScale(NO_BINS)     # of the odometer as sent
+    t_fit: float = np.inf                # s: later data are held out of the fit
+    by_speed: SpeedScale = SpeedScale(NO_BINS)     # of the uncorrected odometer
     # (w, 4) as window_scale
     by_window: Floats = field(default_factory=lambda: NO_WINDOWS)
 
@@ -64,18 +64,18 @@ class Evidence:
 def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools, pin: MarkFix,
              paths: tuple[Path, Path], config: Config, t_fit: float = np.inf) -> Evidence:
     """
-    Collect what the report draws of a leg.
+    Collect the plot data of a leg.
 
-    leg : for the fixes as sent.   inputs : the screened leg.   track : epochs and attitude.
-    fixes_n : (k, 3) usable fixes, m, at inputs.t_fix.   kept : (k,) bool those that are not
-    absurdly far off; of these, the ones within the track are shown.   pin : where the paths are
-    pinned.   paths : (before, after) callables t (n,) to the antenna's path, (n, 3) m but for a
-    constant, as configured and as calibrated.   config : settings in force.   t_fit : end of what
-    was fitted, s.
+    leg : with all received fixes.   inputs : the screened leg.   track : epochs and attitude.
+    fixes_n : (k, 3) usable fixes, m, at inputs.t_fix.   kept : (k,) bool, fixes without gross
+    errors; those within the time span of the track are shown.   pin : mark whose position the
+    paths are set to.   paths : (before, after) callables t (n,) to the antenna's path, (n, 3) m
+    up to a constant, as configured and as calibrated.   config : settings in force.   t_fit : end
+    of the fitted data, s.
 
     Returns
     -------
-    Evidence, at most 5000 rows of a kind.
+    Evidence, at most 5000 rows of each series.
 
     """
     inside = (track.t >= 0.0) & (track.t <= inputs.t_stop)
@@ -113,7 +113,7 @@ def _gaps(inputs: Inputs, span: tuple[float, float],
     travel = inputs.travel
     found = [('IMU', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
     found += [('odometer', a, b) for a, b in gaps_in_rhythm(travel.t)
-              if travel.at(a) != travel.at(b)]      # some counters are silent where they stand
+              if travel.at(a) != travel.at(b)]      # some counters send nothing at rest
     return tuple((name, float(a), float(b)) for name, a, b in found
                  if a < span[1] and b > span[0])
 
@@ -123,7 +123,7 @@ def _pinned(path: Path, pin: MarkFix) -> Path:
 
     def at(t: Floats) -> Floats:
         out = np.empty((len(t), 3))
-        for rows in chunks(len(t)):       # the sums that a path goes by are 3 x 3 a row
+        for rows in chunks(len(t)):       # the sums behind a path are 3 x 3 a row
             out[rows] = pin.position_n + path(t[rows]) - here
         return out
     return at
@@ -131,8 +131,8 @@ def _pinned(path: Path, pin: MarkFix) -> Path:
 
 def _sent(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
           config: Config) -> tuple[Ints, NDArray[Any], list[str]]:
-    """Return the status of the fixes kept, the times of the others, and why they are not."""
-    leg, _ = without_sets(leg)      # as the screen did: inputs are of its stamps
+    """Return the status of kept fixes, the times of the others, and why those are excluded."""
+    leg, _ = without_sets(leg)      # as in the screening: inputs have these stamps
     fix, gnss = leg.fix, config.gnss
     later = gnss.time_offset - config.imu.time_offset
     t = np.asarray(fix.stamp_ns - leg.start_ns) * 1e-9 + later
@@ -154,11 +154,11 @@ def _sent(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
 
 
 def _forward_at(t_new: Floats, t: Floats, track_n: Floats, sign: Floats) -> Complexes:
-    """Return the forward direction as complex numbers; at rest that of before: (k,)."""
+    """Return the forward direction as complex numbers; at rest the last one: (k,)."""
     if not len(t):
         return np.ones(len(t_new), complex)
     z = (rate_over_second(t, track_n[:, 0]) + 1j * rate_over_second(t, track_n[:, 1])) * sign
-    # below 0.2 m/s what noise a track has (rounding to counts) gives it any direction
+    # below 0.2 m/s noise of the track (rounding to counts) dominates the direction
     moving = np.flatnonzero(np.abs(z) > 0.2)
     if not len(moving):
         return np.ones(len(t_new), complex)
@@ -169,7 +169,7 @@ def _forward_at(t_new: Floats, t: Floats, track_n: Floats, sign: Floats) -> Comp
 
 
 def _split(off_n: Floats, forward: Complexes) -> Floats:
-    """Return horizontal offsets, (k, 3) in n, along and to the left of forward: (k, 2)."""
+    """Return horizontal offsets, (k, 3) in n, as components forward and left: (k, 2)."""
     z = (off_n[:, 0] + 1j * off_n[:, 1]) * np.conj(forward)
     return np.stack([z.real, z.imag], -1)
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An exception within a method as data; the command or the node writes it to a file."""
+"""Exceptions of a method as part of its result; the command or the node writes them to a file."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace

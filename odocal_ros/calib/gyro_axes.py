@@ -6,9 +6,9 @@ Gyro axes against the accelerometer and against the course of the fixes.
 
 A rotation of the whole IMU (imu.mounting_rpy) turns gyro and accelerometer together. Here the gyro
 alone has an axis with the wrong sign, or two axes swapped, or the accelerometer has an axis with
-the wrong sign: no rotation corrects that. To an accelerometer whose first level axis has the
-wrong sign, the gyro looks as if its second level axis and its upright axis had it: in mirrored
-axes, turn rates have these signs.
+the wrong sign: no rotation corrects that. If the first level axis of the accelerometer has the
+wrong sign, the second level axis and the upright axis of the gyro appear to have it, because turn
+rates in mirrored axes have these signs.
 """
 
 from typing import TYPE_CHECKING
@@ -27,12 +27,12 @@ from odocal_ros.screening.inputs import Placed
 if TYPE_CHECKING:
     from odocal_ros.screening.inputs import Inputs
 
-Found = list[tuple[str, str, str]]      # sent axis, true axis with its sign, sentence
-SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a sound gyro
+Found = list[tuple[str, str, str]]      # published axis, true axis with its sign, sentence
+SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a correct gyro
 TURNED = np.array([1.0, -1.0, 1j, -1j])      # definition: of axes mirrored or swapped
-# statistical: all four must hold. False in 0 of 384 zoo drives; detection: docs/zoo.md
+# statistical: all four must hold. False alarms in 0 of 384 zoo drives; detection: docs/zoo.md
 LARGEST_SIGMA, FAR_SIGMAS, NEAR_TURNED, FEWEST_SEGMENTS = 0.2, 5.0, 0.4, 4.0
-INVERTED = -0.5     # judgement: 1 is due; a vehicle that leans into its turns has 0
+INVERTED = -0.5     # judgement: 1 is expected; a vehicle that leans into its turns has 0
 
 
 def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
@@ -43,7 +43,7 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
 
     Returns
     -------
-    (3, 3) rows e1, e2, up, right-handed, and the sensor axis next to each, as "-y".
+    (3, 3) rows e1, e2, up, right-handed, and the sensor axis nearest to each, as "-y".
 
     """
     k = int(np.argmax(np.abs(up)))
@@ -56,15 +56,15 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
 
 def gyro_axes(inputs: 'Inputs', placed: Placed, faces: Facing | None) -> tuple[Reason, ...]:
     """
-    Return a reason where an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
+    Return a reason if an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
 
-    inputs : a screened leg.   placed : its fixes in metres and approximate scale.   faces : its
-    accelerations.
+    inputs : a screened leg.   placed : its fixes in metres and approximate scale.   faces : fit of
+    its accelerations.
 
     Returns
     -------
-    Nothing where the drive does not show it: a flat road has no roll and pitch, a straight one no
-    yaw.
+    The reason, or () if the drive does not show it: a flat road has no roll and pitch, a straight
+    one no yaw.
 
     """
     w_i, f_i = (by_row(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
@@ -73,7 +73,7 @@ def gyro_axes(inputs: 'Inputs', placed: Placed, faces: Facing | None) -> tuple[R
     found = by_course(inputs, placed, w_i, axes, names)
     if not found and inputs.has_accelerometer:
         inverted = faces and faces.inward < min(INVERTED, -FAR_SIGMAS * faces.inward_sigma)
-        if inverted:            # the yaw rate as the accelerometer has it
+        if inverted:            # the yaw rate with the sign by the accelerometer
             w_i = w_i - 2 * np.outer(w_i @ axes[2], axes[2])
         found = by_gravity(inputs, placed, w_i, f_i, axes, names)
         if faces and inverted:
@@ -110,7 +110,7 @@ def _inverted_turns(faces: Facing, found: Found, names: list[str]) -> tuple[Reas
 
 def by_course(inputs: 'Inputs', placed: Placed, w_i: Floats, axes: Floats,
               names: list[str]) -> Found:
-    """Return a level axis of the gyro that measures the yaw rate instead of the upright one."""
+    """Return the level gyro axes that measure the yaw rate instead of the upright one."""
     def ratio(axis: Floats) -> float | None:
         return turn_ratio(inputs.t_imu, by_row(lambda w: w @ axis, w_i), inputs.t_fix,
                           placed.fixes_n, placed.fix_sigma, inputs.least_motion)
@@ -131,7 +131,7 @@ def by_course(inputs: 'Inputs', placed: Placed, w_i: Floats, axes: Floats,
 
 def by_gravity(inputs: 'Inputs', placed: Placed, w_i: Floats, f_i: Floats, axes: Floats,
                names: list[str]) -> Found:
-    """Return the gyro axes that clearly follow another direction of the accelerometer."""
+    """Return the gyro axes that measure the turn of gravity about another axis."""
     fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, placed.rough)
     found: Found = []
     if fit is None:
@@ -150,7 +150,7 @@ def by_gravity(inputs: 'Inputs', placed: Placed, w_i: Floats, f_i: Floats, axes:
 
 
 def _measured(sent: str, true: str, part: float) -> tuple[str, str]:
-    """Return a sent axis without its sign, and the axis that it measures with the sign due."""
+    """Return a published axis without sign, and the axis that it measures, with its sign."""
     minus = (part < 0) ^ sent.startswith('-') ^ true.startswith('-')
     return sent[-1], '-' * minus + true[-1]
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Several legs of a vehicle to one estimate of its constants: that of one fit of all their rows.
+Joint estimate of a vehicle's constants from several legs, equal to one fit of all their rows.
 
-Each leg comes as its border. Constants are those of the vehicle, the same in every leg, but that
-ln K walks at random from leg to leg; priors count once: docs/method.md (S35).
+Each leg is given by its border. The constants are the same in every leg, except ln K, a random
+walk from leg to leg; priors count once: docs/method.md (S35).
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,26 +18,26 @@ from odocal_ros.calib.border import Border, SCATTER_POINTS
 from odocal_ros.calib.linked_legs import LinkedLegs
 
 Floats = NDArray[np.float64]
-# statistical, deviates of a chi-square from which legs disagree: once in 20 sets of sound legs by
-# chance; in one constant once in 300, since some 15 are looked at: again one set in 20
+# statistical, limits of the chi-square's normal deviate for disagreement: by chance once in 20
+# sets of sound legs; in one constant once in 300, with some 15 tested again one set in 20
 Z95, DISPUTED_DEVIATES = 1.6449, 2.7
-# judgement: of the logarithm of a sigma between legs over the usual one, for a mean over it
+# judgement: grid of ln (sigma between legs / usual sigma), for means over it
 SCATTER_GRID = np.linspace(-2.5, 5.0, SCATTER_POINTS)
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
     """
-    The constants by all legs.
+    Joint estimate of the constants from all legs.
 
-    names, value, covariance : (m,), (m, m), of the last leg where they walk.
-    sigma, used : (m,) of the priors, first and with what legs contradicted.
-    chi2, freedom : disagreement of the legs before anything was widened, and what it should be.
-    between : sigma by which a constant scatters between legs, by name.   disputed : constants in
-    which legs differ for certain.   deviation : (J, m) of each leg from the others, in sigmas,
-    without scatter.   factor : on all sigmas, in ``covariance``.
-    bent : (J,) rad, error of taking the leg's equations to where the constants are.
-    carried : information of all of them, for later legs.
+    names, value, covariance : (m,), (m, m), of the last leg for the one that drifts.
+    sigma, used : (m,) prior sigmas, as given and as widened by legs that contradict them.
+    chi2, freedom : chi-square of the legs before any widening, and its degrees of freedom.
+    between : scatter sigma of constants between legs, by name.   disputed : constants in which
+    legs differ significantly.   deviation : (J, m) of each leg from the others, in sigmas,
+    without scatter.   factor : on all sigmas, included in ``covariance``.
+    bent : (J,) rad, linearisation error of each leg at the estimate.
+    carried : information of all legs, for later legs.
     """
 
     names: tuple[str, ...]
@@ -62,16 +62,16 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
     """
     Combine legs of one vehicle.
 
-    borders : by time, at least one.   steps : (J - 1,) sigma by which ``drifting`` may have
-    changed from leg to leg.   drifting : the constant that walks.   angles : constants that are
-    the same after a whole turn.   curved : those in which a leg's equations are not linear: 1 -
-    cos of their change is an error of that leg's own.   usual : constants that scatter between
-    legs, with the usual sigma of it; their levels are estimated, (S38).   same : (J - 1,) the
-    next is a section of the same leg, and does not scatter from it.
+    borders : by time, at least one.   steps : (J - 1,) sigma of the change of ``drifting`` from
+    leg to leg.   drifting : the constant with a random walk.   angles : constants with a period
+    of one turn.   curved : constants in which a leg's equations are not linear: 1 - cos of their
+    change becomes an error of that leg alone.   usual : usual scatter sigma of constants between
+    legs, by name; the scatter is estimated, (S38).   same : (J - 1,) True: the next is a section
+    of the same leg, without scatter.
 
     Returns
     -------
-    Joint. Where legs differ by more than their sigmas and their scatter allow, all sigmas are
+    Joint. If legs differ by more than their sigmas and their scatter allow, all sigmas are
     widened.
 
     """
@@ -81,7 +81,7 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
     chi2, freedom = legs.disagreement()
     drives = legs.joined(same)
     scatter = _scatter(drives, usual)
-    # the constants of a single leg are its own
+    # a single leg has no scatter
     alone = len(drives.borders) == 1 and not borders[0].evidence
     between = {} if alone else scatter.sigmas
     left, rest = (apart + of_legs - of_drives for apart, of_legs, of_drives in zip(
@@ -105,10 +105,10 @@ def deviate(chi2: float, freedom: float) -> float:
 @dataclass(frozen=True, eq=False)
 class Scatter:
     """
-    How much constants scatter between legs, by name.
+    Scatter of constants between legs, by name.
 
-    sigmas : the mean of its logarithm.   evidence : (g,) log likelihood at the points of
-    SCATTER_GRID.
+    sigmas : geometric mean of its distribution.   evidence : (g,) log likelihood at the points
+    of SCATTER_GRID.
     weights : (g,) of these points.
     """
 
@@ -119,7 +119,7 @@ class Scatter:
 
 def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
     """
-    Return the scatter of these constants between the legs, docs/method.md (S38).
+    Return the scatter between the legs of the constants in ``usual``, docs/method.md (S38).
 
     By restricted likelihood, with a half-Cauchy prior whose scale is the usual sigma (Gelman
     2006).
@@ -145,7 +145,7 @@ def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
 def _averaged(legs: LinkedLegs, scatter: Scatter,
               usual: Mapping[str, float]) -> tuple[Floats, Floats]:
     """
-    Return the unknowns at this scatter, and their covariance over all scatters.
+    Return the unknowns at this scatter, and their covariance averaged over all scatters.
 
     Few legs hardly determine the scatter of a constant: docs/method.md (S39).
     """
@@ -161,16 +161,16 @@ def _averaged(legs: LinkedLegs, scatter: Scatter,
 def _disputed(legs: LinkedLegs, between: dict[str, float],
               usual: Mapping[str, float]) -> tuple[str, ...]:
     """
-    Return the constants in which legs differ for certain.
+    Return the constants in which legs differ significantly.
 
-    By more than the usual scatter; of those without a level, the one that explains most of what
-    is left.
+    By more than the usual scatter; of those without scatter, only the one that explains most of
+    the remaining chi-square.
     """
     def deviates(name: str) -> float:
         now, freedom = (legs.disagreement({**between, name: usual[name]}) if name in usual
                         else as_they_are)
         left, rest = legs.disagreement({**between, name: np.inf})
-        # less is no constant that legs determine
+        # below, the legs do not determine the constant
         return deviate(now - left, freedom - rest) if freedom - rest > 0.5 else -np.inf
     if len(legs.borders) < 2:
         return ()
@@ -182,10 +182,10 @@ def _disputed(legs: LinkedLegs, between: dict[str, float],
 
 
 def _bend(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
-    """Give each leg an error for the distance from its linearisation point; return it, (J,)."""
+    """Add a linearisation error to each leg, by the distance from its point; return it, (J,)."""
     first, at = legs.borders, [legs.names.index(n) for n in curved]
     bent = np.zeros(len(first))
-    for _ in range(3 if curved else 0):     # legs of less weight move the others less
+    for _ in range(3 if curved else 0):     # with reduced weights the estimate changes
         x, _ = legs.solve()
         way = np.array([x[legs.place(j)][at] - b.value[at] for j, b in enumerate(first)])
         bent = (way**2).sum(axis=1) / 2

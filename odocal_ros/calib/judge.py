@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Judging values against the asked limits; run on a leg and again on a combination."""
+"""Comparison of values with their limits, for each leg and again for the combination."""
 
 from collections.abc import Mapping
 
@@ -12,7 +12,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import SCALE_LIMIT
 
-# ratio to the nominal scale, by unit of the scale: what sends such a number. Physical, definitions
+# likely cause of a ratio to the nominal scale, by unit of the scale. Physical, definitions
 MISTAKEN = {
     '1': {1 / 3.6: 'speeds in km/h', 0.44704: 'speeds in mph', 1852 / 3600: 'speeds in knots',
           0.3048: 'speeds in ft/s', 0.01: 'speeds in cm/s', 1e-3: 'speeds in mm/s'},
@@ -20,13 +20,13 @@ MISTAKEN = {
               np.pi / 30: 'rates in rpm'},
     'm/pulse': {0.25: 'a counter of the four edges of a pulse',
                 0.5: 'a counter of both edges of a pulse'}}
-PER_CENT_FROM = 0.01    # definition: relative figures from here on are shown in per cent
+PER_CENT_FROM = 0.01    # definition: relative values from this size are shown in per cent
 
 
 def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
     """Return the probable unit of a scale this far from its nominal, and the setting for it."""
     for known, what in MISTAKEN.get(unit, {}).items():
-        if abs(ratio / known - 1) < 0.04:      # what tyres add: the ratios lie farther apart
+        if abs(ratio / known - 1) < 0.04:      # tolerance for tyres: the ratios are farther apart
             return f', typical for {what}', (
                 f'If so, set odometer.nominal_scale to {known * nominal:.6g}, or correct the '
                 'sender. Otherwise check the odometer. The limit is odometer.max_scale_deviation.')
@@ -35,7 +35,7 @@ def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
 
 def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
           config: Config) -> tuple[Reason, ...]:
-    """Return the reasons from required sigmas and nominal values."""
+    """Return the reasons by limits of the sigmas and of the deviation from nominal values."""
     reasons = []
     scale, yaw = estimates['scale_factor'], estimates['yaw_mounting_angle']
     if scale.value is not None:
@@ -59,7 +59,7 @@ def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
 
 
 def far_from_nominal(scale: float, unit: str, nominal: float, config: Config) -> list[Reason]:
-    """Return SCALE_FAR_FROM_NOMINAL where a scale is; nominal: 0 unknown."""
+    """Return SCALE_FAR_FROM_NOMINAL if the scale is; nominal: 0 if unknown."""
     off = scale / nominal - 1 if nominal else 0.0
     if abs(off) <= config.odometer.max_scale_deviation:
         return []
@@ -70,6 +70,6 @@ def far_from_nominal(scale: float, unit: str, nominal: float, config: Config) ->
 
 
 def share(relative: float, sign: str = '') -> str:
-    """Return a relative figure as people say it: in ppm, or in per cent from one on."""
+    """Return a relative value as text: in ppm, or in per cent if at least 1 %."""
     return f'{100 * relative:{sign}.1f} %' if abs(relative) >= PER_CENT_FROM else (
         f'{1e6 * relative:{sign}.0f} ppm')

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rows of several legs as one least squares: docs/method.md (S35) to (S37)."""
+"""The rows of several legs as one least-squares problem: docs/method.md (S35) to (S37)."""
 
 from collections.abc import Sequence
 
@@ -11,16 +11,16 @@ from odocal_ros.calib.border import Border, directions, loosened
 from odocal_ros.data.arrays import Floats, Ints
 
 # relative, rad: unit of a constant without a prior, ln K and angles. Judgement: a leg's equations
-# are linear as far, the square of it being 0.1 %
+# are linear within it, half its square being 0.1 %
 STEP_UNIT = 0.05
 
 
 class LinkedLegs:
-    """Borders on common names, the constants' prior, and the walk of one of them."""
+    """Borders with common names, the priors of the constants, and the random walk of one."""
 
     def __init__(self, borders: Sequence[Border], drifting: str,
                  steps: Sequence[float] | Floats, angles: Sequence[str] = ()) -> None:
-        """Take legs by time; ``steps`` (J - 1,): sigmas of ``drifting`` between them."""
+        """Take legs by time; ``steps`` (J - 1,): sigmas of the change of ``drifting``."""
         self.names = tuple(dict.fromkeys(n for b in borders for n in b.names))
         self.take([_on(b, self.names) for b in borders])
         last = self.borders[-1]
@@ -33,11 +33,11 @@ class LinkedLegs:
             for which in ('sigma', 'used'))
         self.unit = np.where(np.isfinite(self.used), self.used, STEP_UNIT)
         self.drifting = self.names.index(drifting)
-        # 0.1 ppm of ln K: no vehicle keeps it, and rows of less would swamp all others by rounding
+        # 0.1 ppm of ln K: any vehicle changes more; with smaller sigmas rounding is too large
         self.steps = np.maximum(steps, 1e-7)
 
     def joined(self, same: Sequence[bool]) -> 'LinkedLegs':
-        """Return these legs, each one with the next if that is a section of the same leg."""
+        """Return these legs, with the sections of the same leg added up."""
         apart = [not together for together in same] or [True] * len(self.steps)
         if all(apart):
             return self
@@ -47,18 +47,18 @@ class LinkedLegs:
         return LinkedLegs(borders, self.names[self.drifting], self.steps[apart])
 
     def take(self, borders: list[Border]) -> None:
-        """Take legs in place of those there, on the names of all."""
+        """Replace the borders; each must have the names of all."""
         self.borders = borders
         self._determined: list[Border] | None = None
 
     def determined(self) -> list[Border]:
-        """Return of each leg what it determines at least as well as the priors do."""
+        """Return the part of each border that is determined at least as well as by the priors."""
         if self._determined is None:      # requested for each constant
             self._determined = [b.determined(self.unit) for b in self.borders]
         return self._determined
 
     def columns(self, j: int) -> Ints:
-        """Return the indices of the constants of leg j in the unknowns: z, then k by leg."""
+        """Return the indices of the constants of leg j in the unknowns: z, then the drifting."""
         m = len(self.names)
         where = np.arange(m)
         where[self.drifting] = m + j
@@ -66,7 +66,7 @@ class LinkedLegs:
 
     def system(self, spread: dict[str, float] | None = None,
                borders: Sequence[Border] | None = None) -> tuple[Floats, Floats]:
-        """Return the rows of all legs and of the walk, and what they should be."""
+        """Return the rows of all legs and of the random walk, and their right-hand sides."""
         m, J, borders = len(self.names), len(self.borders), borders or self.borders
         A, b = [], []
         D, pull = self._scattering(borders, spread)
@@ -101,7 +101,7 @@ class LinkedLegs:
         return x * scale, inverse @ inverse.T * np.multiply.outer(scale, scale)
 
     def log_likelihood(self, spread: dict[str, float]) -> float:
-        """Return the restricted log likelihood of a scatter between legs, but for a constant."""
+        """Return the restricted log likelihood of a scatter between legs, up to a constant."""
         at, size = [self.names.index(n) for n in spread], np.array(list(spread.values()))
         A, b = self.system(spread)
         prior, centre = self._prior_rows(A.shape[1])
@@ -115,7 +115,7 @@ class LinkedLegs:
         return float(out)
 
     def _prior_rows(self, columns: int, but: Sequence[int] | Ints = ()) -> tuple[Floats, Floats]:
-        """Return the priors of constants, but for some, as rows and what they should be."""
+        """Return the priors of the constants, except ``but``, as rows and right-hand sides."""
         held = np.setdiff1d(np.flatnonzero(np.isfinite(self.used)), but)
         prior = np.zeros((len(held), columns))
         prior[np.arange(len(held)), self.place(0)[held]] = 1.0     # columns are in its units
@@ -126,7 +126,7 @@ class LinkedLegs:
         """
         Return the information of all legs on the last leg's constants, at ``value``.
 
-        evidence : on the scatter between legs.
+        evidence : log likelihood of the scatter between legs, by name.
         """
         A, b = self.system(spread)
         rows, b = _left(A, b, self.place(len(self.borders) - 1))
@@ -135,21 +135,21 @@ class LinkedLegs:
                       self.centre, self.sigma, self.used, evidence)
 
     def evidence(self, name: str, points: int) -> Floats:
-        """Return the evidence of combined legs on the scatter of a constant: (points,)."""
+        """Return the log likelihood of a constant's scatter by combined legs: (points,)."""
         out: Floats = sum((b.evidence[name] for b in self.borders if name in b.evidence),
                           np.zeros(points))
         return out
 
     def disagreement(self, spread: dict[str, float] | None = None) -> tuple[float, float]:
         """
-        Return chi-square of the legs as one vehicle's, and its degrees of freedom: (S36).
+        Return the chi-square of the legs with common constants, and its degrees of freedom: (S36).
 
-        Of what legs determine at least as well as the priors: farther off than that their
-        equations need not be true.
+        Only of directions determined at least as well as by the priors: the equations of a leg
+        need not be linear over larger changes.
         """
         A, b = self.system(spread, self.determined())
-        # priors hold what no leg determines: else two legs that determine half of the constants
-        # each, in directions that are never the same, would have one set, however far apart
+        # priors bound what no leg determines: otherwise two legs that determine half of the
+        # constants each, in different directions, would always agree
         prior, centre = self._prior_rows(A.shape[1])
         U, size, _ = np.linalg.svd(np.concatenate([A, prior]), full_matrices=False)
         of_legs, U = slice(len(A)), U[:, size > 1e-8 * size[0]]      # below is rounding
@@ -160,8 +160,8 @@ class LinkedLegs:
         """
         Return the normalised residual of each leg's constants against the others': (J, m) sigmas.
 
-        The leg's gradient at the joint estimate over its own sigma, each constant alone: the test
-        of one more unknown, as if the leg were left out (Baarda 1968), docs/method.md (S37).
+        The gradient of the leg at the joint estimate, over its sigma, for each constant: the test
+        of one additional unknown, as if the leg were left out (Baarda 1968), docs/method.md (S37).
         """
         x, C = self.solve(spread)
         out = np.zeros((len(self.borders), len(self.names)))
@@ -170,7 +170,7 @@ class LinkedLegs:
             where = self.place(j)
             pull = pull - D @ (x[where] - legs[j].value)
             variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
-            # if the others predict all of a constant, to a millionth, a leg adds nothing
+            # no test if the others have less than a millionth of the leg's information
             news = variance > np.maximum(1e-6 * np.diag(D), 1e-300)
             out[j, news] = pull[news] / np.sqrt(variance[news])
         return out
@@ -180,7 +180,7 @@ class LinkedLegs:
         """
         Return information and pull of legs whose constants scatter: (J, m, m), (J, m).
 
-        Combined legs determine their mean.
+        The information of combined legs already includes their scatter.
         """
         D, pull = (np.stack([getattr(b, what) for b in borders]) for what in (
             'information', 'pull'))
@@ -192,15 +192,15 @@ class LinkedLegs:
 
 
 def _left(A: Floats, b: Floats, keep: Ints) -> tuple[Floats, Floats]:
-    """Return rows of some unknowns, the others eliminated by QR, and what they should be."""
+    """Return rows of some unknowns, the others eliminated by QR, and their right-hand sides."""
     gone = np.setdiff1d(np.arange(A.shape[1]), keep)
-    # orthogonal rows of which only the first hold what is eliminated
+    # only the first rows of R contain the eliminated unknowns
     R = np.asarray(np.linalg.qr(np.column_stack([A[:, gone], A[:, keep], b]), mode='r'))
     return R[len(gone):, len(gone):-1], R[len(gone):, -1]
 
 
 def _on(border: Border, names: tuple[str, ...]) -> Border:
-    """Return a border on more names, of which it has neither information nor prior."""
+    """Return a border with more names, without information or prior on the new ones."""
     if border.names == names:
         return border
     at = [names.index(n) for n in border.names]
@@ -212,6 +212,6 @@ def _on(border: Border, names: tuple[str, ...]) -> Border:
         out = np.full(m, rest)
         out[at] = values
         return out
-    # a prior that a leg does not have is none that it has widened
+    # sigma 0: has no effect in the maximum over legs
     return Border(names, on(border.value, 0.0), D, on(border.pull, 0.0), on(border.centre, 0.0),
                   on(border.sigma, 0.0), on(border.used, 0.0), border.evidence)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reference positions at the marks: fixes averaged over a standstill, or fitted around a mark.
+Reference positions at the marks: mean of the fixes over a standstill, or around a mark in motion.
 
-How far fixes average down depends on the correlation time of their errors. Their covariance
-states the whole error; their scatter shows what part of it changes from fix to fix. Only
-that part averages down, unless the data show that the slow part moved on within the window too.
+The error of the mean depends on the correlation time of fix errors. The stated covariance is the
+total error; the scatter shows the part that changes from fix to fix. Only this part averages
+down, unless the data show that the slow part changes within the window too.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,11 +20,11 @@ from odocal_ros.nav.statistics import NORMAL_MEDIAN, RAYLEIGH_MEDIAN
 from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
 Path = Callable[[Floats], Floats]     # t (n,) s to an antenna's path, (n, 3) m, or t () to (3,)
-# s, least half-window of fixes about a mark in motion. Judgement: two seconds of fixes, over which
-# dead reckoning errs by less than any of them
+# s, least half-window of fixes about a mark in motion. Judgement: over two seconds the error of
+# dead reckoning is smaller than that of a fix
 MARK_WINDOW = 1.0
-# fixes below which their scatter says nothing of how their errors go on. Statistical: a variance
-# by 20 is good to 30 %
+# fewest fixes whose scatter is used for the correlation of their errors. Statistical: a variance
+# by 20 has a sigma of 30 %
 FEWEST_SCATTERED = 20
 
 
@@ -33,9 +33,9 @@ class MarkFix:
     """
     Antenna position at a mark.
 
-    t : s, time it holds for.      position_n : (3,) m.       covariance_n : (3, 3) m^2.
+    t : s, time of the mark.       position_n : (3,) m.       covariance_n : (3, 3) m^2.
     standing : averaged at rest.   used, dropped : fixes.     surveyed : from settings.
-    height_known : False where no fix states a height.
+    height_known : False if any fix has no height.
     """
 
     t: float
@@ -48,7 +48,7 @@ class MarkFix:
     surveyed: bool = False
 
     def at_least(self, variance: float, up_ratio: float) -> 'MarkFix':
-        """Return the mark with no less than a level variance, m^2, and so many times it up."""
+        """Return the mark with at least a horizontal variance, m^2; the increase up is scaled."""
         if self.surveyed:
             return self
         level = (self.covariance_n[0, 0] + self.covariance_n[1, 1]) / 2
@@ -61,8 +61,8 @@ def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
     """
     Average fixes of one place: docs/method.md (T6), (T7).
 
-    t : (n,) times, s.   position_n : (n, 3) fixes, m, motion taken out.   covariance_n : (n, 3, 3)
-    as stated, m^2.   correlation_time : s; 0: white; NaN: estimated from the data.
+    t : (n,) times, s.   position_n : (n, 3) fixes, m, motion removed.   covariance_n : (n, 3, 3)
+    stated, m^2.   correlation_time : of the errors, s; 0: white; NaN: estimated from the data.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def _near_middle(position_n: Floats, covariance_n: Floats) -> Bools:
 
 def _share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
            correlation_time: float) -> float:
-    """Return the share of a single fix's variance left in the mean: docs/method.md (T7)."""
+    """Return the variance of the mean over that of a single fix: docs/method.md (T7)."""
     n = len(t)
     white = float(weight @ weight)          # 1/n for equal weights
     if n == 1 or correlation_time == 0:
@@ -116,7 +116,7 @@ def _share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
 
 
 def _left(t: Floats, weight: Floats, tau: float) -> float:
-    """Return the variance share of a mean of first-order Gauss-Markov errors of time tau, s."""
+    """Return the variance share of a mean of Gauss-Markov errors with correlation time tau, s."""
     if tau == np.inf:
         return 1.0
     pick = np.unique(np.linspace(0, len(t) - 1, min(len(t), 400)).round().astype(int))
@@ -137,7 +137,7 @@ def _correlation_time(t: Floats, z: Floats, fast: float, slow: float) -> float:
 
 def standing_at(t_mark: float, spans: Floats | Sequence[tuple[float, float]],
                 slack: float = 0.5) -> tuple[float, float] | None:
-    """Return the standstill (begin, end) that contains or touches a mark, or None."""
+    """Return the standstill (begin, end) at most ``slack`` s from a mark, or None."""
     for begin, end in spans:
         if begin - slack <= t_mark <= end + slack:
             return float(begin), float(end)

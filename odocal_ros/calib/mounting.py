@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How an IMU sits in the vehicle: up from gravity, forward from what driving does to it."""
+"""Orientation of an IMU in the vehicle: up from gravity, forward from accelerations."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -18,24 +18,24 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import FEWEST_BINS_FACING, pushes
 from odocal_ros.screening.inputs import Inputs
 
-# rad of yaw from nominal: a nominal rotation or heading is wrong; no mounting, but reversed.
-# Judgement: nobody mounts an IMU 20 deg askew unawares, and quarter turns are set
+# rad of yaw from nominal: beyond it a nominal rotation or heading is wrong; beyond it reversed.
+# Judgement: unintended mounting angles are below 20 deg, and quarter turns are configured
 FAR_YAW, BACKWARDS_YAW = np.deg2rad(20.0), np.deg2rad(160.0)
-# rad within which an axis is meant to be another: a third of a quarter turn, to its sigma of half
-# of that an axis is named at all. Judgement
+# rad, largest angle between a measured axis and the quarter turn assigned to it: a third of a
+# quarter turn; the axis must be determined with half of it as its sigma. Judgement
 MEANT_AXIS = np.deg2rad(30.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
     """
-    The nominal rotation that a drive suggests.
+    The nominal rotation estimated from a drive.
 
-    C_bi : (3, 3) takes the IMU frame i to b (forward, left, up), quarter turns only; None where
-        it is not observable.
-    forward_i : (3,) forward as measured, None if the drive does not show it.
-    forward_sigma : rad.    assumed : forward was not measured but taken as x.
-    off : rad, between what was measured and the quarter turns.
+    C_bi : (3, 3) rotation of the IMU frame i to b (forward, left, up), quarter turns only; None
+        if not observable.
+    forward_i : (3,) measured forward axis, None if not observable.
+    forward_sigma : rad.    assumed : forward is assumed to be x, not measured.
+    off : rad, angle between the measured axes and the quarter turns.
     """
 
     C_bi: NDArray[np.float64] | None
@@ -53,7 +53,7 @@ class Mounting:
 
 
 def remedy(found: Mounting) -> str:
-    """Return the setting to make, '' where the drive does not determine it."""
+    """Return the setting to make, '' if the drive does not determine it."""
     if found.rpy is None:
         return ''
     rpy = ','.join(f'{x:.10g}' for x in found.rpy)
@@ -62,7 +62,7 @@ def remedy(found: Mounting) -> str:
 
 
 def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
-    """Return reasons, IMU_AXES with what to set where the screened inputs show it."""
+    """Return reasons, with the setting in IMU_AXES if the screened inputs determine it."""
     if not any(r.code is Code.IMU_AXES and not r.do for r in reasons):
         return list(reasons)
     found = mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
@@ -77,8 +77,8 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
     Return the mounting of an IMU.
 
     t, w_i, f_i : (n,), (n, 3), (n, 3) times, s, turn rate, rad/s, and specific force, m/s^2 or g,
-    in the sensor's frame.   travel : odometer; positive is taken as forward.   metres_per_unit :
-    its rough scale.
+    in the sensor's frame.   travel : odometer; positive means forward.   metres_per_unit : its
+    approximate scale.
     """
     mean = medians(f_i)
     size = float(np.linalg.norm(mean))
@@ -101,11 +101,11 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
 def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
              metres_per_unit: float) -> tuple[Floats | None, float]:
     """
-    Return the forward axis (level, unit) and its sigma, rad; None where it is not seen.
+    Return the forward axis (level, unit) and its sigma, rad; None if not observable.
 
-    In the level plane, as complex numbers, f = e^(i theta) (dv/dt + i v w_up) + bias: speeding up
-    pushes forward, turning pushes to the inside. One least-squares angle fits both. If none does,
-    turns are inverted: a mirrored axis of gyro or accelerometer, which is judged later, does that.
+    In the level plane, as complex numbers, f = e^(i theta) (dv/dt + i v w_up) + bias: forward and
+    centripetal acceleration. One least-squares angle fits both. If it does not, turns are
+    inverted, as by a mirrored axis of gyro or accelerometer, which is tested later.
     """
     found = pushes(t, w_i, f_i, up_i, travel, metres_per_unit)
     if found is None:
@@ -122,13 +122,13 @@ def _angle(A: Complexes, F: Complexes) -> tuple[float, float]:
     """Return the angle from accelerations A to forces F and its sigma, rad; pi if unknown."""
     A, F = A - A.mean(), F - F.mean()
     power = float(np.vdot(A, A).real)
-    if len(A) < FEWEST_BINS_FACING or power < 1e-3 * len(A) * 0.05:     # hardly a push anywhere
+    if len(A) < FEWEST_BINS_FACING or power < 1e-3 * len(A) * 0.05:     # hardly any acceleration
         return 0.0, np.pi
     gain = np.vdot(A, F) / power
-    if not gain:            # of no accelerometer
+    if not gain:            # no accelerometer
         return 0.0, np.pi
     rest = F - gain * A
-    # half the residual lies across the axis; neighbours share noise, so count every third bin
+    # half the residual is across the axis; adjacent bins share noise, so count every third
     sigma = float(np.sqrt(np.vdot(rest, rest).real / (2 * len(A) / 3) / power) / abs(gain))
     return float(np.angle(gain)), sigma
 

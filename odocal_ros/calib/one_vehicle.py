@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Legs that are not of one vehicle, or not of one set of settings: they have no mean."""
+"""Detection of legs of different vehicles or settings, which must not be combined."""
 
 from collections.abc import Iterable, Sequence
 import math
@@ -16,9 +16,9 @@ from odocal_ros.settings.levels import FAULT_SIGMAS, TYRE_SPREAD
 
 def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]:
     """
-    Return LEGS_UNLIKE where scale or yaw of legs differ by more than one vehicle can.
+    Return LEGS_UNLIKE if scale or yaw of legs differ by more than those of one vehicle.
 
-    numbered : those that are combined, with their numbers.
+    numbered : the combined legs, with their numbers.
     """
     found = []
     estimates = [(n, leg_estimates(leg)) for n, leg in numbered]
@@ -35,9 +35,9 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
         found.append(f'the scale of leg {high.leg} is {100 * more:.1f} % above '
                      f'that of leg {low.leg}')
     yaws = _values('yaw_mounting_angle', estimates)
-    # of an IMU that faces backwards they are near +-180 deg
+    # of a reversed IMU they are near +-180 deg
     far = _farthest([yaw._replace(value=float(wrap(yaw.value - yaws[0].value))) for yaw in yaws])
-    # rad, 5 deg: no mounting bends so far
+    # rad, 5 deg: mountings bend less
     if far and (more := far[1].value - far[0].value) > 0.087:
         low, high = far
         found.append(f'the yaw mounting of leg {high.leg} is {math.degrees(more):.1f} deg above '
@@ -62,7 +62,7 @@ def _values(name: str, estimates: Sequence[tuple[int, dict[str, Estimate]]]) -> 
 
 
 def _farthest(values: list[_LegValue]) -> tuple[_LegValue, _LegValue] | None:
-    """Return the lowest and the highest where they surely differ."""
+    """Return the lowest and the highest value if they differ significantly."""
     if len(values) < 2:
         return None
     order = sorted(values, key=lambda one: one.value)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Error of dead reckoning per distance driven, before and after: what scale and yaw make of it."""
+"""Error of dead reckoning by path length, before and after the correction of scale and yaw."""
 
 from collections.abc import Iterator
 
@@ -12,20 +12,20 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-PIECE_LENGTHS = 100.0, 500.0, 1000.0    # m, definition: as KITTI's benchmark has them, for a road
+PIECE_LENGTHS = 100.0, 500.0, 1000.0    # m, definition: as in KITTI's benchmark, for roads
 PIECE_STARTS = 10                       # definition: of pieces, on the length of one, as there
 
 
 def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
     """
-    Return the relative error of two tracks, pinned again to a fix for each piece.
+    Return the errors of two tracks over pieces of the path, each set to the fix at its begin.
 
-    way : (k,) m driven at each fix.   before, after : (k, 3) track less fixes, m, pinned anywhere.
+    way : (k,) path length at each fix, m.   before, after : (k, 3) track minus fixes, m, up to a
+    constant.
 
     Returns
     -------
-    One entry for each length that the path holds: rms of what track and fixes differ by at the end
-    of a piece that begin together, the fixes' own noise at both ends in it.
+    An entry for each length in the path: rms difference at the ends, with the noise of the fixes.
 
     """
     return tuple(PerDistance(length, float(np.sqrt(was.mean())), float(np.sqrt(now.mean())),
@@ -43,25 +43,25 @@ def _lengths(way: Floats, before: Floats,
 
 
 def _ends(way: Floats, length: float) -> tuple[Ints, Ints]:
-    """Return the rows at which pieces of a length begin and end, a tenth of it apart."""
+    """Return first and last rows of pieces of a length, whose begins are a tenth of it apart."""
     begin = np.arange(way[0], way[-1] - length, length / PIECE_STARTS) if len(way) else np.empty(0)
     a = np.searchsorted(way, begin)
     b = np.searchsorted(way, way[a] + length)
     whole = b < len(way)
     a, b = a[whole], b[whole]
-    near = way[b] - way[a] <= 1.2 * length      # farther apart, fixes are missing in there
+    near = way[b] - way[a] <= 1.2 * length      # in longer ones fixes are missing
     return a[near], b[near]
 
 
 def check_worse(way: Floats, before: Floats, after: Floats, configured: bool) -> list[Reason]:
     """
-    Return CHECK_WORSE where the correction takes the track farther from the fixes, beyond chance.
+    Return CHECK_WORSE if the correction significantly increases the distance to the fixes.
 
-    before, after, way : as for ``per_distance``.   configured : whether a nominal scale is.
+    before, after, way : as for ``per_distance``.   configured : a nominal scale is configured.
     """
     for length, pieces, (was, now) in _lengths(way, before, after):
         more = now - was
-        # of fewer than three pieces end to end no scatter is known, a tenth more nobody would mind
+        # fewer than three pieces end to end have no known scatter; a tenth more is acceptable
         if pieces < 3 or now.mean() < 1.1**2 * was.mean() \
                 or more.mean() < REMARK_SIGMAS * more.std() / np.sqrt(pieces):
             continue

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What comes out: estimates with sigmas and units, per method, per leg and combined."""
+"""Results: estimates with sigmas and units, per method, per leg and combined."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -16,14 +16,14 @@ from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.reasons import GRAVITY, Reason, Verdict, verdict_of
 
-# what stands in a result beside its estimates (calibration.json)
+# keys of a result in calibration.json that are not estimates
 BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
                     'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
                     'pitch_mounting_angle_housing_sigma'})
 
 
 AS_SENT = 'scale_factor_as_sent'
-FACTOR = 'scale_factor_'      # format: before the name of a wheel
+FACTOR = 'scale_factor_'      # format: prefix of a wheel's name
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """What one method says of one leg, or of all."""
+    """The result of one method on one leg, or on all."""
 
     name: str
     reasons: tuple[Reason, ...]
@@ -91,12 +91,12 @@ class TrackCheck:
 
 @dataclass(frozen=True)
 class PerDistance:
-    """Error of dead reckoning that begins at a fix, after some path length: rms in m."""
+    """Error of dead reckoning a path length after a fix, before and after calibration: rms, m."""
 
     length: float       # m driven
     before: float
     after: float
-    pieces: float       # that the path holds, end to end
+    pieces: float       # of this length in the path, end to end
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +120,16 @@ class LegResult:
     track_before_n: NDArray[np.float64] | None = None   # (m, 3) as configured
     reference_n: NDArray[np.float64] | None = None      # (k, 3) fixes used
     origin: tuple[float, float, float] | None = None  # latitude, longitude rad, height m of n
-    bag: str = ''                             # where it was recorded, empty when live
+    bag: str = ''                             # recording of the leg, empty when live
     C_bi: NDArray[np.float64] | None = None   # (3, 3) nominal rotation used, imu frame to b
-    deciding: tuple[str, ...] = ()            # methods whose verdict counts, all where empty
-    evidence: Evidence | None = None          # what a report draws, None where no track was fit
-    path_ratio: float | None = None     # median of distance between fixes by travel
+    deciding: tuple[str, ...] = ()            # methods whose verdict counts, all if empty
+    evidence: Evidence | None = None          # plot data, None if no track was usable
+    path_ratio: float | None = None     # median of distance between fixes over travel
     cut_from_ns: int | None = None            # start mark of the leg that it is a part of
 
     @property
     def driven_ns(self) -> int:
-        """Return the time of driving: of parts of a leg the same, no scale walks between them."""
+        """Return the start of the drive, ns, common to its sections: no scale drift in between."""
         return self.start_ns if self.cut_from_ns is None else self.cut_from_ns
 
     @cached_property
@@ -141,7 +141,7 @@ class LegResult:
         return Verdict.worst([verdict_of(self.reasons), best])
 
     def numbers(self) -> 'LegResult':
-        """Return all that a combination and its tables take, without the rows that are drawn."""
+        """Return the data for a combination and its tables, without plot data."""
         methods = {name: replace(method, details={
             key: value for key, value in method.details.items()
             if not isinstance(value, np.ndarray)}) for name, method in self.methods.items()}
@@ -151,7 +151,7 @@ class LegResult:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The combination of all legs: what is published and written."""
+    """The combined result of all legs, as published and written."""
 
     reasons: tuple[Reason, ...]
     estimates: dict[str, Estimate]
@@ -159,7 +159,7 @@ class Calibration:
     legs: tuple[LegResult, ...]
     imu_rotation_xyzw: tuple[float, ...] | None = None  # base_link <- imu frame
     imu_rotation_rpy: tuple[float, ...] | None = None
-    carried: Carried | None = None      # what it leaves for legs to come
+    carried: Carried | None = None      # information for later legs
 
     @property
     def verdict(self) -> Verdict:

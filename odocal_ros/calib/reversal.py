@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reversing that the odometer counts upwards: the direction of travel flips against the fixes.
+Detection of reversing with an odometer that counts upwards: the track runs opposite to the fixes.
 
 The track is level: travel along a heading that is the integral of the gyro about the mean upward
 axis. A three-dimensional attitude by gyros alone tilts within minutes, and its horizontal
 directions are then wrong. The heading drifts too, but slowly. A reversal flips the direction by
-half a turn from one piece of the drive to the next, and the fixes stay back by twice its length;
-an error of the fixes that runs against the travel goes away again.
+half a turn from one piece of the drive to the next, and the fixes remain behind the track by twice
+its length; a fix error opposite to the travel disappears again.
 """
 
 from typing import NamedTuple
@@ -23,10 +23,10 @@ from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
-# rad: a direction that changes by more is taken to flip. Judgement: half a turn, less what noise
-# and drift may take off
+# rad: a larger change of direction is a flip. Judgement: half a turn, minus a margin for noise
+# and drift
 FLIP = np.deg2rad(135.0)
-# s about a reversal, in which an error of the fixes is over. Judgement: multipath lasts as long
+# s around a reversal, within which a fix error disappears. Judgement: duration of multipath
 ERROR_LASTS = 60.0
 
 
@@ -34,8 +34,8 @@ class Pieces(NamedTuple):
     """
     Pieces of a drive between fixes, one after the other: (k,) each.
 
-    t : s, the middle.   off : rad, direction of the track less course by the fixes.
-    length : m, by the fixes.   stretch : length of the track over that, 1 usually.
+    t : s, the middle.   off : rad, direction of the track minus course by the fixes.
+    length : m, by the fixes.   stretch : length of the track over ``length``, median 1.
     """
 
     t: Floats
@@ -46,7 +46,7 @@ class Pieces(NamedTuple):
 
 def level_track(way: Floats, turned: Floats) -> Floats:
     """
-    Return the path of travel on level ground, but for a rotation: (n, 2) in units of travel.
+    Return the path of travel on level ground, up to a rotation: (n, 2) in units of travel.
 
     turned, way : (n,) arrays, turn about the upward axis, rad, and travel.
     """
@@ -63,7 +63,7 @@ def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Piece
     track_2d, fixes_2d, t : (n, 2), (n, 2), (n,) at the fixes, any unit, m and s.   sigma : white
     noise of a fix, m.
     """
-    # a direction is then good to sqrt(2) / 20 rad
+    # the sigma of a direction is then sqrt(2) / 20 rad
     knots = np.array(knots_of(fixes_2d, max(10.0, 20 * sigma)), int)
     if len(knots) < 2:
         return Pieces(*(np.empty(0),) * 4)
@@ -77,15 +77,15 @@ def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Piece
 
 def backwards(found: Pieces) -> Bools:
     """
-    Return True for pieces that run backwards: (k,) bool.
+    Return True for pieces that are driven backwards: (k,) bool.
 
-    The offset of the heading is a random walk: its variance grows with the time between pieces,
-    and its size is the median of what the offset changes by. What changes by half a turn, and by
-    FAULT_SIGMAS of that walk, is a flip. Where the walk may reach a flip nothing is known of what
-    follows; each part between such gaps has its own forward direction, in which most pieces run.
+    The heading offset is a random walk: its variance grows with the time between pieces, and its
+    size is by the median of its changes. A change beyond FLIP is a flip. Where FAULT_SIGMAS of the
+    walk exceed FLIP, the drive is divided; each part has its own forward direction, that of most
+    of its pieces.
 
-    While the fixes go back the counter continues: a piece on the spot, or in which fixes jump,
-    has no direction.
+    A piece whose path length by track and by fixes differs too much, as on the spot or with a
+    jump of the fixes, has no direction.
     """
     back = np.zeros(len(found.t), bool)
     found = _without_bias(found)
@@ -108,7 +108,7 @@ def backwards(found: Pieces) -> Bools:
 
 
 def _without_bias(found: Pieces) -> Pieces:
-    """Return pieces without the remaining gyro bias, which turns all of them equally."""
+    """Return pieces without the remaining gyro bias, a constant rate of the offset."""
     if len(found.t) < 2:
         return found
     rate = np.median(wrap(np.diff(found.off)) / np.diff(found.t))
@@ -119,8 +119,8 @@ def _stays_back(found: Pieces, run: Ints, forward: Ints) -> bool:
     """
     Return True if the fixes stay behind after a run of pieces, as after a reversal.
 
-    Against a heading that drifts each piece is held by that of the next one forwards.
-    run, forward : indices of the pieces that may run backwards, and of those that do not.
+    To remove heading drift, the offset of each piece is relative to the nearest forward piece.
+    run, forward : indices of the pieces that may be driven backwards, and of the others.
     """
     t = found.t
     about = (t >= t[run[0]] - ERROR_LASTS) & (t <= t[run[-1]] + ERROR_LASTS)
@@ -128,12 +128,12 @@ def _stays_back(found: Pieces, run: Ints, forward: Ints) -> bool:
     nearest = forward[np.argmin(np.abs(t[about][:, None] - t[forward]), axis=1)]
     ahead = found.length[about] * (
         np.cos(found.off[about] - found.off[nearest]) - found.stretch[about])
-    # of twice the run, which the fixes lack, they make up all or nothing
+    # after an error the fixes catch up by twice the run, after a reversal by nothing
     return bool(ahead.sum() < found.length[run].sum())
 
 
 def against_travel(found: Pieces, signed: bool) -> tuple[Reason, ...]:
-    """Return TRACK_MISMATCH where counts rise while the vehicle drives backwards."""
+    """Return TRACK_MISMATCH if counts increase while the vehicle drives backwards."""
     back = backwards(found)
     if not back.any():
         return ()

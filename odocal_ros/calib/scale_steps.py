@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where, between legs of a vehicle, the scale changed by more than a walk: new tyres, a load."""
+"""Detection of scale changes between legs beyond a random walk: new tyres, a load."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from odocal_ros.calib.linked_legs import LinkedLegs
 from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-# 1 sigma of ln K where it changes for good, by any tyre, gear or counter: physical
+# 1 sigma of a permanent change of ln K, by any tyre, gear or counter: physical
 FREE_STEP = 1.0
 
 
 @dataclass(frozen=True)
 class ScaleStep:
-    """A change: from leg ``leg`` - 1 to ``leg`` of the borders, of ln K, and in sigmas."""
+    """A change of ln K from border ``leg`` - 1 to border ``leg``, and its size in sigmas."""
 
     leg: int
     change: float
@@ -29,14 +29,14 @@ class ScaleStep:
 def scale_steps(borders: Sequence[Border], steps: Sequence[float] | Floats, drifting: str,
                 angles: Sequence[str] = ()) -> list[ScaleStep]:
     """
-    Compare each leg's scale with its prediction by those before.
+    Compare the scale of each leg with its prediction by the earlier legs.
 
-    borders : by time.   steps : (J - 1,) sigma by which ``drifting`` walks from leg to leg.
+    borders : by time.   steps : (J - 1,) sigma of the change of ``drifting`` from leg to leg.
     drifting, angles : as for ``joint``.
 
     Returns
     -------
-    Changes beyond REMARK_SIGMAS, in order. After one, a leg is held against those since.
+    Changes beyond REMARK_SIGMAS, in order. After a change, only later legs predict the scale.
 
     """
     steps, found = np.array(steps, float), []

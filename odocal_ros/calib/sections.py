@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scale by section of the path, each with the sigma that its own fixes leave."""
+"""Scale by section of the path, each with a sigma by the residuals of its fixes."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Complexes, Floats
 
-# blocks, at which the correlation of what a fit leaves is looked at: judgement, the next and one
-# that white noise on top does not hide
+# lags of the correlation of residuals, in blocks: judgement, the next block and one at which
+# additional white noise does not hide it
 BLOCK_LAGS = (1, 3)
-Stretch = tuple[np.complexfloating, Complexes, float]      # turn and stretch, what is left, spread
-# judgement: correlation of errors from block to block, a grid, finer where a stretch's sigma grows
+Stretch = tuple[np.complexfloating, Complexes, float]      # rotation and scale, residuals, spread
+# judgement: grid of the correlation from block to block, finer where the sigma of a scale grows
 MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])
 
 
@@ -24,7 +24,7 @@ class Sections:
     """
     Scale by section: length by the fixes over length dead reckoned as calibrated.
 
-    begin, end : (k,) m driven.   ratio, sigma : (k,), NaN where the fixes do not determine it.
+    begin, end : (k,) path length, m.   ratio, sigma : (k,), NaN: not determined by the fixes.
     """
 
     begin: NDArray[np.float64]
@@ -37,16 +37,16 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
     """
     Return the scale of each tenth of the path, relative to the one used in dead reckoning.
 
-    The dead-reckoned piece is turned, stretched and shifted onto its fixes by least squares; the
-    stretch is the ratio, so no heading enters. Its sigma is by what the fixes leave after that,
-    not by what the receiver states, most of which is the same at both ends of a section. Fixes
-    err like those before: of means of a few, a first-order process is matched to the residuals of
-    all sections together, their power and correlation as they are after such a fit.
-    Errors that change more slowly than over a section are not in it.
+    The dead-reckoned section is rotated, scaled and shifted onto its fixes by least squares; the
+    scale is the ratio, so the heading has no effect. Its sigma is by the residuals: most of the
+    stated error is common to both ends of a section. Fix errors are time-correlated: a first-order
+    process is matched to power and correlation of the residuals, as means of a few fixes, of all
+    sections together, including the effect of the fit on them.
+    Errors that change more slowly than over a section are not included.
 
-    way : (k,) m driven at each fix, rising.   reckoned_n, fix_n : (k, 3) dead-reckoned and fixed
-    positions, m.   sigma : (k,) of a fix as stated, m per horizontal axis; a hundredth of it is
-    the least taken.
+    way : (k,) path length at each fix, m, rising.   reckoned_n, fix_n : (k, 3) dead-reckoned and
+    fixed positions, m.   sigma : (k,) stated for a fix, m per horizontal axis; a hundredth of its
+    median is the lower limit of the error.
     """
     whole = way[-1] - way[0] if len(way) else 0.0
     fewest = 8      # fixes of a section, twice the parameters of its fit
@@ -61,7 +61,7 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
     for i in range(count):
         rows = np.flatnonzero(part == i)
         if len(rows) >= fewest and np.ptp(way[rows]) > 0:
-            # means of fixes: in 24 of them noise from one to the next is gone
+            # means of fixes: 24 of them, with little noise from fix to fix
             blocks = np.array_split(rows, min(len(rows), 24))
             fits[i] = _stretched(*(np.array([x[b].mean() for b in blocks]) for x in (z, w)))
     for i, found in zip(fits, _errors(list(fits.values()), float(np.median(sigma))),
@@ -72,7 +72,7 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
 
 
 def _stretched(z: Complexes, w: Complexes) -> Stretch:
-    """Return the turn and stretch that takes z onto w (complex, m), what is left, and spread."""
+    """Return rotation and scale from z to w (complex, m), residuals, and spread of z, m^2."""
     z, w = z - z.mean(), w - w.mean()
     spread = float(np.vdot(z, z).real)
     c = np.vdot(z, w) / spread
@@ -80,7 +80,7 @@ def _stretched(z: Complexes, w: Complexes) -> Stretch:
 
 
 def _errors(fits: list[Stretch], stated: float) -> list[float]:
-    """Return the sigma of each stretch."""
+    """Return the sigma of each scale."""
     if not fits:
         return []
     n = int(np.median([len(left) for _, left, _ in fits]))
@@ -88,13 +88,13 @@ def _errors(fits: list[Stretch], stated: float) -> list[float]:
     power = np.array([np.vdot(left, left).real / len(left) for _, left, _ in fits]) / 2
     whole = sum(np.vdot(left, left).real for _, left, _ in fits)
     at = np.arange(len(MEMORIES))
-    # white noise on top hides a memory at the next block, not further on: the longer one counts,
-    # where there are enough blocks to determine it
+    # additional white noise hides the correlation at the next block, not at the longer lag: the
+    # larger memory counts; the longer lag is used with enough blocks
     memory = max(np.interp(sum(np.vdot(left[:-lag], left[lag:]).real for _, left, _ in fits)
                            / whole if whole else 0.0, row, at)
                  for lag, row in zip(BLOCK_LAGS, alike, strict=True) if lag == 1 or n >= 16)
     level = np.maximum(power, np.median(power)) / np.interp(memory, at, left_over)
-    level = np.maximum(level, (0.01 * stated)**2)    # no fix is better than that, one to the next
+    level = np.maximum(level, (0.01 * stated)**2)    # lower limit from fix to fix
     return [float(np.sqrt(v * np.interp(memory, at, widening) / spread))
             for v, (_, _, spread) in zip(level, fits, strict=True)]
 
@@ -102,11 +102,11 @@ def _errors(fits: list[Stretch], stated: float) -> list[float]:
 @lru_cache(maxsize=32)
 def _process(n: int) -> Floats:
     """
-    Return the residual of a line through n rows of a first-order process, by its memory.
+    Return statistics of a line fitted to n rows of a first-order process, by its memory.
 
-    Mean power left, the variance of the slope over that of white noise, and the correlation left
-    at each lag, of a process of variance 1: each (len(MEMORIES),). Closed form: traces with the
-    projector off a line.
+    Mean power of the residuals, the variance of the slope over that of white noise, and the
+    correlation of the residuals at each lag, for a process of variance 1: each (len(MEMORIES),).
+    Closed form: traces with the residual projector of a line.
     """
     x = np.stack([np.ones(n), np.linspace(-1.0, 1.0, n)], -1)
     x /= np.linalg.norm(x, axis=0)

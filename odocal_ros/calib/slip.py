@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Wheel slip: where the odometer runs farther than the IMU's acceleration allows.
+Wheel slip: intervals in which the odometer travels farther, or less, than the IMU.
 
 Over a few seconds the path is the integral of speed, and speed that of the specific force along
-the forward axis less gravity. With the speed pinned to the odometer's at both ends of the window,
-a steady accelerometer bias and a tilt drop out; what a wheel spun in between does not. An odometer
-that is late, or whose speed is low-pass filtered, departs from the IMU at every change of
-acceleration: the lateness at which the two agree best is estimated first.
+the forward axis minus gravity. With the speed set to the odometer's at both ends of the window, a
+constant accelerometer bias and tilt cancel; slip within the window does not. A delayed odometer,
+or one whose speed is low-pass filtered, differs from the IMU at every change of acceleration: the
+delay at which the two agree best is estimated first.
 """
 
 from dataclasses import dataclass
@@ -31,26 +31,26 @@ from odocal_ros.reasons import Code, Reason
 SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill: judgement
 SPIN_GRID = 0.2      # s between rows, a spin lasts longer: judgement
 SPAN = round(SPIN_WINDOW / SPIN_GRID)      # definition: rows of a window
-PIN_STEPS = 2        # rows each side that the speed at an end is taken over: judgement
-# rad in a window: in more of a turn the level's error is another axis'. Judgement
+PIN_STEPS = 2        # rows each side over which the speed at an end is averaged: judgement
+# rad in a window: in larger turns the level error acts on another axis. Judgement
 SPIN_TURN = 0.1
-# odometer counts that rounding may make of a window: one over the 0.8 s of a pin is 5 over the
-# window, its own ends 1 more; the rest is margin: judgement
+# counts, possible rounding error of a window: one over the 0.8 s of an end is 5 over the window,
+# plus 1 at the window's ends; the rest is margin: judgement
 PIN_COUNTS = 8.0
-# m/s^2: a sliding wheel brakes the vehicle by no less, even on ice (friction 0.1). Physical
+# m/s^2: a sliding wheel brakes the vehicle by at least this, even on ice (friction 0.1). Physical
 LEAST_BRAKING = 0.5
-BRAKES_BESIDE = 1.0  # s beside a slip in which the vehicle may brake, a keyframe: judgement
-# s by which the odometer may be late, looked at: judgement; a bus or a filter takes less
+BRAKES_BESIDE = 1.0  # s around a slip searched for braking, a keyframe interval: judgement
+# s, delays of the odometer that are tested: judgement; a bus or a filter has less
 LATE = 0.05 * np.arange(-10, 21)
 
 
 class Slips(NamedTuple):
     """
-    Where the wheels spun or slid.
+    Slips of the wheels.
 
-    t : (k,) s, middle of each slip.   size : (k,) m, > 0 where the wheel spun, < 0 where it slid.
-    late : s by which the odometer is late against the IMU, where it would look like slip, else 0.
-    missing : (k,) bool, travel that the odometer lacks although no wheel slid.
+    t : (k,) s, middle of each slip.   size : (k,) m, > 0 if the wheel spun, < 0 if it slid.
+    late : delay of the odometer relative to the IMU, s, if it would look like slip, else 0.
+    missing : (k,) bool, travel missing in the odometer although no wheel slid.
     """
 
     t: Floats
@@ -60,9 +60,9 @@ class Slips(NamedTuple):
 
 
 def rounding(travel: Travel) -> float:
-    """Return the size of a count, scale units, or that of one as coarse as steps of a speed."""
+    """Return the size of a count, scale units; for coarse speeds, that of an equivalent count."""
     coarse = travel.coarse
-    # speeds at both ends of a window, and within it, err by up to that
+    # coarse.most is the largest error of speeds at the ends of a window and within it
     return travel.quantum if coarse is None else coarse.most * SPIN_WINDOW / PIN_COUNTS
 
 
@@ -80,12 +80,12 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     if len(grid) < 2 * SPAN:
         return Slips(np.empty(0), np.empty(0))
     a = acceleration(grid, t_imu, f_b, track, f / K, latitude)
-    # in a turn the level error comes to bear on another axis: no window is judged there
+    # in a turn the level error acts on another axis: such windows are excluded
     C = track.C_nb_at(grid)
     yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[PIN_STEPS:-PIN_STEPS]
     turns = np.ptp(sliding_window_view(yaw, SPAN + 1), axis=1) > SPIN_TURN
     windows = _Windows(grid, a, turns, track, K, quantum)
-    # a mean of sizes: slips hardly move it
+    # a mean of absolute values: slips hardly affect it
     late = float(LATE[np.argmin([np.abs(windows.excess(late)).mean() for late in LATE])])
     t, size = windows.events(late)
     hidden = len(windows.events(0.0)[0]) > len(t)
@@ -98,9 +98,9 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
 @dataclass(frozen=True, eq=False)
 class _Windows:
     """
-    The windows of a drive, from each of grid, (n,) s, on.
+    Windows of a drive, which begin at the times in grid, (n,) s.
 
-    a : (n - 1,) m/s^2 along by the IMU.   turns : (m,) bool, windows that are not judged.
+    a : (n - 1,) forward acceleration by the IMU, m/s^2.   turns : (m,) bool, excluded windows.
     track, K, quantum : Track, its scale, size of a count in scale units.
     """
 
@@ -112,16 +112,16 @@ class _Windows:
     quantum: float
 
     def excess(self, late: float) -> Floats:
-        """Return by how much the odometer exceeds the IMU in each window if so late, s: (m,) m."""
+        """Return odometer minus IMU path in each window, at an odometer delay, s: (m,) m."""
         way = self.K * np.interp(self.grid + late, self.track.t, self.track.s)
         return np.where(self.turns, 0.0, excess_way(SPAN, self.a, way))
 
     def events(self, late: float) -> tuple[Floats, Floats]:
-        """Return time, s, and size, m, of each slip if the odometer is so late, s."""
+        """Return time, s, and size, m, of each slip, at an odometer delay, s."""
         excess = self.excess(late)
-        # what the drive as a whole does (rough road, soft suspension) is no event
+        # the usual excess of the drive (rough road, soft suspension) is no event
         usual = robust_sigma(excess[excess != 0.0]) if excess.any() else 0.0
-        least = 0.45    # m, 3 sigmas: a tilt that drifts makes 0.1 m/s^2 of a window, 0.15 m
+        least = 0.45    # m, 3 sigmas: tilt drift gives 0.1 m/s^2 in a window, 0.15 m
         limit = max(least, PIN_COUNTS * self.quantum * self.K, 6 * usual)
         return _events(self.grid[PIN_STEPS:-SPAN - PIN_STEPS] + SPIN_WINDOW / 2, excess, limit)
 
@@ -138,14 +138,14 @@ def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward
 
 def excess_way(span: int, a: Floats, way: Floats) -> Floats:
     """
-    Return the odometer's path over each window less that by acceleration: (m,) m.
+    Return the odometer path over each window minus that by acceleration: (m,) m.
 
     The speed by acceleration is set to the odometer's at both ends by a straight line; both are
-    taken as means over the same few steps, so that a jump of acceleration there does no harm.
+    means over the same few steps, so that a jump of acceleration there has no effect.
     """
-    u = np.concatenate([[0.0], np.cumsum(a) * SPIN_GRID])        # speed but for a constant
+    u = np.concatenate([[0.0], np.cumsum(a) * SPIN_GRID])        # speed up to a constant
     x = np.concatenate([[0.0], np.cumsum((u[:-1] + u[1:]) / 2) * SPIN_GRID])
-    ahead = way - x                 # its slope is what the speed by acceleration lacks
+    ahead = way - x                 # its slope is odometer speed minus speed by acceleration
     lacks = (ahead[2 * PIN_STEPS:] - ahead[:-2 * PIN_STEPS]) / (2 * PIN_STEPS * SPIN_GRID)
     ahead = ahead[PIN_STEPS:-PIN_STEPS]
     lacked = (lacks[:-span] + lacks[span:]) / 2 * span * SPIN_GRID
@@ -157,8 +157,8 @@ def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Float
     """
     Return time and size of each event.
 
-    An event is seen by every window that holds it, from both flanks on: the windows beyond the
-    limit are one group, and in its middle stand those that hold the event whole.
+    Every window that contains an event exceeds the limit: these windows are one group, and those
+    in its middle contain the whole event.
     """
     far = np.flatnonzero(np.abs(excess) > limit)
     groups = np.split(far, np.flatnonzero(np.diff(middle[far]) > SPIN_WINDOW / 2) + 1)
@@ -170,9 +170,9 @@ def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Float
 def without_braking(t: float, duration: float, metres: float, t_speed: Floats,
                     speed: Floats) -> bool:
     """
-    Return True if a wheel travels less than the vehicle, which does not brake: it does not slide.
+    Return True if a wheel travels less than a vehicle that does not brake: it does not slide.
 
-    t, duration : s.   metres : by which the wheel turned beyond the ground.   t_speed, speed :
+    t, duration : s, of the slip.   metres : wheel travel minus vehicle travel.   t_speed, speed :
     (n,) s, m/s, of the vehicle, < 0 backwards.
     """
     inside = slice(*np.searchsorted(t_speed, (t - BRAKES_BESIDE, t + duration + BRAKES_BESIDE)))
@@ -183,7 +183,7 @@ def without_braking(t: float, duration: float, metres: float, t_speed: Floats,
 
 
 def missing_reasons(t: Floats, metres: Floats) -> list[Reason]:
-    """Return TRAVEL_MISSING of travel that the odometer lacks: (k,) s, m; empty where none."""
+    """Return TRAVEL_MISSING for travel missing in the odometer, (k,) s, m; empty if none."""
     if not len(t):
         return []
     return [Reason(Code.TRAVEL_MISSING, f'the odometer counts {np.abs(metres).sum():.2f} m less '
@@ -192,16 +192,16 @@ def missing_reasons(t: Floats, metres: Floats) -> list[Reason]:
 
 
 def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floats) -> Source:
-    """Return slips as a source of error: one for all, since wheels spin in one direction."""
+    """Return all slips as one source of error, since wheels spin in one direction."""
     along_n = track.C_nb_at(t) @ f / np.linalg.norm(f) * np.abs(size)[:, None]
     return Source('wheel_slip', gradient @ along_n.sum(axis=0)[:, None])
 
 
 def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
     """
-    Return DELAY_SEEN, WHEEL_SLIP and TRAVEL_MISSING with what was seen, empty where nothing was.
+    Return DELAY_SEEN, WHEEL_SLIP and TRAVEL_MISSING for detected faults, empty if there are none.
 
-    slips : Slips.   time_offset : odometer.time_offset as set, s.
+    slips : Slips.   time_offset : odometer.time_offset in force, s.
     """
     found: tuple[Reason, ...] = ()
     t, size, late = slips.t[~slips.missing], slips.size[~slips.missing], slips.late

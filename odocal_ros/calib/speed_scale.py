@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scale against speed: the odometer as sent, compared with the fixes, cell by cell of a leg."""
+"""Scale by speed: the uncorrected odometer compared with the fixes in short cells of a leg."""
 
 from dataclasses import dataclass
 
@@ -11,9 +11,9 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.statistics import robust_sigma
 
-# judgement: s of a comparison at most, where the speed hardly varies, and at least; cells wanted
+# judgement: s, longest cell, in which the speed hardly varies, and shortest; intended number
 LONGEST_CELL, SHORTEST_CELL, WANTED_CELLS = 5.0, 2.0, 40
-SLOWEST_CELL = 0.2            # judgement: of a high speed; in slower cells fix errors dominate
+SLOWEST_CELL = 0.2            # judgement: share of a high speed; below it fix errors dominate
 FEWEST_CELLS, BINS = 12, 10    # judgement: cells for a result; points of a figure
 # judgement: spread of the speeds over their mean, below which an offset is not separable
 LEAST_SPREAD = 0.1
@@ -42,8 +42,8 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     Return the scale against speed of a leg.
 
     t_fix : (k,) times of fixes, s, rising.   fix_n, dead_n : (k, 2 or more) positions by fixes and
-    by dead reckoning, m.   distance : (k,) distance driven by dead reckoning, m; with ``dead_n``
-    it gives path length by chord.   travel : of the odometer as sent.
+    by dead reckoning, m.   distance : (k,) path length by dead reckoning, m; over the chord by
+    ``dead_n`` it converts chords to path lengths.   travel : of the uncorrected odometer.
     """
     if len(t_fix) < FEWEST_CELLS or len(travel.t) < FEWEST_CELLS:
         return SpeedScale(NO_BINS)
@@ -56,8 +56,8 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     rolled = np.diff(travel.at(t))
     slope = 0.5       # s to either side of a knot, for the speed there
     speed = (travel.at(t + slope) - travel.at(t - slope)) / (2 * slope)
-    straight = dead > 0.8 * path      # judgement: in tighter turns a chord says little
-    high = 90     # percentile of the speeds, as outliers are among them
+    straight = dead > 0.8 * path      # judgement: in tighter turns a chord is too short
+    high = 90     # percentile of the speeds, which may have outliers
     good = (2 * cell > T) & straight & (rolled != 0) & _moves(travel, t)
     good &= path / T > SLOWEST_CELL * float(np.percentile(path / T, high))
     if good.sum() < FEWEST_CELLS:
@@ -98,7 +98,7 @@ def _fit(length: Floats, rolled: Floats, T: Floats, change: Floats
 
 def _bins(length: Floats, rolled: Floats, T: Floats) -> Floats:
     """Return speed, ratio, its sigma and number of cells, of groups of equally many cells."""
-    # by the odometer: fixes would be sorted by their errors
+    # sorted by odometer speed: by the fixes they would be sorted by fix errors
     order, scale = np.argsort(rolled / T, kind='stable'), float(length.sum() / rolled.sum())
     rows = []
     for part in np.array_split(order, min(BINS, len(order) // 4)):

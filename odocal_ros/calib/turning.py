@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Turns by the gyro beside turns of the course: a wrong sign or unit, before all that follows."""
+"""Turns by the gyro compared with turns of the course, to detect a wrong sign or unit."""
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from odocal_ros.nav.integral import integral_at, twice_integral_at
 from odocal_ros.nav.local_frame import GNSS_MOVES
 from odocal_ros.reasons import Code, Reason
 
-# statistical: correlation of turns by gyro and by course from which they are the same turns, and
-# sigmas of the slope, since of a few courses chance makes some correlated
+# statistical: least correlation of the same turns by gyro and by course, and least sigmas of the
+# slope, since a few courses may be correlated by chance
 SAME_TURNS, SLOPE_SIGMAS = 0.9, 8.0
 # rad^2, judgement: a chord with a U-turn in it, and the next, are off by 0.35 rad each (0.1 to 0.2
 # for a mower whose rows are 1.6 m apart)
@@ -26,12 +26,12 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     """
     Return turns by the gyro over turns of the course by fixes: 1 if units and sign are right.
 
-    None where the drive hardly turns or the two have little to do with each other.
+    None if the drive hardly turns or the two are not correlated.
 
     t_imu, w_up : (n,) s, and turn rate about the upward axis.   t_fix, fixes_n, sigma : (k,), (k,
-    2 or more), float s, m, and m horizontally.   least : distance over which fixes surely move, m.
+    2 or more), float s, m, and m horizontally.   least : least significant motion of fixes, m.
     """
-    # m: a course is then good to 0.14 rad
+    # m: the sigma of a course is then 0.14 rad
     knots = knots_of(fixes_n, max(min(5.0, least), 10 * sigma))
     if len(knots) < 5:
         return None
@@ -40,14 +40,14 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     step = np.diff(fixes_n[knots, :2], axis=0)[keep]
     t = ((ends[:-1] + ends[1:]) / 2)[keep]
     course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
-    # the mean angle over each chord; what a bias adds goes with the time
+    # the mean angle over each chord; the effect of a bias is linear in time
     gyro = (np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends))[keep]
-    # where the course turns about at once a vehicle may have backed up: by how much is left open
+    # at a sudden U-turn of the course the vehicle may have reversed: a free step is fitted there
     about = np.flatnonzero(np.abs(np.diff(course)) > 2.0)
     drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > about])
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)
-    # rad^2: turns of 1 rad in all, by their rms, and what the two chords of a U-turn are off
+    # rad^2: turns of 1 rad in total, root sum of squares, plus the error of chords at U-turns
     if course @ course < 1.0 + U_TURN * len(about) or power == 0:
         return None
     slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
@@ -59,20 +59,20 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
 def _pivots(ends: Floats, angle: Floats) -> Bools:
     """Return a mask of the chords in which a vehicle stops and turns: (n,), angle in rad."""
     lasts, turns = np.diff(ends), np.abs(np.diff(angle))
-    # judgement: times the usual, and rad: there the mean angle by time is not that of the path
+    # judgement: ratio to the median duration, and rad: the mean over time is not that over path
     pivots: Bools = (lasts > 3.0 * np.median(lasts)) & (turns > 0.5)
     return pivots
 
 
 def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
-    """Return GYRO_SIGN or IMU_UNITS where such a ratio, with such an imu.gyro_scale, shows it."""
+    """Return GYRO_SIGN or IMU_UNITS if ``turn_ratio`` shows it; gyro_scale: as configured."""
     if ratio is None or ONE_MOTION_RATIO[0] < ratio < ONE_MOTION_RATIO[1]:
         return ()
     if ratio < -ONE_MOTION_RATIO[0]:
         return (Reason(Code.GYRO_SIGN, 'the gyro turns opposite to the course of the fixes '
                        f'(ratio {ratio:.2f} instead of 1)'),)
-    degrees = 40.0 < ratio < 80.0       # 180 / pi, within what scale errors and skid make of it
-    if abs(ratio) < 0.01:       # no unit makes that of a turn: revolutions make 0.16
+    degrees = 40.0 < ratio < 80.0       # 180 / pi, with a margin for scale errors and skid
+    if abs(ratio) < 0.01:       # no error of the unit: revolutions give 0.16
         return (Reason(Code.IMU_UNITS, f'the gyro shows only {ratio:#.2g} times the turns of the '
                        'fixes', 'Set imu.mounting_rpy if another IMU '
                        'axis is vertical; otherwise correct the IMU driver.'),)

@@ -4,11 +4,11 @@
 """
 The two-point method: scale, yaw and pitch from the end of a leg, dead reckoned and by fixes.
 
-Shi et al. 2015 takes the ratio of two chords in a plane and the angle between them,
-eq. (6)-(10). The same similarity is solved here in the Earth-fixed Cartesian frame n, where track
-and truth are similar to the last digit: with M the attitude summed over travel and c the chord
-between the reference positions, M f = c gives f = K forward_b, and so scale, yaw and pitch at
-once. The plane and the geodesic of the paper are the cross-check.
+Shi et al. 2015 uses the ratio of two chords in a plane and the angle between them, eq. (6)-(10).
+The same similarity is solved here in the Earth-fixed Cartesian frame n, where track and truth are
+exactly similar: with M the attitude summed over travel and c the chord between the reference
+positions, M f = c gives f = K forward_b, and so scale, yaw and pitch at once. The plane and the
+geodesic of the paper are the cross-check.
 """
 
 from collections.abc import Iterable
@@ -46,17 +46,17 @@ PITCH_LIMIT = 0.26
 
 @dataclass(frozen=True, eq=False)
 class Chord:
-    """What the two-point method is solved on."""
+    """Input of the two-point method."""
 
     track: Track
     origin: Origin
     start: MarkFix
     end: MarkFix
     lever_b: Floats     # (3,) antenna from the odometer's point, m, in v
-    velocity_change: Floats  # (3, 3) end less start: times f gives m/s in n
+    velocity_change: Floats  # (3, 3) end minus start: times f gives m/s in n
     alignment: Alignment
-    doubt: tuple[Floats, Floats] = (np.empty(0), np.empty(0))    # of travel, at s, scale units
-    # wheel slips: when, s, and how far, m
+    doubt: tuple[Floats, Floats] = (np.empty(0), np.empty(0))    # of travel: s, scale units
+    # wheel slips: times, s, and sizes, m
     slips: tuple[Floats, Floats] = (np.empty(0), np.empty(0))
 
     @property
@@ -69,12 +69,12 @@ def solve(chord: Chord, up_scale: float = 1.0) -> tuple[Floats, bool]:
     """
     Solve M f = c for f = K forward_b: docs/method.md (T3), (T4).
 
-    up_scale : factor on the stated height sigmas; np.inf leaves heights out.
+    up_scale : factor on the stated height sigmas; np.inf: heights are not used.
 
     Returns
     -------
     f : (3,) m per unit of travel, in b.
-    vertical_known : False if heights contain no information and the pitch is taken as zero.
+    vertical_known : False if heights contain no information; the pitch is then zero.
 
     """
     M = chord.M
@@ -109,7 +109,7 @@ def refusal(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
     between = (chord.track.t >= chord.start.t) & (chord.track.t <= chord.end.t)
     path = np.abs(np.diff(chord.track.s[between])).sum() * scale_guess
     length = np.hypot(*(chord.end.position_n - chord.start.position_n)[:2])
-    # the length of the track's own chord, whatever the yaw: M is a turn times it
+    # the length of the track's own chord, independent of yaw: M is a rotation times it
     reckoned = np.sqrt(abs(np.linalg.det(chord.M[:2, :2]))) * scale_guess
     for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
         if chord_length <= path / 5:
@@ -175,13 +175,13 @@ def _gyro_bias(alignment: Alignment) -> dict[str, Estimate]:
 def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_scale: Floats,
              config: Config) -> tuple[Source, ...]:
     track = chord.track
-    # gyro errors accumulate from the alignment on, with a fixed heading from the mark on
+    # gyro errors accumulate from the alignment, with a fixed heading from the start mark
     first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
     keep = epochs_between(track, min(first, chord.start.t), chord.end.t)
     t = track.t[keep]
     D = displacement(track, keep, chord.start.t, f) * (t >= chord.start.t)[:, None]
     start, end, M = chord.start, chord.end, chord.M
-    if not vertical_known:       # the prior in the pitch stands in for the heights
+    if not vertical_known:       # the prior of the pitch replaces the heights
         fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
         rise = PITCH_PRIOR * float(np.linalg.norm(M @ f))
         start, end = _blind_height(start), _blind_height(end, rise)
@@ -194,7 +194,7 @@ def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_
 
 
 def _doubt(chord: Chord, f: Floats) -> tuple[Source, ...]:
-    """Return the sources of travel lost in gaps and resets, and of slip; empty where none."""
+    """Return the sources of travel lost in gaps and resets, and of slip; empty if none."""
     gradient = parameter_gradient(f) @ np.linalg.inv(chord.M)
     sources: tuple[Source, ...] = ()
     if len(chord.slips[0]):
@@ -253,7 +253,7 @@ def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
     """
     Return K and yaw by eq. (6)-(10) in the plane and by the geodesic: docs/method.md (T14).
 
-    The track is taken with K0, yaw 0 and the pitch found, moved to the start position.
+    The track has ``nominal_scale``, yaw 0 and the estimated pitch, and begins at the start mark.
     """
     from odocal_ros.nav.projection import plane_for
     K = np.linalg.norm(f)
@@ -276,7 +276,7 @@ def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
 def _planes_agree(check: dict[str, dict[str, float]], K: float,
                   sigma_relative: float) -> tuple[Reason, ...]:
     worst = max(abs(c['scale_factor'] / K - 1) for c in check.values())
-    # relative: a plane about the leg keeps ratios of chords far better
+    # relative: a plane about the leg preserves ratios of chords far better
     if worst > 3e-5 + 0.2 * sigma_relative:
         return (Reason(Code.PLANES_DISAGREE, 'the scale in the plane or on the geodesic differs '
                        f'by {worst * 1e6:.0f} ppm from the scale in space'),)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Scale of the fixes against dead reckoning by the length of the window.
+Scale of the fixes relative to dead reckoning, by the length of the window.
 
-With the scale right and errors of fixes that do not depend on the motion, it is the same in all
-windows. A receiver that filters, dead-reckons or holds an odometer of its own, and fixes with
-late stamps, depend on the motion over seconds and not over minutes: the short windows differ.
+If fix errors do not depend on the motion, it is the same for all lengths. A receiver that filters,
+dead-reckons or uses an odometer, and fixes with late stamps, have errors that depend on the motion
+over seconds but not over minutes: short windows then differ.
 """
 
 import numpy as np
@@ -24,8 +24,8 @@ def window_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats) -> Floats:
     Return length of the windows, s, scale - 1 of the fixes, its sigma, and windows: (w, 4).
 
     t_fix : (k,) times of fixes, s, rising.   fix_n, dead_n : (k, 2 or more) positions by fixes and
-    by dead reckoning, m. The sigma is that of the scatter over parts of the leg (jackknife); with
-    errors that last longer than such a part it is too small.
+    by dead reckoning, m. The sigma is by the scatter over parts of the leg (jackknife); it is too
+    small if errors last longer than such a part.
     """
     rows = [(length, *found) for length in WINDOWS
             if (found := _scale(t_fix, fix_n[:, :2], dead_n[:, :2], length))]
@@ -35,7 +35,7 @@ def window_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats) -> Floats:
 def _scale(t: Floats, fix: Floats, dead: Floats, length: float) -> tuple[float, float, int] | None:
     """Return scale - 1, its sigma and the number of windows of a length, half a length apart."""
     begin = np.arange(t[0], t[-1] - length, length / 2) if len(t) else np.empty(0)
-    # without the last fix: the end of the last window may be rounded to after it
+    # without the last fix: by rounding, the end of the last window may be after it
     i, j = np.searchsorted(t, begin), np.searchsorted(t[:-1], begin + length)
     near = np.abs(t[j] - t[i] - length) < length / 4     # judgement: else fixes are missing
     i, j = i[near], j[near]
@@ -49,7 +49,7 @@ def _scale(t: Floats, fix: Floats, dead: Floats, length: float) -> tuple[float, 
     along = np.clip(along, -most, most)
     block = np.minimum((PARTS * (t[i] - t[0]) / (t[-1] - t[0])).astype(int), PARTS - 1)
     top, bottom = (np.bincount(block, x, PARTS) for x in (size * along, size**2))
-    # without any one block, some weight is left to compare
+    # no block may have more than half of the weight
     if (bottom > 0).sum() < PARTS / 2 or bottom.max() > bottom.sum() / 2:
         return None
     left = (top.sum() - top) / (bottom.sum() - bottom)

@@ -13,11 +13,11 @@ class Input(NamedTuple):
     """
     One input; its slot is its name in code, bags, journals and options.
 
-    label : for people.   kind : name of the class of its samples (``data/samples.py``).   needed :
-    columns without which a row is unusable.   clock : group of settings that holds its
-    ``time_offset``, or empty.   topic : the node subscribes to it; empty for further wheels of one
-    message.   queue : messages that the subscription keeps.   possible : least and largest value
-    of the needed column, where a sensor of one number has any.
+    label : in texts.   kind : name of the class of its samples (``data/samples.py``).   needed :
+    columns that a usable row must have.   clock : group of settings with its ``time_offset``, or
+    empty.   topic : of the node's subscription; empty for further wheels of one message.
+    queue : messages that the subscription keeps.   possible : limits of the value of a sensor of
+    one number, None: no limits.
     """
 
     label: str
@@ -29,8 +29,8 @@ class Input(NamedTuple):
     possible: tuple[float, float] | None = None
 
 
-# queues, physical: five seconds of the highest expected rate, 4 kHz, 1 kHz and 100 Hz: messages
-# that overrun a queue are lost
+# queues, physical: five seconds of the highest expected rate, 4 kHz, 1 kHz and 100 Hz; messages
+# beyond are lost
 INPUTS = {
     'imu': Input('IMU', 'ImuSamples', ('w_i', 'f_i'), 'imu', 'imu/data', 20_000),
     'odometer': Input('odometer', 'OdometerSamples', ('value',), 'odometer', 'odometer', 5000),
@@ -46,7 +46,7 @@ INPUTS = {
     'pressure': Input('air pressure', 'ScalarSamples', ('value',), '', 'pressure', 1000,
                       (1e4, 2e5)),
 }
-# the sensors besides IMU, odometer and fixes
+# sensors other than IMU, odometer and fixes
 OUTSIDE = tuple(slot for slot in INPUTS if slot not in ('imu', *WHEELS, 'fix'))
 TOPICS = {slot: one.topic for slot, one in INPUTS.items() if one.topic}
 

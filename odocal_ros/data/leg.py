@@ -44,10 +44,10 @@ class Leg:
     """
     The samples between two marks, with the pre-roll before the first.
 
-    Each topic holds the rows from ``start_ns`` minus the pre-roll to the first row after
-    ``stop_ns``, in order of arrival, as sent. ``odometer`` is the only wheel or the first of
-    several; ``form_right`` is what the values of ``odometer_right`` mean where its messages are
-    not those of the first.
+    Each topic has the rows from ``start_ns`` minus the pre-roll to the first row after
+    ``stop_ns``, unchanged, in order of arrival. ``odometer`` is the only wheel or the first of
+    several; ``form_right`` is the meaning of the values of ``odometer_right``, None if it is that
+    of the first.
     """
 
     start_ns: int
@@ -69,11 +69,11 @@ class Leg:
 
     @property
     def wheel_slots(self) -> tuple[str, ...]:
-        """Return the slots of the wheels that sent messages, the first in any case."""
+        """Return the slots of the wheels with messages, and in any case the first."""
         return (WHEELS[0], *(slot for slot in WHEELS[1:] if len(self.rows(slot).stamp_ns)))
 
     def rows(self, slot: str) -> Any:
-        """Return the rows of a slot, as sent."""
+        """Return the unchanged rows of a slot."""
         rows = self.outside.get(slot) if slot in OUTSIDE else getattr(self, slot)
         return EMPTY[slot]() if rows is None else rows
 
@@ -132,7 +132,7 @@ class LegRecorder:
         return copy
 
     def forget_before(self, stamp_ns: int, slots: Iterable[str] = SLOTS) -> None:
-        """Drop blocks that lie whole before a stamp, to bound memory."""
+        """Drop blocks that are completely before a stamp, to limit memory."""
         for slot in slots:
             self._rows[slot].forget(lambda block: _key(block) < stamp_ns)
 
@@ -145,9 +145,9 @@ class LegRecorder:
         Return the leg between two marks, with ``preroll`` seconds before the first.
 
         Rows up to the first one after ``stop_ns`` are kept in each topic, so that values can be
-        interpolated at the mark; later ones are not, however late the leg is closed.
+        interpolated at the mark; later ones are not, independent of the time of closing.
 
-        Raises BadData: the marks are days apart: what is computed second by second would not end.
+        Raises BadData: the marks are more than MOST_DAYS apart, too long for a computation.
         """
         days = (stop_ns - start_ns) / 86400e9
         if days > MOST_DAYS:
@@ -162,7 +162,7 @@ class LegRecorder:
 
 def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
     """Return the part of a leg between two stamps; ``first_ns``: no IMU row before it."""
-    lead_ns = 10**9    # of odometer and fixes, to interpolate at the first row of the IMU
+    lead_ns = 10**9    # of odometer and fixes, for interpolation at the first row of the IMU
     rows = {slot: _cut(leg.rows(slot), (first_ns or 0) - lead_ns, stop_ns) for slot in SLOTS}
     imu = rows['imu']
     rows['imu'] = take(imu, (imu.stamp_ns >= (first_ns or 0)) & (imu.stamp_ns <= stop_ns))
@@ -170,7 +170,7 @@ def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
 
 
 def _key(samples: Samples) -> Ints:
-    """Return the stamp by which a row is placed: rows without one go by their arrival."""
+    """Return the time of each row: its stamp, or its arrival if it has none."""
     return _placed(samples.stamp_ns, samples.received_ns)
 
 
@@ -187,5 +187,5 @@ def _cut(samples: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
     if keep.all():
         return samples
     spans = runs(keep)
-    # in order, as rows are wont to come, they are a view and no copy
+    # rows in order of time, the usual case, are a view and no copy
     return take(samples, slice(*spans[0]) if len(spans) == 1 else keep)

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Arrays in files without a name: hours of samples, and work space of that length.
+Arrays in unnamed files: hours of samples, and work space of that length.
 
-For readers they are normal arrays. ``let_go`` gives back the memory of all of them
-once they are large: released data is read again on access. If the disk takes no more, arrays are
-in memory.
+For readers they are normal arrays. ``let_go`` releases their memory if they are large: released
+data is read again on access. If the disk is full, arrays are in memory.
 """
 
 from collections.abc import Iterator
@@ -23,8 +22,8 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-ROOM_BYTES = 2**24      # judgement: bytes of an array to work in from which it lies in a file
-# judgement: bytes of all arrays in files up to which they are held, for pages read again cost time
+ROOM_BYTES = 2**24      # judgement: least bytes of a work array in a file
+# judgement: bytes of all arrays in files that stay in memory, since reading pages again takes time
 HELD_BYTES = 2**27
 LET_GO_AFTER = 512      # judgement: rows between releases of mapped memory
 _maps: WeakSet[mmap.mmap] = WeakSet()
@@ -37,7 +36,7 @@ def nameless() -> BinaryIO:
 
 
 def mapped(file: BinaryIO, size: int, access: int = mmap.ACCESS_WRITE) -> mmap.mmap:
-    """Return a file's bytes as memory that ``let_go`` gives back; a size of 0: all of them."""
+    """Return a file's bytes as memory that ``let_go`` can release; size 0: all bytes."""
     pages = mmap.mmap(file.fileno(), size, access=access)
     with _lock:
         _maps.add(pages)
@@ -45,11 +44,11 @@ def mapped(file: BinaryIO, size: int, access: int = mmap.ACCESS_WRITE) -> mmap.m
 
 
 def room(*shape: int, dtype: DTypeLike = float) -> NDArray[Any]:
-    """Return zeros to work in: many of them in a file, as far as the disk has room."""
+    """Return a work array of zeros; a large one is in a file if the disk has space."""
     size = np.dtype(dtype).itemsize * math.prod(shape)
     if size >= ROOM_BYTES:
         with contextlib.suppress(OSError), nameless() as file:
-            os.posix_fallocate(file.fileno(), 0, size)      # a page that finds no place kills
+            os.posix_fallocate(file.fileno(), 0, size)      # without space, a write would kill
             return np.frombuffer(mapped(file, size), dtype).reshape(shape)
     return np.zeros(shape, dtype)
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Long columns processed in pieces, with the same bits as at once.
+Long columns processed in pieces, bitwise equal to processing at once.
 
-The IMU of a long leg is most of the memory that a computation takes, and each column as long as it
-is as much again.
+The IMU rows of a long leg are most of the memory of a computation, and each further column of this
+length needs as much.
 """
 
 from collections.abc import Callable, Iterator
@@ -53,7 +53,7 @@ def across(ufunc: np.ufunc, x: Array) -> Array:
 
 
 def lengths(x: Floats) -> Floats:
-    """Return ``np.linalg.norm(x, axis=1)``, (n, k) to (n,), likewise."""
+    """Return ``np.linalg.norm(x, axis=1)``, (n, k) to (n,); faster, as ``across``."""
     return np.sqrt(across(np.add, x * x))
 
 
@@ -66,7 +66,7 @@ def median(x: Floats) -> float:
     """
     Return the median of x, (n,), like numpy but four times as fast for many rows.
 
-    Only what lies about the median of some of them is put in order.
+    Only the values near the median of a subset are sorted.
     """
     if len(x) < PIECE_ROWS:
         return float(np.median(x))
@@ -96,14 +96,14 @@ def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Fl
     Return the number of rows in each bin, and the mean of each vector there.
 
     t : (n,) times of the rows, rising.   edges : (m + 1,) of the bins, in the same unit; a bin
-    holds its upper edge.   vectors : (n, k) values of the rows.
+    includes its upper edge.   vectors : (n, k) values of the rows.
 
     Returns (m,) counts, (m, k) means; 0 in an empty bin.
     """
     first = np.searchsorted(t, edges, side='right')
     count = np.diff(first)
     means = [np.empty((len(count), vector.shape[1])) for vector in vectors]
-    bins_at_a_time = 64    # bins worked on at a time
+    bins_at_a_time = 64    # limits the memory
     for bins in (slice(k, k + bins_at_a_time) for k in range(0, len(count), bins_at_a_time)):
         rows = slice(first[bins.start], first[bins.start + len(count[bins])])
         cell = np.repeat(np.arange(len(count[bins])), count[bins])
@@ -116,7 +116,7 @@ def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Fl
 
 
 def pieces(times: Array, t: Array) -> Iterator[tuple[slice, slice]]:
-    """Yield slices of rising times, and of the rows of t that they lie between; all of each."""
+    """Yield slices of rising times and of the rows of t that enclose them; all of each."""
     done = 0
     for rows in chunks(len(t) - 1):
         rows = slice(rows.start, rows.stop + 1)

@@ -4,10 +4,10 @@
 """
 Samples of the sensors as read-only arrays, of one row or a million.
 
-Rows stand in order of arrival and hold what was sent, NaN and stale stamps included;
-``screening/screen.py`` decides what is usable. ``stamp_ns`` is the header stamp (arrival where a
-message has none), ``received_ns`` the arrival (bag time, or the middleware's source stamp): it
-is used to compare clocks and never enters a result.
+Rows are in order of arrival and unchanged, including NaN and stale stamps; ``screening/screen.py``
+selects the usable ones. ``stamp_ns`` is the header stamp (arrival if a message has none),
+``received_ns`` the arrival (bag time, or the middleware's source stamp): it is used to compare
+clocks and never in a result.
 """
 
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints, Values
 from odocal_ros.errors import BadData
 
 Stamps = Ints
-FRAME_BYTES = 48     # judgement: of a frame_id that is shown
+FRAME_BYTES = 48     # judgement: of a frame_id in texts
 # format: status of a position in a local frame; that of a NavSatFix is an int8
 LOCAL = 1000
 
@@ -64,23 +64,23 @@ class Samples:
 class ImuSamples(Samples):
     """IMU rows, in the sensor's own frame i (before the nominal mounting rotation)."""
 
-    w_i: Floats = column(3)        # rad/s, turn rate against inertial space
+    w_i: Floats = column(3)        # rad/s, turn rate relative to inertial space
     f_i: Floats = column(3)        # m/s^2, specific force
-    q_ni: Floats = column(4)       # x y z w, orientation as sent: takes i to ENU
+    q_ni: Floats = column(4)       # x y z w, published orientation, i to ENU
     yaw_variance: Floats = column()    # rad^2; 0 unknown, NaN no orientation
 
 
 @dataclass(frozen=True, eq=False)
 class OtherImuSamples(Samples):
-    """Messages on the IMU topic that are of another frame_id than the IMU in use."""
+    """Messages on the IMU topic with another frame_id than that of the IMU in use."""
 
-    frame: NDArray[np.bytes_] = column(dtype=f'S{FRAME_BYTES}')    # as sent, the first bytes
+    frame: NDArray[np.bytes_] = column(dtype=f'S{FRAME_BYTES}')    # its first bytes
     used: NDArray[np.bytes_] = column(dtype=f'S{FRAME_BYTES}')     # of the IMU in use
 
 
 @dataclass(frozen=True, eq=False)
 class OdometerSamples(Samples):
-    """Odometer rows as sent; ``OdometerForm`` defines the meaning of the values."""
+    """Raw odometer rows; ``OdometerForm`` defines the meaning of the values."""
 
     value: Values = column()       # int64 for counters (uint64 as its int64 bits), else float64
 
@@ -111,10 +111,10 @@ class OdometerForm:
 @dataclass(frozen=True, eq=False)
 class FixSamples(Samples):
     """
-    GNSS fixes, or positions in a local frame: those have the status LOCAL.
+    GNSS fixes, or positions in a local frame with the status LOCAL.
 
-    A local frame is placed on the Earth where no vehicle is (``nav/local_frame.py``): x, y
-    and z are then east, north and up, but its y axis does not point to north.
+    A local frame has a fictitious place on the Earth (``nav/local_frame.py``): x, y and z are
+    treated as east, north and up, but its y axis does not point to north.
     """
 
     latitude: Floats = column()                     # rad
@@ -145,7 +145,7 @@ class ScalarSamples(Samples):
 class HeadingSamples(Samples):
     """External heading of the IMU's x axis, as ENU yaw."""
 
-    q_ni: Floats = column(4)           # x y z w, as sent
+    q_ni: Floats = column(4)           # x y z w, as published
     yaw_variance: Floats = column()    # rad^2; 0 unknown, NaN no orientation
 
 
@@ -154,7 +154,7 @@ Index = slice | Ints | Bools      # of rows
 
 
 def take(samples: SomeSamples, index: Index) -> SomeSamples:
-    """Return the rows that a numpy index picks, as the same type."""
+    """Return the rows selected by a numpy index, as the same type."""
     return of_columns(type(samples), *(column[index] for column in columns_of(samples)))
 
 
@@ -173,9 +173,9 @@ def columns_of(samples: Samples) -> list[NDArray[Any]]:
 
 
 def of_columns(kind: type[SomeSamples], *columns: NDArray[Any]) -> SomeSamples:
-    """Return samples of arrays that were checked before and that nobody else holds: no copy."""
+    """Return samples from checked arrays without other references, without a copy."""
     samples = object.__new__(kind)
-    for name, array in zip(kind.__dataclass_fields__, columns, strict=True):
+    for array in columns:
         array.setflags(write=False)
-        object.__setattr__(samples, name, array)
+    vars(samples).update(zip(kind.__dataclass_fields__, columns, strict=True))
     return samples

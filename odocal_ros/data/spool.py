@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Rows of a topic: up to MEMORY_BYTES in memory, hours of them in a file without a name.
+Rows of a topic: up to MEMORY_BYTES in memory, more of them in an unnamed file.
 
-Two hours of an IMU at 1 kHz are 0.8 GB. What lies in the file is mapped: a reader sees
-arrays like any others, and ``mapped.let_go`` gives their memory back. Where the disk takes no
-more, rows stay in memory.
+Two hours of an IMU at 1 kHz are 0.8 GB. The file is mapped: for readers its rows are normal
+arrays, and ``mapped.let_go`` releases their memory. If the disk is full, rows stay in memory.
 """
 
 from collections.abc import Callable
@@ -21,11 +20,11 @@ from odocal_ros.data.arrays import Bools
 from odocal_ros.data.mapped import mapped, nameless
 from odocal_ros.data.samples import columns_of, join, of_columns, Samples, take
 
-MEMORY_BYTES = 2**24    # judgement: bytes of a topic's rows from which they go to the file
-TAIL_BYTES = 2**23      # judgement: bytes after those of the file, the same
-MERGED_BYTES = 2**20    # judgement: bytes, so much of small blocks is made one
+MEMORY_BYTES = 2**24    # judgement: bytes of a topic's rows in memory before a file is used
+TAIL_BYTES = 2**23      # judgement: bytes in memory before more is written to the file
+MERGED_BYTES = 2**20    # judgement: bytes of small blocks that are merged to one
 LARGE_BYTES = 2**17     # judgement: bytes of a block that is not small
-MOVED_BYTES = 2**20     # judgement: bytes moved at a time
+MOVED_BYTES = 2**20     # judgement: bytes written at a time
 
 
 class Rows:
@@ -37,7 +36,7 @@ class Rows:
         self._fresh: list[Samples] = []            # small ones, after the blocks
         self._size = self._fresh_size = 0     # bytes of both, of the small ones
         self._file: _Columns | None = None
-        self._stop = 0                    # rows of the file that are ours
+        self._stop = 0                    # number of this object's rows in the file
         self._writes = True
 
     def feed(self, block: Samples) -> None:
@@ -51,7 +50,7 @@ class Rows:
                 self._to_file()
 
     def all(self) -> Samples:
-        """Return all rows as one block; of a file, as a view of it."""
+        """Return all rows as one block; rows in a file as a view of it."""
         self._merge()
         if self._file is not None:
             self._to_file()
@@ -64,20 +63,20 @@ class Rows:
         return parts[0]
 
     def snapshot(self) -> 'Rows':
-        """Return the rows so far; what comes later or is forgotten does not change it."""
+        """Return a copy of the rows so far; ``feed`` and ``forget`` here do not change it."""
         if self._file is not None:
             self._merge()
             self._to_file()
         copy = Rows(self._nothing)
-        copy._writes = False              # the file is still written to by this one
+        copy._writes = False              # only this object writes to the file
         copy._hold([*self._blocks, *self._fresh])
         copy._file, copy._stop = self._file, self._stop
         return copy
 
     def forget(self, before: Callable[[Samples], Bools]) -> None:
-        """Drop blocks of which ``before``, (n,) bool of a block, is true throughout."""
+        """Drop leading blocks for which ``before``, (n,) bool of a block, is true in all rows."""
         if self._file is not None and before(self._file.row(self._stop // 2)).all():
-            # most of it may go: what is left is the pre-roll of the next leg
+            # most of it can be dropped: the rest is the pre-roll of the next leg
             rows = self.all()
             late = np.flatnonzero(~before(rows))
             kept = slice(late[0], None) if len(late) else slice(0, 0)
@@ -103,7 +102,7 @@ class Rows:
             self._fresh, self._fresh_size = [], 0
 
     def _to_file(self) -> None:
-        """Move the blocks to the file, as far as the disk takes them."""
+        """Move the blocks to the file, as far as the disk has space."""
         try:
             while self._blocks and self._writes:
                 if self._file is None:
@@ -116,7 +115,7 @@ class Rows:
 
 
 class _Columns:
-    """Samples of one kind in files that have no name, one for each column."""
+    """Samples of one kind in unnamed files, one for each column."""
 
     def __init__(self, like: Samples) -> None:
         self._kind = type(like)
@@ -133,7 +132,7 @@ class _Columns:
         return at + len(block.stamp_ns)
 
     def rows(self, stop: int) -> Samples:
-        """Return the rows before one, mapped."""
+        """Return the rows before row ``stop``, mapped."""
         return of_columns(self._kind, *(
             np.frombuffer(mapped(file, 0, mmap.ACCESS_READ), dtype,
                           stop * math.prod(shape)).reshape(stop, *shape)

@@ -35,8 +35,8 @@ class Normal:
     Normal equations H x = g of N blocks of n unknowns and a border of m, initially zero.
 
     diagonal : (N, n, n).   beside : (N - 1, n, n), row k, column k + 1.   border : (N, n, m).
-    corner : (m, m).   g, g_border : (N, n), (m,).   absent : weights of the priors of further
-    constants, on which nothing depends: they are in the results only.
+    corner : (m, m).   g, g_border : (N, n), (m,).   absent : prior weights of constants that no
+    row depends on; they appear only in the results.
     """
 
     def __init__(self, N: int, n: int, m: int) -> None:

@@ -55,7 +55,7 @@ class Convergence:
     fitted_below: float = 1.0
     measured_above: float = 4.0
     moves: float = 0.08         # a constant may still
-    others: float = 0.3         # weight of what is not scale or mounting, in that
+    others: float = 0.3         # weight of the other constants in ``moves``
     nearly: float = 0.1         # scale and mounting, after the last pass
     creeping: float = 0.5       # the same: values that are worth having, with wider sigmas
     sigmas: float = 0.02        # relative change of the sigmas of scale and mounting

@@ -5,8 +5,8 @@
 The fit of a leg that grows, in windows of ten minutes.
 
 A finished window contributes its marginal information on the constants, (S33). Only the window in
-progress is fitted, from the result of the fit before: a look at a leg of an hour costs no more
-than one at ten minutes.
+progress is fitted, starting from the previous fit: an update after an hour costs no more than one
+after ten minutes.
 """
 
 from collections.abc import Callable
@@ -48,8 +48,8 @@ class Running:
     """
     The running estimate.
 
-    method : as the leg would come out, ended here.   sigmas : (3,) of ln scale, yaw, pitch, rad,
-    also of what is not determined; inf: fixed.   distance : m.   agility : m^2/s^3, integral of
+    method : result if the leg ended here.   sigmas : (3,) of ln scale, yaw, pitch, rad, also of
+    undetermined ones; inf: fixed.   distance : m.   agility : m^2/s^3, integral of
     the squared horizontal acceleration.   speed : m/s, median while driving.
     """
 
@@ -167,7 +167,7 @@ def _joined(past: Running, now: Running, config: Config) -> Running:
 
 
 def _sigmas(method: MethodResult) -> Floats:
-    """Return the sigmas of ln scale, yaw and pitch, of what is not determined too: (3,)."""
+    """Return the sigmas of ln scale, yaw and pitch, also of undetermined ones: (3,)."""
     border = _border(method)
     legs = LinkedLegs([border], CONSTANTS[LN_K], np.empty(0))
     at = legs.place(0)[:WANTED]

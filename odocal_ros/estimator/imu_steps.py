@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-IMU samples of a leg as steps of a tenth of a second: what they add up to, computed once.
+IMU samples of a leg, summed once to steps of a tenth of a second.
 
 A step holds the rotation vector and the single and double integral of the specific force in the
 axes at its begin, coning and sculling at the sample rate included (two-speed strapdown, Savage
@@ -99,7 +99,7 @@ class ImuSteps(Steps):
         return out
 
     def over_intervals(self, x: Floats) -> Floats:
-        """Return the sums over the intervals between keyframes of what each step has: (K, ...)."""
+        """Return the sums of a quantity of the steps over the keyframe intervals: (K, ...)."""
         out: Floats = np.add.reduceat(x, self.key[:-1])
         return out
 

@@ -40,7 +40,7 @@ class LevelSides:
 @dataclass(frozen=True, eq=False)
 class LevelInformation:
     """
-    What the data know of the levels, and what the levels change.
+    Information of the data on the levels, and the effect of the levels on the constants.
 
     names : of the L levels.   average : (L, L) information on their logarithms.   moves : (m, L)
     derivatives of the constants by these logarithms.
@@ -54,7 +54,7 @@ class LevelInformation:
         """
         Return the effects of independent unit errors of the levels on the constants: (m, L).
 
-        That of a column is what the level errs by beyond the errors of those before it.
+        A column is the error of its level that is independent of the levels before it.
 
         precision : information of the prior on each logarithm, by the name of the level.
         """

@@ -184,10 +184,11 @@ class _Chunk:
 
     def cut(self, steps: Ints) -> None:
         """
-        Sum up what the errors in each step do, from the interval's begin to its end and to steps.
+        Sum the effects of errors in each step, from the interval start to its end and to steps.
 
-        An error in a step acts on what follows: a turn on the rest of dv and dp, a force for the
-        rest of the time. What depends on the end is a factor of the sums (``_effects``).
+        An error in a step acts on the rest of the interval: a rotation on the rest of dv and dp, a
+        force for the remaining time. Terms that depend on the end are factors of the sums
+        (``_effects``).
         """
         self.cuts = np.unique(np.concatenate([self.key[:-1], steps]))
         dt, by = self.dt[:, None], self.signals

@@ -58,8 +58,8 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
 
     inputs : of ``screen``.   config : lever arms, nominal scale.   origin, fixes_n : Origin, (k,
     3) where n is fixed and the fixes in it, m; NaN up where a fix has no height.   spans : (s, 2)
-    standstills, s.   rough_scale : metres per unit of travel.   t_stop : end of what is used, s (a
-    held-out rest); the stop mark by default.
+    standstills, s.   rough_scale : metres per unit of travel.   t_stop : end of the used data, s
+    (the rest is held out); the stop mark by default.
     """
     t_stop = inputs.t_stop if t_stop is None else t_stop
     if not inputs.has_accelerometer:         # the ground is taken as level, so heights have no say

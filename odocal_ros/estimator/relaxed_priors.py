@@ -39,9 +39,9 @@ def relaxed(first: Priors, now: Priors, state: State, solved: Solved,
 
 def _wider(first: Floats, now: Floats, off: Floats, variance: Floats) -> Floats:
     """
-    Return sigmas at which ``off`` is no more than RELAXED_BEYOND, none below the first.
+    Return sigmas for which ``off`` is at most RELAXED_BEYOND sigmas, none below the first.
 
-    30 times the first is the most: a prior so far off is a setting that is wrong, and said.
+    At most 30 times the first: a prior farther off is a wrong setting, which is reported.
     """
     held = np.isfinite(first)
     first_, now_ = np.where(held, first, 1.0), np.where(held, now, 1.0)

@@ -44,14 +44,14 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     Combine the smoother results of several legs of one vehicle.
 
     results : those with a border, at least one.   times_ns : when each leg was driven.   config :
-    limits, ``verdict.scale_drift_per_day``.   numbers : what the legs are called; 1, 2, ...; 0:
-    legs of an earlier result, carried on.
+    limits, ``verdict.scale_drift_per_day``.   numbers : of the legs in messages, 1, 2, ... by
+    default; 0: legs of an earlier result.
 
     Returns
     -------
     MethodResult: the result of one fit of all legs, the scale as in the last leg. A value that no
-    leg determines alone may be determined by all. One in which the legs disagree has their scatter
-    in its sigma (LEGS_DISAGREE). With ``leg.automatic`` a scale may change permanently between two
+    leg determines alone may be determined by all. If the legs disagree, the sigma includes their
+    scatter (LEGS_DISAGREE). With ``leg.automatic`` a scale may change permanently between two
     legs (SCALE_CHANGED).
 
     """
@@ -97,8 +97,8 @@ def _of_one_vehicle(borders: Sequence[Border]) -> list[Border]:
     """
     Return borders with the same sizes of imperfections.
 
-    The geometric mean of the legs' sizes, each leg weighted as far as it knows the constant: one
-    that knows nothing of it has the usual size.
+    The geometric mean of the legs' sizes, weighted by the information of each leg on the constant:
+    a leg without information has the usual size.
     """
     imperfect = set(CONSTANTS[IMPERFECT])
     logs: dict[str, list[tuple[float, float]]] = {}
@@ -159,7 +159,7 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
 
 
 def _sources(used: Floats, C: Floats) -> tuple[Source, ...]:
-    """Return the budget: priors of the vehicle, shared, and what is the legs' own."""
+    """Return the budget: shared priors of the vehicle, and the effects of each leg."""
     alike = np.abs(C[:WANTED] / np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))).max(axis=0)
     shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
               if alike[i].max() > 1e-9]      # of a correlation: rounding

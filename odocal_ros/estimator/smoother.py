@@ -45,7 +45,7 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
 
     Returns
     -------
-    MethodResult named ``smoother``; what the leg cannot determine is None with its reason.
+    MethodResult named ``smoother``; an undetermined value is None with its reason.
 
     """
     few = too_little_of(leg)
@@ -136,8 +136,8 @@ def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
     Return the covariance of the constants at a given state, covariance only.
 
     leg, config : as for ``smooth``.   truth : values of all unknowns, at the times of
-    ``keyframe_times``.   levels : noise levels.   imperfect : (k,) sigmas of what is imperfect, as
-    IMPERFECT; None: as usual.
+    ``keyframe_times``.   levels : noise levels.   imperfect : (k,) sigmas of the imperfections,
+    ordered as IMPERFECT; None: as usual.
 
     Returns
     -------

@@ -53,7 +53,7 @@ def standing(leg: SmootherLeg, t: Floats) -> Bools:
 
 
 def rest_bias(leg: SmootherLeg, imu: ImuSteps) -> tuple[Floats, float]:
-    """Return the mean turn rate of all standstills, (3,), and how long they last, s."""
+    """Return the mean turn rate at standstills, (3,), and their total duration, s."""
     inside = standing(leg, imu.t)
     still = inside[:-1] & inside[1:]
     length = float(np.diff(imu.t)[still].sum())
@@ -191,7 +191,7 @@ def _rotation(moved: Complexes, gone: Complexes, sigma: float) -> float:
     Return the mean angle from steps of the track to those of the fixes, rad.
 
     moved, gone : (n,) steps, any unit and m.   sigma : m, of a fix. The weight of a step is its
-    length by the odometer: a jump of the fixes weighs no more than others.
+    length by the odometer, so that a jump of the fixes has no larger weight.
     """
     return float(np.angle((moved.conj() * gone / np.maximum(np.abs(gone), sigma)).sum()))
 

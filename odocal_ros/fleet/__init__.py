@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Many vehicles: each bag a task of replay's pipeline on Dask, then the vehicles, a page."""
+"""Many vehicles: each bag is a Dask task with the pipeline of replay; then vehicles and a page."""
 
 
 from odocal_ros.fleet.notebook import calibrate_bags

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One bag to its row: the very pipeline of replay, in bounded time and memory, on any worker."""
+"""The row of a bag: the pipeline of replay with limits of time and memory, on any worker."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -32,11 +32,11 @@ NO_MEMORY = ("can't start new thread", 'failed to map segment')
 @dataclass(frozen=True)
 class BagJob:
     """
-    What a worker needs for a bag.
+    The job of a worker for one bag.
 
-    topics, config, legs : asked for, as ``library.calibrate_bag`` takes them.   settings : the
-    name of all that touches a leg.
-    seconds, memory : that it may take, bytes; 0: any.
+    topics, config, legs : arguments of ``library.calibrate_bag``.   settings : hash of all that
+    affects a leg.
+    seconds, memory : limits, s and bytes; 0: none.
     """
 
     bag: FleetBag
@@ -50,7 +50,7 @@ class BagJob:
 
     @property
     def place(self) -> str:
-        """Return the key of the row where its content is not known: of a bag that failed."""
+        """Return the key of the row of a failed bag, whose content is unknown."""
         return key_of('failed', self.bag.bag, self.settings)
 
     def failed(self, reason: str, **more: Any) -> Row:
@@ -68,11 +68,11 @@ class Done:
     status: str
     reason: str
     seconds: float
-    computed: bool      # now, not before
+    computed: bool      # in this run
 
 
 def calibrate_bag(job: BagJob) -> Done:
-    """Have the row of a bag in the data set, computed if it is not there."""
+    """Ensure that the data set has the row of a bag; compute it if it is missing."""
     store, began = RowStore(job.folder), time.monotonic()
     seen = ''
     _load_libraries()
@@ -88,7 +88,7 @@ def calibrate_bag(job: BagJob) -> Done:
             return Done(row.key, row.status, row.reason, row.seconds, computed)
         except OdocalError as error:
             why = said_by(error)
-        except Exception as error:     # noqa: BLE001 one bag stops nobody
+        except Exception as error:     # noqa: BLE001 one bag must not stop others
             why = f'internal error ({type(error).__name__}: {said_by(error)}); please report it'
             if isinstance(error, MemoryError) or any(x in str(error) for x in NO_MEMORY):
                 why = f'exceeds the memory limit --task-memory ({job.memory / 2**20:g} MiB)'
@@ -103,28 +103,28 @@ def _load_libraries() -> None:
     """
     Load the libraries of a calibration before its memory is limited.
 
-    OpenBLAS maps a buffer when it is loaded or first used, and tries for ever if that is refused.
+    OpenBLAS maps a buffer when it is loaded or first used, and retries endlessly if it is refused.
     """
     for name in ('odocal_ros.estimator', 'odocal_ros.library.calibrate_bag'):
         import_module(name)
     from scipy.linalg import cho_factor
-    matrix = np.eye(128)        # larger than what OpenBLAS multiplies without a buffer
+    matrix = np.eye(128)        # large enough that OpenBLAS needs a buffer
     cho_factor(matrix @ matrix)
 
 
 def _known(store: RowStore, job: BagJob, seen: str) -> Row | None:
-    """Return the row that is there of a bag unchanged."""
+    """Return the existing row of an unchanged bag, None without one."""
     if key := store.known(seen):
         return store.get(key)
     failed = store.get(job.place)
-    # one that ended its worker was not looked at: its place is all that is known
+    # a bag that ended its worker may have no hash: only its place is known
     if failed is not None and failed.seen in ('', seen):
         return failed
     return None
 
 
 def _row(job: BagJob, store: RowStore, seen: str, began: float) -> tuple[Row, bool]:
-    """Return the row of a bag, and whether it was computed: a copy of a known one is not."""
+    """Return the row of a bag, and whether it was computed, not copied from a known one."""
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.library.calibrate_bag import calibrate_bag as calibrated
     worker = _worker()
@@ -158,10 +158,10 @@ def _worker() -> Any:
 @contextmanager
 def _bounded(job: BagJob, give_up: Callable[[str], None]) -> Iterator[None]:
     """
-    End the worker where a bag takes too long, its row written first; have it refused memory.
+    Limit the memory, and end the worker after the time limit, once the bag's row is written.
 
-    Nothing else ends code that hangs; the worker's nanny starts another one, and Dask gives that
-    the bag again, whose row is then there. Without a nanny there are no bounds.
+    Nothing else ends hanging code. The worker's nanny starts another worker, which gets the bag
+    again from Dask; its row then exists. Without a nanny there are no limits.
     """
     worker = _worker()
     if worker is None or worker.nanny is None:
@@ -194,7 +194,7 @@ def _bounded(job: BagJob, give_up: Callable[[str], None]) -> Iterator[None]:
 
 
 def _data_bytes() -> int:
-    """Return the memory that this process has of its own."""
+    """Return the private data memory of this process, bytes."""
     for line in Path('/proc/self/status').read_text().splitlines():
         if line.startswith('VmData:'):
             return int(line.split()[1]) * 1024

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which bags of which vehicles: a manifest, folders, globs, or URLs that fsspec knows."""
+"""Bags of vehicles: from a manifest, folders, globs, or URLs that fsspec supports."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,12 +19,12 @@ from odocal_ros.outside.names import said_by
 
 COLUMNS = ('vehicle', 'bag', 'config', 'legs', 'model', 'odometer_km')
 ENDINGS = ('*.mcap', '*.db3', '*.bag')
-META = 'metadata.yaml'       # what makes a folder a rosbag2
+META = 'metadata.yaml'       # marks a folder as a rosbag2
 
 
 @dataclass(frozen=True)
 class FleetBag:
-    """A bag of a vehicle; ``config`` and ``legs`` where its manifest has its own."""
+    """A bag of a vehicle; ``config`` and ``legs`` if its manifest names them."""
 
     vehicle: str
     bag: str
@@ -39,10 +39,10 @@ def find_bags(names: list[str], vehicle_from: str | None) -> list[FleetBag]:
     Return the bags of a manifest, or in folders, globs and URLs.
 
     vehicle_from : pattern (re) searched in a bag's path: its group ``vehicle``, else its first
-    one, names the vehicle; groups ``model`` and ``odometer_km`` likewise. None: the folder that
-    the bag lies in.
+    one, names the vehicle; groups ``model`` and ``odometer_km`` likewise. None: the bag's folder
+    names it.
 
-    Raises BadUsage: a manifest cannot be read, nothing is found, or the pattern does not fit a
+    Raises BadUsage: a manifest cannot be read, nothing is found, or the pattern does not match a
     path.
     """
     if len(names) == 1 and names[0].endswith(('.csv', '.parquet')):
@@ -89,7 +89,7 @@ def _number(value: Any, where: str) -> float | None:
 
 
 def _of_manifest(name: str) -> list[FleetBag]:
-    """Return the rows of a manifest; its paths are against its folder."""
+    """Return the rows of a manifest; its paths are relative to its folder."""
     import pyarrow as pa
     from pyarrow import csv, parquet
     fs, path = file_system(name)
@@ -139,7 +139,7 @@ def file_system(url: str) -> tuple[Any, str]:
 
 
 def _bags_in(name: str) -> list[str]:
-    """Return the bags at a path: itself, what a glob fits, or all in a folder."""
+    """Return the bags at a path: itself, the matches of a glob, or all in a folder."""
     fs, path = file_system(name)
     try:
         paths = fs.glob(path) if any(c in path for c in '*?[') else [path]
@@ -170,9 +170,9 @@ def is_local(url: str) -> bool:
 
 def seen_as(url: str, settings: str) -> str:
     """
-    Return a name for a bag by its place, size and date, and by settings.
+    Return a hash of the place, size and date of a bag, and of settings.
 
-    Raises BadBag: it cannot be looked at.
+    Raises BadBag: the bag cannot be accessed.
     """
     try:
         fs, path = file_system(url)
@@ -188,7 +188,7 @@ def seen_as(url: str, settings: str) -> str:
 
 
 def _fits(url: str, fs: Any, path: str, folder: str) -> None:
-    """Raise BadBag where a copy would take more than half of what is free for it."""
+    """Raise BadBag if a copy would need more than half of the free disk space."""
     files = fs.find(path, detail=True) if fs.isdir(path) else {path: fs.info(path)}
     size = sum(int(about.get('size') or 0) for about in files.values())
     free = shutil.disk_usage(folder).free
@@ -200,7 +200,7 @@ def _fits(url: str, fs: Any, path: str, folder: str) -> None:
 
 @contextmanager
 def at_hand(url: str, scratch: str | None) -> Iterator[Path]:
-    """Give a bag as a path of this machine: a copy in ``scratch`` that is removed, if need be."""
+    """Yield a local path of a bag; of a remote one, that of a temporary copy in ``scratch``."""
     fs, path = file_system(url)
     if is_local(url):
         yield Path(path)

@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Calibrate a fleet; return 0 if all is well (of --accept: all pass), else 1."""
+    """Calibrate a fleet; return 0 without failures (with --accept: all pass), else 1."""
     from odocal_ros.fleet.engine import check_installed
     check_installed()
     from odocal_ros.fleet.bags import find_bags

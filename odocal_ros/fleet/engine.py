@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Dask: local processes, or a cluster that is there; tasks given, results as they come."""
+"""Dask: local processes or an existing cluster; submits tasks and yields their results."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,18 +13,18 @@ from typing import Any
 from odocal_ros.errors import BadUsage, OdocalError
 
 NEEDS = ('cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
-MEMORY = 2 * 2**30       # judgement: bytes for a task, unless said
-FEWEST = 50              # judgement: of them, least: workers may be starting
+MEMORY = 2 * 2**30       # judgement: bytes for a task, by default
+FEWEST = 50              # judgement: least tasks submitted: workers may be starting
 LOST = ('the connection to the Dask scheduler is lost; start it again and repeat the command: '
         'finished bags are kept')
 
 
 class EngineLost(OdocalError):
-    """The scheduler went away while it was needed."""
+    """The connection to the scheduler was lost during a run."""
 
 
 def check_installed() -> None:
-    """Raise BadUsage with the line that installs what is missing."""
+    """Raise BadUsage with the command that installs the missing packages."""
     missing = [name for name in NEEDS if find_spec(name) is None]
     if missing:
         raise BadUsage(f'odocal fleet needs {", ".join(missing)}: pip install '
@@ -35,15 +35,15 @@ def check_installed() -> None:
 def engine(scheduler: str | None, workers: int | None, memory: int,
            tries: int) -> Iterator[Any]:
     """
-    Give a Dask client: of the scheduler at an address, or of local processes for as long.
+    Yield a Dask client: of the scheduler at an address, or of temporary local processes.
 
     workers : None: as many as cores or memory allow.   memory : bytes of a task.
-    tries : of a bag that ends its worker; of a cluster that is there, its own setting holds.
+    tries : of a bag that ends its worker; an existing cluster uses its own setting.
     """
     import dask
     from distributed import Client, LocalCluster, Security
     if scheduler:
-        for name in ('distributed', 'tornado.application'):      # we say it in a sentence
+        for name in ('distributed', 'tornado.application'):      # reported in a sentence
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             client = Client(scheduler, timeout='5s')
@@ -54,19 +54,19 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
             yield client
         return
     ours = {'distributed.scheduler.allowed-failures': tries - 1,
-            # beyond two bags a worker, one at a time: what ends it takes no other bag with it
+            # above two bags a worker, one at a time: a bag that ends it affects no other bag
             'distributed.scheduler.worker-saturation': 1.0,
             'distributed.logging.distributed': 'critical',
             'distributed.worker.memory.terminate': False,
-            # a look at the stack each 10 ms costs a core a twentieth
+            # its profiling every 10 ms takes 5 % of a core
             'distributed.worker.profile.enabled': False,
-            # without Dask's MALLOC_TRIM_THRESHOLD_: memory given back at once is a page fault when
-            # it is needed next, which took a quarter of a bag's time
+            # without Dask's MALLOC_TRIM_THRESHOLD_: memory returned at once causes page faults at
+            # its next use, which took a quarter of a bag's time
             'distributed.nanny.pre-spawn-environ': dict.fromkeys(
                 ('OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), 1)}
     with dask.config.set(ours), LocalCluster(
             n_workers=workers or _workers(memory), threads_per_worker=1, processes=True,
-            # who reaches a scheduler's port runs code: only who holds this key, of this run, does
+            # access to a scheduler's port allows to run code: it requires the key of this run
             security=Security.temporary(), host='127.0.0.1',
             dashboard_address='127.0.0.1:0', memory_limit=0,
             silence_logs='CRITICAL') as cluster, Client(cluster) as client:
@@ -91,11 +91,11 @@ def dashboard(client: Any) -> str:
 def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: str,
             keys: Sequence[str]) -> Iterator[tuple[int, Any, BaseException | None]]:
     """
-    Yield (number of the job, result, what went wrong) as tasks end, in any order.
+    Yield (number of the job, result, error) as tasks end, in any order.
 
-    The scheduler is given some tasks for each worker, not all: its memory is bounded.
+    The scheduler gets some tasks for each worker at a time, which limits its memory.
 
-    Raises EngineLost: the scheduler is gone.
+    Raises EngineLost: the connection to the scheduler is lost.
     """
     from distributed import as_completed, CancelledError
     ended, left, fewest = as_completed(), range(len(jobs)), 0
@@ -122,9 +122,9 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
 
 
 def _ahead(client: Any) -> int:
-    """Return of how many tasks the scheduler is given as many again."""
+    """Return the number of tasks to submit at a time, and the rest at which to submit more."""
     try:
-        per_worker = 2    # tasks at the scheduler from which on it is given as many again
+        per_worker = 2    # tasks submitted at a time
         return max(FEWEST, per_worker * int(sum(client.nthreads().values())))
     except OSError:
         raise EngineLost(LOST) from None

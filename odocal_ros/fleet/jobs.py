@@ -23,7 +23,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
     """
     Return a job for each bag.
 
-    args : as replay's options parse them (``add_calibration_arguments``).   config : settings
+    args : parsed options of replay (``add_calibration_arguments``).   config : settings
     that take precedence, in any form accepted by the library.
 
     Raises BadUsage, BadConfig: a setting or a settings file is wrong.
@@ -47,7 +47,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
 
 
 def _from_anywhere(bag: FleetBag) -> FleetBag:
-    """Return the bag with a path that workers understand, whatever folder they run in."""
+    """Return the bag with an absolute path, valid for workers in any folder."""
     if not is_local(bag.bag):
         return bag
     return replace(bag, bag=os.path.abspath(file_system(bag.bag)[1]))
@@ -77,7 +77,7 @@ def computed_rows(client: Any, jobs: Sequence[BagJob],
 
 
 def _known(store: RowStore, job: BagJob) -> str | None:
-    """Return the key of the row of a bag on this machine that is unchanged."""
+    """Return the key of the row of an unchanged bag on this machine, None without one."""
     if not is_local(job.bag.bag):      # the worker contacts servers: they may not answer
         return None
     try:

@@ -21,18 +21,18 @@ def calibrate_bags(bags: Any, config: Any = None, client: Any = None,
     bags : str, sequence of str, or DataFrame
         Bags, folders, globs or URLs, or a manifest; a DataFrame has the manifest's columns.
     config : Config, dict or str, optional
-        Settings: all, by dotted name, or a parameter file.
+        Settings: a Config, by dotted name, or a parameter file.
     client : distributed.Client, optional
-        Whose workers compute; none: local processes, for as long as it takes.
+        Client of the workers; None: temporary local processes.
     output : path, optional
-        Folder whose rows are kept and used again; none: a temporary one.
+        Folder for the rows, which are used again; None: a temporary one.
     **options
-        Of ``replay`` by name: imu_topic, leg, method and the like; vehicle_from.
+        Options of ``replay`` by name: imu_topic, leg, method and the like; vehicle_from.
 
     Returns
     -------
-    DataFrame with the columns of legs.parquet, and ``status`` and ``reason`` of the bag; one that
-    failed is a row without values.
+    DataFrame with the columns of legs.parquet, and ``status`` and ``reason`` of the bag; a
+    failed bag is a row without values.
 
     """
     from odocal_ros.fleet.engine import check_installed, engine, MEMORY

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a fleet's rows come to: tables, page, single reports, a few lines, an exit code."""
+"""Output from a fleet's rows: tables, page, reports of vehicles, summary, exit code."""
 
 from argparse import Namespace
 from collections import Counter
@@ -72,7 +72,7 @@ def _csv(table: Path) -> str:
 
 def _reports(client: Any, vehicles: Sequence[dict[str, Any]], jobs: Sequence[BagJob], output: Path,
              which: str) -> None:
-    """Draw single reports, each a task; note in a vehicle's row where it is, or why not."""
+    """Draw reports of vehicles, each a task; store the cause of a failure, or '', in the row."""
     of = {job.bag.bag: job for job in jobs}
     wanted = [row for row in vehicles if row['now'] and (
         which == 'all' or which == 'flagged' and second_stage.flagged(row))]
@@ -85,7 +85,7 @@ def _reports(client: Any, vehicles: Sequence[dict[str, Any]], jobs: Sequence[Bag
 
 
 def draw_report(job: ReportJob) -> str:
-    """Replay bags into a folder; return why it could not be."""
+    """Replay bags into a folder; return the cause of a failure, or ''."""
     from odocal_ros.library.calibrate_bag import calibrate_bag
     first = job.jobs[0]
     troubles: list[str] = []
@@ -115,7 +115,7 @@ def said(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
 
 
 def exit_code(vehicles: Sequence[dict[str, Any]], strict: bool) -> int:
-    """Return 0 where all vehicles are well: of limits, all that pass."""
+    """Return 1 for failed bags, and for vehicles that are rejected or do not pass; else 0."""
     bad = {'FAIL', 'UNDECIDED', Verdict.REJECTED.value} | (
         {Verdict.CAUTION.value} if strict else set())
     return int(any(row['bags_failed'] or (row['decision'] or row['verdict']) in bad

@@ -21,13 +21,13 @@ from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.summary import DEG
 from odocal_ros.settings.levels import TYRE_SPREAD
 
-MOST_POINTS = 3000       # judgement: of a picture: more are thinned, but for those far off
+MOST_POINTS = 3000       # judgement: of a picture: more are thinned, except outliers
 TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting angle',
           'pitch_mounting_angle': 'Pitch mounting angle'}
 
 
 def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[str, str, str]]:
-    """Return (svg, title, what it shows) of what there is to draw."""
+    """Return (svg, title, description) of each figure that has data."""
     from odocal_ros.output.drawing import look
     drawn = []
     with look():
@@ -42,7 +42,7 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[
 
 
 def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
-    """Draw each vehicle's value against its model's mean, one column a model."""
+    """Draw each vehicle's value against its model's median, one column a model."""
     from odocal_ros.output.drawing import BLUE, evenly, RED, sheet, svg
     models = sorted({row['model'] for row in rows})
     figure, (ax,) = sheet(2.8)
@@ -71,7 +71,7 @@ def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
 
 
 def _within(ax: Any, points: np.ndarray) -> None:
-    """Have the many fill the picture; those far beyond are arrows at its edge."""
+    """Scale the plot to most vehicles; those far beyond are arrows at its edge."""
     from odocal_ros.output.drawing import RED
     wide = 6.0    # medians of the distance that a picture shows
     usual = wide * float(np.median(np.abs(points[:, 1])))
@@ -141,7 +141,7 @@ def _legs(path: Path, known: set[str], named: set[str]) -> list[tuple[str, float
 
 
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
-    """Return the page of a fleet whose rows stand in ``output``, the worst vehicle first."""
+    """Return the page of a fleet with its rows in ``output``, the worst vehicle first."""
     from jinja2 import Environment, StrictUndefined
 
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
@@ -169,7 +169,7 @@ def _facts(vehicles: Sequence[dict[str, Any]]) -> str:
 
 
 def _models(vehicles: Sequence[dict[str, Any]]) -> list[tuple[str, str, list[dict[str, Any]]]]:
-    """Return (model, unit of the scale, vehicles), what was rejected left out."""
+    """Return (model, unit of the scale, vehicles), without rejected vehicles."""
     kinds: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in vehicles:
         if row['legs'] and row['verdict'] != 'rejected':

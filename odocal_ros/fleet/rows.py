@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The data set of a fleet: one small Parquet file a bag, there whole or not at all.
+The data set of a fleet: one small Parquet file per bag, written atomically.
 
-rows/ab/<key>.parquet: the key is of the bag's content, the settings that touch its legs and the
-software's version; of a bag that failed, of its place instead of its content. seen/ab/<key> holds
-the row's key by place, size and date of the bag: known ones are not read again.
+rows/ab/<key>.parquet: the key is a hash of the bag's content, the settings that affect its legs
+and the software version; for a failed bag, of its place instead of its content. seen/ab/<key>
+has the row's key by place, size and date of the bag: known bags are not read again.
 """
 
 from collections.abc import Iterable, Iterator
@@ -38,13 +38,13 @@ from odocal_ros.settings.config import Config, flat, with_settings
 
 DONE, FAILED = 'done', 'failed'
 KEY, MAGIC = re.compile('[0-9a-f]{40}'), b'PAR1'
-# groups of settings that do not touch the legs of a bag
+# groups of settings that do not affect the legs of a bag
 NOT_OF_LEGS = ('accept', 'output', 'journal', 'publish', 'frames', 'diagnostic_updater')
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What is known of one bag; ``legs`` as ``leg_text`` has them, ``settings`` those changed."""
+    """Data of one bag; ``legs`` from ``leg_text``, ``settings`` that are not the default."""
 
     key: str
     bag: str
@@ -59,18 +59,18 @@ class Row:
     settings: str = '{}'
     topics: str = '{}'
     bytes: int = 0
-    seconds: float = 0.0        # that it took
+    seconds: float = 0.0        # computing time
     driven_s: float = 0.0
     start_ns: int = 0
     legs: str = '[]'
 
     def config(self) -> Config:
-        """Return the settings that it was made with."""
+        """Return the settings of the computation."""
         return with_settings(Config(), json.loads(self.settings))
 
 
 def key_of(*parts: Any) -> str:
-    """Return a name for what the parts are of."""
+    """Return a hash of the software version and the parts."""
     return hashlib.sha256(json.dumps([__version__, *parts]).encode()).hexdigest()[:40]
 
 
@@ -82,7 +82,7 @@ def changed_settings(config: Config) -> dict[str, Any]:
 
 
 def settings_key(config: Config, *more: dict[Any, Any] | tuple[Any, ...]) -> str:
-    """Return a name for the settings that touch the legs of a bag, and what else does."""
+    """Return a hash of the settings that affect the legs of a bag, and of ``more``."""
     return key_of([[name, repr(value)] for name, value in flat(config).items()
                    if name.partition('.')[0] not in NOT_OF_LEGS], *more)
 
@@ -102,32 +102,32 @@ class RowStore:
         import pyarrow.parquet as pq
         path = self.path(row.key)
         path.parent.mkdir(parents=True, exist_ok=True)
-        with locked(path.parent), whole_file(path) as file:      # of another fleet's command
+        with locked(path.parent), whole_file(path) as file:      # against another fleet command
             sink = pa.BufferOutputStream()
             pq.write_table(pa.Table.from_pylist([asdict(row)], schema=row_schema()), sink,
                            compression='zstd')
             file.write(sink.getvalue().to_pybytes())
 
     def get(self, key: str) -> Row | None:
-        """Return the row of a key, None where there is none, or a file that is no row."""
+        """Return the row of a key, None without one or if the file is not a row."""
         try:
             return next(rows_of([self.path(key)]), None)
         except (BadData, FileNotFoundError):
             return None
 
     def drop(self, key: str) -> None:
-        """Take a row away."""
+        """Remove a row."""
         self.path(key).unlink(missing_ok=True)
 
     def remember(self, seen: str, key: str) -> None:
-        """Note which row is that of a bag at a place, of a size and date."""
+        """Store the key of a bag's row under the hash of its place, size and date."""
         path = self._seen(seen)
         path.parent.mkdir(parents=True, exist_ok=True)
         with locked(path.parent):
             write_text(path, key)
 
     def known(self, seen: str) -> str | None:
-        """Return the key of the row that is there of a bag, None where there is none."""
+        """Return the key of the existing row of a bag, None without one."""
         try:
             key = self._seen(seen).read_text()
             whole = KEY.fullmatch(key) and _whole(self.path(key))
@@ -147,7 +147,7 @@ def row_schema() -> Any:
 
 
 def _whole(path: Path) -> bool:
-    """Return True if a file starts and ends as Parquet does; a truncated one does not."""
+    """Return True if a file starts and ends like Parquet; a truncated one does not."""
     with open(path, 'rb') as file:
         head = file.read(len(MAGIC))
         file.seek(-len(MAGIC), os.SEEK_END)
@@ -155,13 +155,13 @@ def _whole(path: Path) -> bool:
 
 
 def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
-    """Yield the rows of files in order; raise BadData where a file is no fleet row."""
+    """Yield the rows of files in order; raise BadData if a file is not a fleet row."""
     import pyarrow as pa
     import pyarrow.parquet as pq
     for path in paths:
         with open(path, 'rb') as file:
             try:
-                # its own threads end the process with an abort, if they still run as it ends
+                # its own threads abort the process if they still run at its end
                 table = pq.ParquetFile(file).read(use_threads=False)
                 rows = [Row(**entry) for entry in table.cast(row_schema()).to_pylist()]
             except (pa.ArrowException, OSError, TypeError, ValueError) as error:
@@ -172,7 +172,7 @@ def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
 
 KINDS = {kind.__name__: kind for kind in (
     Border, Estimate, LegResult, MethodResult, PerDistance, Reason, Source, TrackCheck)}
-IS = '~'      # the key that says what an object is
+IS = '~'      # the key of an object's type
 
 
 def leg_text(legs: list[LegResult]) -> str:

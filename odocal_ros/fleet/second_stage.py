@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From rows to vehicles on the engine: groups of vehicles, each a task that writes its part."""
+"""Vehicles from rows on the engine: groups of vehicles, each a task that writes its part."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ WORST = ('FAIL', 'UNDECIDED', 'rejected', 'caution', 'PASS', 'accepted')
 
 @dataclass(frozen=True)
 class GroupJob:
-    """Vehicles whose legs go to one part of a table; ``files``: write their results there."""
+    """Vehicles whose legs go to one part of a table; ``files``: folder for results, or ''."""
 
     vehicles: tuple[VehicleJob, ...]
     part: str
@@ -48,7 +48,7 @@ def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
 
 def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path,
                       files: bool) -> list[dict[str, Any]]:
-    """Return the vehicles' rows, the worst first; write the tables, with ``files`` theirs too."""
+    """Return the vehicles' rows, the worst first; write tables, and results if ``files``."""
     parts = folder / f'.parts.{uuid.uuid4().hex}'
     parts.mkdir(parents=True)
     try:
@@ -102,7 +102,7 @@ def group_of(group: GroupJob) -> list[dict[str, Any]]:
 
 
 def _write_files(vehicle: Vehicle, folder: Path) -> None:
-    """Write what replay writes of a vehicle, but for what is drawn."""
+    """Write the files of replay for a vehicle, except report and track."""
     from odocal_ros.output.files import write_results
     from odocal_ros.settings.config import with_settings
     assert vehicle.calibration is not None
@@ -114,18 +114,18 @@ def _write_files(vehicle: Vehicle, folder: Path) -> None:
 
 
 def file_name(vehicle: str) -> str:
-    """Return a name for a vehicle's folder: no path, none of another's, whatever it is called."""
+    """Return a unique name for a vehicle's folder that is never a path."""
     from urllib.parse import quote
     name = quote(vehicle, safe=' ')
     name = name.replace('.', '%2E', 1) if name.startswith('.') else name or '_'
-    most = 120    # characters: a file system takes 255, and files in the making have longer names
+    most = 120    # characters: a file system allows 255, and temporary files have longer names
     if len(name) > most:
         name = f'{name[:most]}~{hashlib.sha256(vehicle.encode()).hexdigest()[:16]}'
     return name
 
 
 def beside_their_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows with each vehicle's deviates from its model, the worst first."""
+    """Return the rows with each vehicle's deviations from its model in sigmas, the worst first."""
     for name, short in COMPARED.items():
         for row in rows:
             row[f'{short}_deviate'] = None

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Values of a vehicle over its legs, and the vehicles of a model beside each other.
+Values of a vehicle over its legs, and comparison of the vehicles of a model.
 
-When a vehicle changed: steps in a value over its legs (tyres, pressure, a moved IMU), and drift.
-The legs' values are one level, steps, a slope and errors of known covariance: what is each leg's
-own, what legs share, and the walk that a scale is known for. Of the slope, all steps and all
-single odd legs the one that explains most is taken as long as it is beyond chance; then what has
-lost its meaning beside the others is dropped (backward after forward: a pair is not kept for what
-one of it explains).
+Changes of a vehicle are steps in a value over its legs (tyres, pressure, a moved IMU), and drift.
+The model of the values is a level, steps, a slope and errors of known covariance: independent
+errors of each leg, shared errors, and the random walk of a scale. Forward selection adds the
+slope, step or single odd leg that explains most, while it is significant. Backward elimination
+then drops terms that are no longer significant: no pair is kept if one alone explains the values.
 """
 
 from collections.abc import Sequence
@@ -37,9 +36,9 @@ class Change:
 @dataclass(frozen=True)
 class History:
     """
-    What a value did.
+    The history of a value.
 
-    changes : in order.   odd : legs that stand alone.   slope, slope_sigma : per unit of ``t``;
+    changes : in order.   odd : single outlier legs.   slope, slope_sigma : per unit of ``t``;
     None if not determined.
     """
 
@@ -54,8 +53,8 @@ def covariance(own: Floats, shared: Sequence[Floats] = (), days: Floats | None =
     """
     Return the covariance of the values of n legs.
 
-    own : (n,) variance of what is each leg's alone.   shared : (n, k) one-sigma effects of errors
-    that legs have in common.   walk : sigma of a random walk per square root of a day.
+    own : (n,) variance of independent errors.   shared : each (n, k), one-sigma effects of errors
+    that legs share.   walk : sigma of a random walk per square root of a day.
     """
     ridge = 1e-18    # smallest variance of a leg: the inverse exists
     V = np.diag(np.maximum(own, ridge)) + sum((g @ g.T for g in shared), np.zeros(()))
@@ -63,9 +62,9 @@ def covariance(own: Floats, shared: Sequence[Floats] = (), days: Floats | None =
 
 
 def chance(n: int) -> float:
-    """Return the deviate that no step, odd leg or slope of n legs comes to by chance."""
+    """Return the limit of steps, odd legs and slopes of n legs, in sigmas, for significance."""
     from scipy.special import ndtri
-    false = 1e-3    # chance that a vehicle without any is said to have a change
+    false = 1e-3    # chance of a reported change for a vehicle without one
     return float(-ndtri(false / (2 * max(1, 2 * n - 2))))
 
 
@@ -73,13 +72,13 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
     """
     Return the changes of n values in order, y (n,), of covariance V, and their slope over t.
 
-    A last leg that is odd is a change: nothing after it says otherwise.
+    An outlier at the last leg is a change, since no later leg contradicts it.
     """
     n = len(y)
     if n < 2:
         return History()
     L = np.linalg.cholesky(V)
-    # all that may be: a step from leg k on, 1 to n - 1; leg k alone, 1 to n - 2; and the slope
+    # candidates: a step from leg k on, 1 to n - 1; leg k alone, 1 to n - 2; and the slope
     drifts = t is not None and np.ptp(t) > 0 and n > 2
     white = np.linalg.solve(L, np.column_stack([
         y, np.tril(np.ones((n, n))), np.eye(n)[:, 1:n - 1],
@@ -122,7 +121,7 @@ def _selected(z: Floats, level: Floats, W: Floats, least: float) -> list[int]:
 
 
 def _without(X: Floats, z: Floats, W: Floats) -> tuple[Floats, Floats]:
-    """Return z and the columns of W with all that X explains taken out."""
+    """Return z and the columns of W minus their projections on the columns of X."""
     Q, _ = np.linalg.qr(X)
     return z - Q @ (Q.T @ z), W - Q @ (Q.T @ W)
 
@@ -138,9 +137,9 @@ class Population:
     """
     Values of one model's vehicles.
 
-    mean, sigma : robust, and how well it is known.   spread : between vehicles, beyond their
-    sigmas, 1 sigma.   deviates : (n,) of each vehicle, in sigmas of spread and its own together;
-    nan of too few vehicles.
+    mean, sigma : robust mean and its sigma.   spread : between vehicles, in addition to their
+    sigmas, 1 sigma.   deviates : (n,) deviation of each vehicle over the sigma from spread and
+    its own sigma; nan for too few vehicles.
     """
 
     mean: float
@@ -153,14 +152,14 @@ def population(values: Floats, sigmas: Floats) -> Population:
     """
     Return the population of vehicles, values (n,) with their sigmas.
 
-    The spread is that with which half of all lie as near to the mean as the normal law says; the
-    mean is Huber's, so that a vehicle far off moves neither.
+    The spread makes the median deviation that of a normal distribution; the mean is Huber's. Both
+    are robust to outliers.
     """
     x, s = np.asarray(values, float), np.asarray(sigmas, float)
     mean, spread = float(np.median(x)), 0.0
     if len(x) < LEAST:
         return Population(mean, float(s.max()), 0.0, np.full(len(x), np.nan))
-    huber = 1.5    # sigmas from which a vehicle counts for less
+    huber = 1.5    # sigmas from which a vehicle has less weight
     passes = 50
     for _ in range(passes):
         before = mean
@@ -174,7 +173,7 @@ def population(values: Floats, sigmas: Floats) -> Population:
 
 
 def _spread(off: Floats, s: Floats) -> float:
-    """Return the spread at which the median of off / sigma is that of the normal law."""
+    """Return the spread at which the median of off / sigma is that of a normal distribution."""
     if np.median(off / np.maximum(s, 1e-300)) <= NORMAL_MEDIAN:
         return 0.0
     low, high = 0.0, float(off.max()) / NORMAL_MEDIAN

@@ -37,7 +37,7 @@ def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
 
 
 def rows_of_legs(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
-    """Return the legs of a bag's row as rows of a table; of one that failed a row without."""
+    """Return the legs of a bag's row as rows of a table; of a failed bag a row without values."""
     of_bag = {'status': row.status, 'reason': row.reason}
     return [leg_row(bag.vehicle, bag.model, k, bag.odometer_km, leg) | of_bag
             for k, leg in enumerate(legs_from(row.legs), 1)] or [
@@ -45,7 +45,7 @@ def rows_of_legs(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
 
 
 def utc(stamp_ns: int) -> datetime:
-    """Return a time as tables have it."""
+    """Return a time as datetime in UTC."""
     return datetime.fromtimestamp(stamp_ns / 1e9, UTC)
 
 
@@ -88,7 +88,7 @@ def batches(parts: Sequence[Path]) -> Iterator[Any]:
 
 
 def write_table(path: Path, schema: Any, tables: Iterable[Any]) -> None:
-    """Write tables one after the other as one file, whole or not at all."""
+    """Write tables one after the other to one file, atomically."""
     import pyarrow as pa
     import pyarrow.parquet as pq
     with locked(path.parent), whole_file(path) as file, pq.ParquetWriter(

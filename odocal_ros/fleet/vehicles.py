@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A vehicle from the rows of its bags: legs combined as replay has it, changes, pass or fail."""
+"""A vehicle from the rows of its bags: legs combined as in replay, changes, pass or fail."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -36,14 +36,14 @@ FEWEST_REJECTED = 2             # judgement: last legs, all rejected; one alone 
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """A leg with what its bag is known for."""
+    """A leg with the odometer reading of its bag, km."""
 
     leg: LegResult
     odometer_km: float | None
 
     @cached_property
     def estimates(self) -> dict[str, Estimate]:
-        """Return its values, each by the method that gives it."""
+        """Return the leg's values, each from the method that gives it."""
         return leg_estimates(self.leg)
 
 
@@ -84,7 +84,7 @@ def history_of(name: str, driven: Sequence[Driven],
 
 
 def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the variance of what is each leg's own, and the effects of what legs share."""
+    """Return the variance of each leg's own errors, and the effects of shared errors."""
     own = np.zeros(len(methods))
     shared: dict[tuple[Any, ...], np.ndarray] = {}
     for k, method in enumerate(methods):
@@ -100,13 +100,13 @@ def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndar
 
 
 def rejecting(leg: LegResult) -> list[Reason]:
-    """Return the explanation why a leg is rejected, empty if it is not."""
+    """Return the reasons that reject a leg, empty if it is not rejected."""
     return [r for r in (*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons))
             if r.code.gravity is Verdict.REJECTED and leg.verdict is Verdict.REJECTED]
 
 
 def rejected_from(driven: Sequence[Driven]) -> int:
-    """Return from which leg on all are rejected, their number where the last one is not."""
+    """Return the first leg from which all are rejected; the number of legs if there is none."""
     return 1 + max((k for k, one in enumerate(driven)
                     if one.leg.verdict is not Verdict.REJECTED), default=-1)
 
@@ -121,7 +121,7 @@ def gone(lost: Sequence[Driven]) -> Reason:
 
 @dataclass(frozen=True)
 class VehicleJob:
-    """The bags of a vehicle and where their rows are; ``accept`` and the like as asked now."""
+    """The bags of a vehicle, the files of their rows, and the settings in force, as ``accept``."""
 
     vehicle: str
     bags: tuple[FleetBag, ...]
@@ -131,7 +131,7 @@ class VehicleJob:
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """What is known of a vehicle: its row of vehicles.parquet, those of legs.parquet, and more."""
+    """Result of a vehicle: its row of vehicles.parquet, those of legs.parquet, and more."""
 
     row: dict[str, Any]
     legs: list[dict[str, Any]]
@@ -190,7 +190,7 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
 
 
 def _periods(histories: dict[str, Any]) -> list[int]:
-    """Return with which leg each period begins in which nothing changed, the first at 0."""
+    """Return the first leg of each period without changes; the first period starts at 0."""
     return sorted({0} | {number[change.leg] for number, found, _ in histories.values()
                          for change in found.changes})
 

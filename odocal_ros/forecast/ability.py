@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Values that a drive can determine, before it is driven; by the code that will process it."""
+"""Values that a planned drive can determine, by the code that processes recorded drives."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Received:
     """
     Samples received before the start mark.
 
-    variances : of the yaw, rad^2, in ``heading_topic`` and ``imu_orientation``, inf if none is
+    variances : of the yaw by ``heading_topic`` and ``imu_orientation``, rad^2; inf if none is
     sent.   rested_s : length of the current or last standstill.   latitude : rad.   height : the
     fixes have one.   has_accelerometer : the IMU has an accelerometer.   imu : there is one.
     """
@@ -54,7 +54,7 @@ class Received:
 
 @dataclass(frozen=True)
 class Ability:
-    """Observable quantities, those that are not with the cause, and a common weakness."""
+    """Observable quantities, unobservable ones with the cause, and a weakness of all."""
 
     can: tuple[str, ...]
     cannot: tuple[str, ...]
@@ -114,7 +114,7 @@ def _of_two_wheels(config: Config) -> list[tuple[bool, str]]:
 
 
 def _alignment(config: Config, received: Received) -> Alignment:
-    """Return the alignment of a drive straight on from here."""
+    """Return the alignment of a straight drive from the current position."""
     rest = received.rested_s if received.rested_s >= config.leg.standstill else 0.0
     t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
     drive = from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
@@ -124,7 +124,7 @@ def _alignment(config: Config, received: Received) -> Alignment:
 
 
 def stated_variance(sent: Oriented) -> float:
-    """Return the yaw variance stated by orientations as sent, rad^2; inf if none is sent."""
+    """Return the median yaw variance in orientation messages, rad^2; inf if none is sent."""
     variance = oriented(sent).yaw_variance
     stated = variance[~np.isnan(variance)]
     return float(np.median(stated)) if len(stated) else math.inf

@@ -29,12 +29,12 @@ class Prospect:
     """
     The forecast of one parameter.
 
-    sigma, asked : relative or rad, asked: required; sigma None: not determined so far.
-    metres : m more for the limit, 0: reached, None: unreachable.
+    sigma, asked : predicted, required sigma, relative or rad; None: not determined so far.
+    metres : remaining distance to the limit, m; 0: reached, None: unreachable.
     sources : (name, sigma) of the largest errors, in order.
     why : cause why more driving does not reach the limit.
     now : the value so far, as text, if it is determined before the end.
-    lack : manoeuvres for it, besides metres.
+    lack : required manoeuvres, besides distance.
     """
 
     sigma: float | None
@@ -46,7 +46,7 @@ class Prospect:
     lack: str = ''
 
     def words(self, name: str, unit: str, factor: float) -> str:
-        """Return it as text, sigmas times ``factor`` in ``unit``."""
+        """Return the forecast as text, sigmas times ``factor`` in ``unit``."""
         if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
             unit, factor = '%', 100.0
         asked = three_digits(self.asked * factor)
@@ -82,9 +82,9 @@ class Forecast:
     The forecast of a leg that ends at the current position.
 
     pitch : rad, sigma.   wheels : None with one counter, and before the first estimate.
-    methods : results of methods that need no end of the drive.   estimates : the running
-    estimate, each value by the method that will give it.   until_ns : stamp of the newest sample
-    used.   faults : reasons for which a method will reject the leg, however long it is.
+    methods : results of methods that need no end point.   estimates : the running estimate, each
+    value from the method that will provide it.   until_ns : stamp of the newest sample used.
+    faults : reasons for which a method will reject the leg at any length.
     """
 
     scale: Prospect
@@ -103,7 +103,7 @@ class Forecast:
                 'left_right': of_wheels.left_right, 'track_width': of_wheels.track_width}[quantity]
 
     def words(self) -> str:
-        """Return it as a sentence: limits reached, remaining distances, limits out of reach."""
+        """Return it as a sentence: reached limits, remaining distances, unreachable limits."""
         return '; '.join([self.scale.words('scale', 'ppm', 1e6),
                           self.yaw.words('yaw', 'deg', math.degrees(1))])
 
@@ -114,18 +114,18 @@ class Forecast:
 
     @property
     def lacks(self) -> list[str]:
-        """Return the manoeuvres to drive besides metres."""
+        """Return the required manoeuvres, besides distance."""
         return list(dict.fromkeys(p.lack for p in (self.scale, self.yaw) if p.lack))
 
     def ended(self) -> 'Forecast':
-        """Return the running estimate alone, as of a leg that has ended."""
+        """Return the running estimate only, for a leg that has ended."""
         scale, yaw = (Prospect(None, one.asked, None) for one in (self.scale, self.yaw))
         return Forecast(scale, yaw, estimates=self.estimates, until_ns=self.until_ns)
 
     def age_s(self, stamp_ns: int) -> float:
         """Return the time from the estimate to a stamp, s; NaN if the stamp is not after it."""
         age = (stamp_ns - self.until_ns) * 1e-9
-        return age if age >= 0 else math.nan       # the stamps were wild, or the IMU's are gone
+        return age if age >= 0 else math.nan       # wild stamps, or the IMU has stopped
 
 
 def better(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None:
@@ -177,18 +177,18 @@ def _running(forecast: Forecast | None, age_s: float) -> dict[str, str | float]:
 
 
 def _rounded_up(metres: float) -> int:
-    """Return metres in two digits, not fewer than they are."""
+    """Return a distance, m, rounded up to two digits."""
     step: int = 10 ** max(0, math.floor(math.log10(max(metres, 1.0))) - 1)
     return math.ceil(metres / step) * step
 
 
 def three_digits(value: float) -> str:
-    """Return a number in three digits, never as a power of ten where it is large."""
+    """Return a number in three digits; large numbers have no exponent."""
     return f'{value:.0f}' if value >= 999.5 else f'{value:.3g}'
 
 
 def sources_of(method: MethodResult, parameter: str) -> tuple[tuple[str, float], ...]:
-    """Return the sources of a parameter's error that matter, the largest first."""
+    """Return (name, sigma) of the main error sources of a parameter, the largest first."""
     row = method.parameters.index(parameter)
     sizes = {s.name: float(np.linalg.norm(s.effects[row])) for s in method.sources}
     least = SOURCE_SHARE * sum(size**2 for size in sizes.values())

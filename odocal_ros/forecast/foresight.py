@@ -4,8 +4,8 @@
 """
 Forecast of a leg: its sigmas if it ended here, and the remaining distance to the limits.
 
-For a vehicle that stops at its current position and stands for REST_FORESEEN_S in total, with the
-start mark and the recorded path. Shown to the operator, never part of a result.
+The vehicle is assumed to stop at its current position and to rest for REST_FORESEEN_S in total.
+The forecast is shown to the operator, and is never part of a result.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ from odocal_ros.screening.leg_kind import lacking
 from odocal_ros.settings.config import Config
 
 DRIVE_ROWS = 1000         # judgement: of the drive of a prediction
-# judgement: this many orientations, until this time after the start mark, give their accuracy
+# judgement: the accuracy is from so many orientations, up to this time after the start mark
 ORIENTATION_NS, ORIENTATION_ROWS = 10**9, 100
 DRIVE_ON = 'drive on with stops, starts and turns'
 
@@ -46,7 +46,7 @@ class DriveSoFar(PlannedDrive):
     wanted: Callable[[], bool] = field(default=lambda: True)
 
     def lengthened(self, metres: float) -> 'DriveSoFar':
-        """Return the drive with so many metres more straight on from here, at its own speed."""
+        """Return the drive extended straight ahead by ``metres``, at its median speed."""
         if not self.wanted():
             raise Abandoned
         moving = np.flatnonzero(np.abs(self.speed) > REST_SPEED)
@@ -60,18 +60,18 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
                 wanted: Callable[[], bool] = lambda: True,
                 smoother: leg_so_far.SmootherSoFar | None = None) -> Forecast:
     """
-    Return the forecast of a leg that ends here, and the reasons of its methods so far.
+    Return the forecast of a leg that ends here, with the faults of its methods so far.
 
-    leg : the data so far; its last row is the current position.   fix_rate : Hz.   config : as
-    frozen into the leg.   wanted : called sometimes; if False, Abandoned is raised.   smoother :
-    that of this leg; each update starts from the previous one.
+    leg : the data so far; its last row is the current position.   fix_rate : Hz.   config : in
+    force at the leg's start.   wanted : called repeatedly; if False, Abandoned is raised.
+    smoother : of this leg; each update starts from the previous one.
 
     Raises OdocalError: no forecast is possible yet: no motion, no fixes, scale unknown.
     """
     unusable = lacking(leg.imu, config.imu.accel_scale)
     running = smoother_forecast.look(leg, config, smoother, wanted)
     only_smoother = deciding(config.method) == smoother_forecast.ONLY
-    if only_smoother or smoother_forecast.gives_all(running):     # the ends add nothing to it
+    if only_smoother or smoother_forecast.gives_all(running):     # the end points add nothing
         forecast = smoother_forecast.nothing_foreseen(config)
     else:
         forecast = _by_ends(leg, fix_rate, config, wanted)

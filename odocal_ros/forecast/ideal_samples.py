@@ -30,11 +30,11 @@ SENT = ('heading_topic', 'imu_orientation')
 @dataclass(frozen=True, eq=False)
 class Ideal:
     """
-    A planned drive as the smoother sees it, free of errors.
+    A planned drive as input of the smoother, free of errors.
 
     leg : its samples; fixes and headings are thinned to one for each keyframe or so.
     imu : their IMU steps with keyframes.     state : true state at the keyframes.
-    fixes_in_one : how many fixes each fix of the leg stands for.
+    fixes_in_one : number of planned fixes that each fix of the leg replaces.
     """
 
     leg: SmootherLeg
@@ -61,7 +61,7 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
     Return the samples of a drive without any error.
 
     drive : as planned. Mounting angles are zero, the scale is 1: sigmas do not depend on them.
-    sigmas : lever arms, fix rate and sigma, size of a count, heading from outside.   spacing : s
+    sigmas : lever arms, fix rate and sigma, size of a count, external heading.   spacing : s
     between keyframes.
     """
     config = sigmas.config
@@ -92,7 +92,7 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
 
 
 def _motion(drive: PlannedDrive, t: Floats, origin: Origin, config: Config) -> _Motion:
-    """Return the motion of the IMU on the plane that n lies in."""
+    """Return the motion of the IMU in the frame n."""
     speed, yaw, slope = (np.interp(t, drive.t, x) for x in (drive.speed, drive.yaw, drive.slope))
     C_nb = matrix_from_rpy(np.stack([np.zeros_like(yaw), -slope, yaw], -1))
     turn, climb = np.gradient(yaw, t), np.gradient(slope, t)

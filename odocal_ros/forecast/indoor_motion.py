@@ -13,7 +13,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.nav.integral import running_integral
 from odocal_ros.settings.config import HOLONOMIC
 
-MOTION_STEP = 0.1                     # s, definition: of a motion
+MOTION_STEP = 0.1                     # s, definition: time step of a motion
 FULL_TURN = 2 * math.pi        # definition, rad
 # judgement: of a small robot: m/s^2, rad/s, rad/s^2; s at rest after a move, and at either end
 ACCELERATION, TURN_RATE, TURN_ACCELERATION = 0.5, 0.8, 2.0
@@ -24,7 +24,7 @@ Move = tuple[float, float, float]      # m forward, m to the left, rad to the le
 @dataclass(frozen=True, eq=False)
 class RobotMotion:
     """
-    Motion of the middle of the wheels.
+    Motion of the centre of the wheels.
 
     t : (n + 1,) s.   speed, side : (n + 1,) m/s forward and to the left.   rate : (n + 1,) rad/s.
     rests : (r, 2) s, begin and end of the rests after moves.
@@ -62,7 +62,7 @@ def pattern(name: str, size: float, rounds: int, drive: str, speed: float = 0.5)
     drive : as odometer.drive; a robot of HOLONOMIC also moves sideways by half of each straight.
     speed : m/s.
 
-    Raises BadUsage: a figure is out of range.
+    Raises BadUsage: a value is out of range.
     """
     for flag, value in (('--size', size), ('--speed', speed), ('--rounds', rounds)):
         if not (math.isfinite(value) and value > 0):
@@ -98,7 +98,7 @@ def _driven(moves: list[Move], speed: float) -> RobotMotion:
 
 
 def _trapezoid(length: float, top: float, acceleration: float) -> Floats:
-    """Return the share of a length in each second, one per step of time: (n,)."""
+    """Return the speed profile of a move as share of its length, 1/s: (n,)."""
     top = min(top, math.sqrt(length * acceleration))
     ramp, whole = top / acceleration, length / top + top / acceleration
     t = MOTION_STEP * np.arange(1, max(2, math.ceil(whole / MOTION_STEP)) + 1)

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The leg that is recorded: its faults, by the functions that will check it, and its profile.
+The recorded leg: its faults, by the functions that check a finished leg, and its profile.
 
-Its rows in cells show most faults, every few seconds in the worker (``calibrate.faults``). A gap
-of the IMU is detected in the stamps at once, and is kept. Sigmas are predicted from the profile.
+Most faults are found in cell means, every few seconds in the worker (``calibrate.faults``). IMU
+gaps are found in the stamps at once, and are kept. Sigmas are predicted from the profile.
 """
 
 from collections.abc import Callable, Iterable
@@ -42,7 +42,7 @@ SILENT_TIME = 0.9    # s; judgement: delay of rows out of order; reported within
 
 
 class ImuGaps:
-    """The IMU stamps of a leg, reduced to those that show its gaps."""
+    """The IMU stamps of a leg, reduced to those around its gaps."""
 
     def __init__(self, start_ns: int, limit_s: float) -> None:
         self._start_ns, self._limit_s = start_ns, limit_s
@@ -63,7 +63,7 @@ class ImuGaps:
 
     def reasons(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
         """Return IMU_GAP if there was one; ``silent_s``: time without IMU messages."""
-        # between two gaps there is none: rows that close fill it
+        # rows closer than the limit fill the sections between the gaps
         t = (np.array([*self._edges_ns, self._newest_ns]) - self._start_ns) * 1e-9
         t = np.concatenate([[0.0], t])
         sound = np.concatenate([np.arange(a, b, self._limit_s / 2)
@@ -80,7 +80,7 @@ def screened_in_cells(leg: Leg, config: Config) -> Screened:
 
 def faults_in_cells(leg: Leg, config: Config) -> tuple[Reason, ...]:
     """Return the faults of a leg whose IMU rows are means over cells of time."""
-    return faults(leg, screened_in_cells(leg, config), _with_cells(leg, config))
+    return faults(screened_in_cells(leg, config), _with_cells(leg, config))
 
 
 def _with_cells(leg: Leg, config: Config) -> Config:
@@ -108,7 +108,7 @@ def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
     t = np.linspace(first, last, max(2, int((last - first) / step)))
     spans = inputs.standstills(scale, config)
     resting = _within(t, spans)
-    profile_window = 0.5    # s each side that a speed is taken over
+    profile_window = 0.5    # s on each side, of the mean speed
     path_length = inputs.travel.at(t + profile_window) - inputs.travel.at(t - profile_window)
     speed = np.where(resting, 0.0, path_length * scale / (2 * profile_window))
     speed[~resting & (np.abs(speed) <= REST_SPEED)] = 2 * REST_SPEED   # too short to count as rest
@@ -127,12 +127,12 @@ def _placed(inputs: Inputs, config: Config) -> Placed:
 
 
 def count_size(inputs: Inputs, config: Config) -> float:
-    """Return the metres of one count, 0 for speeds; raise BadData if the scale is not known."""
+    """Return the size of one count, m, 0 for speeds; raise BadData if the scale is unknown."""
     return inputs.travel.quantum * _placed(inputs, config).rough
 
 
 def _yaw(inputs: Inputs, spans: Floats, t: Floats) -> Floats:
-    """Return the angle turned about the vertical by each time, rad; rate at rest taken out."""
+    """Return the angle turned about the z axis of b, rad, without the rate at rest: (m,)."""
     t_imu, w = inputs.t_imu, inputs.w_b[:, 2]
     at_rest = _within(t_imu, spans)
     w = w - (w[at_rest].mean() if at_rest.any() else 0.0)
@@ -157,7 +157,7 @@ def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n:
 
 
 def fix_figures(inputs: Inputs) -> dict[str, float]:
-    """Return sigma of one fix, east or north and up, m, and fixes a second, as in ``Sigmas``."""
+    """Return sigma of one fix, east or north and up, m, and fix rate, Hz, as in ``Sigmas``."""
     inside = (inputs.t_fix >= 0) & (inputs.t_fix <= inputs.t_stop)
     if inside.sum() < 2:
         raise BadData('fewer than two usable fixes between the marks')
@@ -176,17 +176,17 @@ class SmootherSoFar:
 
     @property
     def once_s(self) -> float:
-        """Return the CPU time of the last update for work that is done ever less often, s."""
+        """Return the CPU time of the last fit if it was a cold start, s; these become rarer."""
         return self._growing.once_s
 
     def look(self, leg: Leg, config: Config, wanted: Callable[[], bool] = lambda: True) -> Running:
         """
         Return the running estimate.
 
-        leg : the data so far: the earlier data, and more.   config : as frozen into the leg.
-        wanted : asked between passes; Abandoned is raised when it says no.
+        leg : the data so far, including those of the last call.   config : at the leg's start.
+        wanted : called between passes; Abandoned is raised if it returns False.
 
-        Raises OdocalError: too little of the drive, or no fit; the next update is a cold start.
+        Raises OdocalError: too few data, or no fit; the next update is a cold start.
         """
         def trace(*_: object) -> None:
             if not wanted():

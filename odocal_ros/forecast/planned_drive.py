@@ -15,12 +15,12 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.rotations import matrix_from_rpy
 
-REST_SPEED = 1e-6     # m/s, judgement: below it a planned drive stands
+REST_SPEED = 1e-6     # m/s, judgement: below it a planned drive is at rest
 SPOT_TURN = 0.05       # rad/s, judgement: a robot that turns on the spot is not at rest
-DRIVE_STEP = 0.1      # s, judgement: of drives made here
+DRIVE_STEP = 0.1      # s, judgement: time step of generated drives
 BRAKING = 1.5    # m/s^2, judgement: as in a town
 QUARTER = np.pi / 2    # definition: rad
-# judgement: a minute of town: still, up, cruise with a turn, down, still
+# judgement: a minute of town: rest, acceleration, cruise with a turn, braking, rest
 TOWN_T = np.array([0.0, 5.0, 15.0, 40.0, 50.0, 60.0])
 TOWN_SPEED = np.array([0.0, 0.0, 12.0, 12.0, 0.0, 0.0])
 TOWN_SIDES = 1.0, 1.0, -1.0, -1.0    # two to the left, then two to the right
@@ -67,7 +67,7 @@ class PlannedDrive:
 
     @property
     def C_nb(self) -> NDArray[np.float64]:
-        """Return the attitude of an IMU that looks forward, (m, 3, 3)."""
+        """Return the attitude of an IMU aligned with the vehicle, (m, 3, 3)."""
         return matrix_from_rpy(np.stack([np.zeros_like(self.yaw), -self.slope, self.yaw], -1))
 
     @property
@@ -78,29 +78,29 @@ class PlannedDrive:
 
     @property
     def distance(self) -> float:
-        """Return the metres driven between the marks, forwards and backwards."""
+        """Return the path length between the marks, forwards and backwards, m."""
         inside = self.t >= 0.0
         return float(np.abs(np.diff(self.travel[inside])).sum())
 
     @property
     def duration(self) -> float:
-        """Return the seconds between the marks."""
+        """Return the time between the marks, s."""
         return float(self.t[-1])
 
     def standstills(self, shortest: float) -> list[tuple[float, float]]:
-        """Return begin and end of the stretches at rest that last ``shortest`` s or more."""
+        """Return (begin, end) of the standstills of at least ``shortest`` s."""
         turning = np.abs(np.gradient(self.yaw, self.t)) > SPOT_TURN      # on the spot
         rest = (np.abs(self.speed) <= REST_SPEED) & ~turning
         spans = self.t[runs(rest) - [0, 1]]
         return [(float(a), float(b)) for a, b in spans if b - a >= shortest]
 
     def lengthened(self, metres: float) -> 'PlannedDrive':
-        """Return the drive with so many metres more at its fastest moment, straight ahead."""
+        """Return the drive extended straight ahead by ``metres`` at its fastest moment."""
         k = int(np.argmax(np.where(self.t >= 0, np.abs(self.speed), -1.0)))
         return self._held(k, metres / abs(self.speed[k]))
 
     def standing_longer(self, seconds: float) -> 'PlannedDrive':
-        """Return the drive with so much more rest before the start and at the stop mark."""
+        """Return the drive with ``seconds`` more rest before the start and at the stop mark."""
         return self._held(len(self.t) - 1, seconds, at_rest=True)._held(0, seconds, at_rest=True)
 
     def turned_around(self) -> 'PlannedDrive':
@@ -114,7 +114,7 @@ class PlannedDrive:
         return cut._held(len(cut.t) - 1, rest, at_rest=True)
 
     def _held(self, k: int, seconds: float, at_rest: bool = False) -> 'PlannedDrive':
-        """Return the drive with the state of row k held for so long; before 0, all moves back."""
+        """Return the drive with row k held for ``seconds``; a rest at row 0 is added before it."""
         hold = np.arange(DRIVE_STEP, seconds + DRIVE_STEP, max(DRIVE_STEP, seconds / 1000))
         hold = hold * (seconds / hold[-1])
         rows: dict[str, Any] = {
@@ -131,7 +131,7 @@ class PlannedDrive:
 def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.pi / 4,
                **more: Any) -> PlannedDrive:
     """
-    Return the drive of a speed and a turn rate by time; marked where it first moves and ends.
+    Return a drive from speed and turn rate, with marks at its first motion and its end.
 
     t, speed, yaw_rate : (m,) s, m/s, rad/s (left positive).   heading : of the vehicle at the
     start, clockwise from north, rad.   more : further fields of PlannedDrive; slope is 0 where
@@ -164,7 +164,7 @@ def left_and_right_turns(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with a turn of 90 deg to the left and, a little later, one to the right."""
     k = _amid(drive)
     v = drive.speed[k]
-    turn_time, sideways_force = 8.0, 2.0    # s of 90 deg; m/s^2 to the side that make it longer
+    turn_time, sideways_force = 8.0, 2.0    # s of 90 deg; m/s^2, limit to the side
     turn = max(turn_time, QUARTER * abs(v) / sideways_force)
     turns_apart = 5.0    # s straight between the two turns
     whole = 2 * turn + turns_apart
@@ -196,7 +196,7 @@ def town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
 
 def inserted(drive: Drive, k: int, t: Floats, speed: Floats, turned: Floats) -> Drive:
     """
-    Return the drive with a piece after row k; what follows comes later and turned.
+    Return the drive with a section inserted after row k; the rest is delayed and rotated.
 
     drive : as planned.   k : row between the marks.   t, speed, turned : (m,) s since row k, above
     0 and rising; m/s; rad turned to the left since row k.

@@ -38,7 +38,7 @@ from odocal_ros.settings.config import (
 )
 from odocal_ros.settings.grades import grade_of
 
-# m^2/m, judgement: what fits of robots without sideways slip find, 0.3 mm in a metre
+# m^2/m, judgement: usual in fits of robots without sideways slip, 0.3 mm in a metre
 NO_SIDE_SLIP = 1e-7
 FASTEST_NODES = 10.0       # Hz, definition: of positions that the planar estimator uses
 
@@ -48,11 +48,11 @@ class Robot:
     """
     Robot and reference of a run.
 
-    drive : as odometer.drive.   imu : it has one.   width : m, track width, of skid steering on
+    drive : as odometer.drive.   imu : has an IMU.   width : m, track width, of skid steering on
     the spot; of HOLONOMIC twice the rotation lever.   straight_width : m, of skid steering
-    straight on.   wheels : how many.   slip : m/sqrt(s) of each wheel while it moves.
+    straight on.   wheels : number.   slip : m/sqrt(s) of each wheel while it moves.
     white, rate : m and Hz of the positions.   drift : m, stationary sigma of their correlated
-    error, forgotten in drift_length m of path.   at_rests : positions in the rests only.
+    error of correlation length drift_length, m of path.   at_rests : positions in the rests only.
     """
 
     drive: str
@@ -94,7 +94,7 @@ def _wheels(d: Floats, robot: Robot) -> tuple[Wheels, list[float]]:
 
     def of(apart: Floats) -> Wheels:
         return of_sides(d[:, 0] - apart / 2, d[:, 0] + apart / 2, robot.drive)
-    for _ in range(50 * (robot.drive == SKID)):      # the width depends on the wheels
+    for _ in range(50 * (robot.drive == SKID)):      # the width depends on the paths
         apart = d[:, 2] / (1 / robot.width + arc * of(apart).straightness)
     return of(apart), [arc] * (robot.drive == SKID)
 
@@ -133,7 +133,7 @@ def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:
     spins = moving & (np.hypot(d[:, 0], d[:, 1]) < np.abs(d[:, 2]) * robot.width / 2)
 
     def level(of: Bools) -> float:
-        """Return the variance of the slip of one wheel a metre of its path."""
+        """Return the variance of the slip of one wheel per metre of its path."""
         metres = (path[of] + 0.1 * MOTION_STEP).sum() if of.any() else 1.0
         return float(robot.slip**2 * max(of.sum(), 1) * MOTION_STEP / metres)
     table = (run.wheels.table**2).sum(1) * len(run.wheels.rows) / robot.wheels
@@ -164,7 +164,7 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: Config) -> Metho
         wheels=tuple(replace(leg.travel, s=leg.travel.s + side * turned, name=name)
                      for side, name in zip((-1, 1), SIDES, strict=True)),
         origin=replace(leg.origin, local=rate_without_north(leg.origin.latitude)))
-    # the positions of a mark have one error
+    # the positions of a mark share one error
     made = replace(made, leg=leg, fixes_in_one=1.0 if robot.at_rests else made.fixes_in_one)
     problem = problem_of(leg, config, made.imu)
     white = 1 / made.fixes_in_one
@@ -179,8 +179,8 @@ def _with_slip(method: MethodResult, motion: RobotMotion, robot: Robot) -> Metho
     """
     Return a prediction of the smoother with the slip of two wheels in ratio and width.
 
-    Ideal wheels have no noise from which the smoother takes it. The path of the right less that
-    of the left wheel is ratio times path and width times turn: least squares.
+    Ideal wheels have no noise from which the smoother could estimate slip. Least squares: right
+    minus left wheel path is ratio times path plus width times turn.
     """
     d = motion.increments[motion.moving[1:], ::2]
     covariance = np.linalg.pinv(d.T @ d) * 2 * robot.slip**2 * MOTION_STEP
@@ -196,14 +196,14 @@ def _with_slip(method: MethodResult, motion: RobotMotion, robot: Robot) -> Metho
 
 
 def _at_rests(t_fix: Floats, motion: RobotMotion) -> Ints:
-    """Return the fix nearest to the middle of each rest; of one mark."""
+    """Return the fix nearest to the middle of each rest, one for each mark."""
     middle = motion.rests.mean(axis=1) - motion.t[np.argmax(motion.moving) - 1]
     out: Ints = np.abs(t_fix[:, None] - middle).argmin(axis=0)
     return out
 
 
 def predict_robot(motion: RobotMotion, robot: Robot, config: Config) -> MethodResult:
-    """Return the prediction of the method that calibrates such a robot."""
+    """Return the prediction of the method that calibrates this robot."""
     by_smoother = robot.imu and robot.drive == DIFFERENTIAL
     return (predict_with_imu if by_smoother else predict_planar)(motion, robot, config)
 

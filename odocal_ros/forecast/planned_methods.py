@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Prediction of each method for a planned drive; of the smoother its covariance at the truth."""
+"""Predictions of the methods for a planned drive; of the smoother, its covariance at the truth."""
 
 from dataclasses import dataclass
 
@@ -38,8 +38,8 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     """
     Return the prediction of the smoother for a drive, covariance only.
 
-    The rows are those of ``smooth`` at the true states of ideal samples; its reasons are by the
-    code that gives them for a fit. Scale 1, angles 0, sigmas and budget as they will be.
+    The equations are those of ``smooth`` at the true states of ideal samples; reasons are from the
+    same code as for a fit. Scale is 1, angles are 0; sigmas and budget are the predicted ones.
     spacing : s between keyframes; default: ``spacing_for``.
     """
     few = too_little(int(drive.duration * sigmas.fix_rate), drive.duration)
@@ -58,7 +58,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
 
 def spacing_for(drive: PlannedDrive) -> float:
     """Return the time between keyframes for the prediction of a drive, s."""
-    # keyframes lie farther apart in longer drives: sigmas come out 5 to 10 % too large at
+    # keyframes lie farther apart in longer drives: sigmas are 5 to 10 % too large at
     # WIDEST_SPACING, more beyond two hours, longer than a live leg may last; never too small
     enough_intervals, most_intervals = 600, 1440
     usual = np.clip(drive.duration / enough_intervals, SPACING, WIDEST_SPACING)
@@ -69,9 +69,9 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
     """
     Return the noise levels of a planned drive, which a fit would estimate.
 
-    IMU by its grade; wheel slip by ``sigmas.slip``, sideways and vertical motion by
-    ``sigmas.sway``; fixes of the stated sigma, white, or white to WHITE_SHARE of it besides a
-    time-correlated part for the correlation time. Never less than the smoother's own bounds.
+    IMU: by its grade. Wheel slip: ``sigmas.slip``. Sideways and vertical motion: ``sigmas.sway``.
+    Fixes: the stated sigma, white, or with a correlation time WHITE_SHARE of it white and the rest
+    time-correlated. No level is below the lower bound of the smoother.
     """
     grade = grade_of(sigmas.config.imu)
     road = dict.fromkeys(SLIPPING, sigmas.sway**2 / SWAY_RATE)
@@ -83,7 +83,7 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
         for name, variance in (('slow', sigmas.fix**2), ('slow_up', up))}
     values |= dict.fromkeys(('fix', 'fix_up'), white / fixes_in_one)
     least = {name: problem.least.get(name, 0.0) for name in values}
-    # that of a fix is for each, not for those that one stands for
+    # the bound is for one fix, not for the fixes that it replaces
     least |= {name: least[name] / fixes_in_one for name in ('fix', 'fix_up')}
     return problem.first_levels.but(
         correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
@@ -102,9 +102,9 @@ class Plan:
     """
     The prediction of a drive.
 
-    two_point : by the operator's own marks, with alignment and drive.
-    methods : by name, those predicted, with their reasons on the alignment.
-    estimates : each parameter by the method that will give it, as in a result.
+    two_point : between the operator's marks, with alignment and drive.
+    methods : name -> predicted result.
+    estimates : each parameter from the method that will provide it, as in a result.
     deciding : the methods of ``methods`` that may give a parameter.
     """
 
@@ -149,8 +149,8 @@ class Plan:
         """
         Return the reasons of the prediction.
 
-        Of the drive; of methods that give a parameter; and the refusals of the others that may
-        give one, those of the smoother always.
+        Those of the drive, of the smoother, and of methods that give a parameter; of the other
+        methods the refusals only.
         """
         said = list(self.two_point.of_drive)
         for name in self.methods:

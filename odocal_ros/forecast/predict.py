@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Prediction: the sigmas a leg will have, before it is driven or while it is.
+Prediction of the sigmas of a leg, before or during the drive.
 
-The planned drive is converted to a track, two marks and an alignment, as a recorded one, and goes
-through ``two_point.fit``: predicted sigmas and those of results have the same budget.
+The planned drive is converted to a track, two marks and an alignment, as a recorded one, and
+processed by ``two_point.fit``: predictions and results have the same error budget.
 """
 
 from collections.abc import Sequence
@@ -38,13 +38,13 @@ class Sigmas:
     """
     Errors of a planned drive, 1 sigma.
 
-    config : grade of the IMU (imu.*), heading source and its sigma (alignment.*; ``auto`` takes
-    the given heading sigma where the source is set, else a gyrocompass if the gyro allows, else
-    the course), lever arm, latencies, correlation time of the fixes (NaN: 60 s; 0: white).
+    config : grade of the IMU (imu.*), heading source and its sigma (alignment.*; ``auto`` uses
+    the configured heading if it is set, else a gyrocompass if the gyro is good enough, else the
+    course), lever arm, latencies, correlation time of the fixes (NaN: 60 s; 0: white).
     fix, fix_up : m, error of one fix, east and north each, and up (None: twice that).
     fix_rate : Hz.    quantum : m, size of an odometer count, 0 for speeds.
     sway : m/s, white at 10 Hz, of the odometer's point to the side and up.    slip : m/sqrt(s) of
-    the wheels. Both while driving, for the smoother: the two-point method knows neither.
+    the wheels. Both apply while driving, and to the smoother only.
     """
 
     config: Config = Config()
@@ -87,7 +87,7 @@ class Prediction:
     """
     The prediction of a drive by one method.
 
-    method : as in a result; scale factor 1, angles 0, sigmas and budget as they will be (scale
+    method : as in a result; scale factor 1, angles 0, predicted sigmas and budget (scale
     relative).    reasons : of drive and method.    of_drive : those of the drive, for all methods.
     distance, chord : m.    duration : s.    standing : s of rest for each mark, 0 in motion.
     """
@@ -149,7 +149,7 @@ def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: flo
 
     if enough(0.0):
         return 0.0
-    # a drifting gyro may spoil what a longer chord gains: look at several lengths, then halve
+    # gyro drift may cancel the gain of a longer chord: try several lengths, then bisect
     tried = [farthest / 2**k for k in range(14, -1, -1)]
     high: float | None = next((m for m in tried if enough(m)), None)
     if high is None:
@@ -173,14 +173,14 @@ def _track(drive: PlannedDrive, quantum: float) -> Track:
 
 
 def _from(track: Track, t: float) -> Track:
-    """Return the track from an epoch on."""
+    """Return the track from time t on, s."""
     keep = track.t >= t - 1e-9
     return Track(track.t[keep], track.q_nb[keep], track.s[keep], track.P[keep])
 
 
 def _mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
           spans: Sequence[tuple[float, float]], surveyed: tuple[float, ...]) -> MarkFix:
-    """Return the reference position there will be at a mark, by the fixes that fall to it."""
+    """Return the expected reference position at a mark, surveyed or from the fixes at it."""
     span = standing_at(t, spans)
     forward = np.array([1.0, 0.0, 0.0])
     position_n = (track.at(np.array(t)) - track.at(np.array(0.0))) @ forward
@@ -199,7 +199,7 @@ def _mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
 
 
 def _velocity_change(track: Track, marks: tuple[MarkFix, MarkFix]) -> Floats:
-    """Return C_nb s' at the end mark less that at the start, zero where it stands: (3, 3)."""
+    """Return C_nb s' at the end minus at the start, 0 at resting or surveyed marks: (3, 3)."""
     change = np.zeros((3, 3))
     for mark, sign in zip(marks, (-1.0, 1.0), strict=True):
         if not (mark.standing or mark.surveyed):

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the operator needs while driving: distance, speed, standstill, clocks that differ."""
+"""Progress of a drive for the operator: distance, speed, standstill, clocks that differ."""
 
 from collections import deque
 from dataclasses import replace
@@ -20,10 +20,10 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_APART, DAY_NS, FASTEST
 from odocal_ros.settings.nominal import nominal_scale
 
-IMU_BLOCKS = 40       # judgement: newest blocks that other topics are compared with: some seconds
+IMU_BLOCKS = 40       # judgement: newest IMU blocks to compare other topics with: some seconds
 CLOCK_ROWS = 10       # judgement: newest rows of a topic that determine its clock
 SPEED_SPAN_NS = 10**9       # judgement: minimum time over which a speed is computed
-STANDING_S = 0.5            # judgement: without a count, the vehicle stands
+STANDING_S = 0.5            # judgement: after it without a count, the vehicle is at rest
 SHORTEST_REST_NS = 10**9    # judgement: a shorter pause is no standstill
 
 
@@ -37,7 +37,7 @@ class Clocks:
     def __init__(self, simulated: bool = False) -> None:
         self._simulated = simulated
         self._imu: deque[tuple[Ints, Ints]] = deque(maxlen=IMU_BLOCKS)
-        self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the IMU's
+        self._waiting: dict[str, tuple[int, int]] = {}      # newest rows, until the IMU's
         self._ahead_s: dict[str, deque[float]] = {}
 
     def feed(self, slot: str, block: Samples) -> None:
@@ -47,7 +47,7 @@ class Clocks:
         self._imu.append((block.received_ns, block.stamp_ns))
         if not self._waiting:
             return
-        # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
+        # differences first: float64 seconds since 1970 have a resolution of 238 ns
         received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
         first_received, first_stamp = int(received[0]), int(stamps[0])
         received, stamps = received - first_received, stamps - first_stamp
@@ -109,7 +109,7 @@ class Travel:
         self._anchor = 0.0
         self._rest = 0.0, 0      # length, s, and end of the last standstill
         self.top = 0.0           # highest speed, units/s
-        self._since = 0.0, 0     # total and stamp that the speed is taken from
+        self._since = 0.0, 0     # total and stamp at the start of a speed
 
     def feed(self, block: OdometerSamples, scale: float) -> None:
         """Take a block; scale: m per unit, 0 unknown."""
@@ -152,7 +152,7 @@ class FixPath:
         self._anchor: tuple[float, float, int] | None = None      # rad, rad, stamp
 
     def feed(self, block: FixSamples, min_status: int, moving: bool) -> None:
-        """Take a block of fixes; moving: as the counter has it."""
+        """Take a block of fixes; moving: by the odometer."""
         for lat, lon, stamp, variance, status in zip(
                 block.latitude, block.longitude, block.stamp_ns,
                 block.covariance_n[:, 0, 0], block.status, strict=True):
@@ -185,7 +185,7 @@ class Progress:
 
     def feed(self, slot: str, block: Any, config: Config, form: OdometerForm | None,
              found_scale: float) -> None:
-        """Take a block as recorded."""
+        """Process a recorded block."""
         if not len(block.stamp_ns):
             return
         self.clocks.feed(slot, block)
@@ -215,7 +215,7 @@ class Progress:
                        rested_s=self._travel.rested_s(preroll_s) if self._travel else 0.0)
 
     def begin_leg(self) -> None:
-        """Count distance and speed from here."""
+        """Restart distance and highest speed."""
         self._path = FixPath()
         if self._travel is not None:
             self._zero, self._travel.top = self._travel.total, 0.0

@@ -28,7 +28,7 @@ class Quantity:
     of_imu: bool = False      # the planar estimator has none
 
     def limit(self, config: Config) -> float:
-        """Return the largest sigma that is good enough, a share of the value or rad."""
+        """Return the limit of the sigma, relative to the value or rad."""
         if self.estimates[0] == 'track_width':
             # no setting verdict.*: the limit of the method
             return TRACK_WIDTH.determined_share
@@ -53,9 +53,9 @@ def nothing_known() -> dict[str, str]:
 def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
                 lost: bool = False) -> dict[str, str]:
     """
-    Return the values within their limits for a leg that ends now.
+    Return yes, no or unknown for each quantity of a leg that ends now.
 
-    Unknown before the first update; a configured track width is not required of the drive.
+    Unknown before the first update; a configured track width need not be determined.
     ``lost``: the leg would be rejected: no value is within its limit.
     """
     ok = nothing_known()
@@ -74,7 +74,7 @@ def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
 
 
 def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str, str]:
-    """Return the values of a result that meet their limits; none for a rejected one."""
+    """Return yes, no or unknown for each quantity of a result; no yes for a rejected one."""
     doubted = {ABOUT[r.code] for r in calibration.reasons
                if r.code in ABOUT and r.code.gravity is not Verdict.ACCEPTED}
     return of_estimates(calibration.estimates, config, two_wheels,
@@ -84,7 +84,7 @@ def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -
 def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
                  doubted: Set[str] = frozenset()) -> dict[str, str]:
     """
-    Return the estimates within their limits.
+    Return yes, no or unknown for each quantity: within its limit.
 
     valid : False: no value is usable.   doubted : names of estimates with a reason against
     their use.
@@ -114,7 +114,7 @@ def as_keys(ok: dict[str, str]) -> dict[str, str]:
 
 
 def words(ok: dict[str, str]) -> str:
-    """Return them as text, empty if all are unknown."""
+    """Return the quantities as text, empty if all are unknown."""
     parts = []
     for value, text in ((YES, 'OK'), (NO, 'not OK')):
         labels = [QUANTITIES[name].label for name, v in ok.items() if v == value]
@@ -128,7 +128,7 @@ def _given(name: str, config: Config) -> bool:
 
 
 def _share(estimate: Estimate | None, relative: bool) -> float:
-    """Return the sigma of an estimate against its limit's unit, infinite where it has none."""
+    """Return the sigma of an estimate, relative to its value or not; infinite without one."""
     if estimate is None or estimate.value is None or estimate.sigma is None:
         return math.inf
     if relative:

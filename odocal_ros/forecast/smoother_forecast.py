@@ -35,8 +35,8 @@ ONLY = ('smoother',)
 SCALE, YAW, PITCH = PARAMETERS
 # physical: m/s^2 of an ordinary stop and start, and the minimum speed for it, m/s
 STOP_FORCE, STOP_SPEED = 1.5, 5.0
-# physical: path length is proportional to sigma to the power of minus this: for white errors of
-# fixes, with slow
+# physical: path length is proportional to sigma to the power of minus this, for white and for
+# time-correlated errors of the fixes
 PATH_POWER, PATH_POWER_SLOW = 1.0, 2.0
 MOST_STOPS = 50    # judgement: limit of a useful number of stops and starts
 OPEN_YET = NOT_YET | {Code.ODOMETER_STILL}     # codes that disappear with more driving
@@ -69,7 +69,7 @@ def nothing_foreseen(config: Config) -> Forecast:
 
 
 def without_force(forecast: Forecast) -> Forecast:
-    """Return a forecast without what only an accelerometer determines."""
+    """Return a forecast without the values that need an accelerometer."""
     yaw = forecast.yaw
     if yaw.sigma is None and not yaw.why:
         yaw = replace(yaw, why='not determined without an accelerometer or an external heading')
@@ -108,7 +108,7 @@ def wheels_of(method: MethodResult) -> WheelsForecast | None:
 
 
 def relative(e: Estimate) -> float | None:
-    """Return the sigma over the value, None without them."""
+    """Return the sigma divided by the value, None without them."""
     return None if e.value is None or e.sigma is None else e.sigma / abs(e.value)
 
 
@@ -126,7 +126,7 @@ def _scale(running: Running, asked: float) -> Prospect:
 
 
 def _slow_share(running: Running) -> float:
-    """Return the share of the slow fix errors in what the fixes add to the scale's variance."""
+    """Return the share of slow errors in the contribution of fixes to the scale's variance."""
     by = {s.name: float((s.effects[0]**2).sum()) for s in running.method.sources
           if s.name in ('fixes', 'slow_fix_errors')}
     total = sum(by.values())
@@ -134,7 +134,7 @@ def _slow_share(running: Running) -> float:
 
 
 def _yaw(running: Running, asked: float) -> Prospect:
-    """Return the prospect of the yaw, which accelerations along or across determine."""
+    """Return the forecast of the yaw, which accelerations along or across determine."""
     e = running.method.estimates[YAW]
     sigma = float(running.sigmas[1])
     ratio, lack = sigma / asked, ''
@@ -184,7 +184,7 @@ def planar_forecast(leg: Leg, config: Config, wanted: Callable[[], bool]) -> For
 
 
 def _planar_scale(result: LegResult, asked: float) -> Prospect:
-    """Return the prospect of the scale, whose sigma falls with the root of the distance."""
+    """Return the forecast of the scale, whose sigma falls with the root of the distance."""
     scale = result.methods[PLANAR].estimates['scale_factor']
     sigma = relative(scale)
     if sigma is None or scale.value is None or scale.sigma is None:

@@ -44,15 +44,15 @@ class ThinnedLeg:
     def __init__(self, form: OdometerForm | None = None) -> None:
         self.form = form or COUNTER
         self._cells: dict[str, Any] = {}       # slot -> rows, one a cell
-        self._open: dict[str, Any] = {}        # slot -> rows of the cell that is not over
+        self._open: dict[str, Any] = {}        # slot -> rows of the unfinished cell
         self._width_ns: dict[str, int] = {}
         self._late: dict[str, LateSoFar] = {}        # slot -> the newest counts
-        # slot -> last count as sent, (1,), and as unrolled
+        # slot -> last count as received, (1,), and as unrolled
         self._last: dict[str, tuple[Values, int | float]] = {}
         self._fix_steps: list[Ints] = []
 
     def feed(self, slot: str, samples: Samples) -> None:
-        """Take rows as they were recorded."""
+        """Add recorded rows."""
         samples = _usable(samples)
         if not len(samples.stamp_ns):
             return
@@ -100,7 +100,7 @@ class ThinnedLeg:
         return cells if before is None else join([before, cells])
 
     def fix_rate(self) -> float:
-        """Return fixes a second by the median of their intervals, NaN where there are too few."""
+        """Return the fix rate by the median interval, Hz; NaN with too few fixes."""
         steps = np.concatenate([np.empty(0, np.int64), *self._fix_steps])
         self._fix_steps = [steps[-MOST_CELLS:]]
         rising = steps[steps > 0]
@@ -125,7 +125,7 @@ class ThinnedLeg:
 
 
 def _usable(samples: SomeSamples) -> SomeSamples:
-    """Return the rows that have a stamp and finite figures where a mean is taken."""
+    """Return the rows with a stamp, and with finite values where a mean is computed."""
     keep = samples.stamp_ns > 0
     if isinstance(samples, ImuSamples):
         keep &= np.isfinite(samples.w_i).all(axis=1) & np.isfinite(samples.f_i).all(axis=1)
@@ -135,7 +135,7 @@ def _usable(samples: SomeSamples) -> SomeSamples:
 
 
 def _gathered(rows: SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> SomeSamples:
-    """Return one row for each run of equal ``cell``: its last, but the mean of ``averaged``."""
+    """Return the last row of each run of equal ``cell``, with the means of ``averaged``."""
     first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
     count = np.diff(np.append(first, len(cell)))
     last = take(rows, first + count - 1)
@@ -156,7 +156,7 @@ class LateSoFar:
 
     def __init__(self) -> None:
         self._rows: OdometerSamples | None = None
-        self._given = 0             # of these, returned
+        self._given = 0             # number of these already returned
 
     def feed(self, rows: OdometerSamples) -> OdometerSamples:
         """Take rows, and return those whose times are final."""
@@ -169,7 +169,7 @@ class LateSoFar:
         return out
 
     def rest(self) -> OdometerSamples:
-        """Return the remaining rows at their estimated times; some were fed."""
+        """Return the remaining rows at their estimated times; ``feed`` came before."""
         assert self._rows is not None
         return take(_on_time(self._rows), slice(self._given, None))
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a caller asks for (settings, legs), and the receivers of notes and progress it gives."""
+"""Arguments of a caller (settings, legs), and its receivers of notes and progress."""
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -55,18 +55,18 @@ class Notes(Listener):
 
 @dataclass(frozen=True)
 class LegSpan:
-    """A leg as asked for; None: open on that side."""
+    """A requested leg; None: open on that side."""
 
     start_ns: int | None
     stop_ns: int | None
-    relative: tuple[bool, bool] = (False, False)   # against the bag's first message
+    relative: tuple[bool, bool] = (False, False)   # from the bag's first message
 
 
 def paths_of(asked: Any) -> list[Path]:
     """
     Return the paths of one bag or several.
 
-    Raises BadUsage: there is none, or one that is no path at all.
+    Raises BadUsage: there is none, or one is not a path.
     """
     several = [asked] if isinstance(asked, (str, Path)) or not isinstance(asked, Iterable) \
         else list(asked)
@@ -75,7 +75,7 @@ def paths_of(asked: Any) -> list[Path]:
     for one in several:
         try:
             with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
-                Path(one).stat()       # whether it is there is for who reads it to say
+                Path(one).stat()       # the reader reports a missing file
         except (OSError, TypeError, ValueError) as error:
             raise BadUsage(f'{brief_line(repr(one)[:100])} is not the path of a bag: '
                            f'{said_by(error)[:100]}') from None
@@ -96,9 +96,9 @@ def topics_of(asked: Any) -> dict[str, str]:
 
 def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> Config:
     """
-    Return all settings: defaults, then those of a journal, then those asked for.
+    Return all settings: defaults, then those of a journal, then those of ``asked``.
 
-    asked : by dotted name, or a ROS parameter file; a Config is taken as it is.
+    asked : by dotted name, or a ROS parameter file; a Config is returned unchanged.
 
     Raises BadConfig, BadUsage: a setting is unknown or of a wrong value; the file cannot be read.
     """
@@ -117,7 +117,7 @@ def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> C
 
 def legs_of(asked: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
     """
-    Return legs as ``find_legs`` takes them.
+    Return legs in the form of ``find_legs``.
 
     asked : 'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates, 'each-stop',
         or (A, B), None for open; one or many.
@@ -162,7 +162,7 @@ def parse_leg(text: str) -> LegSpan:
 
 
 def _edge(text: str, whole: str) -> tuple[int | None, bool]:
-    """Return nanoseconds and whether they are against the bag's first message."""
+    """Return a time, ns, and whether it counts from the bag's first message."""
     if not text:
         return None, False
     try:

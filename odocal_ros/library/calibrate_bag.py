@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags to one calibration: what ``odocal replay`` does, for any program."""
+"""One calibration from bags: ``odocal replay`` as a function."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm p
 
 
 class LegDropped(BadUsage):
-    """A journal holds a leg that the operator dropped."""
+    """The operator dropped the leg of a journal."""
 
 
 def calibrate_bag(path: Path | str | Sequence[Path | str],
@@ -62,7 +62,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
 
     Returns
     -------
-    Calibration; a drive that cannot be calibrated says why in its reasons.
+    Calibration; its reasons name the cause if the drive cannot be calibrated.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def _look(path: Path, asked: _Asked) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _BagLegs:
-    """What is kept of a bag: the results of its legs, not its rows."""
+    """Data kept of a bag: the results of its legs, not its rows."""
 
     path: Path
     entry: dict[str, Any]
@@ -205,7 +205,7 @@ def _worth_keeping(results: list[LegResult], received: Notes) -> list[LegResult]
 
 
 def unique_paths(paths: list[Path]) -> tuple[list[Path], list[Path]]:
-    """Return the bags, one given twice once, and those that were given again."""
+    """Return the bags without duplicates, and the duplicates."""
     first: dict[Path, Path] = {}
     again = []
     for path in paths:
@@ -226,7 +226,7 @@ def about(path: Path, error: Exception) -> str:
 
 
 def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
-    """Look at each of several bags; BadUsage names all errors together, before the work."""
+    """Check each bag before the work; raise one BadUsage that names all errors."""
     troubles = []
     for path in paths:
         try:
@@ -239,7 +239,7 @@ def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
 
 
 def unlike_settings(configs: list[Config]) -> list[str]:
-    """Return the names of the settings that differ between bags, as journals bring their own."""
+    """Return the names of the settings that differ between bags; journals have their own."""
     first, *others = [flat(config) for config in configs]
     # as text: an unset one is NaN, which is not equal to itself
     return [name for name, value in first.items()
@@ -249,9 +249,9 @@ def unlike_settings(configs: list[Config]) -> list[str]:
 def unique_names(paths: list[Path], legs: list[list[LegResult]],
                inputs: list[dict[str, Any]]) -> tuple[list[LegResult], list[dict[str, Any]]]:
     """
-    Return legs and inputs named so that no two bags have one name: by their paths if need be.
+    Return legs and inputs with unique bag names: paths if the names are not unique.
 
-    legs : of each bag.   inputs : what is written of each.
+    legs : of each bag.   inputs : entry of each bag in the results.
     """
     names = [entry['bag'] for entry in inputs]
     if len(set(names)) == len(names):

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A calibration as other programs take it: values, tables, series, figures, files."""
+"""A calibration for other programs: values, tables, series, figures, files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -38,8 +38,8 @@ class Calibration:
     """
     A calibration of a vehicle.
 
-    result : all of it, as the pipeline gives it.   config : settings it was made with.
-    inputs : of each bag its name, sha256 and topics.   notes : sentences from the computation.
+    result : complete result of the pipeline.   config : its settings.
+    inputs : name, sha256 and topics of each bag.   notes : sentences from the computation.
     created : ISO 8601 time.
     """
 
@@ -70,7 +70,7 @@ class Calibration:
         return {name: e.sigma for name, e in self._estimates().items()}
 
     def _estimates(self) -> dict[str, Estimate]:
-        """Return the estimates, those that each result has to have also where no leg was fit."""
+        """Return the estimates; the mandatory ones exist even if no leg was fitted."""
         from odocal_ros.output.files import ALWAYS
         named = {name: Estimate(None, None, unit or '') for name, unit in ALWAYS.items()}
         named |= self.result.estimates
@@ -127,8 +127,8 @@ class Calibration:
 
         ``tell`` receives a sentence if the report cannot be drawn.
 
-        Raises BadUsage: there is a calibration.json and no ``force``, or the folder cannot be
-        written.
+        Raises BadUsage: a calibration.json exists and ``force`` is not set, or the folder is not
+        writable.
         """
         from odocal_ros.output.files import write_results
         return write_results(self.result, self.config, Path(folder), list(self.inputs),

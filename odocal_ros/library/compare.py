@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibrations of one vehicle beside one another, to see whether it has changed."""
+"""Comparison of calibrations of one vehicle, to detect changes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.output.stored import read_stored, Stored, stored_from
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-# what belongs to a drive (turn-on bias, its heading) or follows from another value
+# values of one drive (turn-on bias, its heading), or derived from another value
 NOT_COMPARED = {'scale_ratio', 'heading_error', 'gyro_bias_x', 'gyro_bias_y', 'gyro_bias_z'}
 ANGLES = {'yaw_mounting_angle', 'pitch_mounting_angle'}
 ORDER = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'track_width',
@@ -38,7 +38,7 @@ class Difference:
     A change of one parameter from one calibration to a later one.
 
     change : in the parameter's unit; sigma : of the change; sigmas : change over sigma, None
-    where a sigma is unknown or zero.
+    if a sigma is unknown or zero.
     """
 
     since: int
@@ -74,11 +74,11 @@ class Change:
 
 def changes(stored: list[Stored]) -> list[Change]:
     """
-    Return each parameter that two usable calibrations have, over all that have it.
+    Return each parameter of two or more usable calibrations, over all that have it.
 
-    A rejected calibration shows its change, but nothing later is measured from it.
+    A rejected calibration shows its change, but is no reference for later ones.
 
-    Raises BadUsage: a parameter comes in different units: these are different odometers.
+    Raises BadUsage: the units of a parameter differ: these are different odometers.
     """
     names = sorted({n for s in stored for n, e in s.estimates.items()
                     if e.value is not None} - NOT_COMPARED, key=_order)
@@ -137,10 +137,10 @@ def _difference(name: str, stored: list[Stored], since: int | None,
         return None
     a, b = stored[since], stored[index]
     old, new = a.estimates[name], b.estimates[name]
-    assert old.value is not None     # what has no value is no entry
+    assert old.value is not None     # entries have a value
     assert new.value is not None
     change = new.value - old.value
-    if name in ANGLES:      # of an IMU that faces backwards they lie about +-pi
+    if name in ANGLES:      # of a backward IMU they are near +-pi
         change = float(wrap(change))
     if old.sigma is None or new.sigma is None:
         return Difference(since, change, None, None, None)
@@ -156,10 +156,10 @@ def _difference(name: str, stored: list[Stored], since: int | None,
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """
-    How values changed over calibrations, the oldest first.
+    Changes of values over calibrations, the oldest first.
 
-    stored : what was compared.   changes : of each parameter.   notes : what to know of them.
-    sentence : on all of it.   changed : whether any change counts; None: nothing to judge.
+    stored : compared calibrations.   changes : of each parameter.   notes : on calibrations.
+    sentence : summary.   changed : whether any change is significant; None: nothing to compare.
     """
 
     stored: tuple[Stored, ...]
@@ -209,7 +209,7 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
 
 
 def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | None]:
-    """Return one sentence on all changes, and whether any counts; None: nothing to judge."""
+    """Return a summary sentence, and whether any change is significant; None: not comparable."""
     if not found:
         return ('nothing to compare: no value exists in two calibrations that are not '
                 'rejected', None)
@@ -240,15 +240,15 @@ def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
 
 
 def label(parameter: str) -> str:
-    """Return a parameter as people call it."""
+    """Return the name of a parameter for people."""
     return parameter.replace('_', ' ').replace(' angle', '')
 
 
 def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> str:
-    """Return a change as people read it: scales in per cent or ppm, angles in deg."""
+    """Return a change as text: scales in per cent or ppm, angles in deg."""
     if change.parameter.startswith('scale_'):
         before = stored[difference.since].value(change.parameter)
-        assert before is not None      # what has no value is no entry
+        assert before is not None      # entries have a value
         return change_in_words(difference.change / before)
     if change.unit == 'rad':
         return f'{math.degrees(1.0) * difference.change:+.3g} deg'
@@ -256,7 +256,7 @@ def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> 
 
 
 def hints(found: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
-    """Yield what would count if the errors that the legs share were the same each time."""
+    """Yield notes on changes that are significant only if shared errors are the same in both."""
     for change in found:
         last = change.entries[-1]
         for d in (last.to_first, last.to_previous):

@@ -65,7 +65,7 @@ def _log_leg(recording: Any, name: str, pose: Series, state: Series) -> None:
 
 
 def tum(columns: Series) -> str:
-    """Return poses as evo reads them: s, m, quaternion x y z w, by spaces."""
+    """Return poses in the format of evo: s, m, quaternion x y z w, separated by spaces."""
     stamp = columns['stamp_ns']
     rows = zip(*(columns[name] for name in (
         'east_m', 'north_m', 'up_m', 'qx', 'qy', 'qz', 'qw')), strict=True)
@@ -75,7 +75,7 @@ def tum(columns: Series) -> str:
 
 
 def csv(columns: Series) -> str:
-    """Return a series as text with its names at the top, numbers in full."""
+    """Return a series as CSV text with a header line, numbers in full."""
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     return ','.join(columns) + '\n' + ''.join(f'{",".join(map(str, row))}\n' for row in rows)
 
@@ -116,7 +116,7 @@ def mcap(result: Calibration, path: Path) -> None:
     Write all series as one mcap file, for PlotJuggler and Foxglove.
 
     /odocal/track NavSatFix, PoseStamped in a local frame; /odocal/biases IMU: the vehicle's
-    attitude, and the biases in the place of rates and forces, their variances in that of those;
+    attitude, the biases in the fields of rates and forces, and their variances;
     /odocal/residuals/SENSOR JointState: each component and its sigma, units in the names.
     """
     with tempfile.TemporaryDirectory(prefix='.odocal_', dir=path.parent) as work:
@@ -201,7 +201,7 @@ def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
     """
     Write series as files; their names select series and format: ``KNOWN``.
 
-    Raises BadUsage: a name is another, a leg gives no such series, a file cannot be written.
+    Raises BadUsage: a name is unknown, no leg has such a series, a file cannot be written.
     """
     paths = [Path(file) for file in files]
     check_names(paths)

@@ -48,7 +48,7 @@ def map_figure(shapes: list[dict[str, Any]]) -> Any:
 
 
 def _draw(ax: Any, shape: dict[str, Any]) -> None:
-    """Draw one feature; a kind has its label once."""
+    """Draw one feature; each kind is labelled once."""
     from odocal_ros.output.drawing import BLUE, GREY, RED
     kind, geometry = shape['properties']['kind'], shape['geometry']
     style: dict[str, Any] = {
@@ -99,7 +99,7 @@ def scale_by_speed(result: Calibration) -> Series:
     """
     Return the scale against speed, one row per leg and group of sections.
 
-    speed_m_per_s, ratio, ratio_sigma : path by the fixes over the odometer as sent.   sections :
+    speed_m_per_s, ratio, ratio_sigma : path by the fixes over the raw odometer.   sections :
     in the group.   factor, offset, lag with sigma : of the leg's fit; NaN if not determined.
 
     Raises BadUsage: no leg has enough sections.

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which legs a recording holds: as asked, as marked by the node, or from its standstills."""
+"""Legs of a recording: as requested, as marked by the node, or from its standstills."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -23,8 +23,8 @@ from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
-Stops = tuple[Ints, tuple[Floats, float] | None]     # as ``stops_of`` gives them
-OPENING = 0.2                 # judgement: of the distance; a first stop later splits no leg
+Stops = tuple[Ints, tuple[Floats, float] | None]     # result of ``stops_of``
+OPENING = 0.2                 # judgement: of the distance; a later first stop does not start a leg
 CUT_SHORT_NS = 10 * 10**9     # judgement: drivers and recorders start and stop within it
 STATUS_NAME = 'calibrator: calibration'
 DROPPED = ('cancelled', 'undone')
@@ -67,7 +67,7 @@ def open_ended(spans: Spans, marks: Sequence[tuple[int, int]]) -> list[tuple[Rea
     """
     Return a note for each leg that was marked at its start and not at its end.
 
-    spans : (start, stop) of the legs.   marks : as ``marked_legs`` gives them.
+    spans : (start, stop) of the legs.   marks : result of ``marked_legs``.
     """
     starts = {start for start, stop in marks if not stop}
     return [(Reason(Code.STOP_MARK_MISSING, OPEN_LEG),) if start in starts else ()
@@ -128,13 +128,13 @@ def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | st
     """
     Return (start, stop) stamps of the legs of one bag.
 
-    recorder : fed with the whole bag.   bag : for its time span.   asked : empty: marks if there
-    are any, else automatic legs with leg.automatic, else one from standstill to standstill.
-    marks : (start, stop) as the node marked them.   config : standstills, least distance.
-    stops : what ``stops_of`` finds in all that the topics have in common, where that is known.
+    recorder : fed with the whole bag.   bag : for its time span.   asked : requested legs; empty:
+    the marks, else automatic legs with leg.automatic, else one from standstill to standstill.
+    marks : (start, stop) by the node.   config : standstills, least distance.   stops : result of
+    ``stops_of`` for the common time of the topics, if known.
 
-    Raises BadUsage: an asked leg lies outside the bag; BadData: the stamps of the topics have no
-    time in common, and a leg is to be found or open-ended.
+    Raises BadUsage: a requested leg is outside the bag; BadData: the stamps of the topics have no
+    common time, and a leg must be searched or is open-ended.
     """
     first, last = _common(recorder)
     closed = marks or any(isinstance(a, LegSpan) and None not in (a.start_ns, a.stop_ns)
@@ -168,7 +168,7 @@ def _marked(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans
 
 
 def _common(recorder: LegRecorder) -> tuple[int, int]:
-    """Return the first and the last stamp that IMU, odometer and fix have in common, if any."""
+    """Return the first and last common stamp of IMU, odometer and fix; last before first: none."""
     firsts, lasts = zip(*_ends(recorder).values() or [(0, 1)], strict=True)
     return max(firsts), min(lasts)
 
@@ -195,7 +195,7 @@ def _apart(recorder: LegRecorder) -> str:
 def _placed(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, int]:
     start = first if span.start_ns is None else span.start_ns + bag.start_ns * span.relative[0]
     stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.relative[1]
-    # stamps may be of another clock than the bag's times, as of a drive that was played again
+    # stamps may be on another clock than bag times, as in a recording of a replay
     begin, end = min(bag.start_ns, first), max(bag.end_ns, last)
     if stop <= start or stop < begin - 10**10 or start > end + 10**10:
         length = (bag.end_ns - bag.start_ns) * 1e-9
@@ -207,11 +207,11 @@ def _placed(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, i
 
 def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
     """
-    Return the standstills of a recording, and how far was driven until then.
+    Return the standstills of a recording, and the path length up to them.
 
-    inputs : of all that its topics have in common, screened.   first : ns, where they begin.
+    inputs : screened, over the common time of the topics.   first : their start, ns.
 
-    Returns (k, 2) ns, and (k, 2) m driven before each with the total, None if unknown.
+    Returns (k, 2) ns, and the path length at these, (k, 2) m, with the total; None if unknown.
     """
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         return np.empty((0, 2), np.int64), None
@@ -246,7 +246,7 @@ def _by_standstill(first: int, last: int, known: Stops) -> tuple[int, int]:
 
 
 def _each_stop(known: Stops, config: Config) -> Spans:
-    """Return a leg from each standstill to the next that is long enough."""
+    """Return a leg from each standstill to the next, without short ones if others are left."""
     stops, driven = known
     if driven is None:
         return []

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How good a calibration will be, before it is driven, and what would help."""
+"""Predicted accuracy of a calibration before the drive, and possible improvements."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -31,14 +31,14 @@ from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import GRADES, with_settings
 
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
-RTK = 0.02                        # m, physical: of a fix, as receivers' data sheets have it
+RTK = 0.02                        # m, physical: sigma of a fix, by receivers' data sheets
 PITCH = 'pitch_mounting_angle'
 PARAMETERS = (SCALE, YAW, PITCH)
 
 
 @dataclass(frozen=True)
 class Change:
-    """A change and the sigmas it leaves, relative and rad; None: not determined."""
+    """A change and the resulting sigmas, relative and rad; None: not determined."""
 
     text: str
     scale: float | None
@@ -58,7 +58,7 @@ class Change:
 
 def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
     """Return the possible changes, each with the resulting sigmas."""
-    # keyframes as far apart as they were: farther ones alone make a sigma larger
+    # the same keyframe spacing: a wider one alone makes a sigma larger
     spacing = spacing_for(drive)
     found = []
     for text, other_drive, other_sigmas in (*_other_drives(drive, sigmas, before),
@@ -70,7 +70,7 @@ def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
 
 def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
                   before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
-    """Yield longer drives, and such with more to see in them."""
+    """Yield (text, drive, sigmas) of drives that are longer or have more manoeuvres."""
     yield (f'{length(drive.distance)} more, straight ahead', drive.lengthened(drive.distance),
            sigmas)
     least_rest = 60.0    # s
@@ -88,7 +88,7 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
 
 def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
                     before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
-    """Yield fixes, heading and IMU that are better than what there is."""
+    """Yield (text, drive, sigmas) with better fixes, heading and IMU."""
     if sigmas.fix > 2 * RTK:
         yield f'RTK fixes ({RTK:g} m)', drive, replace(sigmas, fix=RTK, fix_up=2 * RTK)
     alignment = before.two_point.alignment
@@ -139,7 +139,7 @@ def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Chang
 
 
 def _whole(method: MethodResult) -> MethodResult:
-    """Return the method with a value for what it does not determine, so that legs combine."""
+    """Return the method with dummy values of undetermined parameters, so that legs combine."""
     known = {name: e if e.value is not None else Estimate(0.0, 0.0, e.unit)
              for name, e in method.estimates.items()}
     return replace(method, estimates=known)
@@ -147,7 +147,7 @@ def _whole(method: MethodResult) -> MethodResult:
 
 def ranked(found: list[Change], before: Plan, parameter: str) -> list[Change]:
     """Return the changes that help a parameter, best first."""
-    worth = 0.98    # of a sigma: what leaves more is no help
+    worth = 0.98    # of a sigma: a change that leaves more is no help
     helpful = [c for c in found if c.gain(before, parameter) > 1 / worth]
     return sorted(helpful, key=lambda c: (-c.gain(before, parameter), c.sigma(parameter)))
 
@@ -155,9 +155,9 @@ def ranked(found: list[Change], before: Plan, parameter: str) -> list[Change]:
 @dataclass(frozen=True, eq=False)
 class Planned:
     """
-    What a drive will give.
+    The prediction of a drive.
 
-    drive : the motion.   sigmas : what errs, and the settings.   plan : by each method.
+    drive : the motion.   sigmas : its errors, and the settings.   plan : of each method.
     """
 
     drive: PlannedDrive
@@ -166,7 +166,7 @@ class Planned:
 
     @property
     def verdict(self) -> Verdict:
-        """Return the predicted verdict of such a drive."""
+        """Return the predicted verdict of the drive."""
         return self.plan.verdict
 
     @property
@@ -222,21 +222,21 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     distance, speed, turns, standstill, acceleration
         m, m/s, turns of 90 deg, s at rest at either end, m/s^2: a drive by its figures.
     scenario, duration
-        That of a simulated one, s.
+        Name of a simulated drive, and its duration, s.
     gpx
-        That of a GPX track; one without times is driven at ``speed``.
+        A GPX track; one without times is driven at ``speed``.
     bag, topics
-        That of a recorded bag, with the figures of its own fixes.
+        A recorded bag, with the accuracy and rate of its own fixes.
     config : Config, mapping of dotted names, or a parameter file, optional
         Settings: IMU grade, heading source and the like.
     figures
-        As ``forecast.predict.Sigmas`` has them: fix, fix_up m, fix_rate Hz, quantum m a count,
+        Fields of ``forecast.predict.Sigmas``: fix, fix_up m, fix_rate Hz, quantum m per count,
         sway m/s, slip m/sqrt(s).
 
     Raises
     ------
     BadUsage, BadConfig
-        Not one drive is given, or it makes no sense.
+        Not exactly one drive is given, or its values are invalid.
 
     """
     kinds = {'scenario': scenario, 'gpx': gpx, 'bag': bag, 'distance': distance}

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How good a run of a small robot will be: patterns, references and drives."""
+"""Predicted accuracy of runs of a small robot: patterns, references and drives."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,7 +22,7 @@ from odocal_ros.sim.wheels import effective_width, STRAIGHT
 
 MARKS = 'marks'
 KINDS = ('mocap', 'total_station', 'slam', 'amcl', MARKS)
-# m, judgement: of a run between marks: path in which a correlated error is forgotten
+# m, judgement: of a run between marks: correlation length of the position error
 MARKS_LENGTH = 1.0
 SHOWN = {'scale_factor': 'scale', 'track_width': 'track width', 'rotation_lever':
          'rotation lever', 'track_width_arc': 'width on arcs', 'lateral_scale_factor': 'lateral',
@@ -65,12 +65,12 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
     Predict the sigmas of runs of a small robot on a level floor.
 
     run : of PATTERNS, or ``all``.   reference : of KINDS.   drive : as ``odometer.drive``.
-    imu : the robot has one.   size, rounds, speed : m of a straight, how often, m/s.
+    imu : the robot has one.   size, rounds, speed : m of a straight, repetitions, m/s.
     track_width : m between the wheels (skid steering widens it by 1.7 on the spot and 1.4
-    straight on).   wheels : how many.   slip : m/sqrt(s) of each.   points_sigma : m, accuracy of
+    straight on).   wheels : number.   slip : m/sqrt(s) of each.   points_sigma : m, accuracy of
     the robot on its marks; None: ``reference.points_sigma``.   config : as ``calibrate_bag``.
 
-    Raises BadUsage, BadConfig: a name is unknown, or a figure is out of range.
+    Raises BadUsage, BadConfig: a name is unknown, or a value is out of range.
     """
     for flag, value, names in (('--indoor', run, ('all', *PATTERNS)), ('--drive', drive, DRIVES),
                                ('--reference', reference, KINDS)):
@@ -98,7 +98,7 @@ def robot_of(options: SimOptions) -> Robot:
     usual = dict(REFERENCES[options.reference].usual)
     drift, length = usual.get('reference_drift', 0.0), usual.get('drift_length', 0.0)
     model = Robot.drift_length
-    # forgotten with the path: its own sigma; else that of the model with the same steps
+    # of a correlated error its sigma; of a random walk that of the model with the same steps
     stationary = drift * np.sqrt((length or model) / 2)
     straight = STRAIGHT * options.track_width if options.drive == SKID else 0.0
     return Robot(drive=options.drive, imu=options.imu, width=effective_width(options),

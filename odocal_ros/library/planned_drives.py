@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where a planned drive comes from: figures, a named scenario, a GPX track or a recorded bag."""
+"""Planned drives from figures, a named scenario, a GPX track or a recorded bag."""
 
 from datetime import UTC
 import math
@@ -22,10 +22,10 @@ MOST_SECONDS = 36_000.0      # of a planned drive, judgement: ten hours
 def from_figures(speed: float, distance: float, standstill: float, turns: int,
                  acceleration: float) -> PlannedDrive:
     """
-    Return a drive of so many metres between two standstills, with 90 deg turns left and right.
+    Return a drive of ``distance`` m between two standstills, with 90 deg turns left and right.
 
-    Turns are spread evenly over the stretch at full speed; a drive too short to reach ``speed``
-    turns back to braking where it must.
+    Turns are spread evenly over the section at full speed. A drive too short to reach ``speed``
+    brakes from a lower one.
     """
     for flag, value, least in (('--speed', speed, 0.0), ('--distance', distance, 0.0),
                                ('--acceleration', acceleration, 0.0)):
@@ -123,12 +123,12 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
 
 
 def _child(point: Any, name: str) -> str | None:
-    """Return the text of the child of an element that has a name."""
+    """Return the text of the first child of an element with a name, None without one."""
     return next((c.text for c in point if c.tag.rpartition('}')[2] == name), None)
 
 
 def _seconds(text: str | None) -> float | None:
-    """Return seconds since 1970 of an ISO 8601 date, None where there is none."""
+    """Return seconds since 1970 of an ISO 8601 date, None without one."""
     from datetime import datetime
     if text is None:
         return None
@@ -137,7 +137,7 @@ def _seconds(text: str | None) -> float | None:
 
 
 def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> PlannedDrive:
-    """Return the drive through points; nearer than 5 m they give no direction."""
+    """Return the drive through points; points closer than 5 m are skipped."""
     rising = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
     t, p = t[rising], position_n[rising]
     used = [0]
@@ -150,7 +150,7 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
     a, b = np.array(used[:-1]), np.array(used[1:])
     step = p[b] - p[a]
     path_length, level = np.linalg.norm(step, axis=1), np.hypot(*step[:, :2].T)
-    # a slow step was mostly a stop: its motion is put into the interval of its last point
+    # a slow step was mostly a stop: its motion is assigned to the interval before its last point
     pace = path_length / (t[b] - t[a])
     gpx_rest, gpx_slow = 0.3, 0.1    # m/s, of the median speed: slower steps were mostly a stop
     rest = pace < max(gpx_rest, gpx_slow * np.median(pace))
@@ -164,8 +164,8 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
     speed = np.where(moving, (path_length / np.maximum(t[b] - begin, 1e-3))[piece], 0.0)
     yaw = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     middle = (begin + t[b]) / 2
-    # s: what changes faster between points is their noise and spacing; rests, found too long by
-    # the path to the next used point loses half of it at each end
+    # s: faster changes between points are noise and spacing; rests, too long by the path to the
+    # next used point, lose half of this at each end
     gpx_smooth = 4.0
     wide = max(1, round(gpx_smooth / (grid[1] - grid[0]) / 2)) * 2 + 1
     slopes = 5    # odd; times longer for slopes: heights are noisier, hills longer
@@ -175,7 +175,7 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
 
 
 def _smooth(x: Floats, wide: int) -> Floats:
-    """Return means over so many rows, odd; the ends go on as they are."""
+    """Return moving means over ``wide`` rows, odd; the end values are extended."""
     padded = np.pad(x, wide // 2, mode='edge')
     total = np.concatenate([[0.0], np.cumsum(padded)])
     mean: Floats = (total[wide:] - total[:-wide]) / wide
@@ -184,7 +184,7 @@ def _smooth(x: Floats, wide: int) -> Floats:
 
 def from_bag(path: Path, config: Config,
              topics: dict[str, str]) -> tuple[PlannedDrive, dict[str, float]]:
-    """Return the drive of a recorded bag's first leg, and the figures of its own fixes."""
+    """Return the drive of a bag's first leg, and ``Sigmas`` arguments by its fixes and counts."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.data.leg import LegRecorder
     from odocal_ros.forecast.leg_so_far import count_size, fix_figures, profile_of

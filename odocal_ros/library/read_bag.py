@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bag to samples: topics chosen, messages decoded, its marks, the notes of a journal."""
+"""Samples of a bag: chosen topics, decoded messages, marks, metadata of a journal."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -35,12 +35,12 @@ from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
 BLOCK = 'odocal_journal'
-STILL_SHARE = 0.05      # judgement: of the largest travel in a second: the robot moves
+STILL_SHARE = 0.05      # judgement: of the largest travel in a second; above it the robot moves
 
 
 @dataclass(frozen=True)
 class JournalNotes:
-    """Settings of a journal's leg by dotted name, slot -> topic, and where they were found."""
+    """Settings of a journal's leg by dotted name, slot -> topic, and their file."""
 
     path: Path
     settings: dict[str, object] = field(default_factory=dict)
@@ -74,10 +74,10 @@ class Recording:
     """
     A bag that was read.
 
-    name, sha256 : of the bag.   topics : slot -> topic.   imu_frame : of the IMU's headers.
+    name, sha256 : of the bag.   topics : slot -> topic.   imu_frame : frame_id of the IMU.
     start_ns, end_ns : bag times of its first and last message.   marks : (start, stop) stamps of
-    the legs that a node marked, stop 0 where there is none; dropped : it took one back.
-    notes : what a result says of the bag.   config : settings in force, a journal's among them.
+    the legs that a node marked, stop 0 if missing; dropped : a journal's leg was dropped.
+    notes : reasons from the bag for its results.   config : settings, including a journal's.
     """
 
     name: str
@@ -103,11 +103,11 @@ class Recording:
         return rows
 
     def spans(self, legs: list[asked.LegSpan | str]) -> list[tuple[int, int]]:
-        """Return (start, stop) stamps of legs that ``legs_of`` gave; of none, those it holds."""
+        """Return (start, stop) stamps of legs from ``legs_of``; if none, of the recorded legs."""
         return find_legs(self.recorder, self, legs, [] if legs else list(self.marks), self.config)
 
     def legs(self, legs: asked.Leg | list[asked.Leg] | None = None) -> list[Leg]:
-        """Return the legs asked for, or those it holds, for ``pipeline.calibrate``."""
+        """Return the requested legs, or the recorded ones, for ``pipeline.calibrate``."""
         return [self.recorder.close(start, stop, self.config.leg.preroll)
                 for start, stop in self.spans(asked.legs_of(legs))]
 
@@ -115,7 +115,7 @@ class Recording:
 def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
                journal: JournalNotes | None,
                hearer: asked.Listener | None = None) -> tuple[dict[str, str], dict[str, Reader]]:
-    """Return slot -> topic of a bag, and topic -> reader; named ones precede a journal's."""
+    """Return slot -> topic, and topic -> reader; ``topics`` take precedence over a journal's."""
     from odocal_ros.library.topics import choose_topics, local_reference
     named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
     chosen = choose_topics(bag.topics, config, named, bool(marks_of(config, bag)))
@@ -134,7 +134,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
     Parameters
     ----------
     path : path
-        Of the bag, or of a journal of the node: that brings settings and topics of its own.
+        Of the bag, or of a journal of the node, which has settings and topics of its own.
     topics : mapping, optional
         Slot (imu, odometer, odometer_right, fix, fix_velocity, heading) -> topic; the others are
         found by their type.
@@ -146,14 +146,14 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
     Raises
     ------
     BadBag, BadData, BadUsage, BadConfig
-        The bag cannot be read, lacks an input, or holds several that could be it.
+        The bag cannot be read, or an input is missing or ambiguous.
 
     """
     hearer = hearer or asked.Listener()
     path = Path(path)
     journal = journal_notes(path)
     settings = asked.config_of(config, journal.settings if journal else None)
-    # the hash costs as long as reading the file: beside the decoding, which holds one core
+    # the hash takes as long as reading the file: parallel to the decoding, which uses one core
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
         name = one_line(bag.name)
         floor_marks = marks_of(settings, bag)
@@ -213,7 +213,7 @@ def _stored_marks(bag: Bag, points: int) -> list[FloorMark]:
 
 def check_still(marks: Sequence[FloorMark], recorder: LegRecorder, start_ns: int) -> None:
     """
-    Raise BadUsage for a mark at which the odometer counts, or that is outside the recording.
+    Raise BadUsage for a mark at which the wheels move, or that is outside the recording.
 
     start_ns : of the first message of the bag.
     """

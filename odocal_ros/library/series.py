@@ -19,7 +19,7 @@ from odocal_ros.nav.rotations import quat_from_matrix, rpy_from_matrix
 Series = dict[str, NDArray[Any]]
 NONE = ('no leg has a result of the smoother, which computes this series; see the reasons, or '
         'use method auto')
-# what the smoother leaves over: its sensors, their unit, their components
+# residuals of the smoother: sensors, units, components
 SMOOTHED = (('fix', 'm', ('east', 'north', 'up')), ('odometer', 'm', ('along', 'left', 'up')),
             ('gyro', 'rad/s', ('x', 'y', 'z')), ('accelerometer', 'm/s^2', ('x', 'y', 'z')))
 
@@ -28,16 +28,16 @@ def trajectory(result: Calibration) -> Series:
     """
     Return the smoothed drive, second by second, of the legs that the smoother could fit.
 
-    east_m, north_m, up_m : of the odometer's point, in n, which stands at the leg's origin.
-    latitude_deg, longitude_deg, height_m : the same.   qx, qy, qz, qw : take vehicle axes
-    (forward, left, up) to n.   Raises BadUsage: no leg has a fit of the smoother.
+    east_m, north_m, up_m : of the odometer's point, in n at the leg's origin.
+    latitude_deg, longitude_deg, height_m : the same.   qx, qy, qz, qw : rotation from vehicle
+    axes (forward, left, up) to n.   Raises BadUsage: no leg has a fit of the smoother.
     """
     return _of_fits(result, _pose)
 
 
 def states(result: Calibration) -> Series:
     """
-    Return attitude and biases of the IMU, second by second, as the smoother finds them.
+    Return attitude and biases of the IMU, second by second, as the smoother estimates them.
 
     roll, pitch, yaw : of the vehicle in n, yaw from east.   gyro_bias_x ... : rad/s, in the body
     frame b.   accelerometer_bias_x ... : m/s^2.   Each with its sigma: gyro_bias_x_sigma ...
@@ -49,7 +49,7 @@ def states(result: Calibration) -> Series:
 
 def _of_fits(result: Calibration,
              columns: Callable[[LegResult, dict[str, Any]], Series]) -> Series:
-    """Return the columns of each leg that the smoother fitted: (leg, its details) to them."""
+    """Return ``columns``, a function of (leg, details), for each leg the smoother fitted."""
     found = [(number, leg, columns(leg, leg.methods['smoother'].details))
              for number, leg in enumerate(result.legs, 1)
              if leg.track_n is not None
@@ -60,7 +60,7 @@ def _of_fits(result: Calibration,
 
 
 def _rows(smoothed: dict[str, Any], column: Floats) -> Floats:
-    """Return the rows of what each keyframe has at which the track was kept."""
+    """Return the rows of a column by keyframe at the times of the stored track."""
     rows: Floats = column[np.searchsorted(smoothed['key_t'], smoothed['track_t'])]
     return rows
 
@@ -76,7 +76,7 @@ def _vehicle(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
 
 def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:
     track_n = smoothed['track_n']
-    # of a local frame no place on the Earth is known
+    # a local frame has no position on the Earth
     geodetic = Origin(*leg.origin).to_geodetic(track_n) if leg.origin else np.full(
         track_n.shape, np.nan)
     latitude, longitude, height = geodetic.T
@@ -100,7 +100,7 @@ def _state(leg: LegResult, smoothed: dict[str, Any]) -> Series:
 
 
 def stacked(found: list[tuple[int, LegResult, Series]]) -> Series:
-    """Return the series of legs, one under the other, their times as stamps."""
+    """Return the concatenated series of legs, with times and stamps."""
     legs = [{'leg': np.full(len(columns['t']), number),
              'stamp_ns': leg.start_ns + np.round(columns['t'] * 1e9).astype(np.int64),
              't_s': columns['t'],
@@ -111,7 +111,7 @@ def stacked(found: list[tuple[int, LegResult, Series]]) -> Series:
 
 @dataclass(frozen=True, eq=False)
 class Left:
-    """What is left over of a sensor in a leg: t (m,) s, value and sigma (m, c), NaN: nothing."""
+    """Residuals of a sensor in a leg: t (m,) s, value and sigma (m, c), NaN: none."""
 
     sensor: str
     unit: str
@@ -141,13 +141,13 @@ def residuals(result: Calibration) -> Series:
     """
     Return the residuals of each sensor, one row per component.
 
-    sensor, component, value, sigma, unit : the calibrated drive less what the sensor says, and one
-    standard deviation of the noise it is modelled with.   distance_m : driven until then.
+    sensor, component, value, sigma, unit : calibrated drive minus measurement, and one standard
+    deviation of its modelled noise.   distance_m : path length so far.
 
-    ``track`` along, left: dead reckoning from the start mark less each fix, as calibrated;
-    ``track_before`` as configured. By the smoother, where it could fit: ``fix`` east, north, up;
-    of the second before, ``odometer`` along, left, up, and ``gyro`` and ``accelerometer`` x, y, z,
-    means, in the body frame b.   Raises BadUsage: no leg has a track.
+    ``track`` along, left: dead reckoning from the start mark minus each fix, as calibrated;
+    ``track_before`` as configured. By the smoother, if it fits: ``fix`` east, north, up; over
+    the second before, ``odometer`` along, left, up, and means of ``gyro`` and ``accelerometer``
+    x, y, z in the body frame b.   Raises BadUsage: no leg has a track.
     """
     found = [(number, leg, _residual_rows(leg, one)) for number, leg in enumerate(result.legs, 1)
              for one in left_in(leg)]

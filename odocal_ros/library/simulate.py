@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A drive with known truth, as samples or as a bag with its truth beside it."""
+"""A drive with known truth, as samples or as a bag with a truth file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -32,18 +32,18 @@ def simulate(scenario: str | SimOptions = 'town', out: Path | str | None = None,
         paper, straight, out_and_back, town, motorway, oval, yard, indoor or square; or all
         options.
     out : path, optional
-        Bag to write; truth.yaml and calibrator.yaml, what an operator would know, go beside it.
+        Bag to write; truth.yaml and calibrator.yaml (the operator's settings) are next to it.
     storage, compression, force, progress
-        As ``bagio.write.write_bag`` takes them.
+        Arguments of ``bagio.write.write_bag``.
     heading_sigma : float, optional
-        rad: a heading of this accuracy goes into calibrator.yaml.
+        rad: calibrator.yaml gets a heading of this accuracy.
     options
         Fields of SimOptions: duration, seed, imu_grade, fix_noise, two_wheels and so on.
 
     Raises
     ------
     BadUsage
-        An option is unknown or out of range; a file is there already and no ``force``.
+        An option is unknown or out of range; a file exists and ``force`` is not set.
 
     """
     if out is not None:
@@ -73,7 +73,7 @@ def beside(out: Path) -> list[Path]:
 
 
 def _check_beside(path: Path, force: bool) -> None:
-    """Refuse to write over a file, unless forced and it was made here."""
+    """Refuse to overwrite a file, unless ``force`` is set and it was made here."""
     if not path.exists():
         return
     if not force:

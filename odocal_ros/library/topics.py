@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which topic of a bag is which input: by message type, where exactly one can be meant."""
+"""Assignment of a bag's topics to inputs, by message type if exactly one topic fits."""
 
 from collections.abc import Iterable
 import re
@@ -15,16 +15,16 @@ from odocal_ros.messages.sensor_types import FIX, IMU, LOCAL_TYPES, TRANSFORMS, 
 from odocal_ros.settings.config import Config, OdometerConfig
 
 NEVER = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
-COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # asked of a vehicle, not measured
+COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # to a vehicle, not measured
 # poses that a person sets: Nav2 and RViz
 GOALS = ('goal', 'initialpose', 'initial_pose', 'clicked')
-# estimates made of GNSS or of everything: no odometer while there is another
+# estimates from GNSS or all sensors: no odometer while there is another
 FUSED = ('filtered', 'fused', 'gps', 'gnss', 'fix', 'global', 'ground_truth', 'ekf')
 GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
 
 # an Odometry is the reference only if it is named: most are the wheel odometry itself
 REFERENCES = (FIX, *(kind for kind in LOCAL_TYPES if kind not in ODOMETERS))
-FIRST = ('odometer_right', 'odometer', 'heading')     # chosen first, for what they leave to others
+FIRST = ('odometer_right', 'odometer', 'heading')     # chosen first; others take the rest
 
 Topics = dict[str, TopicInfo]
 
@@ -35,7 +35,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
     Return slot -> topic.
 
     topics : by name.   config : required inputs, and the type of the odometer.   overrides :
-    slot -> topic, as the user named them.   marked : the positions are those of marks.
+    slot -> topic, by the user.   marked : the positions are those of marks.
 
     Raises BadUsage: a named topic is missing, or a required input is not unique: none or several
     fit. All such inputs are named at once, with the option that selects each.
@@ -71,7 +71,7 @@ def wanted(config: Config, marked: bool = False) -> tuple[str, ...]:
 
 
 def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]) -> list[str]:
-    """Return the topics that could be a slot, given what the others are."""
+    """Return the topics that fit a slot and are not chosen for another."""
     types = _types(slot, config)
     taken = set(chosen.values())
     found = [t.name for t in topics.values()
@@ -83,7 +83,7 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
         if config.odometer.own_topics:
             found = [name for name in found if ('right' in _last(name)) == (slot != 'odometer')]
     elif slot == 'heading':
-        if config.alignment.heading_source == 'auto':    # by the name the node listens to
+        if config.alignment.heading_source == 'auto':    # by the name of the node's input
             return [name for name in found if _last(name) == 'heading']
         # the only one is the IMU's
         alone = len(found) == 1 and 'imu' not in chosen
@@ -96,7 +96,7 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
         found = _unless_all(found, ('filtered', 'fused'))
     elif slot == 'fix_velocity':
         found = [name for name in found if _of_receiver(name)]
-        # by the name the node listens to
+        # by the name of the node's input
         found = [name for name in found if _last(name) == slot] or found
     return found
 
@@ -111,7 +111,7 @@ def _check_reference(chosen: dict[str, str]) -> None:
 
 
 def local_reference(topics: Topics, chosen: dict[str, str], overrides: dict[str, str]) -> str:
-    """Return the note that poses are the reference, if nobody named them; otherwise ''."""
+    """Return the note that poses are the reference if the user did not name them, or ''."""
     fix = chosen.get('fix', '')
     if not fix or 'fix' in overrides or topics[fix].msgtype == FIX:
         return ''
@@ -185,13 +185,13 @@ def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: s
 
 
 def _described(topics: Topics, names: Iterable[str]) -> str:
-    """List topics with their types for people; those without a message are none."""
+    """Return the topics that have messages, with their types, as text."""
     return ', '.join(f'{name} ({topics[name].msgtype})' for name in names
                      if topics[name].count and name not in NEVER) or 'no topic with messages'
 
 
 def _last(name: str) -> str:
-    """Return the end of a topic's name that distinguishes wheels: all of it but a namespace."""
+    """Return the last part of a topic's name, which distinguishes wheels."""
     return name.rstrip('/').rpartition('/')[2]
 
 
@@ -200,5 +200,5 @@ def _has(name: str, words: Iterable[str]) -> bool:
 
 
 def _unless_all(found: list[str], words: Iterable[str]) -> list[str]:
-    """Leave out topics with such a word in their name, unless that leaves none."""
+    """Return the topics without such a word in their name; all, if none are left."""
     return [name for name in found if not _has(name, words)] or found

@@ -18,8 +18,8 @@ from odocal_ros.reasons import cautions, Reason, Verdict
 
 MOST_REASONS = 3     # judgement: in an answer
 KMH = 3.6    # definition: km/h in a m/s
-FORECAST_OLD_S = 15.0    # judgement: age from which what is foreseen is said to be old
-FEWEST_MARKS = 2         # judgement: marks after which the operator knows
+FORECAST_OLD_S = 15.0    # judgement: age from which the forecast is reported as old
+FEWEST_MARKS = 2         # judgement: marks after which the hint omits ~/mark
 DRIVE = 'drive '
 STRAIGHT = 'drive straight at speed until left and right wheel are separable'
 TURNS = 'for the track width: turn by 90 deg in total or more'
@@ -30,10 +30,10 @@ SPOT_TURNS = ('for the track width: turn on the spot in both directions, and dri
 def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: int = 0,
             good: str = '', advice: str = '') -> tuple[bool, str]:
     """
-    Return the answer that carries a result: values, verdict, legs, what to do better.
+    Return (success, text) of a result: values, verdict, legs, cautions and the next action.
 
-    good, advice : which quantities are good enough, and what to do next, as the status says them.
-    A rejected calibration is no success: a script must not take its values for good.
+    good, advice : quantities within their limits, and the next action, as in the status.
+    A rejected calibration is no success, so that a script does not use its values.
     """
     text = sentence(calibration)
     if parts and len(calibration.legs) > 1:
@@ -53,8 +53,8 @@ def provisional(at_stop: SessionView) -> str:
     """
     Return the answer that a leg is being computed, with its running estimate.
 
-    at_stop : as it was just before the stop mark.   The word *provisional* stands where the
-    answer with the result has its verdict.
+    at_stop : view just before the stop mark.   The word *provisional* takes the place of the
+    verdict in the final answer.
     """
     session, forecast = at_stop.session, at_stop.forecast
     known = forecast.estimates if forecast else {}
@@ -78,13 +78,13 @@ def restored(result: Restored, unit: str, good: str) -> tuple[bool, str]:
 
 
 def _sentences(parts: Iterable[str]) -> str:
-    """Return sentences one after the other, each ended once."""
+    """Join non-empty sentences; all but the last get one full stop."""
     *before, last = filter(None, parts)
     return ' '.join([*(f'{part.rstrip(".")}.' for part in before), last])
 
 
 def one_line(error: BaseException) -> str:
-    """Return an error as one line; an unexpected one is named an internal error."""
+    """Return an error as one line; an unexpected one is reported as an internal error."""
     text = said_by(error)
     if isinstance(error, OdocalError):
         return text
@@ -143,14 +143,14 @@ def quantities_ok(now: SessionView) -> dict[str, str]:
 
 
 def metres_to_go(now: SessionView) -> float:
-    """Return the metres that the leg still lacks to leg.min_distance, 0 outside of one."""
+    """Return the distance that the leg lacks to leg.min_distance, m; 0 without a leg."""
     if now.session.state is not State.RECORDING:
         return 0.0
     return max(0.0, now.leg.min_distance - now.distance_m)
 
 
 def seconds_to_stand(now: SessionView) -> float:
-    """Return the seconds of standstill still wanted: before the start, or at the end of a leg."""
+    """Return the seconds of standstill still required, before the start or at the end of a leg."""
     if now.session.state is State.RECORDING or not now.session.busy:
         return max(0.0, REST_FORESEEN_S - now.still_s)
     return 0.0
@@ -162,7 +162,8 @@ def manoeuvres(now: SessionView) -> list[str]:
         return []
     wants, least = [], now.leg.min_speed
     if now.max_speed < least:
-        wants.append(f'{DRIVE}faster than {least:.3g} m/s ({KMH * least:.0f} km/h)')
+        wants.append(f'{DRIVE}faster than leg.min_speed, {least:.3g} m/s '
+                     f'({KMH * least:.0f} km/h)')
     if now.config.reference.points and len(now.session.marks_of_leg()) < FEWEST_MARKS:
         wants.append('call ~/mark at rest on each point')
     if now.two_wheels and 'smoother' in deciding(now.session.config.method):
@@ -171,7 +172,7 @@ def manoeuvres(now: SessionView) -> list[str]:
 
 
 def _of_two_wheels(now: SessionView) -> list[str]:
-    """Return the manoeuvres for the wheels; before the first update only the general ones."""
+    """Return the manoeuvres for the wheels; before the first update only for the track width."""
     config = now.session.config
     wheels = None if now.forecast is None else now.forecast.wheels
     asked = quantities.QUANTITIES['left_right'].limit(config)
@@ -184,7 +185,7 @@ def _of_two_wheels(now: SessionView) -> list[str]:
 
 
 def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
-    """Return the hint: what to do, then what is known."""
+    """Return the hint as two lists: actions, then facts."""
     metres, wants = metres_to_go(now), manoeuvres(now)
     facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution, or a gap
     slow = now.max_speed < now.leg.min_speed
@@ -242,7 +243,7 @@ def after_result(now: SessionView) -> str:
 
 
 def _notes(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:
-    """Return the remedies of what is not OK and yet no reason against the result."""
+    """Return the remedies of the reasons about quantities that exceed their limits."""
     wanted = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
               if value == quantities.NO for part in quantities.QUANTITIES[name].estimates}
     advice: dict[str, None] = {}

@@ -10,7 +10,7 @@ from odocal_ros.live.session import SessionView, State
 from odocal_ros.outside.names import brief_line
 from odocal_ros.reasons import Code
 
-# judgement: of waiting, until it is said, and said again
+# judgement: delay of the first log of missing inputs, longest time until its repetition
 SILENCE_FIRST_NS, SILENCE_SELDOM_NS = 5 * 10**9, 3600 * 10**9
 # judgement: growth of a count of lost messages after which it is reported again
 LOSS_FACTOR = 10
@@ -23,7 +23,7 @@ class PlainLog:
     def __init__(self, logger: Any) -> None:
         self._logger = logger
 
-    # rclpy distinguishes callers by their lines, and wants one severity of each
+    # rclpy identifies callers by their lines, and requires one severity for each
     def debug(self, text: str) -> None:
         self._logger.debug(brief_line(text))
 
@@ -41,16 +41,16 @@ class PlainLog:
 
 
 class LossReport:
-    """Reports counts of lost messages; a topic again at LOSS_FACTOR times the count."""
+    """Reports counts of lost messages; repeats a topic at LOSS_FACTOR times the reported count."""
 
     def __init__(self) -> None:
         self._said: dict[str, int] = {}
 
     def news(self, lost: dict[str, int]) -> list[str]:
         """
-        Return the new sentences.
+        Return the sentences on new losses.
 
-        lost : topic -> messages so far; fewer than before: a new count.
+        lost : topic -> messages lost so far; a smaller number than before starts a new count.
         """
         found = []
         for topic, count in lost.items():
@@ -72,23 +72,23 @@ def losses_in_words(lost: dict[str, int]) -> str:
 
 class Console:
     """
-    Logs changes of the status; what persists is repeated at growing intervals.
+    Logs changes of the status, and repeats missing inputs at growing intervals.
 
-    ``report`` receives every view, with the time of a steady clock.
+    ``report`` receives every view, with the time of a steady clock, ns.
     """
 
     def __init__(self, log: PlainLog) -> None:
         self._log = log
-        self._ready = False          # has been said
-        self._doubled: set[str] = set()      # said
+        self._ready = False          # has been logged
+        self._doubled: set[str] = set()      # logged
         self._losses = LossReport()
-        self._silence = False        # has been said
-        self._due_ns = 0             # when the next word about what is missing is due
+        self._silence = False        # has been logged
+        self._due_ns = 0             # time of the next log of missing inputs
         self._pause_ns = SILENCE_FIRST_NS
-        self._missing_text = ''      # what was missing last, without its seconds
-        self._leg_id = 0             # the leg whose faults are said
-        self._reported: set[Code] = set()      # of them
-        self._withdrawn: set[Code] = set()     # of these
+        self._missing_text = ''      # missing inputs of the last view, without numbers
+        self._leg_id = 0             # the leg whose faults are logged
+        self._reported: set[Code] = set()      # logged faults of this leg
+        self._withdrawn: set[Code] = set()     # logged as no longer valid
 
     def report(self, now: SessionView, steady_ns: int) -> None:
         """Log new events."""
@@ -109,7 +109,7 @@ class Console:
             self._pause_ns = SILENCE_FIRST_NS
             self._due_ns = min(self._due_ns, steady_ns + SILENCE_FIRST_NS)
         self._missing_text = text
-        if not self._due_ns:     # what has been there and falls silent is said at once
+        if not self._due_ns:     # an input lost after the start is logged at once
             self._due_ns = steady_ns + (0 if self._ready else SILENCE_FIRST_NS)
         if steady_ns >= self._due_ns:
             self._log.warning(('' if self._ready else 'waiting: ') + '; '.join(now.missing))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The node that drives a robot along a pattern, from ``~/start`` to a cause to stop."""
+"""The node that drives a robot along a pattern, from ``~/start`` to a stop condition."""
 
 from functools import partial
 import math
@@ -23,9 +23,9 @@ from odocal_ros.live.process import run, SettledNode
 from odocal_ros.settings.node_configs import PatternConfig
 
 PERIOD_S = 0.05       # judgement: base controllers stop after 0.2 s or more without a command
-ZEROS = 20            # judgement: commands of zero, since one may be lost
-STUCK_S = 2.0         # judgement: twice what the slowest robot needs to be seen to move
-LAST_ZEROS, LAST_PERIOD_S = 5, 0.02       # judgement: of a node that must end
+ZEROS = 20            # judgement: zero commands at a stop, since one may be lost
+STUCK_S = 2.0         # judgement: twice the time of the slowest robot for a visible motion
+LAST_ZEROS, LAST_PERIOD_S = 5, 0.02       # judgement: zero commands of an ending node
 HELP = """\
 usage: drive_pattern --ros-args -p speed:=M_PER_S -p 'rectangle:=[X, Y, X, Y]' [-p NAME:=VALUE]
 
@@ -48,7 +48,7 @@ class DrivePattern(SettledNode):
         if math.isnan(self.config.speed):
             raise BadConfig('speed is not set; required: the speed limit, m/s: -p speed:=0.2')
         self._rectangle = pattern.rectangle_of(self.config)
-        pattern.route_of(self.config, self._rectangle[:2])      # refused at once, not at ~/start
+        pattern.route_of(self.config, self._rectangle[:2])      # raises now, not at ~/start
         self._pose: pattern.Pose | None = None
         self._pose_at = -math.inf       # all times: s, of the steady clock
         self._bumped = self._ending = False
@@ -133,7 +133,7 @@ class DrivePattern(SettledNode):
         return response
 
     def _halt(self, why: str) -> None:
-        """Stop the robot: a command of zero now, and more with the next turns."""
+        """Stop the robot: a zero command now, and more at the next ticks."""
         if self._route:
             self.get_logger().info(f'stopped: {why}')
         self._route, self._zeros = (), ZEROS
@@ -163,7 +163,7 @@ class DrivePattern(SettledNode):
         self._send(speed, rate)
 
     def _stuck(self, asked: float) -> bool:
-        """Return True if the robot has been asked to move for long and does not."""
+        """Return True if the robot has not moved for STUCK_S in spite of commands."""
         pose, now = self._pose, time.monotonic()
         assert pose is not None
         if not asked or self._moved is None or pattern.moved(self._moved[0], pose):

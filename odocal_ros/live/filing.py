@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result files: written by the worker, answered by a future."""
+"""Result files: written by the worker; a future has the answer."""
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -28,13 +28,13 @@ from odocal_ros.outside.whole import locked, new_folder
 from odocal_ros.settings.config import Config
 
 LATEST = 'latest'
-LEFT_S = 60.0      # judgement: age of an empty folder, or of an unfinished link, that nobody uses
-RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # by its time
+LEFT_S = 60.0      # judgement: age from which an empty folder or unfinished link is unused
+RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # time, count
 
 
 @dataclass(frozen=True)
 class Filed:
-    """A written folder: the start marks of its legs, what ``latest`` was before it."""
+    """A written folder, the start marks of its legs, and the earlier target of ``latest``."""
 
     folder: Path
     legs: frozenset[int]
@@ -43,11 +43,10 @@ class Filed:
 
 class ResultFolders:
     """
-    Keeps ``latest`` at the best that is known, in this session and over earlier ones.
+    Keeps ``latest`` at the best known result of this session and earlier ones.
 
-    The link does not go from a good calibration to a worse one unless forced, and it goes back
-    when the legs of what it points at are undone. Nothing that an operator has had written is
-    ever removed.
+    The link does not move from a good calibration to a worse one unless forced. It moves back
+    when a leg of its target is undone. Only results of ``leg.automatic`` are ever removed.
     """
 
     def __init__(self) -> None:
@@ -55,12 +54,12 @@ class ResultFolders:
 
     def file(self, folder: Path, legs: frozenset[int], force: bool) -> str:
         """
-        Point ``latest`` at a folder just written; return why it stays where it is instead.
+        Point ``latest`` at a new folder; return the reason if it stays unchanged, else empty.
 
         legs : start marks, ns, of the legs in it.
         """
         link = folder.parent / LATEST
-        with locked(folder.parent):         # another node may file there, too
+        with locked(folder.parent):         # another node may write there, too
             _clear(folder.parent)
             before = _target(link)
             worse = '' if force else replacing(stored_in(link), folder)
@@ -72,9 +71,10 @@ class ResultFolders:
 
     def prune(self, newest: Path, kept: int) -> None:
         """
-        Remove the oldest results of ``leg.automatic`` beside a new one, all but so many; 0: none.
+        Remove the oldest results of ``leg.automatic`` in the folder of ``newest``.
 
-        What ``latest`` shows, what it would go back to, and the newest good one stay.
+        kept : number of newest results kept; 0 keeps all. Also kept: the target of ``latest``, its
+        earlier targets, and the newest usable result.
         """
         root = newest.parent
         with locked(root):
@@ -95,9 +95,9 @@ class ResultFolders:
 
     def withdraw(self, left: frozenset[int]) -> Path | None:
         """
-        Take back what holds legs that are dropped; ``left`` are the start marks of the others.
+        Withdraw folders with dropped legs; ``left`` are the start marks, ns, of the others.
 
-        Returns the newest folder of this session that still stands, None when there is none.
+        Returns the newest folder of this session that is not withdrawn, None without one.
         """
         dropped = [f for f in self._filed if not f.legs <= left]
         self._filed = [f for f in self._filed if f.legs <= left]
@@ -105,7 +105,7 @@ class ResultFolders:
             root = one.folder.parent
             link = root / LATEST
             if _target(link) != one.folder.name:
-                continue       # somebody else has moved it since
+                continue       # another process has moved it
             if one.before and (root / one.before).is_dir():
                 _point(link, one.before)
             else:
@@ -114,20 +114,20 @@ class ResultFolders:
 
 
 def _age(name: str) -> tuple[str, int]:
-    """Return the sort key of result names: their time, and the number within that second."""
+    """Return the sort key of a result name: its time, and the count within that second."""
     when, count = RESULT_NAME.findall(name)[0]
     return when, int(count or 1)
 
 
 def _clear(root: Path) -> None:
-    """Remove what nodes that were killed have left: empty folders of results, and links."""
+    """Remove the remains of killed nodes: empty result folders and temporary links."""
     until = time.time() - LEFT_S
     for one in root.iterdir():
         with suppress(OSError):
             if one.lstat().st_mtime > until:
                 continue
             if RESULT_NAME.fullmatch(one.name):
-                one.rmdir()      # only an empty folder can be
+                one.rmdir()      # fails unless it is empty
             elif one.name.startswith(f'.{LATEST}-') and one.is_symlink():
                 one.unlink()
 
@@ -151,15 +151,15 @@ def output_root(config: Config, node: str) -> Path:
 
 
 def marks(legs: Iterable[LegResult]) -> frozenset[int]:
-    """Return the start marks of legs, ns: by them a session knows its legs."""
+    """Return the start marks of legs, ns; they identify the legs of a session."""
     return frozenset(leg.start_ns for leg in legs)
 
 
 class Filing:
     """
-    Saves results and takes them back.
+    Saves and withdraws results.
 
-    saved : the newest folder that is not withdrawn.   trouble : of the newest result.
+    saved : the newest folder that is not withdrawn.   trouble : error of the newest save.
     """
 
     def __init__(self, worker: Worker, log: PlainLog, show: Callable[[], None], node: str) -> None:
@@ -167,16 +167,16 @@ class Filing:
         self._node = node
         self._worker, self._log, self._show = worker, log, show
         self._folders = ResultFolders()
-        self._warned: Calibration | None = None    # the operator knows that latest stays
+        self._warned: Calibration | None = None    # a requested save left latest unchanged
         self._under_way = 0
-        self._artist = Worker()        # a leg that ends meanwhile need not wait for a report
+        self._artist = Worker()        # separate: no leg waits for a report
 
     def save(self, calibration: Calibration, config: Config, topics: dict[str, str],
              imu_frame: str, now_ns: int, asked: bool) -> Future:
         """
         Write the result files in the worker; the future has (success, text).
 
-        asked : by the operator. ``latest`` moves to a worse result only at the second request.
+        asked : by the operator; ``latest`` moves to a worse result only at the second request.
         """
         future = Future()
         self._under_way += 1
@@ -212,10 +212,10 @@ class Filing:
     def _write(self, calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
                imu_frame: str, now_ns: int, force: bool) -> tuple[Path, str]:
         """
-        Write the result files into a folder named by the time; for the worker.
+        Write the result files into a folder named by the time; runs in the worker.
 
-        imu_frame : of the IMU's headers, for an empty ``frames.imu``. Returns the folder, and why
-        ``latest`` stays where it was, empty when it does not (``force`` moves it).
+        imu_frame : frame_id of the IMU, for an empty ``frames.imu``. Returns the folder, and the
+        reason if ``latest`` stays unchanged, else empty (``force`` moves it).
 
         Raises OdocalError: the folder cannot be written.
         """
@@ -238,7 +238,7 @@ class Filing:
         except OSError as error:
             raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
                               'output.directory to a writable folder') from None
-        if results.has_report:      # which takes long to draw
+        if results.has_report:      # drawing it takes long
             self._artist.submit(results.draw, self._drawn)
         return folder, stays
 
@@ -256,7 +256,7 @@ class Filing:
         return self._artist.close(grace_s)
 
     def withdraw(self, left: Iterable[LegResult]) -> None:
-        """Move ``latest`` and ``saved`` back to the newest result of the remaining legs only."""
+        """Move ``latest`` and ``saved`` back to the newest result without dropped legs."""
         self.trouble = ''
 
         def then(folder: Path | None, error: Exception | None) -> None:
@@ -270,5 +270,5 @@ class Filing:
 
 
 def latest_of(config: Config, node: str) -> Stored | None:
-    """Return the result that earlier runs of a node hold for the best, None without."""
+    """Return the result at ``latest`` of a node, None without one."""
     return stored_in(output_root(config, node) / LATEST)

@@ -13,7 +13,7 @@ from odocal_ros.data.arrays import Bools
 from odocal_ros.data.samples import FixSamples, Samples
 from odocal_ros.settings.levels import TIME_ANEW_NS, TIME_ANEW_ROWS
 
-# judgement: stamps for a rate, blocks with them; silence until a topic is lost
+# judgement: time span and blocks for a rate; silence after which a topic is lost
 RATE_SPAN_NS, RATE_BLOCKS = 3 * 10**9, 64
 SILENCE_NS = 2 * 10**9
 # judgement: a stamp further ahead is accepted if TIME_ANEW_ROWS of them follow
@@ -24,8 +24,8 @@ class Health:
     """
     Counts and times of the messages of one topic.
 
-    ``newest_ns`` is the newest usable stamp, on the sender's clock; ``received_ns`` when the last
-    message came, on the node's steady clock: the age of a topic must not depend on sim time.
+    ``newest_ns`` is the newest usable stamp, on the sender's clock; ``received_ns`` the arrival of
+    the last message on the node's steady clock: the age of a topic must not depend on sim time.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Health:
         self.delay_s = 0.0     # arrival minus stamp of the newest row
         self.jumped_back = False
         self.fix_status: int | None = None
-        self._ahead: list[int] = []      # stamps far ahead that nothing has confirmed yet
+        self._ahead: list[int] = []      # unconfirmed stamps far ahead
         self._behind = 0                 # stale rows at the end of the last block
         self._last_sequence: int | None = None
         # count and stamp after each block
@@ -48,7 +48,7 @@ class Health:
         self._interval_s = 0.0
 
     def arrived(self, sequences: Sequence[int | None], now_ns: int) -> None:
-        """Count messages as they came; sequences are the publisher's numbers, or None."""
+        """Count lost messages; sequences: publisher's numbers in order of arrival, or None."""
         self.received_ns = now_ns
         numbers = [s for s in [self._last_sequence, *sequences] if s is not None]
         steps = [after - before for before, after in pairwise(numbers)]
@@ -111,10 +111,10 @@ class Health:
 
     def _newest(self, known: list[int], steps: list[int]) -> int:
         """
-        Return the newest stamp with a block of them, and note whether time has restarted.
+        Return the newest stamp after a block, and note whether time has restarted.
 
-        One or two stale stamps are a hiccup of the driver, more are a new start of time; where a
-        block ends with few of them, or has but one row, the next one decides.
+        One or two stale stamps are a driver error, more a restart of time. If a block ends with
+        few stale stamps, or has one row only, the next block decides.
         """
         behind, self._behind = self._behind, 0
         if not steps or min(steps) >= -TIME_ANEW_NS:
@@ -122,7 +122,7 @@ class Health:
         at = steps.index(min(steps))
         after = max(known[at + 1:])
         fell = after < known[at] - TIME_ANEW_NS
-        # back to where the stamps were before one that was wild
+        # back to the stamps before a wild one
         after_wild = at and steps[at - 1] > TIME_ANEW_NS and after >= known[at - 1] - TIME_ANEW_NS
         after_wild = after_wild or not (at or self.newest_ns)
         if not fell or after_wild:

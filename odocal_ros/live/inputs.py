@@ -11,7 +11,7 @@ from odocal_ros.live.topic_input import Input
 from odocal_ros.messages.sensor_types import types_of
 from odocal_ros.settings.config import Config
 
-LOOK_AROUND_S = 1.0     # judgement: between two looks for publishers
+LOOK_AROUND_S = 1.0     # judgement: between two searches for publishers
 
 
 class Inputs:
@@ -25,7 +25,7 @@ class Inputs:
             one.check(config)
         self._check_reference()
         for one in self.by_slot.values():
-            if len(one.allowed) == 1:  # what is wrong with it is wrong from the start: raise
+            if len(one.allowed) == 1:  # one fixed type: errors are raised at the start
                 one.subscribe(one.allowed[0], config)
 
     def _check_reference(self) -> None:
@@ -37,7 +37,7 @@ class Inputs:
                                'against itself; remap one of them to another topic')
 
     def update(self, config: Config) -> None:
-        """Add the topics that the configuration uses, and look for publishers."""
+        """Add the topics that the configuration uses, and search for publishers."""
         for slot, allowed in _wanted(config).items():
             if slot not in self.by_slot:
                 self.by_slot[slot] = Input(self._node, slot, allowed)
@@ -57,28 +57,28 @@ class Inputs:
 
     @property
     def without_imu(self) -> bool:
-        """Return True if a leg needs no IMU, and nobody publishes one."""
+        """Return True if a leg needs no IMU, and none is published."""
         imu = self.by_slot['imu']
         return not (self._needs_imu or imu.publishers or imu.health.received_ns)
 
     @property
     def leading(self) -> Input:
-        """Return the topic whose stamps are those of the marks: the IMU, or else the odometer."""
+        """Return the topic whose stamps set the marks: the IMU, or else the odometer."""
         imu = self.by_slot['imu']
         leads = self._needs_imu or imu.newest_ns
         return imu if leads else self.by_slot['odometer']
 
     def missing(self, config: Config) -> list[str]:
-        """Return the causes why a leg cannot start, one line per missing topic."""
+        """Return the causes that prevent a leg, one line per missing topic."""
         return [one.why() for one in self.required(config) if not one.flowing()]
 
     def begin_leg(self) -> None:
-        """Count lost messages from here on."""
+        """Start a new count of lost messages."""
         for one in self.by_slot.values():
             one.health.lost_before = one.health.lost
 
     def lost(self) -> dict[str, int]:
-        """Return topic -> messages lost since the leg began, before the first one in all."""
+        """Return topic -> messages lost since the last leg began, or since the start."""
         return {one.topic: one.health.lost - one.health.lost_before
                 for one in self.by_slot.values()}
 
@@ -88,7 +88,7 @@ class Inputs:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Return slot -> topic of those that are listened to and published."""
+        """Return slot -> topic of the subscribed inputs; the IMU only if needed or published."""
         return {slot: one.topic for slot, one in self.by_slot.items()
                 if one.reader is not None and not (slot == 'imu' and self.without_imu)}
 

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The journal: each leg as a bag on the disk while it is driven, so that nothing of it is lost.
+The journal: each leg is written to disk as a bag while it is driven, to survive a crash.
 
-This part runs with the callbacks and only collects; ``JournalWriter`` has its own thread.
+This module runs with the callbacks and only collects; ``JournalWriter`` has its own thread.
 """
 
 from datetime import datetime, UTC
@@ -27,7 +27,7 @@ from odocal_ros.outside.names import for_shell
 from odocal_ros.outside.yaml_files import parameters
 from odocal_ros.settings.config import Config, flat
 
-BATCH_NS = 800_000_000    # judgement: with the writing, a kill then costs about a second
+BATCH_NS = 800_000_000    # judgement: including the writing, a kill loses about a second
 JOURNAL_GRACE_S = 2.0     # judgement: for the last batch, once the node must stop
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 DROPPED = ('cancelled', 'undone')
@@ -42,8 +42,8 @@ class Journal:
     """
     Collects raw messages and marks, and hands them to the thread about once a second.
 
-    ``topic`` is the resolved name of ``~/status``. A leg's journal holds what the recorder got,
-    no message more or less, so that a replay of it gives the same result.
+    ``topic`` is the resolved name of ``~/status``. A leg's journal has exactly the messages of the
+    recorder, so that its replay gives the same result.
     """
 
     def __init__(self, node: Node, topic: str) -> None:
@@ -57,7 +57,7 @@ class Journal:
         self._leg_id = 0                 # of the leg whose journal is not joined yet, 0: none
         self._ended = False              # its samples are complete
         self._last_event = ''
-        self._dropped: set[int] = set()  # legs that the journal knows to be dropped
+        self._dropped: set[int] = set()  # legs reported as dropped
         self._reported = ''
 
     @property
@@ -72,7 +72,7 @@ class Journal:
 
     def remember(self, source: Input | StaticTransforms, raws: list[bytes],
                  sent_ns: list[int]) -> None:
-        """Take messages of a topic as the recorder got them."""
+        """Store messages of a topic in the order of the recorder."""
         if not self._limit:
             return
         received = self._batch.get(source.slot)
@@ -84,7 +84,7 @@ class Journal:
         received.newest_ns = source.newest_ns
 
     def tick(self, config: Config, busy: bool) -> None:
-        """Hand over new messages if due; join the files of a leg once nobody waits for it."""
+        """Hand over new messages if due; join the files of an ended leg once no leg is busy."""
         now_ns = time.monotonic_ns()
         if not self._limit_from(config):
             return
@@ -119,7 +119,7 @@ class Journal:
         config = session.config
         if not self._limit_from(config):
             return
-        self._hand_over()       # what came before is pre-roll
+        self._hand_over()       # earlier messages are pre-roll
         now_ns = self._clock.now().nanoseconds
         self._leg_id, self._ended, self._last_event = session.leg_id, False, ''
         self._writer.submit(self._writer.begin, Plan(
@@ -129,7 +129,7 @@ class Journal:
             config.journal.max_bytes))
 
     def receive(self, session: Session, array: DiagnosticArray) -> None:
-        """Take a status as it was published: the marks of a leg are in it."""
+        """Store a published status: it contains the marks of the leg."""
         leg_id, event = session.leg_id, session.event
         dropped = event in DROPPED and leg_id not in self._dropped
         if event in DROPPED:
@@ -156,7 +156,7 @@ class Journal:
             self._writer.submit(self._writer.end)
 
     def start_anew(self) -> None:
-        """Forget the samples so far, as after a jump of time."""
+        """Discard the samples so far, after a jump of time."""
         self._batch = {}
         self._writer.submit(self._writer.start_anew)
 
@@ -177,7 +177,7 @@ def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, s
 
 
 def replay_command(folder: str, start_ns: int) -> str:
-    """Return the command that computes a cancelled leg from its journal, mark to last sample."""
+    """Return the command that computes a cancelled leg from its mark to the journal's end."""
     seconds, nanoseconds = divmod(start_ns, 10**9)
     start = f'{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{nanoseconds // 1000:06}'
     return for_shell(['odocal', 'replay', folder, '--leg', f'{start}/'])

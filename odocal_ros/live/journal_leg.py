@@ -19,8 +19,8 @@ from odocal_ros.bagio.segments import JOURNAL, SegmentedBag
 from odocal_ros.outside.whole import new_folder, PART, write_text
 
 JOURNAL_NAME = re.compile(r'\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ_leg_\d+(-\d+)?')     # of a journal
-FOLDER_NEW_S = 10.0       # judgement: a node may be about to write into its folder
-WAITING_BYTES = 64 * 2**20     # judgement: held while the disk does not take them
+FOLDER_NEW_S = 10.0       # judgement: a node may still be about to write into a younger folder
+WAITING_BYTES = 64 * 2**20     # judgement: kept in memory while writing fails
 HEADS_BYTES = 2**20            # judgement: for metadata and file heads
 
 
@@ -46,12 +46,12 @@ def clear_empty(root: Path) -> None:
 
 
 def is_nothing(path: Path) -> bool:
-    """Return True if a journal file certainly holds no message."""
+    """Return True if a journal file certainly contains no message."""
     return path.name == JOURNAL or path.name.endswith(PART)
 
 
 def size_of(folder: Path) -> int:
-    """Return the bytes that a journal takes."""
+    """Return the size of a journal, bytes."""
     total = 0
     with suppress(FileNotFoundError):
         for path in folder.iterdir():
@@ -62,9 +62,9 @@ def size_of(folder: Path) -> int:
 
 def make_room(root: Path, limit: int, needed: int = 0) -> int:
     """
-    Delete the oldest journals until all of them and ``needed`` more bytes stay within the limit.
+    Delete the oldest journals until the rest and ``needed`` more bytes are within the limit.
 
-    A journal in use stays. Returns the bytes taken after that.
+    Journals in use are kept. Returns the remaining size, bytes.
     """
     sizes = {folder: size_of(folder) for folder in journals(root)}
     for folder in list(sizes):
@@ -79,7 +79,7 @@ def make_room(root: Path, limit: int, needed: int = 0) -> int:
 def claim(folder: Path) -> TextIO:
     """Lock a journal as in use, until the returned file is closed or the process ends."""
     file = (folder / JOURNAL).open(encoding='utf-8')
-    with suppress(OSError):      # a file system without locks: then it is unknown
+    with suppress(OSError):      # a file system without locks: its use is unknown
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return file
 
@@ -108,17 +108,17 @@ class Plan:
 
 class LegJournal:
     """
-    Writes the journal of one leg; ``trouble`` is the cause while it cannot, else empty.
+    Writes the journal of one leg; ``trouble`` is the cause while writing fails, else empty.
 
-    What the disk does not take waits in memory and is tried again with the next second, until
-    there is too much of it: then the journal ends with what it has, and the trouble stays.
+    Chunks that cannot be written wait in memory for the next attempt. Above WAITING_BYTES the
+    journal ends with the data written so far, and the trouble stays.
     """
 
     def __init__(self, plan: Plan, channels: dict[int, Channel], chunks: list[Chunk]) -> None:
         self.plan = plan
         self.trouble = ''
         self._channels = channels
-        self._waiting = chunks        # the pre-roll goes out with the start mark, never before it
+        self._waiting = chunks        # the pre-roll is written with the start mark, not before
         self._bag: SegmentedBag | None = None
         self._claim: TextIO | None = None
         self._others = 0              # bytes of the other journals
@@ -131,7 +131,7 @@ class LegJournal:
         return str(self._bag.folder) if self._bag else ''
 
     def put(self, chunks: list[Chunk]) -> None:
-        """Write chunks, after those that wait."""
+        """Write chunks, after the waiting ones."""
         if self._over:
             return
         self._waiting += chunks
@@ -147,7 +147,7 @@ class LegJournal:
             self.put([])
             if self._bag is not None and not self._waiting:
                 self._try(self._finish)
-            elif self._bag is not None and not self._bag.segments:     # the disk took nothing
+            elif self._bag is not None and not self._bag.segments:     # nothing was written
                 shutil.rmtree(self._bag.folder, ignore_errors=True)
                 self._bag = None
         self._over, self._waiting = True, []
@@ -160,7 +160,7 @@ class LegJournal:
         self.retry()
 
     def retry(self) -> None:
-        """Write marks that the disk has not taken yet."""
+        """Write the marks that are not written yet."""
         bag = self._bag
         if bag is None or not bag.segments or not bag.folder.exists():
             self.late = []         # there is nothing to replay
@@ -175,7 +175,7 @@ class LegJournal:
     def _write(self) -> None:
         if self._bag is None:
             self._bag = self._open()
-        # joining some files, this one too, takes their size once more for a moment
+        # joining files, this one included, temporarily needs their size twice
         size = 2 * sum(chunk.size for chunk in self._waiting) + self._bag.loose_size + HEADS_BYTES
         if self._others + self._bag.size + size > self.plan.limit:
             taken = make_room(self.plan.root, self.plan.limit, size)

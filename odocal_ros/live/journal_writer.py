@@ -15,7 +15,7 @@ from odocal_ros.bagio.chunks import Chunk, pack
 from odocal_ros.live.journal_leg import LegJournal, Plan
 from odocal_ros.live.messages import definition_of
 
-ALWAYS_NS = 1      # definition: stamp of messages that hold at all times
+ALWAYS_NS = 1      # definition: stamp of static messages
 PREROLL_BYTES = 256 * 2**20    # judgement: 1 kHz for 600 s are 55 MB
 
 
@@ -32,18 +32,18 @@ class Received:
 
 
 class PreRoll:
-    """The newest chunks of each topic, as far back as a leg may reach, bounded in bytes."""
+    """The newest chunks of each topic, as far back as a leg may reach, limited in bytes."""
 
     def __init__(self) -> None:
         self._held: dict[str, deque[tuple[int, Chunk]]] = {}
         self.size = 0
 
     def feed(self, slot: str, newest_ns: int, chunk: Chunk, reach_ns: int) -> None:
-        """Keep a chunk whose last row has a stamp; forget what lies ``reach_ns`` before it."""
+        """Keep a chunk by the stamp of its last row; drop those more than ``reach_ns`` older."""
         held = self._held.setdefault(slot, deque())
         held.append((newest_ns, chunk))
         self.size += chunk.size
-        # by each topic's own stamps: one on a foreign clock must not grow without bound
+        # by the topic's own stamps: a topic on another clock must not grow without limit
         while held[0][0] < newest_ns - reach_ns:
             self._drop(held)
         while self.size > PREROLL_BYTES:
@@ -77,7 +77,7 @@ class JournalWriter:
         self._counts: dict[str, int] = {}             # topic -> messages packed
         self._preroll = PreRoll()
         self._leg: LegJournal | None = None
-        self._listening = False                       # the samples of that leg go on
+        self._listening = False                       # samples of that leg continue
         self._closed: dict[int, LegJournal] = {}
         self._jobs: queue.SimpleQueue[tuple[Callable[..., None], Any] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name='odocal_journal', daemon=True)
@@ -98,7 +98,7 @@ class JournalWriter:
             job, values = entry
             try:
                 job(*values)
-            except Exception as error:  # the journal must never cost a calibration
+            except Exception as error:  # a journal error must not stop a calibration
                 self._leg = None
                 self.trouble = ('internal error, please report it: '
                                 f'{type(error).__name__}: {error}')
@@ -112,7 +112,7 @@ class JournalWriter:
     # jobs
 
     def take(self, batch: dict[str, Received], reach_ns: int, marks: Received | None) -> None:
-        """Pack a batch, keep it for the pre-roll of legs to come, and write it if one is open."""
+        """Pack a batch, keep it as pre-roll of later legs, and write it to the open leg."""
         chunks = []
         for slot, received in batch.items():
             chunk = self._packed(received)
@@ -130,7 +130,7 @@ class JournalWriter:
         self._preroll.clear()
 
     def begin(self, plan: Plan) -> None:
-        """Open the journal of a leg; its pre-roll goes out with the first mark."""
+        """Open the journal of a leg; its pre-roll is written with the first mark."""
         self.finish()
         self._leg, self._listening = LegJournal(plan, self._channels, self._preroll.chunks()), True
 

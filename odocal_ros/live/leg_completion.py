@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Completion of a leg: closed, computed, combined, answered, saved."""
+"""Completion of a leg: close, compute, combine, answer, save."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -32,7 +32,7 @@ from odocal_ros.outside.names import for_shell
 from odocal_ros.pipeline.floor_marks import with_marks
 from odocal_ros.settings.config import Config
 
-LATE_TOPIC_S = 1.0   # judgement: a topic later than that at the stop mark is not waited for
+LATE_TOPIC_S = 1.0   # judgement: longest wait for late topics at the stop mark
 
 
 class LegCompletion:
@@ -55,21 +55,21 @@ class LegCompletion:
         self._computing = worker.Computing(self._worker, self._fail, self.show_status,
                                     node.context.ok)
         self._ability: Ability | None = None  # of the leg last started
-        self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
-        self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
+        self._close_by_ns: int | None = None  # steady time until which a leg waits for its samples
+        self._snapshot: LegRecorder | None = None  # of the open leg, kept for a retry
         self._at_stop: SessionView | None = None   # of the open leg: its last running estimate
         self._distance_m = 0.0                # of the leg last touched
-        self._silent = False                  # the IMU, in the leg
+        self._silent = False                  # the IMU is silent in the leg
         self._console = Console(self._log)
         self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
 
     @property
     def awaited(self) -> bool:
-        """Return True if somebody waits for work."""
+        """Return True while a leg is computed or files are written."""
         return self.session.state is State.COMPUTING or self._filing.busy
 
     def tick(self) -> None:
-        """Process finished jobs, new messages and the time."""
+        """Process finished jobs, new messages and timeouts."""
         self._worker.poll()
         self._filing.poll()
         self.pump()
@@ -92,7 +92,7 @@ class LegCompletion:
             self.show_status()
 
     def pump(self) -> None:
-        """Decode what has arrived."""
+        """Decode the received messages."""
         running = self._watch.forecast and self._watch.forecast.estimates.get('scale_factor')
         found = running.value if running else None
         self._recording.pump(self._config(), found or self._publishing.scale_factor())
@@ -115,7 +115,7 @@ class LegCompletion:
         return f'leg {self.session.leg_id} was not stopped: {kept}'
 
     def _start_time_anew(self) -> None:
-        """Drop all samples of the old time; a running leg is cancelled."""
+        """Drop all samples from before a jump of time; a running leg is cancelled."""
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
             self._log.warning(f'time jumped: leg {self.session.leg_id} is cancelled')
             self._drop_leg(lost='time jumped back')
@@ -154,7 +154,7 @@ class LegCompletion:
             local=recording.local, imu=not inputs.without_imu)
 
     def show_status(self) -> None:
-        """Publish the current status and log what is new in it."""
+        """Publish the current status and log its changes."""
         now = self.view()
         self._console.report(now, time.monotonic_ns())
         array = self._publishing.show_status(now)
@@ -234,7 +234,7 @@ class LegCompletion:
             session.carried, session.by_itself, self._computing.report), self._take_leg)
 
     def _fail(self, trouble: str) -> None:
-        if self.session.state is State.COMPUTING:      # else the result itself is there
+        if self.session.state is State.COMPUTING:      # else the result is available
             self.session.fail(trouble)
         self._log.error(f'leg {self.session.leg_id} failed: {trouble}')
         remedy = ('the leg is kept: call ~/stop_leg to compute it again, or ~/cancel_leg to drop '

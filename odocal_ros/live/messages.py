@@ -4,11 +4,11 @@
 """
 Message classes by name with their definitions, and messages that wait until they are taken.
 
-They wait, serialised, in the middleware's queue: waking the executor for every message is nine
-tenths of what a node costs at 1 kHz. So it is kept away from the subscription, and ``take`` asks
-rclpy's handle for what waits by ``take_message``, as the executor itself does. That is no
-documented part of rclpy: where it is missing, or answers in another way, the executor takes the
-messages from then on. Only the CPU load changes.
+They stay serialised in the middleware's queue: waking the executor for every message is nine
+tenths of a node's CPU load at 1 kHz. The executor therefore skips the subscription, and ``take``
+reads the queue by ``take_message`` of rclpy's handle, as the executor itself does. This method
+is undocumented: if it is missing or behaves differently, the executor takes the messages from
+then on. Only the CPU load changes.
 """
 
 import importlib
@@ -33,8 +33,8 @@ Message: TypeAlias = tuple[bytes, dict[str, Any]]     # serialised, and the info
 
 
 def message_class(msgtype: str) -> Any:
-    """Return the class of 'pkg/msg/Type', or raise BadConfig with what to do."""
-    match = MESSAGE_TYPE.fullmatch(msgtype)     # somebody on the net may have chosen it
+    """Return the class of 'pkg/msg/Type', or raise BadConfig with the action."""
+    match = MESSAGE_TYPE.fullmatch(msgtype)     # untrusted: it may be from the network
     try:
         if match is None or not _has_messages(match['package']):
             raise ImportError
@@ -55,10 +55,10 @@ def _has_messages(package: str) -> bool:
 
 def definition_of(kind: type) -> str:
     """
-    Return the definition of a message class as a bag holds it: its .msg text and those it uses.
+    Return the definition of a message class for a bag: its .msg text and those of its fields.
 
-    Constants and defaults, which the classes do not have, are not in it; the bytes of a message
-    do not depend on them.
+    Constants and defaults are missing, as in the classes; serialised messages do not depend on
+    them.
     """
     texts: dict[str, str] = {}
     _collect(kind, '', texts)
@@ -67,7 +67,7 @@ def definition_of(kind: type) -> str:
 
 
 def _collect(kind: Any, name: str, texts: dict[str, str]) -> None:
-    """Add the text of a class and of all that it uses."""
+    """Add the texts of a class and of all types that it uses."""
     lines, used = [], []
     for field, about in kind.get_fields_and_field_types().items():
         base, whole = _in_msg(about)
@@ -81,7 +81,7 @@ def _collect(kind: Any, name: str, texts: dict[str, str]) -> None:
 
 
 def _in_msg(about: str) -> tuple[str, str]:
-    """Return the base type, and the field's type, as a .msg file has them."""
+    """Return the base type and the field's type in .msg syntax."""
     match = KIND.fullmatch(about)
     if match is None:
         raise ValueError(f'a field of type {about}')
@@ -94,7 +94,7 @@ def _in_msg(about: str) -> tuple[str, str]:
 
 
 class Gate(MutuallyExclusiveCallbackGroup):
-    """A callback group that the executor leaves alone while it is shut."""
+    """A callback group that the executor skips while ``is_open`` is False."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
@@ -108,10 +108,10 @@ class Gate(MutuallyExclusiveCallbackGroup):
 
 class WaitingMessages:
     """
-    The messages of one topic, as they came.
+    The messages of one topic, in order of arrival.
 
-    In simulated time a message is stamped with the node's clock as it arrives: the executor
-    carries it then, too.
+    In simulated time a message is stamped with the node's clock on arrival, so the executor takes
+    it then, too.
     """
 
     def __init__(self, node: Node) -> None:
@@ -119,12 +119,12 @@ class WaitingMessages:
         self._subscription: Subscription | None = None
         self._pending: list[Message] = []
         self._most = 0                # the depth of the queue
-        self._carried = False         # by the executor, for want of take_message
+        self._carried = False         # taken by the executor, without take_message
         self.gate = Gate()
         self.follow_clock()
 
     def follow_clock(self) -> None:
-        """Note whether the node's time is a simulated one."""
+        """Update whether the node uses simulated time."""
         clock = self._node.get_clock()
         self._simulated: bool = clock.ros_time_is_active  # type: ignore[attr-defined]
         self.gate.is_open = self._simulated or self._carried
@@ -134,12 +134,12 @@ class WaitingMessages:
         self._subscription = self._node.create_subscription(
             kind, topic, self._receive, qos,  # type: ignore[arg-type]
             raw=True, callback_group=self.gate,
-            # each event handler costs time in every turn of the executor
+            # each event handler costs time in every cycle of the executor
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def take(self) -> tuple[list[bytes], list[int], list[int | None]]:
-        """Return the messages since the last call: serialised, when sent (ns), and numbers."""
+        """Return messages since the last call: serialised, send times (ns), sequence numbers."""
         if self._subscription is not None and not self._carried:
             try:
                 self._fetch(self._subscription)
@@ -156,9 +156,9 @@ class WaitingMessages:
 
     def _fetch(self, subscription: Subscription) -> None:
         """
-        Take what waits in the middleware's queue.
+        Take all messages in the middleware's queue.
 
-        The executor takes one at a time of each topic, so that where it lags the IMU lags most.
+        The executor takes one message per topic at a time: under load the IMU would lag most.
         """
         handle, kind = subscription.handle, subscription.msg_type
         with handle:

@@ -26,8 +26,8 @@ from odocal_ros.live.recording import Recording
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.floor_marks import check_points
 
-# tuned by benchmarks/live_load.py: s between turns, and while somebody waits for an answer. Of
-# 0.05 s all would cost twice as much; a queue holds 25 of 0.2 s
+# tuned by benchmarks/live_load.py: period of ``_tick``, s, and while a caller waits. 0.05 s at all
+# times would double the CPU load; a queue holds 25 periods of 0.2 s
 TURN_S, AWAITED_TURN_S = 0.2, 0.05
 HELP = """\
 usage: calibrator [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]
@@ -53,9 +53,9 @@ class Calibrator(SettledNode):
     """
     Calibrates an odometer over legs that the operator marks by service.
 
-    Works in any executor; SingleThreadedExecutor is recommended. ``Session`` remembers legs,
-    ``Recording`` samples; the node itself only joins them. ``at_work``: destroyed while one of its
-    threads was, which will end with the process.
+    Works in any executor; SingleThreadedExecutor is recommended. ``Session`` stores legs,
+    ``Recording`` samples; the node only connects them. ``at_work``: one of its threads still ran
+    when the node was destroyed; it ends with the process.
     """
 
     default_name = 'calibrator'
@@ -63,7 +63,7 @@ class Calibrator(SettledNode):
 
     def _build(self) -> None:
         self.config = params.declare(self)
-        known_imu(self.config)      # refused at once, not after the first leg
+        known_imu(self.config)      # raises now, not after the first leg
         if self.config.reference.points:
             check_points(self.config)
         params.declare_results(self)
@@ -77,7 +77,7 @@ class Calibrator(SettledNode):
         self._due_ns = dict.fromkeys(('look', 'diagnostics', 'status'), 0)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
-        group = ReentrantCallbackGroup()  # an answer that waits must not keep callbacks waiting
+        group = ReentrantCallbackGroup()  # a delayed answer must not block callbacks
         for name in SERVICES:
             act = getattr(self.operation, name)
             self.create_service(Trigger, f'~/{name}', partial(self._serve, act),
@@ -90,7 +90,7 @@ class Calibrator(SettledNode):
             if hasattr(self, part) and getattr(self, part).close() is False:
                 self.at_work = True
         if hasattr(self, 'operation') and (left := self.operation.left_behind()):
-            complain('calibrator', left)      # a context that is shut down takes its log with it
+            complain('calibrator', left)      # a context that is shut down cannot log
         super().destroy_node()  # type: ignore[no-untyped-call]
 
     # parameters
@@ -116,7 +116,7 @@ class Calibrator(SettledNode):
     def _take_parameters(self, parameters: list[Parameter]) -> None:
         self.config = params.changed(self.config, parameters)
 
-    # what happens five times a second
+    # called five times a second
 
     def _tick(self) -> None:
         with self._lock:
@@ -152,7 +152,7 @@ class Calibrator(SettledNode):
 
     async def _serve(self, act: Callable[[], tuple[bool, str] | Future], _request: Trigger.Request,
                      response: Trigger.Response) -> Trigger.Response:
-        """Answer a Trigger with what ``act`` returns, or the future it returns brings."""
+        """Answer a Trigger with the result of ``act``, or of the future that it returns."""
         try:
             with self._lock:
                 answer = act()

@@ -35,11 +35,11 @@ from odocal_ros.messages.sensor_types import types_of
 from odocal_ros.outside.names import said_by
 from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 
-# judgement, all in s: between looks for a pose that is due, which poses are late by; between turns
-# of the executor, which cost most; between turns without a pose
+# judgement, all in s: period of checks for a due pose (its largest delay), of the executor (which
+# costs most CPU), and of computations while odometer data are missing
 LOOK_S, SERVE_S, SILENT_S = 0.02, 0.2, 0.2
 TWIST_NUMBERS = 42              # format: floats of a twist with its covariance
-SAID_AGAIN_NS = 10 * 10**9      # judgement: between two sentences of one kind
+SAID_AGAIN_NS = 10 * 10**9      # judgement: between two log lines of one kind
 HELP = """\
 usage: odometry --ros-args --params-file CALIBRATION.yaml [-p NAME:=VALUE] [-r FROM:=TO] ...
 
@@ -55,14 +55,14 @@ settings     parameters, all described in config/odometry.yaml"""
 
 class NumbersPublisher:
     """
-    Publishes copies of one message with another stamp and other numbers.
+    Publishes copies of one message with new stamps and numbers.
 
     Setting the fields of a message object and serialising it takes many times as long.
-    ``message``: its header holds the frame; after its last string are only 64-bit floats.
+    ``message``: template with the frame; only 64-bit floats follow its last string.
     """
 
     def __init__(self, node: Node, topic: str, message: Any) -> None:
-        raw = serialize_message(message)      # what follows the message is no part of it
+        raw = serialize_message(message)      # without the padding after the message
         package, name = type(message).__module__.split('.')[0], type(message).__name__
         layout = layout_of(f'{package}/msg/{name}', raw)
         assert layout is not None
@@ -79,7 +79,7 @@ class NumbersPublisher:
 
 
 class OdometryNode(SettledNode):
-    """Joins the inputs of the calibrator to ``Odometry`` and its poses to two topics."""
+    """Feeds the inputs of the calibrator to ``Odometry`` and publishes its poses on two topics."""
 
     default_name = 'odometry'
 
@@ -108,8 +108,8 @@ class OdometryNode(SettledNode):
             header=Header(frame_id=frames.base)))
         self._look_ns = self._silent_ns = 0
         self._begun, self._pause_ns = False, SILENCE_FIRST_NS
-        self._said_ns: dict[str, int] = {}      # when, by kind of sentence
-        self._doubled: set[str] = set()         # said
+        self._said_ns: dict[str, int] = {}      # last log by kind of text
+        self._doubled: set[str] = set()         # logged
         self._losses = LossReport()
         self.add_on_set_parameters_callback(params.fixed(ApplyConfig))
         self._tf = self._transforms() if self.config.publish_tf else None
@@ -119,14 +119,14 @@ class OdometryNode(SettledNode):
 
     def spin(self, executor: Executor) -> None:
         """Take messages when a pose may be due; the executor handles the rest at a low rate."""
-        self.destroy_timer(self._timer)      # for executors of others
+        self.destroy_timer(self._timer)      # only for other executors
         serve_at = 0.0
         while self.context.ok():
             look_at = time.monotonic() + LOOK_S
             self._turn()
             until = max(look_at, min(self._due_ns * 1e-9, serve_at))
             if any(one.waiting.gate.is_open for one in self._inputs.values()):
-                while (left := until - time.monotonic()) > 0:      # it carries the messages
+                while (left := until - time.monotonic()) > 0:      # it takes the messages
                     executor.spin_once(timeout_sec=left)
                 continue
             if until > serve_at:
@@ -144,7 +144,7 @@ class OdometryNode(SettledNode):
             return
         try:
             poses = self._reckon(now_ns)
-        except Exception as error:      # whatever a message does, the node lives on
+        except Exception as error:      # no message may stop the node
             poses = []
             self._odometry.begin_anew(f'internal error, please report it: {type(error).__name__}: '
                                       f'{said_by(error)}')
@@ -160,7 +160,7 @@ class OdometryNode(SettledNode):
             self._say(text, now_ns)
 
     def _reckon(self, now_ns: int) -> list[Pose]:
-        """Return the poses that are due; the IMU's messages wait for the odometer's."""
+        """Return the poses that are due; IMU messages wait for those of the odometer."""
         for slot, source in self._inputs.items():
             if slot != 'imu':
                 self._pump(source)
@@ -171,7 +171,7 @@ class OdometryNode(SettledNode):
         return self._odometry.poses()
 
     def _say(self, text: str, now_ns: int) -> None:
-        """Log the findings: every restart, other kinds of sentence at a limited rate."""
+        """Log the findings: every restart, other kinds of text at a limited rate."""
         kind = re.sub(r'[-+.\de]*\d', '#', text)
         if text.startswith(BEGINS_ANEW) or now_ns - self._said_ns.get(kind, 0) > SAID_AGAIN_NS:
             self._said_ns[kind] = now_ns
@@ -190,7 +190,7 @@ class OdometryNode(SettledNode):
             source.health.forget()
 
     def _look_around(self, now_ns: int) -> None:
-        """Look for publishers, and log missing inputs at a low rate."""
+        """Search for publishers, and log missing inputs at a low rate."""
         for one in self._inputs.values():
             one.look()
             if not one.flowing():

@@ -22,7 +22,7 @@ from odocal_ros.pipeline.floor_marks import mark_positions, place_of, WITHIN
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, LegConfig
 
-# the positions of a mark reach WITHIN to both sides, and another 0.5 s for the odometer's delay.
+# the positions of a mark extend WITHIN to both sides; 0.5 s more are for the odometer's delay.
 # Judgement
 MARK_STILL_S = 2 * WITHIN + 0.5
 
@@ -37,13 +37,13 @@ class AutomaticLegs(LegCompletion):
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self._search: LegSearch | None = None
-        self._searched: LegConfig | None = None      # the settings it was made with
+        self._searched: LegConfig | None = None      # the settings of the search
         self._counted_ns = 0                  # start of the leg whose metres are counted
-        self._warned: set[str] = set()        # changes of the scale that were said
+        self._warned: set[str] = set()        # changes of the scale that were logged
         self._recording.tap = self._receive
 
     def tick(self) -> None:
-        """Process finished jobs, new messages and the time."""
+        """Process finished jobs, new messages and timeouts."""
         super().tick()
         self._keep_search()
         if self._search is not None and self._search.spans:
@@ -91,12 +91,12 @@ class AutomaticLegs(LegCompletion):
                 self._end_leg(span.stop_ns)
         elif not session.open_leg and not session.busy and not self._why_not():
             if span.start_ns < self._recording.newest_ns - self._config().leg.preroll * 1e9:
-                search.spans.popleft()      # its samples are forgotten
+                search.spans.popleft()      # its samples were dropped
             else:
                 self._begin_leg(span.start_ns, by_itself=True)
 
     def end_leg_now(self) -> None:
-        """End the leg, by service or for its length; it counts as a leg of the operator."""
+        """End the leg, by service or at its longest duration, as a leg of the operator."""
         self.session.by_itself = False
         super().end_leg_now()
         self._look_after(self.session.stop_ns, at_rest=False)
@@ -134,7 +134,7 @@ class Operation(AutomaticLegs):
     """
     The commands of the node's services.
 
-    Each returns (success, text), or a future of it that ``tick`` will fill; refusals are raised.
+    Each returns (success, text), or a future of it that ``tick`` completes; may raise Refused.
     """
 
     def start_leg(self) -> tuple[bool, str]:
@@ -145,12 +145,12 @@ class Operation(AutomaticLegs):
                           f'{session.leg_id}; {answers.hint(self.view())}')
         if why := self._why_not():
             raise Refused(f'no leg can be started: {why}')
-        if session.state is State.RECORDING:      # one that nobody asked for
+        if session.state is State.RECORDING:      # an automatic leg
             self._drop_leg(f'leg {session.leg_id} is replaced by a started by the operator')
         return True, self._begin_leg(mark_ns)
 
     def mark(self) -> tuple[bool, str]:
-        """Record a mark: the robot stands on the next point of ``reference.points``."""
+        """Record a mark: the robot is on the next point of ``reference.points``."""
         session, newest_ns = self.session, self._mark_ns()
         if not self._config().reference.points:
             raise Refused('reference.points is empty: set x and y of each point, and restart the '
@@ -170,7 +170,7 @@ class Operation(AutomaticLegs):
         return True, text
 
     def stop_leg(self) -> tuple[bool, str] | Future:
-        """End the leg; the answer carries the result, a provisional one where it takes long."""
+        """End the leg; the answer has the result, or a provisional one if it takes long."""
         session = self.session
         if session.state is State.RECORDING:
             self.end_leg_now()
@@ -213,7 +213,7 @@ class Operation(AutomaticLegs):
         if not left:
             self._publishing.set_results(None)
             self._publishing.show_paths(worker.leg_paths(None, self._config()))
-            self._computing.drop()      # an undo just before may still be combined
+            self._computing.drop()      # an earlier undo may still be computed
             self._computing.answer(True, f'{text}; no leg is left')
             self.show_status()
             return True, f'{text}; no leg is left'
@@ -232,7 +232,7 @@ class Operation(AutomaticLegs):
             self._drop_leg('reset')
         dropped = self.session.begin_reset()
         self._publishing.forget_restored()
-        for leg in dropped:  # each shown as undone, so that a replay of the bag leaves it out too
+        for leg in dropped:  # each is published as undone: a replay of the bag omits it too
             self.session.dropped(leg)
             self.show_status()
         self._publishing.set_results(None)

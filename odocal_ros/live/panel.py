@@ -18,7 +18,7 @@ COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}
 
 
 def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:
-    """Return a status (its keys and values as sent) as one panel."""
+    """Return a status (its published keys and values) as one panel."""
     colour = COLOURS.get(level, 'white')
     state = Text(', '.join(filter(None, (status.get('state'), status.get('verdict')))),
                  style=f'bold {colour}')
@@ -51,7 +51,7 @@ def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
 
 
 def _of_result(status: dict[str, str]) -> dict[str, float]:
-    """Return the sigmas of the result in the units of the forecast; 0 in a leg or without them."""
+    """Return the sigmas of the result in forecast units; 0 while recording or without one."""
     if status.get('state') == 'recording':
         return {'scale': 0.0, 'yaw': 0.0}
     relative = number(status, 'scale_factor_sigma') / (number(status, 'scale_factor') or nan)

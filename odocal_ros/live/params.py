@@ -26,7 +26,7 @@ SCALE = 'm/pulse, m/rad or 1'
 ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
              'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE,
              'scale_factor_right': SCALE, 'heading_error': 'rad', 'track_width': 'm'}
-# what dead reckoning takes beside
+# further values that dead reckoning uses
 APPLIED = ESTIMATES | {'scale_factor_as_sent': SCALE} | {
     f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
     f'odometer_lever_arm_{axis}': 'm' for axis in 'xyz'}
@@ -52,10 +52,10 @@ def descriptor(setting: Setting) -> msg.ParameterDescriptor:
     """
     Return the descriptor of a setting.
 
-    rclpy refuses NaN where a range is declared, checks no array and knows no choices: there the
-    range stands in the text only, and the on-set callback checks it. Lists that may be empty are
-    typed dynamically, since an empty list in YAML has no type. What is fixed at start-up is not
-    declared read-only: rclpy would refuse it without a remedy, the on-set callback names one.
+    rclpy refuses NaN in a declared range, checks no arrays and has no choices. Such limits are in
+    the constraints text only, and the on-set callback checks them. Lists that may be empty are
+    typed dynamically, since an empty list in YAML has no type. Settings fixed at start-up are not
+    declared read-only: the on-set callback refuses them with a remedy, rclpy without.
     """
     about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
     about += ' Fixed at start-up.' if setting.ro else ''
@@ -81,13 +81,13 @@ def descriptor(setting: Setting) -> msg.ParameterDescriptor:
 
 def declare(node: Node, kind: type = Config) -> Any:
     """
-    Declare every setting as a parameter and return the configuration they make, of a kind.
+    Declare every setting as a parameter and return the configuration, of class ``kind``.
 
     Raises BadConfig: an override has the wrong type or is out of range.
     """
     values, settings = {}, settings_of(kind)
     for name, setting in settings.items():
-        # None for an empty list, which rclpy takes for bytes
+        # None for an empty list, which rclpy reads as bytes
         listed = setting.kind in ('floats', 'strs')
         default = list(setting.default) or None if listed else setting.default
         try:
@@ -103,7 +103,7 @@ def declare(node: Node, kind: type = Config) -> Any:
 
 
 def _warn_of_unknown(node: Node, settings: dict[str, Setting]) -> None:
-    """Warn of overrides in our groups that are no settings; ROS ignores undeclared ones."""
+    """Warn of unknown overrides in our groups or with similar names, which ROS ignores."""
     groups = {name.partition('.')[0] for name in settings if '.' in name}
     for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public access to them
         group, dot, _ = name.partition('.')
@@ -117,7 +117,7 @@ def check_qos(node: Node, topics: Iterable[str]) -> None:
     """
     Raise BadConfig for a QoS override of an input that rclpy would refuse.
 
-    Its message is internal, and comes only when the topic is subscribed.
+    The error of rclpy is internal, and is raised only when the topic is subscribed.
     """
     overrides = getattr(node, '_parameter_overrides', {})
     for topic in topics:
@@ -132,13 +132,13 @@ def check_qos(node: Node, topics: Iterable[str]) -> None:
 
 
 def changed(config: Config, parameters: list[Parameter]) -> Config:
-    """Return config with the settings among some parameters taken over, checked."""
+    """Return config with the settings among the parameters applied and checked."""
     return with_settings(config, {
         p.name: _plain(p.value) for p in parameters if p.name in SETTINGS})
 
 
 def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]) -> str:
-    """Return the refusal of parameters that only the node or its start sets, or ''."""
+    """Return the refusal of parameters that only the node or its start may set, or ''."""
     for p in parameters:
         now = results.get(p.name)
         if p.name in RESULTS and not (p.value == now or str(p.value) == str(now) == 'nan'):
@@ -163,7 +163,7 @@ def fixed(kind: type) -> Callable[[list[Parameter]], msg.SetParametersResult]:
 
 
 def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restored | None:
-    """Declare ``result.*``; return the saved result that came as overrides at start-up, if any."""
+    """Declare ``result.*``; return the saved result given by overrides, if any."""
     for name, default in _result_defaults(estimates).items():
         unit = estimates.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
         about = msg.ParameterDescriptor(dynamic_typing=True, description=(
@@ -187,7 +187,7 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
 
 def as_results(calibration: Calibration, stamp: str,
                vehicle: str = '') -> dict[str, Any]:
-    """Return the values of ``result.*`` that a calibration makes."""
+    """Return the values of ``result.*`` for a calibration."""
     values = dict(RESULTS)
     for name in ESTIMATES:
         estimate = calibration.estimates.get(name) or Estimate(None, None, '')
@@ -202,9 +202,9 @@ def as_results(calibration: Calibration, stamp: str,
 def restored_from(results: dict[str, Any],
                   estimates: dict[str, str] = ESTIMATES) -> Restored | None:
     """
-    Return the result that ``result.*`` hold, None where they hold none.
+    Return the result in the parameters ``result.*``, None without one.
 
-    Raises BadConfig: no calibration gives such values: the checks are those of a calibration.json.
+    Raises BadConfig: impossible values, by the checks of a calibration.json.
     """
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:
@@ -227,7 +227,7 @@ def restored_from(results: dict[str, Any],
 
 
 def _plain(value: Any) -> Any:
-    """Return a parameter's value as settings/config.py knows it: no numpy, no array, no bytes."""
+    """Return a parameter's value in the types of settings/config.py: lists, arrays as tuples."""
     if isinstance(value, (bool, int, float, str)) or value is None:
         return value
     return tuple(value)

@@ -26,7 +26,7 @@ from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import hold_little
 from odocal_ros.outside.names import brief_line, said_by
 
-LOOK_FOR_NAMESAKE_S = 5.0      # judgement: s between looks for another node of the same name
+LOOK_FOR_NAMESAKE_S = 5.0      # judgement: s between searches for another node of the same name
 
 
 class SettledNode(Node):
@@ -54,7 +54,7 @@ class SettledNode(Node):
         return self.create_timer(period_s, turn, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def spin(self, executor: Executor) -> None:
-        """Handle what comes until the context ends."""
+        """Process callbacks until the context ends."""
         executor.spin()
 
     def _look_for_namesake(self) -> None:
@@ -75,10 +75,10 @@ def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> i
     """
     Run a node until it must stop.
 
-    kind : of the node; its default name is that of the command.   about : text of --help.
+    kind : class of the node; its default name is that of the command.   about : text of --help.
 
-    Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and where only help or version
-    was asked for; 1 when it cannot start, with one line that says why.
+    Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and after printing help or
+    version; 1 if it cannot start, with the cause in one line.
     """
     hold_little()
     name = kind.default_name
@@ -110,7 +110,7 @@ def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> i
     except OdocalError as error:
         code = complain(name, str(error))
     except Exception as error:
-        # a callback caught in the middle of a shutdown may find its publisher gone
+        # during a shutdown, the publisher of a callback may be destroyed already
         code = complain(name, said_by(error)) if rclpy.ok() else 0
     finally:
         executor.shutdown()
@@ -118,7 +118,7 @@ def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> i
             node.destroy_node()  # type: ignore[no-untyped-call]
         rclpy.try_shutdown()
     if getattr(node, 'at_work', False):
-        # an interpreter that ends under a thread in C++ aborts; what is on the disk is whole
+        # Python aborts if it ends while a thread runs C++ code; the files on disk are complete
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -141,6 +141,6 @@ def _init(args: list[str] | None) -> None:
 
 
 def complain(name: str, text: str) -> int:
-    """Print on stderr why a command stops; return its exit code."""
+    """Print the cause of a command's failure on stderr; return its exit code."""
     print(brief_line(f'{name}: {text}'), file=sys.stderr)
     return 1

@@ -42,11 +42,11 @@ class Publishing:
         self._diagnostics = publish(DiagnosticArray, '/diagnostics', 1)
         self._hint = publish(String, '~/hint', LATCHED)
         self._plotted = {name: publish(Float64, f'~/{name}', LATCHED) for name in PLOTTED}
-        self._shown: dict[Publisher, str] = {}        # what these publishers said last
+        self._shown: dict[Publisher, str] = {}        # their last messages
         self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
         self.setting_results = False      # true while the node itself sets ``result.*``
-        self._before = self.results()    # what holds while no leg is kept: restored, or nothing
+        self._before = self.results()    # without kept legs: the restored result, or none
 
     def results(self) -> dict[str, Any]:
         """Return the ``result.*`` parameters in force."""
@@ -57,7 +57,7 @@ class Publishing:
         return float(self._node.get_parameter('result.scale_factor').value)
 
     def set_results(self, calibration: Calibration | None) -> None:
-        """Set all ``result.*`` at once: one event, never half a result; None: as it began."""
+        """Set all ``result.*`` in one event; None: to the restored result, or to none."""
         stamp = no_date(iso(self._node.get_clock().now().nanoseconds))
         results = self._before
         if calibration:
@@ -71,7 +71,7 @@ class Publishing:
             self.setting_results = False
 
     def forget_restored(self) -> None:
-        """Let go of a result that came with the start."""
+        """Discard the result restored at the start."""
         self._before = dict(params.RESULTS)
 
     def show_paths(self, messages: Paths) -> None:
@@ -87,7 +87,7 @@ class Publishing:
     def show_status(self, now: SessionView) -> DiagnosticArray:
         """Publish ``~/status`` and return it."""
         array = self._array([calibration_status(now)])
-        # first: who receives a status has its hint
+        # first: a receiver of the status then has its hint
         self._show(self._hint, String(data=action_first(now)))
         self._status.publish(array)
         for name, publisher in self._plotted.items():
@@ -95,7 +95,7 @@ class Publishing:
         return array
 
     def _show(self, publisher: Publisher, message: Float64 | String) -> None:
-        """Publish what is new; NaN after NaN is not."""
+        """Publish a message if it differs from the last one; NaN equals NaN."""
         if repr(message) != self._shown.get(publisher):
             self._shown[publisher] = repr(message)
             publisher.publish(message)
@@ -104,7 +104,7 @@ class Publishing:
         """Publish the health of each input."""
         node = self._node.get_fully_qualified_name()
         if not config.diagnostic_updater.use_fqn:
-            node = node.lstrip('/')      # with its namespace: two vehicles are not one
+            node = node.lstrip('/')      # with its namespace, to separate vehicles
         needed = recording.inputs.required(config)
         self._diagnostics.publish(self._array([
             input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.why(),

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The side of the node that listens: inputs, recorder, and what is seen while driving."""
+"""The receiving side of the node: inputs, recorder, and progress of the drive."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,15 +21,15 @@ from odocal_ros.live.topic_input import Input, StaticTransforms
 from odocal_ros.settings.config import Config
 
 CLOCK_BACK_S = 0.1         # judgement: a clock that steps back by more has jumped
-PREROLL_MARGIN_S = 1.0     # judgement: kept beyond the pre-roll; forgetting goes by whole blocks
+PREROLL_MARGIN_S = 1.0     # judgement: kept beyond the pre-roll; whole blocks are dropped
 
 
 class Recording:
     """
-    Samples so far, as they came.
+    Samples so far, in order of arrival.
 
-    ``remember(input, raws, sent_ns)`` is called with every batch of raw messages, in order of
-    arrival, once it is decoded: the journal's door.
+    ``remember(input, raws, sent_ns)`` is called with every decoded batch of raw messages, in order
+    of arrival, for the journal.
     """
 
     def __init__(self, node: Node, config: Config,
@@ -50,9 +50,9 @@ class Recording:
         return Progress(self._clock.ros_time_is_active)  # type: ignore[attr-defined]
 
     def pump(self, config: Config, found_scale: float) -> None:
-        """Decode what has come since the last call, in blocks."""
+        """Decode the messages since the last call, in blocks."""
         fix = self.inputs.by_slot.get('fix')
-        static = fix.static if fix else None     # a TF reference has a topic beside
+        static = fix.static if fix else None     # a TF reference has two topics
         if static is not None:
             raws, sent_ns = static.take()
             if raws:
@@ -68,14 +68,14 @@ class Recording:
                 self.recorder.feed(slot, block)
                 if slot == 'imu_other':
                     continue
-                if not source.sound.all():     # the pipeline screens for itself
+                if not source.sound.all():     # the recorder has all: the pipeline screens
                     block = take(block, source.sound)
                 self._show(slot, block, config, found_scale)
-            if not self.time_jumped:     # of another time: no sample of a leg before it
+            if not self.time_jumped:     # after a jump: no sample of an earlier leg
                 self._remember(source, raws, sent_ns)
 
     def add_marks(self, block: FixSamples, config: Config) -> None:
-        """Take the positions of a mark, as those of a topic."""
+        """Add the positions of a mark like those of a topic."""
         self.recorder.feed('fix', block)
         self._show('fix', block, config, 0.0)
 
@@ -91,8 +91,8 @@ class Recording:
         return fix is None or fix.health.fix_status == LOCAL
 
     def forget(self, preroll_s: float, start_ns: int) -> None:
-        """Bound the memory of what came before the pre-roll, of a leg that began then."""
-        # by each topic's own stamps: one on a foreign clock must not grow without bound
+        """Drop samples older than the pre-roll of a leg from ``start_ns``, 0: from now."""
+        # by the topic's own stamps: a topic on another clock must not grow without limit
         for source in self.inputs.by_slot.values():
             slots = (source.slot, *self._beside(source))
             if source.health.newest_ns:
@@ -109,7 +109,7 @@ class Recording:
 
     @property
     def newest_ns(self) -> int:
-        """Return the newest stamp of the leading topic, by which marks are set; 0 before it."""
+        """Return the newest stamp of the leading topic, by which marks are set; 0 without one."""
         return self.inputs.leading.newest_ns
 
     def passed(self, mark_ns: int) -> bool:
@@ -131,7 +131,7 @@ class Recording:
         return self._clock_jumped or self.inputs.leading.health.jumped_back
 
     def start_anew(self) -> None:
-        """Drop everything, as after a jump of time."""
+        """Drop all samples, after a jump of time."""
         self._clock_jumped = False
         self.recorder.clear()
         self.progress = self._no_progress()
@@ -160,14 +160,14 @@ class Recording:
         return any(one.health.received_ns for one in self.inputs.by_slot.values())
 
     def imu_silent_s(self) -> float:
-        """Return for how long the IMU has sent nothing while others did; 0 without an IMU."""
+        """Return the time from the last IMU message to the newest of all, s; 0 without an IMU."""
         received_ns = {slot: one.health.received_ns for slot, one in self.inputs.by_slot.items()}
         silent_ns = max(received_ns.values()) - received_ns['imu']
         return 0.0 if self.inputs.without_imu else max(0, silent_ns) * 1e-9
 
     def close(self) -> None:
-        """Let go of the clock."""
+        """Unregister from the clock."""
         self._jumps.unregister()
 
     def _note_jump(self, _jump: object) -> None:
-        self._clock_jumped = True  # called from within the clock: only a note is safe
+        self._clock_jumped = True  # called from within the clock: only a flag is safe

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The running estimate: looks at a leg every few seconds while it is recorded, in the worker."""
+"""The running estimate: updated in the worker every few seconds while a leg is recorded."""
 
 from functools import partial
 import threading
@@ -22,32 +22,32 @@ from odocal_ros.pipeline.planar_run import is_planar
 from odocal_ros.reasons import Code, gravest_first, Reason
 from odocal_ros.settings.config import Config
 
-# judgement: of the IMU's time, so that a fast replay is looked at as often
+# judgement: in IMU time, so that a fast replay has as many updates
 LOOK_PERIOD_NS = 5 * 10**9
-# tuned by benchmarks/live_load.py: of one core, what looking may cost in the long run; with it and
-# all else the node takes less than three fifths of a typed subscriber of 455 messages a second
+# tuned by benchmarks/live_load.py: share of one core for updates in the long run; the whole node
+# then needs less than three fifths of the CPU of a typed subscriber of 455 messages a second
 LOOK_SHARE = 1 / 60
 
 Block: TypeAlias = tuple[str, Any]      # slot, rows
-# forecast, faults, seconds of CPU it took, what went wrong
+# forecast, faults, CPU time in s, error
 Look: TypeAlias = tuple[Forecast | None, tuple[Reason, ...], float, Exception | None]
 
 
 class RunningEstimate:
     """
-    Keeps the newest forecast of the leg that is recorded, None without one.
+    Keeps the newest forecast of the recorded leg, None without one.
 
-    Of a leg that a gap cuts, each quantity is from the better section: both count.
+    If a gap cuts the leg, each quantity is from the section that is better for it.
 
-    The callback thread only collects blocks; cells and prediction are made in the worker, one look
-    at a time. ``end`` stops a running update at its next step, so that the result
-    of the leg need not wait for it. What fails here is a note in the log, never more.
+    The callback thread only collects blocks; cells and forecast are computed in the worker, one
+    update at a time. ``end`` stops a running update at its next step, so that the result of the
+    leg does not wait for it. Errors of an update are only logged.
     """
 
     def __init__(self, worker: Worker, log: PlainLog) -> None:
         self._worker, self._log = worker, log
-        self._newest: Forecast | None = None     # of the part that is driven
-        self._earlier: Forecast | None = None    # of those before it
+        self._newest: Forecast | None = None     # of the current section
+        self._earlier: Forecast | None = None    # of earlier sections
         self._faults: tuple[Reason, ...] = ()
         self._gaps: leg_so_far.ImuGaps | None = None
         self._thinned: ThinnedLeg | None = None
@@ -61,15 +61,15 @@ class RunningEstimate:
         self._pause_until = 0.0
 
     def begin(self, recorder: LegRecorder, start_ns: int, config: Config) -> None:
-        """Watch a leg that starts at a mark; ``recorder`` holds what came so far."""
+        """Watch a leg that starts at a mark; ``recorder`` has the samples so far."""
         self.end()
         self._config, self._before = config, recorder
         self._look_from(start_ns, recorder.form)
         self._gaps = leg_so_far.ImuGaps(start_ns, config.leg.max_gap)
-        self._gaps.feed(recorder.rows('imu'))      # a mark may lie back, as leg.automatic sets it
+        self._gaps.feed(recorder.rows('imu'))      # leg.automatic sets marks in the past
 
     def end(self) -> None:
-        """Let go of the leg."""
+        """Stop watching the leg."""
         self._forget()
         self._thinned = self._gaps = self._earlier = None
 
@@ -88,13 +88,13 @@ class RunningEstimate:
         self._pause_until = 0.0
 
     def _look_from(self, start_ns: int, form: OdometerForm) -> None:
-        """Look at what comes after a stamp."""
+        """Start a new section at a stamp."""
         self._over, self._start_ns = threading.Event(), start_ns
         self._thinned, self._smoother = ThinnedLeg(form), leg_so_far.SmootherSoFar()
         self._due_ns = start_ns + LOOK_PERIOD_NS
 
     def feed(self, slot: str, block: Any) -> None:
-        """Remember a block as it went into the recorder."""
+        """Store the rows of a received block that have a plausible stamp."""
         if self._thinned is None:
             return
         if slot == 'imu' and self._gaps is not None and (again_ns := self._gaps.feed(block)):
@@ -108,7 +108,7 @@ class RunningEstimate:
         """
         Return the problems of the leg so far, one reason per code, the gravest first.
 
-        silent_s : for how long the IMU has said nothing while others did.
+        silent_s : time from the last IMU message to the newest of all, s.
         """
         if self._gaps is None:
             return ()
@@ -119,7 +119,7 @@ class RunningEstimate:
         return tuple(gravest_first(first.values()))
 
     def look(self, newest_ns: int) -> None:
-        """Have the worker look if it is time to."""
+        """Submit an update to the worker if one is due."""
         if (self._thinned is None or self._looking or newest_ns < self._due_ns
                 or time.monotonic() < self._pause_until):
             return
@@ -136,7 +136,7 @@ class RunningEstimate:
             return
         self._looking = False
         self._newest, self._faults, seconds, failure = look or (None, (), 0.0, error)
-        # the first look brings in the pre-roll, and modules: a cost that comes once
+        # the first update loads the pre-roll and modules, a one-time cost
         self._pause_until = time.monotonic() + seconds / LOOK_SHARE if self._warm else 0.0
         self._warm = True
         if failure is not None:
@@ -147,9 +147,9 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], s
           config: Config, over: threading.Event, smoother: leg_so_far.SmootherSoFar,
           ) -> Look:
     """
-    Return forecast, faults, the seconds of CPU it took and what went wrong; for the worker.
+    Return forecast, faults, CPU time in s, and the error; runs in the worker.
 
-    Without what is done ever less often as a leg grows: this is a small share anyway.
+    The CPU time excludes ``once_s``, that of cold starts, which become rare as a leg grows.
     """
     begin = time.thread_time()
     forecast: Forecast | None = None
@@ -167,7 +167,7 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], s
     except Exception as error:  # an error of the running estimate does not end the leg
         failure = error
     finally:
-        leg_so_far.screened_in_cells.cache_clear()      # of this leg nobody asks again
+        leg_so_far.screened_in_cells.cache_clear()      # no later update uses this leg
     return forecast, found, time.thread_time() - begin - smoother.once_s, failure
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The session of legs, and one moment of it: all that status, hint and answers are made from."""
+"""The session of legs, and its snapshot, from which status, hint and answers are made."""
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -20,16 +20,16 @@ from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config, LegConfig
 
-# judgement: newest legs held with their tracks, and drawn; a day of legs must not fill the memory
+# judgement: newest legs kept with their tracks, for plots; a day of legs must not fill the memory
 LEGS_HELD = 30
 
 
 class Refused(OdocalError):
-    """A service was called in the wrong state: the text says what to do instead."""
+    """A service was called in the wrong state; the text names the action."""
 
 
 class State(Enum):
-    """What the node is at; ``waiting`` is idle with an input missing and not kept here."""
+    """State of the node; ``waiting``, which is idle with a missing input, is not a member."""
 
     IDLE = 'idle'
     RECORDING = 'recording'
@@ -41,7 +41,7 @@ class State(Enum):
 
 @dataclass(frozen=True, eq=False)
 class KeptLeg:
-    """A leg that counts; of parts where the IMU had a gap."""
+    """A leg of the result; it has several parts if the IMU had a gap."""
 
     leg_id: int
     start_ns: int
@@ -51,7 +51,7 @@ class KeptLeg:
 
 @dataclass(frozen=True, eq=False)
 class Restored:
-    """What the parameters ``result.*`` held at the start; the unit of a scale is not among it."""
+    """The result of the parameters ``result.*`` at the start, without the unit of the scale."""
 
     estimates: dict[str, Estimate]
     legs: int
@@ -60,7 +60,7 @@ class Restored:
     vehicle: str = ''
 
     def words(self, unit: str) -> str:
-        """Return it as a sentence; ``unit`` is that of scales of the odometer, or empty."""
+        """Return the result as a sentence; ``unit`` is that of the scale factors, or empty."""
         estimates = {name: replace(e, unit=unit) if unit and name.startswith('scale_factor') else e
                      for name, e in self.estimates.items()}
         use = '' if self.valid else ', which was rejected'
@@ -71,10 +71,10 @@ class Restored:
 
 class Session:
     """
-    Legs and their outcome.
+    Legs and their results.
 
-    ``leg_id``, ``start_ns``, ``stop_ns`` (0: open) and ``event`` are those of the leg last
-    touched: they go out with every status, and replay finds the marks by them.
+    ``leg_id``, ``start_ns``, ``stop_ns`` (0: open) and ``event`` belong to the leg that changed
+    last. Every status contains them, and replay finds the marks there.
     """
 
     def __init__(self) -> None:
@@ -87,11 +87,11 @@ class Session:
         self.calibration: Calibration | None = None
         self.restored: Restored | None = None   # from start-up, in force while no leg is kept
         self.trouble = ''
-        self.lost = ''      # why the leg last touched was dropped by nobody's wish
-        self.by_itself = False      # the leg last started: by leg.automatic
-        self.unused: Reason | None = None      # why the last such leg does not count
-        self.carried: Carried | None = None    # of legs that are not kept, or before this session
-        self.marks: list[FloorMark] = []       # with the pre-roll of the leg last started
+        self.lost = ''      # why the last leg was dropped automatically
+        self.by_itself = False      # leg.automatic started the last leg
+        self.unused: Reason | None = None      # why the last automatic leg is not used
+        self.carried: Carried | None = None    # information of released and earlier legs
+        self.marks: list[FloorMark] = []       # since the pre-roll of the last leg
         self._last_id = 0
 
     @property
@@ -126,7 +126,7 @@ class Session:
         return [mark for mark in self.marks if mark.stamp_ns >= self.start_ns]
 
     def mark(self, stamp_ns: int, received_ns: int) -> FloorMark:
-        """Note that the robot stands on the next point of the running leg."""
+        """Record that the robot is on the next point of the running leg."""
         if self.state is not State.RECORDING:
             raise Refused('no leg is running: call ~/start_leg first, then ~/mark on each point')
         point = next_point(self.config, len(self.marks_of_leg()))
@@ -156,7 +156,7 @@ class Session:
         self.settle(calibration)
 
     def leave_out(self, why: Reason) -> None:
-        """Drop the computed leg, which nobody asked for and which is no good."""
+        """Drop the computed automatic leg, which is not usable."""
         self.event, self.unused = 'cancelled', why
         self.settle(self.calibration)
 
@@ -169,7 +169,7 @@ class Session:
         self.state, self.trouble = State.FAILED, trouble
 
     def cancel(self, lost: str = '') -> None:
-        """Drop the open leg; ``lost``: why, where nobody asked for it."""
+        """Drop the open leg; ``lost``: the cause if it is dropped automatically."""
         if not self.open_leg:
             raise Refused('no leg is running: nothing to cancel; ~/undo_leg drops the last kept '
                           'leg')
@@ -202,7 +202,7 @@ class Session:
         return dropped
 
     def dropped(self, leg: KeptLeg) -> None:
-        """Show a leg as undone."""
+        """Set a leg as undone, for the status."""
         self.leg_id, self.start_ns, self.stop_ns = leg.leg_id, leg.start_ns, leg.stop_ns
         self.event = 'undone'
 
@@ -217,7 +217,7 @@ class Session:
         return self.calibration.verdict.value if self.calibration else ''
 
     def settle(self, calibration: Calibration | None) -> None:
-        """Take the combination of the kept legs, None without one; no leg is open then."""
+        """Set the combined result of the kept legs, None without one; no leg is open then."""
         self.calibration, self.trouble = calibration, ''
         if calibration is None:
             self.state = State.IDLE
@@ -229,7 +229,7 @@ class Session:
 
 @dataclass(frozen=True, eq=False)
 class SessionView:
-    """One moment of the node; in a leg the config is the one frozen into it."""
+    """Snapshot of the node; in a leg, config is the one in force at its start."""
 
     session: Session
     config: Config
@@ -239,25 +239,25 @@ class SessionView:
     clocks: list[tuple[str, float]] = field(default_factory=list)
     rates_hz: dict[str, float] = field(default_factory=dict)
     results: dict[str, Any] = field(default_factory=dict)  # result.* parameters
-    restored: str = ''                           # when they were made, of a saved result
+    restored: str = ''                           # date of the restored result
     distance_m: float = 0.0
     duration_s: float = 0.0
     max_speed: float = 0.0
     still_s: float = 0.0
-    two_wheels: bool = False                     # the right wheel has its own topic
-    ability: Ability | None = None               # of the leg that is recorded
-    forecast: Forecast | None = None               # of the leg that is recorded or computed
-    faults: tuple[Reason, ...] = ()              # of the leg that is recorded, gravest first
+    two_wheels: bool = False                     # left and right wheel are known
+    ability: Ability | None = None               # of the recorded leg
+    forecast: Forecast | None = None               # of the recorded or computed leg
+    faults: tuple[Reason, ...] = ()              # of the recorded leg, gravest first
     forecast_age_s: float = nan                   # since its newest sample
-    computed: Stage = Stage()                    # how far the result of a leg is
+    computed: Stage = Stage()                    # progress of the computation
     saved: str = ''
-    lost: str = ''                               # a leg that nobody wanted dropped
-    save_trouble: str = ''                       # why the newest result is in no folder
+    lost: str = ''                               # why a leg was dropped automatically
+    save_trouble: str = ''                       # why the newest result is not saved
     journal: str = ''                            # folder of the newest leg's journal
     journal_trouble: str = ''                    # why it cannot be written
     received: bool = True                           # any message on any topic so far
     local: bool = False                          # positions are in a local frame
-    imu: bool = True                             # the robot has one
+    imu: bool = True                             # it is needed or published
 
     @property
     def state(self) -> str:

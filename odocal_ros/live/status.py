@@ -18,9 +18,9 @@ from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Verdict
 
-SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a move in a yard is no fault
+SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a short move in a yard is no fault
 NAME = 'calibrator: calibration'  # replay finds marks by this name
-# judgement: decimals that mean something
+# judgement: significant decimals
 PLACES = dict.fromkeys((
     'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
     'metres_to_least', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
@@ -85,7 +85,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def in_force(now: SessionView, name: str) -> float:
-    """Return a value or a sigma: of the leg's running estimate until it has a result."""
+    """Return a value or sigma of the result, or of the running estimate until the leg has one."""
     if now.session.state is not State.RECORDING and now.forecast is None:
         return float(now.results[f'result.{name}'])
     estimates = now.forecast.estimates if now.forecast else {}
@@ -174,7 +174,7 @@ def _reason_codes(now: SessionView) -> str:
 
 
 def _bare(value: object, places: int | None = None) -> str:
-    """Return a value as PlotJuggler reads it: a number without unit, to its last digit or less."""
+    """Return a value as text for PlotJuggler: a number without unit, in full or rounded."""
     if not isinstance(value, float):
         return str(value)
     return repr(float(value) if places is None or not math.isfinite(value)
@@ -186,8 +186,8 @@ def input_status(name: str, health: Health, why: str, needed: bool,
     """
     Return the health of one input for ``/diagnostics``.
 
-    Levels as diagnostic_updater has them: no events are an ERROR from the start (STALE is for the
-    aggregator to say of a node that no longer reports); of an input that no leg needs a WARN.
+    Levels as in diagnostic_updater: no messages are an ERROR from the start, or a WARN if no leg
+    needs the input. STALE is left to the aggregator, for nodes that no longer report.
     """
     rate, silent = health.rate_hz(now_ns), health.silent_s(now_ns)
     if why:
@@ -199,7 +199,7 @@ def input_status(name: str, health: Health, why: str, needed: bool,
         message = f'{rate:.1f} Hz, {health.unusable} messages unreadable'
     else:
         status, message = DiagnosticStatus.OK, f'{rate:.1f} Hz'
-    # the first two by the names that diagnostic_updater gives them, which monitors look for
+    # the first two have the names of diagnostic_updater, which monitors search for
     values = {'Events since startup': health.count, 'Actual frequency (Hz)': rate,
               'rate_hz': rate, 'age_s': silent if math.isfinite(silent) else -1.0,
               'messages': health.count, 'gaps': health.gaps, 'dropped': health.lost,

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Listens to a calibrator's latched status and hint; anybody may be their sender."""
+"""Listens to a calibrator's latched status and hint, which are untrusted."""
 
 from collections.abc import Iterator
 
@@ -13,7 +13,7 @@ from std_msgs.msg import String
 
 from odocal_ros.outside.names import brief_line
 
-MOST_VALUES = 500      # judgement: keys of a status that are looked at; a calibrator sends 100
+MOST_VALUES = 500      # judgement: keys of a status that are read; a calibrator sends 100
 # definition: of latched topics, publisher and subscriber
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -21,7 +21,7 @@ HINT_S = 0.1      # judgement: s in which a hint that was sent with a status arr
 
 
 class StatusListener:
-    """A node of its own that waits for statuses; a context manager and an iterator over them."""
+    """A separate node that receives statuses; a context manager and an iterator over them."""
 
     def __init__(self, node_name: str) -> None:
         self._context = rclpy.Context()
@@ -51,7 +51,7 @@ class StatusListener:
         self._context.try_shutdown()
 
     def __iter__(self) -> Iterator[tuple[bytes, dict[str, str], str]]:
-        """Yield (level, key -> value, what to do) of each status, until the end."""
+        """Yield (level, key -> value, hint) of each status, until the context ends."""
         try:
             while self._context.ok():
                 self._executor.spin_once(timeout_sec=0.5)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One topic of the node: raw messages as they wait, decoded in blocks by the readers of bags."""
+"""One topic of the node: waiting raw messages, decoded in blocks by the readers of bags."""
 
 from collections.abc import Callable
 import difflib
@@ -29,16 +29,16 @@ from odocal_ros.messages.transforms import STATIC, StaticReader, TransformReader
 from odocal_ros.outside.names import one_line, said_by
 from odocal_ros.settings.config import Config
 
-MOST_TOPICS_MEANT, NAME_SIMILARITY = 2, 0.4      # judgement: of difflib, 1 for the same name
+MOST_TOPICS_MEANT, NAME_SIMILARITY = 2, 0.4      # judgement: suggestions; of difflib, 1: equal
 STATIC_DEPTH = 100     # judgement: publishers of static transforms
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
 
 
 class StaticTransforms:
     """
-    The topic of static transforms beside a TF reference, which each publisher sends once.
+    The topic of static transforms for a TF reference; each publisher sends them once.
 
-    They hold at all times: each journal has all of them.
+    They are valid at all times, so each journal has all of them.
     """
 
     slot, msgtype, newest_ns = 'fix_static', TRANSFORMS, ALWAYS_NS
@@ -53,7 +53,7 @@ class StaticTransforms:
             reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 
     def take(self) -> tuple[list[bytes], list[int]]:
-        """Return the messages that came since the last call, and when they were sent, ns."""
+        """Return the messages since the last call, and their send times, ns."""
         self._waiting.follow_clock()
         return self._waiting.take()[:2]
 
@@ -64,9 +64,9 @@ class StaticTransforms:
 
 class Input:
     """
-    One topic, from the wire to blocks of samples.
+    One topic, from raw messages to blocks of samples.
 
-    ``allowed`` are the message types it takes; empty: any that ``make_reader`` can read.
+    ``allowed`` are the accepted message types; empty: all that ``make_reader`` can read.
     """
 
     def __init__(self, node: Node, slot: str, allowed: tuple[str, ...]) -> None:
@@ -77,43 +77,43 @@ class Input:
         self.reader: Reader | None = None
         self.health = Health()
         self.trouble = ''
-        self.sound = np.empty(0, bool)    # which rows of the last block can be reckoned with
+        self.sound = np.empty(0, bool)    # rows of the last block with a plausible stamp
         self.frame = ''        # of the IMU's header, once a message has come
         self.publishers: list[TopicEndpointInfo] = []
-        self.meant: list[str] = []     # topics that others publish, where nobody does this one
+        self.meant: list[str] = []     # suggested topics if this one has no publisher
         self._failed = 0
         self._frame_id = ''
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
         self.waiting = WaitingMessages(node)
-        self.static: StaticTransforms | None = None     # the topic beside a TF reference
+        self.static: StaticTransforms | None = None     # second topic of a TF reference
 
     def check(self, config: Config) -> None:
-        """Raise OdocalError where the type the operator wrote cannot be read, at start-up."""
+        """Raise OdocalError at start-up if the one allowed message type cannot be read."""
         if len(self.allowed) == 1:
             message_class(self.allowed[0])
             make_reader(self.slot, self.allowed[0], config)
 
     def look(self) -> None:
-        """Look at the clock, at who publishes the topic, else at what may be meant."""
+        """Update clock and publishers, and without any the suggested topics."""
         self.waiting.follow_clock()
         self.publishers = self._node.get_publishers_info_by_topic(self.topic)
         self.meant = [] if self.publishers else self._same()
 
     def _same(self) -> list[str]:
-        """Return topics that others publish with a type that would serve, the nearest first."""
+        """Return published topics of a suitable type, the most similar name first."""
         wanted, own = set(self.allowed or TYPES), {p.topic_name for p in self._node.publishers}
         if self.slot == 'fix':      # most contain the wheel odometry
             wanted -= {'nav_msgs/msg/Odometry', TRANSFORMS}
         names = [name for name, types in self._node.get_topic_names_and_types()
                  if wanted & set(types) and name not in own
                  and self._node.count_publishers(name)]
-        # of the many types that may be an odometer's only those with a similar name
+        # many types may be an odometer: only similar names
         return difflib.get_close_matches(self.topic, names, MOST_TOPICS_MEANT,
                                          0.0 if self.allowed else NAME_SIMILARITY)
 
     def doubled(self) -> str:
-        """Name those who publish the topic where they are several, else return nothing."""
+        """Return a warning of several publishers or IMUs on the topic, empty without."""
         frames = self.reader.frames if self.reader is not None else None
         if frames is not None and frames.other and not self._frame_id:
             return (f'{self.topic} carries several IMUs (frame_id {one_line(frames.frame)!r} and '
@@ -121,7 +121,7 @@ class Input:
         mixed = [p for p in self.publishers if p.topic_type == self.msgtype]
         if len(mixed) < 2:
             return ''
-        # a node's name comes after its topics
+        # a node's name is discovered after its topics
         who = ', '.join(sorted('not known yet' if 'UNKNOWN' in p.node_name
                                else f'{p.node_namespace.rstrip("/")}/{p.node_name}'
                                for p in mixed))
@@ -144,14 +144,14 @@ class Input:
             self.trouble = trouble
 
     def subscribe(self, msgtype: str, config: Config) -> None:
-        """Create the reader and the subscription, or raise what is wrong."""
+        """Create the reader and the subscription; raise an error for a wrong type."""
         if self.allowed and msgtype not in self.allowed:
             raise BadData(f'{self.topic} carries {msgtype}, not {" or ".join(self.allowed)}: '
                           f'remap {self.name} to another topic')
         kind = message_class(msgtype)
         reader = make_reader(self.slot, msgtype, config)
         self._frame_id = config.imu.frame_id
-        # increments want the QoS on offer; others are optional, an idle subscription is not free
+        # increments need the offered QoS; for optional topics, an idle subscription is not free
         if not self.publishers and (self.slot in OUTSIDE or self._counts_increments(reader)):
             return
         offered = {p.qos_profile.reliability for p in self.publishers}
@@ -170,11 +170,11 @@ class Input:
 
     @staticmethod
     def _counts_increments(reader: Reader) -> bool:
-        # a lost increment is travel lost for good, so such a topic is reliable
+        # a lost increment is lost travel, so such a topic is reliable where offered
         return reader.form is not None and reader.form.quantity == 'increment'
 
     def take(self) -> tuple[list[bytes], list[int]]:
-        """Return the messages that came since the last call, and when they were sent, ns."""
+        """Return the messages since the last call, and their send times, ns."""
         raws, sent_ns, numbers = self.waiting.take()
         if raws:
             self.health.arrived(numbers, time.monotonic_ns())
@@ -182,7 +182,7 @@ class Input:
 
     def decode(self, raws: list[bytes], received_ns: list[int],
                max_gap_s: float | None) -> list[tuple[str, Any]]:
-        """Return (slot, block) pairs of messages; those that cannot be read are counted."""
+        """Return (slot, block) pairs of messages; unreadable messages are counted."""
         reader, deserialize = self.reader, self._deserialize
         if reader is None or deserialize is None:
             return []
@@ -190,7 +190,7 @@ class Input:
             pairs = reader.rows(raws, received_ns, deserialize)
             if self.slot == 'imu':
                 self.frame = reader.frame or self.frame or deserialize(raws[0]).header.frame_id
-        except Exception as error:  # whatever a foreign message does, the node lives on
+        except Exception as error:  # no message may stop the node
             self._failed += len(raws)
             self.trouble = f'{self.topic}: {said_by(error)}'
             pairs = []

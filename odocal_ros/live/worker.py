@@ -31,20 +31,20 @@ from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
-MOST_POSES = 2000    # judgement: of a path shown
+MOST_POSES = 2000    # judgement: of a published path
 Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, reference
-# judgement: s that a stopping node waits, for a computation and for files: launch asks again,
-# and harder, after 5 s
+# judgement: s that a stopping node waits, for a computation and for files: launch sends the next
+# signal after 5 s
 JOB_GRACE_S, FILES_GRACE_S = 1.0, 4.0
 Job: TypeAlias = Callable[[], Any]
 Then: TypeAlias = Callable[[Any, Exception | None], None]      # one of them is None
 Outcome: TypeAlias = tuple[Then, Any, Exception | None]
-# Left alone glibc keeps an arena for every thread, and takes arrays of up to 32 MiB out of it once
-# one was freed: a node held 100 MiB that nobody used after an hour's leg at 1 kHz. judgement, of
-# mallopt(3): arenas for all threads together, bytes from which a block is mapped separately
+# By default glibc has an arena for every thread and, once one was freed, takes arrays of up to 32
+# MiB from it: a node kept 100 MiB unused after a leg of an hour at 1 kHz. judgement, of
+# mallopt(3): number of arenas of all threads, bytes from which a block is mapped separately
 OPTIONS = {-8: 2, -3: 2**22}
 _libc = ctypes.CDLL(None)
-# judgement: s that ~/stop_leg waits for the result. It answers within 5 s, of which one is for a
+# judgement: s that ~/stop_leg waits for the result. It must answer within 5 s, 1 s of it is for a
 # busy machine; the last samples take up to 1 s, the fit of a leg of ten minutes 1 to 2 s
 PATIENCE_S = 4.0
 
@@ -54,8 +54,8 @@ class Computed:
     """
     Result of a leg.
 
-    results : one, or one of each part where the IMU had a gap.
-    carried, folded : information of earlier legs, and how many kept legs are in it.
+    results : one for each part; gaps of the IMU separate parts.
+    carried, folded : information of earlier legs, and the number of kept legs added to it.
     """
 
     results: tuple[LegResult, ...]
@@ -77,7 +77,7 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
             kept: list[tuple[LegResult, ...]], config: Config, carried: Carried | None = None,
             by_itself: bool = False, progress: Callable[[Stage], None] | None = None,
             ) -> Computed | LeftOut:
-    """Return a leg's result, its combination with the legs kept, and the paths to show."""
+    """Return a leg's result, its combination with the kept legs, and the paths to publish."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
     results = tuple(calibrate_parts(leg, config, progress=progress))
     if by_itself and (why := refusal(results[0])):
@@ -92,7 +92,7 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
 
 def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,
               ) -> tuple[Calibration, Paths]:
-    """Return the combination of the legs left, and the paths of the last."""
+    """Return the combination of the remaining legs, and the paths of the last one."""
     return combine(kept, config, carried, known_imu(config)), leg_paths(kept[-1], config)
 
 
@@ -122,9 +122,9 @@ class Worker:
     """
     Runs jobs one after the other in a thread of its own.
 
-    ``poll`` hands their outcomes to the thread that asks, the executor's, so that nothing but
-    the job itself ever runs beside the callbacks. A stopping node waits for result files just
-    asked for, report included, but not for a long computation.
+    ``poll`` delivers their results in the calling thread, the executor's: only the job itself
+    runs in parallel to the callbacks. A stopping node waits for requested result files and their
+    report, but not for a long computation.
     """
 
     def __init__(self) -> None:
@@ -143,7 +143,7 @@ class Worker:
         self._jobs.put((job, then))
 
     def poll(self) -> None:
-        """Call what was to follow each job that has ended."""
+        """Call ``then`` of each finished job."""
         while not self._done.empty():
             then, result, error = self._done.get()
             then(result, error)
@@ -157,13 +157,13 @@ class Worker:
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:
             self._done.put(_outcome(*entry))
-            del entry       # a job holds a leg: not until the next one comes
+            del entry       # release the job's leg now, not at the next job
             give_back()
             self._jobs.task_done()
 
 
 def _outcome(job: Job, then: Then) -> Outcome:
-    """Do a job; every failure of it is an answer to the operator."""
+    """Run a job; an exception becomes part of the outcome."""
     try:
         return then, job(), None
     except Exception as error:
@@ -171,14 +171,14 @@ def _outcome(job: Job, then: Then) -> Outcome:
 
 
 def hold_little() -> None:
-    """Keep little of what is freed; nothing changes where the C library has no such options."""
+    """Limit the freed memory that is kept; no effect if the C library has no such options."""
     if hasattr(_libc, 'mallopt'):
         for option, value in OPTIONS.items():
             _libc.mallopt(option, value)
 
 
 def give_back() -> None:
-    """Give whole free pages back; nothing where the C library cannot."""
+    """Return free pages to the system; no effect if the C library cannot."""
     if hasattr(_libc, 'malloc_trim'):
         _libc.malloc_trim(0)
 
@@ -187,9 +187,9 @@ class Computing:
     """
     At most one active job; the result of a dropped one is ignored.
 
-    ``failed(trouble)`` is called for a job that raised, or whose result could not be taken;
-    ``done()`` is called after each that counted. ``alive()`` is false while the node is shut
-    down: what breaks then is no failure.
+    ``failed(trouble)`` is called if a job, or ``take`` of its result, raises; ``done()`` after
+    each job that was not dropped. ``alive()`` is false during shutdown: an error of ``take`` is
+    then no failure.
     """
 
     def __init__(self, worker: Worker, failed: Callable[[str], None],
@@ -202,7 +202,7 @@ class Computing:
     def report(self, stage: Stage) -> None:
         """Store the progress of the job; called by the worker's thread."""
         self.at = stage
-        give_back()      # what the pass before needed
+        give_back()      # memory of the pass before
 
     def submit(self, job: Job, take: Callable[[Any], object]) -> None:
         """Run a job in the worker and hand its result to ``take``."""
@@ -216,7 +216,7 @@ class Computing:
             try:
                 if error is None:
                     take(result)
-            except Exception as wrong:      # else nobody who waits would ever be answered
+            except Exception as wrong:      # so that waiting callers are answered
                 if not self._alive():
                     raise
                 error = wrong
@@ -231,7 +231,7 @@ class Computing:
         self._job = None
 
     def promise(self, patience_s: float = math.inf) -> Future:
-        """Return a future that the next answer, or that of ``answer_late``, will be set on."""
+        """Return a future that the next ``answer`` or ``answer_late`` completes."""
         future = Future()
         self._waiting.append((future, time.monotonic() + patience_s))
         return future

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Where the fields of a serialised message lie, without a ROS or rosbags import.
+Offsets of the fields of a serialised message, without a ROS or rosbags import.
 
 Messages whose variable parts (strings, lists) have the same lengths have their fields at the
-same bytes: one message gives the layout of all of them.
+same offsets: one message determines the layout for all of them.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ def _pose(prefix: str) -> tuple[str, ...]:
 
 
 _HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
-FRAME_AT = 16       # format: where CDR has the text of _HEADER
+FRAME_AT = 16       # format: offset of the text of _HEADER in CDR
 _LAYOUT = ('dim[] layout.dim', 'uint32 layout.data_offset')
 _DIM = ('string label', 'uint32 size', 'uint32 stride')
 
@@ -79,7 +79,7 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 
 
 class Run(NamedTuple):
-    """Values of one kind side by side: bytes, kind, kind of all as one item, number."""
+    """Adjacent values of one kind: their bytes, kind, kind of all as one item, number."""
 
     place: slice
     dtype: np.dtype[Any]
@@ -89,19 +89,19 @@ class Run(NamedTuple):
 
 @dataclass
 class Layout:
-    """Where the fields of one message lie, and which bytes all messages like it share."""
+    """Offsets of the fields of a message, and the bytes common to all messages of this layout."""
 
     places: dict[str, tuple[int, str]] = field(default_factory=dict)       # offset, dtype
     lists: dict[str, tuple[int, str, int]] = field(default_factory=dict)   # and how many values
     texts: dict[str, list[str]] = field(default_factory=dict)              # lists of strings
     fixed: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
     size: int = 4
-    values: list[bytes] = field(default_factory=list)      # what stands in the fixed places
+    values: list[bytes] = field(default_factory=list)      # content of the fixed bytes
     _runs: dict[tuple[str, ...], list[Run] | None] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
-        """Return the list ``name`` (of joints), empty where there is none."""
+        """Return the list ``name`` (of joints), empty if there is none."""
         return self.texts.get('name', [])
 
     def count(self, path: str) -> int:
@@ -109,7 +109,7 @@ class Layout:
         return self.lists[path][2] if path in self.lists else 0
 
     def find(self, path: str) -> tuple[int, str] | None:
-        """Return offset and dtype of a value, ``path[i]`` in a list; None if it is not there."""
+        """Return offset and dtype of a value, ``path[i]`` in a list; None if it is missing."""
         if path in self.places:
             return self.places[path]
         match = INDEXED.fullmatch(path)
@@ -128,13 +128,13 @@ class Layout:
         """
         Return the values at some paths of messages of this layout, (n, size) bytes.
 
-        Returns (n, len(paths)) array of the first path's dtype; None where a path is not in the
+        Returns (n, len(paths)) array of the first path's dtype; None if a path is not in the
         layout.
         """
         runs = self._places(tuple(paths))
         if runs is None:
             return None
-        # all of a run at a time, not value by value
+        # a run at a time, not a value at a time
         values = [table[:, run.place].view(run.together).copy().view(run.dtype).reshape(
             -1, run.width) for run in runs]
         return values[0] if len(values) == 1 else np.concatenate(values, axis=1)
@@ -143,7 +143,7 @@ class Layout:
         """
         Return the type of a message of this layout whose fields are the values at some paths.
 
-        None where a path is missing, or where the paths of a field are not side by side.
+        None if a path is missing, or if the paths of a field are not adjacent.
         """
         runs = [self._places(tuple(paths)) if paths else None for paths in columns]
         one = [found[0] for found in runs if found is not None and len(found) == 1]
@@ -158,11 +158,11 @@ class Layout:
             raw[a:b] == values for (a, b), values in zip(self.fixed, self.values, strict=True))
 
 
-_before: dict[str, Layout] = {}      # by type, the last one found: most topics have no other
+_before: dict[str, Layout] = {}      # by type, the last one found: most topics have only one
 
 
 def _side_by_side(places: Sequence[tuple[int, str] | None]) -> list[Run] | None:
-    """Return places of values as runs; None if one of them is missing."""
+    """Return offsets of values as runs; None if one of them is missing."""
     found: list[tuple[int, str, int]] = []
     for place in places:
         if place is None:
@@ -179,7 +179,7 @@ def _side_by_side(places: Sequence[tuple[int, str] | None]) -> list[Run] | None:
 
 
 def layout_of(msgtype: str, raw: bytes) -> Layout | None:
-    """Return the layout of one message; None where it cannot be read as columns."""
+    """Return the layout of one message; None if it cannot be read as columns."""
     if msgtype not in SCHEMAS or raw[:2] != b'\x00\x01':    # XCDR1, little endian
         return None
     before = _before.get(msgtype)
@@ -192,14 +192,14 @@ def layout_of(msgtype: str, raw: bytes) -> Layout | None:
     except (struct.error, ValueError):
         return None
     if layout.size > len(raw):
-        return None     # longer is common: serialize_message leaves what lay behind the message
+        return None     # longer is common: serialize_message leaves bytes after the message
     layout.values = [raw[a:b] for a, b in layout.fixed]
     _before[msgtype] = layout
     return layout
 
 
 def frame_of(msgtype: str, raw: bytes) -> str | None:
-    """Return the frame_id of one message; None if the layout does not give it."""
+    """Return the frame_id of one message; None if it has no layout with a header."""
     if SCHEMAS.get(msgtype, ())[:3] != _HEADER or layout_of(msgtype, raw) is None:
         return None
     at, length = FRAME_AT, int.from_bytes(raw[FRAME_AT - 4:FRAME_AT], 'little')
@@ -207,7 +207,7 @@ def frame_of(msgtype: str, raw: bytes) -> str | None:
 
 
 class _Walk:
-    """Walks over one message and notes where everything lies."""
+    """Sequential scan of one message that stores the offsets of all fields."""
 
     def __init__(self, raw: bytes) -> None:
         self.raw = raw
@@ -259,7 +259,7 @@ class _Walk:
         return length
 
     def text(self, keep: bool) -> str:
-        """Pass a string; ``keep``: it is part of what all messages of this layout share."""
+        """Return a string and skip it; ``keep``: it is common to all messages of this layout."""
         length = self.length()
         at = self.layout.size
         self.layout.size += length

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Messages to samples: one set of readers for the wire and for bags.
+Decoding of messages to samples: the same readers for live topics and for bags.
 
-A reader takes messages as they were serialised. Those of one layout are read as columns by
-``messages.raws``; any other goes through ``deserialize`` and gives the same row to the last bit.
+A reader takes serialised messages. Those of one layout are read as columns by ``messages.raws``;
+others are read by ``deserialize``, with bitwise equal rows.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,14 +25,14 @@ from odocal_ros.messages.raws import FEW_ROWS, FrameFilter, Raws, Table, tables
 from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan, TRANSFORMS
 from odocal_ros.settings.config import Config
 
-# judgement: messages that gave nothing, after which odd ones are not looked at
+# judgement: unreadable messages after which unusual ones are no longer deserialised
 HOPELESS = 20_000
 Deserialize = Callable[[bytes], object]
 Feed = Callable[[str, Samples], None]
 
 
 class RowReader(Protocol):
-    """What turns the messages of one topic into rows."""
+    """Reader of the messages of one topic into rows."""
 
     unreadable: int
     trouble: str
@@ -45,10 +45,10 @@ class RowReader(Protocol):
 
 class Reader:
     """
-    Reads the messages of one topic into samples; how they come chopped leaves no trace.
+    Reads the messages of one topic into samples; block sizes have no effect.
 
-    ``unreadable`` counts messages that gave no row (damaged, or without the wheel asked for);
-    ``trouble`` says why for the last of them.
+    ``unreadable`` counts messages without a row (damaged, or without the selected wheel);
+    ``trouble`` is the reason for the last of them.
     """
 
     def __init__(self, slot: str, msgtype: str, plan: SensorPlan | OdometerPlan) -> None:
@@ -59,7 +59,7 @@ class Reader:
         self.frames: FrameFilter | None = None      # of an IMU
         self._plan = plan
         self._layout: cdr.Layout | None = None      # the last one of a few messages
-        self._record: np.dtype[Any] | None = None      # as which they are read
+        self._record: np.dtype[Any] | None = None      # type with which they are read
 
     @property
     def form(self) -> OdometerForm | None:
@@ -68,12 +68,12 @@ class Reader:
 
     @property
     def frame(self) -> str:
-        """Return the frame_id of the IMU in use, empty where it is not known."""
+        """Return the frame_id of the IMU in use, empty if it is not known."""
         return self.frames.frame if self.frames is not None else ''
 
     @property
     def wheels(self) -> tuple[str, ...]:
-        """Return the keys (joints, indices) that odometer values are taken from, in order."""
+        """Return the keys (joints, indices) of the odometer values, in order."""
         return self._plan.keys if isinstance(self._plan, OdometerPlan) else ()
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
@@ -81,13 +81,13 @@ class Reader:
         """
         Decode messages.
 
-        raws : messages as serialised (CDR), in order of arrival.   received_ns : their arrival;
-        the stamp of messages that have none.   deserialize : turns one of them into an object with
-        its fields; asked only where needed.
+        raws : serialised messages (CDR), in order of arrival.   received_ns : their arrival; the
+        stamp of messages without one.   deserialize : converts one of them to an object with its
+        fields; called only if needed.
 
         Returns (slot, block) pairs, one for each wheel of a message, none without a row.
 
-        Raises BadData: the messages can never give what was asked: no such field, not a number.
+        Raises BadData: the message type cannot have the value: no such field, not a number.
         """
         other, raws = None, raws if len(raws) <= FEW_ROWS else Raws.of(raws)
         if self.frames is not None and len(raws):
@@ -114,7 +114,7 @@ class Reader:
         good = np.ones(n, bool)
         for layout, rows, table in tables(self.msgtype, raws):
             values = self._values(layout, table) if layout else None
-            if values and isinstance(rows, slice):       # all of them: as they are
+            if values and isinstance(rows, slice):       # all of them: no copy
                 out = values
                 break
             out = out or [np.empty((n, column.width), column.dtype) for column in plan.columns]
@@ -132,7 +132,7 @@ class Reader:
         return plan.build(received, out) if len(received) else []
 
     def _few(self, raws: Sequence[bytes]) -> list[NDArray[Any]]:
-        """Return the columns of a few messages of one layout; none where one needs more."""
+        """Return the columns of a few messages of one layout; [] if they have several or none."""
         layout = cdr.layout_of(self.msgtype, raws[0])
         if len(raws) > FEW_ROWS or layout is None or not all(map(layout.fits, raws)):
             return []
@@ -147,7 +147,7 @@ class Reader:
             self._record.names or (), columns, strict=True)]
 
     def _values(self, layout: cdr.Layout, table: Table) -> list[NDArray[Any]] | None:
-        """Return the columns of messages of one layout; None where one is not there."""
+        """Return the columns of messages of one layout; None if one is missing."""
         values: list[NDArray[Any]] = []
         for column in self._plan.columns:
             value = column.of_table(layout, table)
@@ -158,7 +158,7 @@ class Reader:
         return values
 
     def _settled(self, raws: Sequence[bytes], deserialize: Deserialize) -> int:
-        """Let the plan see messages in order until it knows all; return how many did not help."""
+        """Pass messages to the plan until it is complete; return the number of skipped ones."""
         for k, raw in enumerate(raws):
             view: View | None = cdr.layout_of(self.msgtype, raw) if self._plan.known else None
             if view is None:
@@ -183,8 +183,8 @@ class Reader:
             return None
 
     def _one(self, out: list[NDArray[Any]], i: int, raw: bytes, deserialize: Deserialize) -> bool:
-        """Read one message into row i; False: it gives none."""
-        if self.unreadable > HOPELESS:      # trying costs a hundred times what reading does
+        """Read one message into row i; False: it has no row."""
+        if self.unreadable > HOPELESS:      # deserialising takes a hundred times as long
             self.unreadable += 1
             return False
         view = self._view(raw, deserialize)
@@ -211,8 +211,8 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
     """
     Return the reader of a slot for messages of a type.
 
-    Raises BadData, BadConfig: the type cannot serve this slot, or not with these settings; the
-    text says what would.
+    Raises BadData, BadConfig: the type cannot be used for this slot, or not with these settings;
+    the text contains the remedy.
     """
     msgtype = full_type(msgtype)
     if slot in WHEELS:
@@ -227,6 +227,6 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
 
 
 def full_type(msgtype: str) -> str:
-    """Return 'pkg/msg/Type' for 'pkg/Type' too."""
+    """Return 'pkg/msg/Type', also for 'pkg/Type'."""
     package, _, name = msgtype.rpartition('/')
     return f'{package}/msg/{name}' if package and '/' not in package else msgtype

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Fields of messages by their path, whether the message is bytes (a layout) or an object."""
+"""Fields of messages by their path, for messages as bytes (a layout) or as objects."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
 
 
 class View(Protocol):
-    """What a column asks of a message: its joint names and how long its lists are."""
+    """Message as seen by a column: its joint names and the lengths of its lists."""
 
     @property
     def names(self) -> Sequence[str]:
-        """Return the list ``name`` (of joints), empty where there is none."""
+        """Return the list ``name`` (of joints), empty if there is none."""
 
     def count(self, path: str) -> int:
         """Return the length of a list, 0 if it is missing."""
@@ -38,7 +38,7 @@ class MessageView:
 
     @property
     def names(self) -> Sequence[str]:
-        """Return the list ``name`` (of joints), empty where there is none."""
+        """Return the list ``name`` (of joints), empty if there is none."""
         return list(getattr(self.message, 'name', ()))
 
     def count(self, path: str) -> int:
@@ -52,7 +52,7 @@ class MessageView:
         """
         Return the value at a dotted path, with [i] in a list or [name] by the list ``name``.
 
-        Raises AttributeError, LookupError: not there.
+        Raises AttributeError, LookupError: it is missing.
         """
         here: Any = self.message
         owner = here
@@ -82,7 +82,7 @@ class MessageView:
 
 @lru_cache
 def parts(path: str) -> tuple[tuple[str, str], ...]:
-    """Return a path as (name, '') and ('', key) pairs; empty if it is no path."""
+    """Return a path as (name, '') and ('', key) pairs; empty if it is not a path."""
     found = tuple(PART.findall(path))
     whole = ''.join(f'[{key}]' if key else f'.{name}' for name, key in found)
     return found if whole.lstrip('.') == path else ()
@@ -101,7 +101,7 @@ class Column:
     pick: Callable[[View], Sequence[str] | None]
 
     def of_table(self, layout: cdr.Layout, table: Table) -> NDArray[Any] | None:
-        """Return (n, width) values of messages of one layout, None if they are not there."""
+        """Return (n, width) values of messages of one layout, None if they are missing."""
         paths = self.pick(layout)
         return layout.columns(table, paths) if paths else None
 
@@ -114,7 +114,7 @@ class Column:
 
 
 def fixed(dtype: type, *paths: str) -> Column:
-    """Return a column whose values lie at the same paths in every message."""
+    """Return a column whose values have the same paths in every message."""
     return Column(dtype, len(paths), lambda view: paths)
 
 

@@ -23,7 +23,7 @@ from odocal_ros.settings.config import Config
 JOINTS = 'sensor_msgs/msg/JointState'
 TWIST = 'geometry_msgs/msg/Twist'
 DEFAULT_FIELD = {
-    JOINTS: '',   # position, or velocity where no position is sent
+    JOINTS: '',   # position, or velocity if there is no position
     TWIST: 'linear.x',
     f'{TWIST}Stamped': 'twist.linear.x',
     f'{TWIST}WithCovarianceStamped': 'twist.twist.linear.x',
@@ -40,9 +40,9 @@ class OdometerPlan:
     """
     Fields to read from the messages of an odometer topic, and their meaning.
 
-    The first message decides some of it (does a JointState hold positions? which of its joints
-    are wheels? is a foreign field a whole number?); ``ready`` is called with messages in order
-    until it says yes.
+    Some of it is determined by the first message (does a JointState have positions? which of its
+    joints are wheels? is a field of an unknown type a whole number?); ``ready`` is called with
+    messages in order until it returns True.
     """
 
     def __init__(self, slot: str, msgtype: str, config: Config) -> None:
@@ -53,7 +53,7 @@ class OdometerPlan:
         self.stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
         self.columns: tuple[Column, ...] = ()
         self.form = OdometerForm('cumulative', self.odometer.wrap, 'm/pulse')
-        self.unclear = ''        # why the last message did not determine the wheels
+        self.unclear = ''        # reason why the last message did not determine the wheels
         self._check()
         self.choosing = self._listed() and not _base(self.field)[1] and not self.keys[0]
         if msgtype == JOINTS and not self.field:
@@ -68,7 +68,7 @@ class OdometerPlan:
                 self._settle(self.field or self.fields[0])
 
     def _check(self) -> None:
-        """Refuse settings that must fail, before the first message."""
+        """Raise an error for settings that must fail, before the first message."""
         if not self.known and not self.field and len(self.keys) < 2:
             raise BadData(
                 f'{self.slot}: {self.msgtype} is not a known odometer type: set '
@@ -99,7 +99,7 @@ class OdometerPlan:
         return self.known and (not base or '[' in _kinds(self.msgtype)[base])
 
     def ready(self, view: View) -> bool:
-        """Determine what is still open from a message; False: repeat with the next one."""
+        """Complete the plan from a message; return False to repeat with the next one."""
         if self.columns:
             return True
         if not self.known:
@@ -135,7 +135,7 @@ class OdometerPlan:
         self.form = replace(self.form, sides=found.sides, chosen=found.about)
 
     def _learn(self, view: MessageView) -> None:
-        """Determine a foreign type from its first message."""
+        """Determine columns and meaning of an unknown type from its first message."""
         value = None
         for key in self.keys:
             path = self._path(self.field, key)
@@ -151,7 +151,7 @@ class OdometerPlan:
         self._settle(self.field, 'int64' if isinstance(value, Integral) else 'float64')
 
     def _settle(self, field: str, kind: str = '') -> None:
-        """Fix columns and form for a field; ``kind`` of foreign types comes from their values."""
+        """Set columns and form for a field; ``kind`` of unknown types is that of their values."""
         self.form = self._meaning(field, kind)
         whole = 'int' in (kind or self._kind(field))
         dtype = np.int64 if whole else np.float64
@@ -184,12 +184,12 @@ class OdometerPlan:
         return f'{_base(field)[0]}[{key}]' if field else key
 
     def _pick(self, field: str, key: str) -> Callable[[View], Sequence[str] | None]:
-        """Return the function that gives the paths of a wheel's values in a message."""
+        """Return a function that returns the paths of a wheel's values in a message."""
         path = self._path(field, key)
         base, own = _base(field)
         if not self.known or '[' not in _kinds(self.msgtype)[base]:
             return lambda view: (path,)
-        key = key or own        # never through the path: a joint may have any name
+        key = key or own        # not by parsing the path: a joint may have any name
 
         def pick(view: View) -> Sequence[str] | None:
             n = view.count(base)
@@ -199,7 +199,7 @@ class OdometerPlan:
         return pick
 
     def missing(self, view: View) -> str:
-        """Return the explanation why a message has no value, for people."""
+        """Return the reason why a message has no value, as text."""
         if self.unclear and not self.columns:
             return self.unclear
         wanted = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
@@ -234,7 +234,7 @@ def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
 
 
 def _kinds(msgtype: str) -> dict[str, str]:
-    """Return path -> kind of the numbers in a type."""
+    """Return path -> kind for the numbers in a message type."""
     lines = (line.split() for line in cdr.SCHEMAS[msgtype])
     return {path: kind for kind, path in lines if not kind.startswith(('string', 'dim'))}
 

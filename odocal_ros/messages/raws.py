@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Serialised messages side by side in one buffer: of one layout as a table, of one frame_id."""
+"""Serialised messages in one buffer: tables of messages of one layout, selection by frame_id."""
 
 from collections.abc import Callable, Iterator, Sequence
 import struct
@@ -17,22 +17,22 @@ from odocal_ros.messages import cdr
 Bytes = bytes | bytearray | memoryview
 Rows = Ints | Bools | slice
 Table = NDArray[np.uint8]
-# judgement: per call; a stream with more is odd enough to be read message by message
+# judgement: per call; further layouts are read message by message
 MAX_LAYOUTS = 16
-FEW_ROWS = 8      # judgement: messages up to which one after another takes less time than a table
-SETTLED = 3     # judgement: messages that decide the frame; a damaged one does not
-TEXT_AT = cdr.FRAME_AT - 4      # format: where the length of the text stands
+FEW_ROWS = 8      # judgement: messages up to which single reads take less time than a table
+SETTLED = 3     # judgement: messages that determine the frame, more than a damaged one
+TEXT_AT = cdr.FRAME_AT - 4      # format: offset of the length of the text
 
 
 class Raws(Sequence[bytes]):
-    """Messages: ``data``, and where in it each starts and how long it is."""
+    """Messages: ``data``, and offset and length of each message in it."""
 
     def __init__(self, data: Bytes, start: Ints, size: Ints) -> None:
         self.data, self.start, self.size = data, start, size
 
     @classmethod
     def of(cls, raws: Sequence[bytes]) -> 'Raws':
-        """Return messages that lie apart."""
+        """Return Raws of separate messages, copied to one buffer."""
         if isinstance(raws, Raws):
             return raws
         size = np.fromiter(map(len, raws), np.int64, len(raws))
@@ -55,16 +55,16 @@ class Raws(Sequence[bytes]):
         return bytes(self.data[start:start + int(self.size[which])])
 
     def take(self, rows: Rows) -> 'Raws':
-        """Return the messages of some rows; nothing is copied."""
+        """Return the messages of some rows, without a copy of their bytes."""
         return Raws(self.data, self.start[rows], self.size[rows])
 
     def table(self, rows: Ints) -> Table:
-        """Return (n, size) bytes of messages that are as long; nobody else holds them."""
+        """Return a copy of messages of equal length: (n, size) bytes."""
         start = self.start if len(rows) == len(self) else self.start[rows]
         size = int(self.size[rows[0]]) if len(rows) else 0
         if not size:
             return np.empty((len(rows), 0), np.uint8)
-        # every place of the buffer as such a message; the rows picked are all that is touched
+        # a view with a message at every offset of the buffer; only the selected rows are read
         there = np.ndarray((len(self.data) - size + 1,), f'V{size}', self.data, 0, (1,))
         return there[start].view(np.uint8).reshape(-1, size)
 
@@ -91,7 +91,7 @@ def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[cdr.Layout | N
     """
     Yield each layout, its rows (numbers, or a slice: all of them) and messages, (n, size) bytes.
 
-    Rows that have no layout come last, with None and no messages.
+    Rows without a layout are last, with None and no messages.
     """
     raws = Raws.of(raws)
     odd: list[Ints] = []
@@ -131,9 +131,9 @@ def _same(table: Table, fixed: Sequence[tuple[int, int]]) -> Bools:
 
 class FrameFilter:
     """
-    Keeps messages of one frame_id: the configured one, else the first that SETTLED messages have.
+    Keeps messages of one frame_id: the configured one, else the first in SETTLED messages.
 
-    Until then all messages are kept, so how a stream is chopped leaves no trace.
+    Until then all messages are kept, so that block sizes have no effect.
     """
 
     def __init__(self, msgtype: str, wanted: str) -> None:
@@ -192,16 +192,16 @@ class FrameFilter:
         return alike
 
     def _frame(self, raw: bytes, deserialize: Callable[[bytes], Any]) -> str | None:
-        """Return the frame_id of one message, None where it cannot be read."""
+        """Return the frame_id of one message, None if it cannot be read."""
         try:
             frame = cdr.frame_of(self._msgtype, raw)
             return str(deserialize(raw).header.frame_id) if frame is None else frame
-        except Exception:       # rclpy and rosbags fail with exceptions of their own
+        except Exception:       # rclpy and rosbags raise different exceptions
             return None
 
 
 def _stamp_ns(raw: bytes) -> int:
-    """Return the header stamp of a message in CDR, little endian; 0, its arrival, of any other."""
+    """Return the header stamp of a message in little-endian CDR, ns; 0 (no stamp) for others."""
     if raw[:2] != b'\0\1':
         return 0
     second, nanosecond = struct.unpack_from('<iI', raw, 4)

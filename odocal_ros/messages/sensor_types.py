@@ -24,9 +24,11 @@ FIX = 'sensor_msgs/msg/NavSatFix'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, samples.Samples]]
 Build = Callable[..., samples.Samples]        # of stamps, arrivals and a slot's columns
+# format: bits of -1 (REP-145), which are compared without a warning of a signalling NaN
+NONE_SENT = np.float64(-1).view(np.int64)
 # format: block of the position in a 6 x 6 covariance, row by row
 _COVARIANCE = array('pose.covariance', 0, 1, 2, 6, 7, 8, 12, 13, 14)
-# columns of each type: position, and its covariance where the type has one
+# columns of each type: position, and its covariance if the type has one
 LOCAL_TYPES: dict[str, Sequence[Column]] = {
     'geometry_msgs/msg/PoseStamped': (xyz('pose.position'),),
     'geometry_msgs/msg/PoseWithCovarianceStamped': (xyz('pose.pose.position'), _COVARIANCE),
@@ -37,10 +39,10 @@ LOCAL_TYPES: dict[str, Sequence[Column]] = {
 
 
 class SensorPlan:
-    """Fields to read from a stamped sensor message, and the samples of them."""
+    """Fields to read from a stamped sensor message, and the function that makes samples."""
 
     form: samples.OdometerForm | None = None
-    known = True         # its layout is all there is to learn of its type
+    known = True         # the layout is sufficient, no message is needed
 
     def __init__(self, slot: str, columns: Sequence[Column], build: Build) -> None:
         self.slot = slot
@@ -48,11 +50,11 @@ class SensorPlan:
         self._build = build
 
     def ready(self, view: View) -> bool:
-        """Return True: nothing is left to learn from the first message."""
+        """Return True: nothing is determined by the first message."""
         return True
 
     def missing(self, view: View) -> str:
-        """Return the explanation why a message has no value, for people."""
+        """Return the reason why a message has no value, as text."""
         return 'a message is incomplete'
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> Pairs:
@@ -63,8 +65,7 @@ class SensorPlan:
 
 def _imu(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw: Floats, w_i: Floats,
          f_i: Floats, of_force: Floats) -> samples.ImuSamples:
-    with np.errstate(invalid='ignore'):      # a NaN that signals
-        none = of_force[:, 0] == -1          # REP-145: none is sent
+    none = of_force.view(np.int64)[:, 0] == NONE_SENT
     if none.any():
         f_i[none] = np.nan
     return samples.of_columns(samples.ImuSamples, stamps, received, w_i, f_i, q_ni,
@@ -77,14 +78,14 @@ def _heading(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw
 
 
 def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
-    """Return covariance[8], NaN where REP-145's -1 or an all-zero quaternion say 'none'."""
-    some = across(np.logical_or, q_ni != 0)
-    return np.where(~some | (of_roll[:, 0] == -1), np.nan, of_yaw[:, 0])
+    """Return covariance[8]; NaN without orientation (REP-145's -1 or an all-zero quaternion)."""
+    some = across(np.logical_or, q_ni) & (of_roll.view(np.int64)[:, 0] != NONE_SENT)
+    return np.where(some, of_yaw[:, 0], np.nan)
 
 
 def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
          status: Ints) -> samples.FixSamples:
-    with np.errstate(invalid='ignore'):      # a NaN that signals
+    with np.errstate(invalid='ignore'):      # a signalling NaN
         latitude, longitude = position[:, 0] * RAD_PER_DEG, position[:, 1] * RAD_PER_DEG
     return samples.of_columns(samples.FixSamples, stamps, received, latitude, longitude,
                               position[:, 2].copy(),
@@ -122,7 +123,7 @@ SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
 
 
 def types_of(slot: str, odometer: OdometerConfig) -> tuple[str, ...]:
-    """Return the message types that an input can have; empty: any type, of an odometer."""
+    """Return the message types that an input can have; empty: any type (odometer)."""
     if slot in WHEELS:
         return () if odometer.type == 'auto' else (odometer.type,)
     types = tuple(kind for own, kind in SENSORS if own == slot)

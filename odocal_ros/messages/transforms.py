@@ -16,8 +16,8 @@ from odocal_ros.nav.frame_chain import FrameChain
 from odocal_ros.nav.local_frame import local_fixes
 from odocal_ros.settings.config import Config
 
-STATIC = '_static'      # what tf2 appends to the name of a topic
-MOST_NAMES, MOST_LETTERS = 12, 40     # judgement: frames in a sentence, and letters of one
+STATIC = '_static'      # suffix of the topic of static transforms
+MOST_NAMES, MOST_LETTERS = 12, 40     # judgement: frames in a sentence, and letters of a frame
 Transform = tuple[str, str, int, tuple[float, ...]]     # child, parent, stamp ns, values
 
 
@@ -46,7 +46,7 @@ def transforms_of(raw: bytes, deserialize: Callable[[bytes], Any]) -> list[Trans
 
 
 def _text(raw: bytes, at: int) -> tuple[str, int]:
-    """Return the frame at a place, and the place after it."""
+    """Return the frame at an offset, and the offset after it."""
     at += -at % 4
     end = at + 4 + int(struct.unpack_from('<I', raw, at)[0])
     return _name(raw[at + 4:end - 1].decode()), end + -end % 4
@@ -58,12 +58,12 @@ def _name(frame: str) -> str:
 
 
 def _shown(frame: str) -> str:
-    """Return a frame of a message for people: somebody else chose the name."""
+    """Return a frame of a message for texts, quoted and limited in length."""
     return repr(frame[:MOST_LETTERS])
 
 
 class TransformReader(Reader):
-    """Reads /tf; ``static`` reads the topic beside it into the same frames."""
+    """Reads /tf; ``static`` reads /tf_static into the same frames."""
 
     def __init__(self, config: Config) -> None:
         build = local_fixes(config.reference.latitude_deg)
@@ -77,7 +77,7 @@ class TransformReader(Reader):
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:
-        """Return the positions that messages make known."""
+        """Return the positions that can be computed with these messages."""
         self._messages += len(raws)
         for raw, received in zip(raws, np.asarray(received_ns, np.int64).tolist(), strict=True):
             for child, parent, stamp_ns, values in self._read(raw, deserialize):
@@ -101,12 +101,12 @@ class TransformReader(Reader):
     def _read(self, raw: bytes, deserialize: Deserialize) -> list[Transform]:
         try:
             return transforms_of(raw, deserialize)
-        except Exception:       # rclpy and rosbags fail with exceptions of their own
+        except Exception:       # rclpy and rosbags raise different exceptions
             self._damaged += 1
             return []
 
     def _why(self) -> str:
-        """Return the explanation why there is no position."""
+        """Return the reason why there is no position, as text."""
         chain = self._chain
         what = f'from {chain.parent} to {chain.child}'
         if chain.top() != chain.parent:
@@ -120,7 +120,7 @@ class TransformReader(Reader):
 
 
 class StaticReader(Reader):
-    """Reads /tf_static; it shares the frames of the reader of /tf, which reports all trouble."""
+    """Reads /tf_static into the frames of the reader of /tf, which reports all errors."""
 
     def __init__(self, moving: TransformReader, plan: SensorPlan) -> None:
         super().__init__('fix', TRANSFORMS, plan)
@@ -134,7 +134,7 @@ class StaticReader(Reader):
 
 
 def with_static(readers: Mapping[str, Reader], topics: Container[str]) -> dict[str, Reader]:
-    """Return topic -> reader, with the static transforms that lie beside a TF reference."""
+    """Return topic -> reader, with readers of the static transforms of TF references."""
     beside = {topic + STATIC: reader.static for topic, reader in readers.items()
               if isinstance(reader, TransformReader) and topic + STATIC in topics}
     return {**readers, **beside}

@@ -5,8 +5,8 @@
 Selection of the wheels among the values of a message, if no setting names them.
 
 Joints are selected by name: wheels, steering and arm joints have typical names. A left and a right
-one make a pair; of several axles the one that does not steer, else the rear one. Without
-typical names nothing is guessed: two values of unknown sides give their mean, more give a refusal.
+one are a pair; of several axles the one that does not steer is used, otherwise the rear one.
+Without typical names, two values of unknown sides give their mean, more are refused.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ MAY_BE = ('track', 'tread', 'drive', 'motor', 'traction', 'hub', 'encoder')
 STEER = ('steer', 'swivel', 'pivot', 'kingpin')
 NO_WHEEL = (*STEER, 'caster', 'castor', 'susp', 'shock', 'spring', 'damper', 'drop', 'brake',
             'bogie', 'rocker', 'camber')
-# parts of a body or a machine: whole words, they occur in other words
+# parts of a body or a machine: only as whole words, since they occur in other words
 NO_TRAVEL = ('arm', 'shoulder', 'elbow', 'wrist', 'finger', 'gripper', 'hand', 'head', 'neck',
              'torso', 'waist', 'hip', 'knee', 'ankle', 'leg', 'pan', 'tilt', 'lift', 'servo',
              'camera', 'mast', 'boom', 'bucket', 'door', 'throttle', 'pedal', 'flipper', 'lidar',
@@ -30,18 +30,18 @@ LETTERS = {'f': 'front', 'r': 'rear', 'b': 'rear', 'm': 'middle', 'c': 'middle'}
 
 @dataclass(frozen=True)
 class Choice:
-    """The values taken (joint names or indices), left before right where ``sides`` is true."""
+    """The selected values (joint names or indices), left before right if ``sides`` is true."""
 
     keys: tuple[str, ...]
     sides: bool
-    about: str            # for people; '' where there was nothing to choose
+    about: str            # explanation; '' if there was no choice
 
 
 def choose(names: Sequence[str], count: int) -> Choice | str:
     """
-    Return the wheels among the values of a message, or why they are unclear.
+    Return the wheels among the values of a message, or the reason why they are unclear.
 
-    names : of the values, as sent; may be fewer than there are, or none.   count : of values.
+    names : of the values, in order; may be fewer than the values, or none.   count : of values.
     """
     names = list(names[:count])
     keys = names or [str(k) for k in range(count)]
@@ -73,14 +73,14 @@ def choose(names: Sequence[str], count: int) -> Choice | str:
 
 
 def sided(choice: Choice, side: str) -> str:
-    """Return the key of the wheel on one side, 'left' or 'right'; '' if that is unclear."""
+    """Return the key of the wheel on one side, 'left' or 'right'; '' if sides are unknown."""
     if len(choice.keys) == 1:
         return choice.keys[0]
     return choice.keys[side == 'right'] if choice.sides else ''
 
 
 def _by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
-    """Return the pair selected by name, else all possible wheels."""
+    """Return the pair selected by name, otherwise all possible wheels."""
     low = {name: name.lower() for name in names}
     free = [n for n in names if not any(w in low[n] for w in NO_WHEEL)]
     rolls = [n for n in free if any(w in low[n] for w in WHEEL)]
@@ -115,7 +115,7 @@ def _taken(names: Sequence[str], pair: tuple[str, str], why: str) -> str:
 
 
 def _words(name: str) -> list[str]:
-    """Return the words of a name, single letters beside each other as one: r_l is rl."""
+    """Return the words of a name; adjacent single letters are one word: r_l is rl."""
     words: list[str] = []
     for word in (w.lower() for w in WORD.findall(name)):
         if len(word) == 1 and words and len(words[-1]) == 1 and (words[-1] + word).isalpha():
@@ -143,7 +143,7 @@ def _place(name: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _letters(word: str) -> tuple[str, str]:
-    """Return axle and side of a short hand: l, rh, fl, rr; '' where it is none."""
+    """Return axle and side of an abbreviation: l, rh, fl, rr; '' if there is none."""
     side = {'l': 'left', 'r': 'right'}
     if word in side or word in ('lh', 'rh'):
         return '', side[word[0]]

@@ -24,7 +24,7 @@ MOTION_LEVEL = 30.0       # s, judgement: of driving that determines a level wit
 COURSE_DISTANCE = 30.0    # m, judgement: of track for a course
 HEADING_LIMIT = 0.5      # rad, judgement: limit of the sigma of an orientation used as heading
 COMPASS_LIMIT = 0.05      # rad, judgement: limit of the sigma of a gyrocompass
-# s, judgement: cut off at each end of a standstill: a slow start tilts the specific force
+# s, judgement: excluded at each end of a standstill: a slow start tilts the specific force
 REST_EDGE = 0.3
 
 
@@ -33,13 +33,13 @@ class Alignment:
     """
     Attitude and gyro bias at one epoch.
 
-    t : s since the start mark, where C_nb holds and the strapdown begins.
-    C_nb : (3, 3) takes b to n.      gyro_bias : (3,) rad/s, in b.
+    t : s since the start mark, epoch of C_nb and start of the strapdown.
+    C_nb : (3, 3) b to n.            gyro_bias : (3,) rad/s, in b.
     level_sigma, heading_sigma : rad, 1 sigma (level: each of east and north).
     gyro_bias_sigma : (3,) rad/s.    gyro_noise : rad/s/sqrt(Hz).   gyro_bias_walk : rad/s/sqrt(s)
-    heading_source : where the heading is from; ``course`` holds the mounting angle itself.
+    heading_source : source of the heading; that of ``course`` includes the mounting angle.
     heading_shared : its error is the same in every leg.
-    standstill : begin and end, s, of the standstill used, None when aligned in motion.
+    standstill : begin and end, s, of the standstill used, None if aligned in motion.
     gyro_scale_sigma : relative error of the gyro's scale.   gyro_axes_sigma : rad, of an axis.
     """
 
@@ -71,16 +71,16 @@ class Alignment:
 @dataclass(frozen=True, eq=False)
 class Level:
     """
-    Level and turn rate before heading is known: L is level, its x axis below b's x axis.
+    Level and turn rate before heading is known: L is level, its x axis the projection of b's.
 
-    Level where the vehicle is, at p: C_np takes the east, north and up of p to those of n.
+    It is level at the position p of the vehicle: C_np is the rotation from ENU at p to n.
     """
 
     t: float
     C_Lb: NDArray[np.float64]           # (3, 3)
     level_sigma: float                  # rad, each axis
     mean_rate_b: NDArray[np.float64]    # (3,) rad/s over the standstill, zero in motion
-    rate_sigma: float                   # rad/s, of the mean against the bias at t
+    rate_sigma: float                   # rad/s, of the mean as bias at t
     standstill: tuple[float, float] | None
     C_np: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
 
@@ -111,7 +111,7 @@ def level_frame(up_b: Floats) -> Floats:
     """
     Return C_Lb for the up direction in b: x of L is b's x axis projected on the level.
 
-    Where b's x axis is upright, b's y axis is that of L.
+    If b's x axis is vertical, b's y axis is that of L.
     """
     u = up_b / np.linalg.norm(up_b)
     level = np.hypot(u[1], u[2])
@@ -120,7 +120,7 @@ def level_frame(up_b: Floats) -> Floats:
 
 
 def C_nL(yaw: float) -> Floats:
-    """Return the rotation that takes level axes to n for the ENU yaw of L's x axis, rad."""
+    """Return the rotation from L to n for the ENU yaw of L's x axis, rad."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -132,12 +132,12 @@ def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[floa
 
     t, w_b, f_b : (n,), (n, 3), (n, 3) IMU rows, s, rad/s, m/s^2.   span : (2,) begin and end of
     the standstill, s.   grade : accelerometer bias, axes and noise.   gyro_noise : rad/s/sqrt(Hz).
-    An accelerometer bias tilts the level by bias / g. The gyro bias walks while its mean is taken:
-    by a third of its variance over the standstill, from the last value.
+    An accelerometer bias tilts the level by bias / g. The gyro bias is a random walk: its mean
+    differs from its last value by a third of the variance over the standstill.
     """
     cut = min(REST_EDGE, (span[1] - span[0]) / 4)
     inside = (t >= span[0] + cut) & (t <= span[1] - cut)
-    if not inside.any():        # rows at its very ends only
+    if not inside.any():        # rows only at its ends
         inside = (t >= span[0]) & (t <= span[1])
     length = max(span[1] - span[0] - 2 * cut, 1e-3)
     up_b = f_b[inside].mean(axis=0)
@@ -152,15 +152,15 @@ def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[floa
 def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitude: float,
                     grade: Grade) -> Level:
     """
-    Return the level from the mean specific force of some driving, without the odometer's speed.
+    Return the level from the mean specific force in motion, corrected for the change of velocity.
 
     In axes fixed at the start 0, the integral of C_0b f is the change of velocity plus g T up;
-    the velocity lies along b's x axis but for the mounting angles, taken as within 3 deg.
+    the velocity is along b's x axis up to the mounting angles, assumed to be within 3 deg.
 
-    t, f_b : (n,), (n, 3) IMU rows of the stretch: s, m/s^2.   q_0b : (n, 4) attitude against the
-    first row, from the gyro.   speed : (2,) speed at the first and the last row, m/s.   latitude :
-    rad.   grade : sensor figures: without a standstill the turn-on gyro bias is still in the
-    attitude, and the Earth's turn cannot be taken out before heading is known.
+    t, f_b : (n,), (n, 3) IMU rows of the interval: s, m/s^2.   q_0b : (n, 4) attitude relative to
+    the first row, from the gyro.   speed : (2,) speed at the first and the last row, m/s.
+    latitude : rad.   grade : sensor errors: without a standstill the attitude includes the turn-on
+    gyro bias, and the Earth rate cannot be subtracted before heading is known.
     """
     T = t[-1] - t[0]
     C_0b = matrix_from_quat(q_0b)
@@ -170,7 +170,7 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
     up_0 = lift - change
     g = gravity(latitude, 0.0)
     fastest = np.abs(speed).max()
-    earth = OMEGA * (T / 2 + 2 * fastest / g)       # the level turning away, and Coriolis
+    earth = OMEGA * (T / 2 + 2 * fastest / g)       # rotation of the level, and Coriolis
     parts = (grade.level_bias / g, grade.gyro_bias * T / 2, earth, fastest * 0.05 / (g * T))
     return Level(float(t[0]), level_frame(up_0), float(np.linalg.norm(parts)), np.zeros(3),
                  0.0, None)
@@ -178,10 +178,10 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
 
 def gyrocompass(level: Level, latitude: float, grade: Grade) -> tuple[float, float]:
     """
-    Return the ENU yaw of L's x axis and its sigma, rad, from the Earth rate seen at rest.
+    Return the ENU yaw of L's x axis and its sigma, rad, from the Earth rate measured at rest.
 
-    The level part of the mean rate points north. A gyro bias east turns it by
-    bias / (Omega cos latitude), and a level tilted about north by tilt * tan latitude.
+    The level part of the mean rate points north. An east gyro bias rotates it by
+    bias / (Omega cos latitude), and a tilt about north by tilt * tan latitude.
     """
     rate_L = level.C_Lb @ level.mean_rate_b
     yaw = wrap(np.pi / 2 - np.arctan2(rate_L[1], rate_L[0]))
@@ -191,9 +191,9 @@ def gyrocompass(level: Level, latitude: float, grade: Grade) -> tuple[float, flo
 
 def off_the_earth(level: Level, latitude: float, grade: Grade) -> float:
     """
-    Return the deviation of the rate at rest from the Earth's in sigmas, level or up: the larger.
+    Return the deviation of the rate at rest from the Earth's in sigmas: larger of level and up.
 
-    Both are known without the heading, so a bias beyond the grade is detected.
+    Neither depends on the heading, so a bias beyond the grade is detected.
     """
     rate_L = level.C_Lb @ level.mean_rate_b
     level_rate, up_rate = OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)
@@ -206,9 +206,9 @@ def off_the_earth(level: Level, latitude: float, grade: Grade) -> float:
 def complete(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bool,
              origin: Origin, grade: Grade, gyro_noise: float) -> Alignment:
     """
-    Return the Alignment of a level and a heading, rad; with the gyro bias of a standstill.
+    Return the Alignment by a level and a heading, with the gyro bias by a standstill.
 
-    yaw : of L's x axis where the level is measured.   yaw_sigma : of the same.
+    yaw : of L's x axis in ENU at the level's position, rad.   yaw_sigma : of ``yaw``, rad.
     """
     C_nb = level.C_np @ C_nL(yaw) @ level.C_Lb
     bias_n, sigma_n = _gyro_bias_n(level, C_nb, yaw_sigma, origin, grade)
@@ -221,26 +221,26 @@ def complete(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bo
 def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, origin: Origin,
                  grade: Grade) -> tuple[Floats, Floats]:
     """
-    Return gyro bias and its sigma, ENU: the mean rate at rest less the Earth's.
+    Return gyro bias and its sigma, ENU: the mean rate at rest minus the Earth's.
 
-    A wrong heading puts the Earth rate on wrong axes: a yaw error psi moves the east part by
-    psi, the north part by psi^2 / 2 of its level part; a tilt moves all three. In a local frame
-    the Earth rate is not known. If the reading is less certain than the turn-on bias of the grade,
-    or without a standstill, the bias is zero; so is the east part after a gyrocompass, which has
-    used it. If the grade excludes the reading, grade or unit are wrong, and the reading is used.
+    A heading error rotates the Earth rate: a yaw error psi changes the east part by psi, the north
+    part by psi^2 / 2 of the level rate; a tilt changes all three. In a local frame the Earth rate
+    is not known. If the measurement is less certain than the turn-on bias of the grade, or without
+    a standstill, the bias is zero; so is the east part after a gyrocompass, which has used it. If
+    the grade excludes the measurement, grade or unit is wrong, and the measurement is used.
     """
     if level.standstill is None:
         return np.zeros(3), np.full(3, grade.gyro_bias)
     latitude = origin.latitude
     level_rate, up_rate = OMEGA * np.cos(latitude), abs(OMEGA * np.sin(latitude))
-    # rms of psi^2 / 2 for a normal psi: sqrt(3) / 2 sigma^2; of an unknown one sqrt(3 / 2)
+    # rms of psi^2 / 2 for a normal psi: sqrt(3) / 2 sigma^2; for an unknown one sqrt(3 / 2)
     by_yaw = level_rate * np.array(
         [min(yaw_sigma, 1.0), min(np.sqrt(3) / 2 * yaw_sigma**2, np.sqrt(1.5)), 0.0])
     by_tilt = level.level_sigma * np.array([up_rate, up_rate, level_rate])
     unknown = np.array(origin.local.sigma_n) if origin.local else 0.0
     sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2 + unknown**2)
     measured = C_nb @ level.mean_rate_b - origin.earth_rate_n
-    # sigmas of noise and turn-on bias: a gyro that reads more is not of its grade
+    # sigmas of noise and turn-on bias: with a larger rate the grade is wrong
     ruled_out_sigmas = 10.0
     known = (sigma < grade.gyro_bias) | (
         np.abs(measured) > ruled_out_sigmas * np.hypot(sigma, grade.gyro_bias))

@@ -7,7 +7,7 @@ Speeds in coarse steps: whole km/h of a car's bus, truncated or rounded, sometim
 Such a value determines a cell of the grid, and its error is not noise: a cruise stays in one cell
 for half a minute. Changes are accurate: when the value changes by one step, the speed passes the
 edge between two cells. When it changes by more, each value only determines its cell. Zero is not a
-cell: it stands for all speeds that the sender considers rest.
+cell: it includes all speeds that the sender treats as rest.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ LEAST_CROSSING = 0.02      # judgement: of a cell, minimum sigma of a crossing
 LEAST_CELLS = 3.0          # judgement: cells that the values must span
 # judgement: |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
 GRID_COHERENCE = 0.9
-# judgement: of the values' span, and with zeros: frequencies between; those that rule out a grid
+# judgement: cells of the values' span; FFT size with zero padding; FFT size of the quick test
 GRID_CELLS, GRID_PADDED, GRID_ROUGH = 2**17, 2**20, 2**18
 
 
@@ -36,7 +36,7 @@ class SpeedInstants:
     sigma: Floats    # (m,)
 
     def between(self, begin: float, end: float) -> 'SpeedInstants':
-        """Return those of a time, s."""
+        """Return the instants between two times, s."""
         pick = (self.t >= begin) & (self.t <= end)
         return SpeedInstants(self.t[pick], self.value[pick], self.side[pick], self.sigma[pick])
 
@@ -46,8 +46,8 @@ class CoarseSpeed:
     """
     A speed on a grid.
 
-    step : scale units per s.   t, value : (n,) s and scale units per s, the rows that are data.
-    interpolated : rows between these were sent too, without more information.
+    step : scale units per s.   t, value : (n,) s and scale units per s, rows with information.
+    interpolated : the sender also publishes interpolated rows between these.
     """
 
     step: float
@@ -57,7 +57,7 @@ class CoarseSpeed:
 
     @property
     def truncation(self) -> float:
-        """Return the possible truncation of all values: half a step."""
+        """Return the possible common error of all values by truncation: half a step."""
         return self.step / 2
 
     def mirrored(self, sign: Floats) -> 'CoarseSpeed':
@@ -66,7 +66,7 @@ class CoarseSpeed:
 
     @cached_property
     def most(self) -> float:
-        """Return the maximum deviation of a speed from the line between rows, with bends."""
+        """Return the limit of the deviation of a speed from lines between rows, with curvature."""
         change = np.abs(np.diff(self.value))
         return self.step + (float(np.percentile(change, 95)) / 4 if len(change) else 0.0)
 
@@ -88,12 +88,12 @@ class CoarseSpeed:
     @cached_property
     def instants(self) -> SpeedInstants:
         """
-        Return the speeds that the rows determine, but for the offset that all values share.
+        Return the speeds that the rows determine, up to the offset common to all values.
 
         The offset is half a cell if the sender truncates, zero if it rounds. A change by one cell
-        gives the speed in its middle: the mean of both values, with an error uniform over the
-        speed change in the step. A value between larger changes, or in steps so long that the
-        speed changes by more than a cell, is uniform in its cell; its rows count as one.
+        gives the speed at its middle: the mean of both values, with an error uniform over the
+        speed change in the step. The error of a value between larger changes, or in steps so long
+        that the speed changes by more than a cell, is uniform in its cell; its rows count as one.
         """
         q, t, v = self.step, self.t, self.value
         cell = np.rint(v / q)
@@ -105,7 +105,7 @@ class CoarseSpeed:
         usual = np.median(np.diff(t)) if len(t) > 1 else 0.0
         gained = _rates(middle, edge, q) * h
         jump = np.where(gained > q, 2, jump)    # there a step may pass two edges, or none
-        least_cell = 2    # cells from zero: in the first, a dead band may be at work
+        least_cell = 2    # cells from zero: the first may have a dead band
         single = (jump == 1) & (outer >= least_cell) & (inner > 0)
         if not self.interpolated:
             single &= h <= MISSING_INTERVALS * usual
@@ -113,7 +113,7 @@ class CoarseSpeed:
         run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= least_cell)
         first, length = at[:-1][run] + 1, np.diff(at)[run]
         golden = 0.618034    # steps through a range evenly
-        # one of its rows by turns: where the speed turns about, the middle one is the fastest
+        # rows at varying places: at an extremum of the speed, the middle one would be the fastest
         row = first + (length * (np.arange(len(first)) * golden % 1.0)).astype(int)
         when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
         sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), LEAST_CROSSING * q)
@@ -123,14 +123,14 @@ class CoarseSpeed:
 
 def _rates(t: Floats, edge: Floats, q: float) -> Floats:
     """
-    Return the limit of the speed change at its crossings (m,): the faster of both sides.
+    Return an upper limit of the rate of change at each crossing, (m,): the larger of both sides.
 
     It is at least the upper quartile of the drive: a small step between two cruises is as fast as
-    a large one, but no other edge is near to show it. By its own neighbours alone, a crossing late
-    in its step, which is its error, would have a larger weight.
+    a large one, but has no other edge nearby. With a rate by its neighbours alone, the weight of a
+    crossing would depend on its error.
     """
     if len(t) < 2:
-        return np.full(len(t), np.inf)      # one change alone shows no rate
+        return np.full(len(t), np.inf)      # a single change gives no rate
     side = np.maximum(np.abs(np.diff(edge)), q) / np.diff(t)
     rate = np.maximum(np.r_[0.0, side], np.r_[side, 0.0])
     floored: Floats = np.maximum(rate, np.percentile(rate, 75))
@@ -138,18 +138,18 @@ def _rates(t: Floats, edge: Floats, q: float) -> Floats:
 
 
 def coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
-    """Return a speed's grid, scale units per s, by its rows; None where it has none."""
+    """Return the grid of a speed from its rows, (n,) s and scale units per s; None without one."""
     step = grid(value)
     top = np.abs(value).max(initial=0.0)
     knots = np.ones(len(value), bool)
     if len(value) > 2:
-        collinear_of_top = 1e-6    # of the top speed: a second difference that vanishes
+        collinear_of_top = 1e-6    # of the top speed: limit of a second difference of zero
         knots[1:-1] = np.abs(np.diff(value, n=2)) > collinear_of_top * top
     changes = np.diff(value, prepend=value[:1]) != 0
-    knot_share = 0.5    # share of the rows that change: more are no knots of an interpolation
+    knot_share = 0.5    # of the rows that change: an interpolation has fewer knots
     if (knots & changes).sum() < knot_share * changes.sum():
         own = grid(value[knots])
-        knot_step = 1.5    # the knots' grid over that of all rows, at least, of an interpolation
+        knot_step = 1.5    # least ratio of the knots' grid to that of all rows
         if own and own > knot_step * (step or 0.0):
             return CoarseSpeed(own, t[knots], value[knots], True)
     return CoarseSpeed(step, t, value) if step else None
@@ -157,10 +157,10 @@ def coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
 
 def grid(value: Floats) -> float | None:
     """
-    Return the step of the grid that values other than zero lie on, None where they lie on none.
+    Return the step of the grid of all values other than zero, None if they are not on a grid.
 
-    Each distinct value counts once, so that a cruise has no more weight than a passage. The grid
-    is the lowest frequency at which all values have the same phase.
+    Each distinct value counts once, so that a cruise has the same weight as a short passage. The
+    grid is the lowest frequency at which all values have the same phase.
     """
     value = np.abs(value[value != 0])
     span = np.ptp(value) if len(value) else 0.0
@@ -168,7 +168,7 @@ def grid(value: Floats) -> float | None:
         return None
     u, count = np.unique(np.rint((value - value.min()) / span * (GRID_CELLS - 1)).astype(int),
                          return_counts=True)
-    fewest_values = 20    # distinct values to know a grid by
+    fewest_values = 20    # distinct values needed to detect a grid
     if len(u) < fewest_values:
         return _of_few(value, u * (span / (GRID_CELLS - 1)) + value.min(), count)
     if not _may_be_grid(u):
@@ -181,8 +181,8 @@ def grid(value: Floats) -> float | None:
     last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
     peak = high[0] + int(np.argmax(phase[high[0]:last + 1]))
     step = _refined(value, 1 / float(f[peak]))
-    fewest_cells = 6    # cells that they must lie in
-    # where a speed bends into a cruise values crowd: at two or three speeds, on some grid
+    fewest_cells = 6    # cells with values
+    # values accumulate at the begin of a cruise: two or three such speeds are on some grid
     return step if len(np.unique(np.rint(value / step))) >= fewest_cells else None
 
 
@@ -196,10 +196,10 @@ def _coherence(u: Ints, size: int) -> Floats:
 
 def _may_be_grid(u: Ints) -> bool:
     """
-    Return True if distinct cells u can contain a grid: a quick test of a tenth of them.
+    Return True if distinct cells u can contain a grid: a quick test of a quarter of frequencies.
 
-    One of GRID_COHERENCE c is within half a step of these frequencies, so at most pi / 4 either
-    side of it in phase: there (c - sqrt(1 - c^2)) / sqrt(2) is left of it at least.
+    A peak with coherence c, GRID_COHERENCE, is within half a step of one of them, so that phases
+    differ by at most pi / 4 to either side: there it is at least (c - sqrt(1 - c^2)) / sqrt(2).
     """
     left = (GRID_COHERENCE - np.sqrt(1 - GRID_COHERENCE**2)) / np.sqrt(2)
     fewest = int(LEAST_CELLS * GRID_ROUGH / GRID_CELLS) - 1
@@ -207,13 +207,13 @@ def _may_be_grid(u: Ints) -> bool:
 
 
 def _of_few(value: Floats, u: Floats, count: Ints) -> float | None:
-    """Return the step that divides few distinct values u, each sent many times."""
-    few_values, often_sent = 4, 5    # distinct, times that each is sent
+    """Return the step that divides few distinct values u, each repeated many times."""
+    few_values, often_sent = 4, 5    # least number of distinct values, and of repetitions
     if len(u) < few_values or np.median(count) < often_sent:
         return None
     step = _refined(value, float(np.diff(u).min()))
     off = u / step - np.rint(u / step)
-    divides_cell = 0.02    # of a cell, by which values may be off its grid
+    divides_cell = 0.02    # of a cell, largest deviation of values from the grid
     return step if np.abs(off).max() < divides_cell else None
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Dead reckoning: attitude and odometer travel to a track in n, linear in scale and forward axis.
+Dead reckoning: track in n from attitude and odometer travel, linear in scale and forward axis.
 
 ``P`` is the sum of attitude over travel: the track of a vehicle whose forward axis in b is d and
 whose scale is K is P @ (K d). P does not depend on scale, yaw and pitch, so they can be solved
@@ -31,15 +31,15 @@ from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.nav.statistics import robust_sigma
 
 SHORT_SECTION = 2.0     # m, judgement: correlated fix errors change by less in that path
-# judgement: ratio of scales by short and long sections from which on the path folds back; noise
-# of an eighth of a chord makes the short one 1 % longer
+# judgement: least ratio of scales by short and long sections if the path folds back; noise of an
+# eighth of a chord makes the short one 1 % longer
 FOLDED = 1.3
 
 
 @dataclass(frozen=True, eq=False)
 class Origin:
     """
-    Where n is fixed: geodetic position, rad, rad, m.
+    Origin of n: geodetic position, rad, rad, m.
 
     local : the Earth rate of a local frame, whose y axis does not point to north; None: it does.
     """
@@ -51,17 +51,17 @@ class Origin:
 
     @property
     def earth_rate_n(self) -> Floats:
-        """Return the Earth's turn rate in n as far as it is known, rad/s: (3,)."""
+        """Return the known part of the Earth's turn rate in n, rad/s: (3,)."""
         return np.array(self.local.rate_n) if self.local else earth_rate_n(self.latitude)
 
     def to_n(self, geodetic: Floats) -> Floats:
-        """Return positions in n, m, of (..., 3) latitude, longitude (rad), height (m)."""
+        """Return positions in n, m, from (..., 3) latitude, longitude (rad), height (m)."""
         r_e = ecef_from_geodetic(geodetic[..., 0], geodetic[..., 1], geodetic[..., 2])
         own_e = ecef_from_geodetic(self.latitude, self.longitude, self.height)
         return (r_e - own_e) @ C_en(self.latitude, self.longitude)
 
     def to_geodetic(self, position_n: Floats) -> Floats:
-        """Return (..., 3) latitude, longitude (rad), height (m) of positions in n, m."""
+        """Return (..., 3) latitude, longitude (rad), height (m) from positions in n, m."""
         own_e = ecef_from_geodetic(self.latitude, self.longitude, self.height)
         r_e = own_e + position_n @ C_en(self.latitude, self.longitude).T
         return np.stack(geodetic_from_ecef(r_e), -1)
@@ -85,8 +85,8 @@ class Track:
         """Return P at times t, linear between epochs, constant outside: (...) to (..., 3, 3)."""
         last = len(self.t) - 1
         k = np.clip(np.searchsorted(self.t, t, side='right') - 1, 0, max(last - 1, 0))
-        after = np.minimum(k + 1, last)         # a track of one epoch has but that
-        least_epoch_step = 1e-9    # s, no two epochs are nearer
+        after = np.minimum(k + 1, last)         # a track may have a single epoch
+        least_epoch_step = 1e-9    # s, shorter than any step
         step = np.maximum(self.t[after] - self.t[k], least_epoch_step)
         x = np.clip((t - self.t[k]) / step, 0.0, 1.0)[..., None, None]
         before, beyond = self.P.take(k, axis=0), self.P.take(after, axis=0)
@@ -104,7 +104,7 @@ class Track:
 
 def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
     """
-    Return the track of attitude over travel: docs/method.md (T1).
+    Return the track, the sum of attitude over travel: docs/method.md (T1).
 
     t, q_nb : (m,), (m, 4) epochs, s, and attitude at them.   travel : odometer travel,
     interpolated to the epochs. Trapezoid rule, of second order in the turn per epoch.
@@ -141,33 +141,39 @@ def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
 def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
                 least: float = GNSS_MOVES) -> float | None:
     """
-    Return metres per unit of travel from distances between fixes, None where nothing moves.
+    Return metres per unit of travel from distances between fixes, None without motion.
 
-    It is the median of equal sections of the path, as short as possible with fixes ``least`` m and
-    eight sigmas apart. Despite outliers it is good to a few per cent: enough for thresholds and
-    for scales without a nominal value. Where the path folds back within ``least`` (the lanes of a
-    mower), shorter sections have the longer chords.
+    It is the median of equal sections of the path, as short as possible with chords of ``least`` m
+    and eight sigmas. Despite outliers its error is a few per cent: enough for thresholds and for
+    scales without a nominal value. If the path folds back within ``least`` (the lanes of a mower),
+    the ratio of shorter sections is larger and is used.
     """
     inside = (t_fix >= travel.t[0]) & (t_fix <= travel.t[-1]) if len(travel.t) else []
     if not np.any(inside):
         return None
     s, p = travel.at(t_fix[inside]), fixes_n[inside, :2]
-    scale = _by_sections(s, p, max(least, 8 * sigma))
+    scale = section_ratio(s, s[:, None], p, max(least, 8 * sigma))
     if scale is None or len(s) < 5:
         return scale
-    # of a cubic, white noise adds up to 20 times its variance
+    # third differences of white noise have 20 times its variance
     noise = robust_sigma(np.diff(p, 3, axis=0)) / np.sqrt(20)
-    short = _by_sections(s, p, max(SHORT_SECTION, 8 * sigma, 8 * noise))
+    short = section_ratio(s, s[:, None], p, max(SHORT_SECTION, 8 * sigma, 8 * noise))
     return short if short is not None and short > FOLDED * scale else scale
 
 
-def _by_sections(s: Floats, p: Floats, least: float) -> float | None:
-    """Return the median of chord over travel in the shortest sections with chords of ``least``."""
+def section_ratio(s: Floats, path: Floats, p: Floats, least: float) -> float | None:
+    """
+    Return the median of distance between fixes over distance on a path, None if no section does.
+
+    s, path, p : (n,) travel, (n, k) path in its units, (n, 2) fixes, m, all at their times. The
+    sections are equal in travel, as short as possible with a median of ``least`` m between fixes.
+    """
     path_length = np.append(0.0, np.cumsum(np.abs(np.diff(s))))
     pieces = len(s) // 2
     while pieces and path_length[-1] > 0:
         k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], pieces + 1)))
-        chord, run = np.hypot(*np.diff(p[k], axis=0).T), np.abs(np.diff(s[k]))
+        chord = np.hypot(*np.diff(p[k], axis=0).T)
+        run = np.sqrt((np.diff(path[k], axis=0)**2).sum(axis=1))
         onward = run > 0
         if onward.any() and np.median(chord[onward]) >= least:
             return float(np.median(chord[onward] / run[onward]))

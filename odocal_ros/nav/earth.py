@@ -46,14 +46,14 @@ def earth_rate_n(latitude: ArrayLike) -> Floats:
 
 @dataclass(frozen=True)
 class PartlyKnownRate:
-    """The Earth's turn rate where north is not known: what is known of it, and 1 sigma, rad/s."""
+    """The Earth's turn rate in a frame with unknown north: known part, and 1 sigma, rad/s."""
 
     rate_n: tuple[float, float, float]
     sigma_n: tuple[float, float, float]
 
 
 def rate_without_north(latitude: float) -> PartlyKnownRate:
-    """Return the Earth's turn rate in a level frame of unknown azimuth; rad, NaN: not known."""
+    """Return the Earth rate in a level frame of unknown azimuth; latitude: rad, NaN: unknown."""
     if np.isnan(latitude):
         return PartlyKnownRate((0.0, 0.0, 0.0), (OMEGA, OMEGA, OMEGA))
     level = float(OMEGA * np.cos(latitude) / np.sqrt(2))
@@ -61,7 +61,7 @@ def rate_without_north(latitude: float) -> PartlyKnownRate:
 
 
 def transport_rate_n(latitude: Floats, height: Floats, velocity_n: Floats) -> Floats:
-    """Return the turn rate of the local level against the Earth, ENU, rad/s: (..., 3)."""
+    """Return the turn rate of the local level relative to the Earth, ENU, rad/s: (..., 3)."""
     meridian, normal = radii(latitude)
     east, north = velocity_n[..., 0], velocity_n[..., 1]
     return np.stack([-north / (meridian + height), east / (normal + height),
@@ -69,7 +69,7 @@ def transport_rate_n(latitude: Floats, height: Floats, velocity_n: Floats) -> Fl
 
 
 def ecef_from_geodetic(latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> Floats:
-    """Return Earth-fixed coordinates, m, of rad, rad, m: (...) to (..., 3)."""
+    """Return Earth-fixed coordinates, m, from geodetic ones, rad, rad, m: (...) to (..., 3)."""
     latitude, longitude, height = np.broadcast_arrays(latitude, longitude, height)
     normal = radii(latitude)[1]
     level = (normal + height) * np.cos(latitude)
@@ -79,10 +79,10 @@ def ecef_from_geodetic(latitude: ArrayLike, longitude: ArrayLike, height: ArrayL
 
 def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """
-    Return latitude, longitude (rad), height (m) of Earth-fixed coordinates, m: (..., 3).
+    Return latitude, longitude (rad), height (m) from Earth-fixed coordinates, m: (..., 3).
 
     Bowring's start and Newton-like steps on the reduced latitude: within 1e-9 m up to 100 km
-    of height, poles included.
+    of height, including the poles.
     """
     x, y, z = np.moveaxis(np.asarray(r_e, dtype=float), -1, 0)
     b = A * (1 - F)
@@ -98,7 +98,7 @@ def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Floats, Floats, Floats]:
 
 
 def C_en(latitude: ArrayLike, longitude: ArrayLike) -> Floats:
-    """Return the rotation that takes ENU to Earth-fixed axes: (...) to (..., 3, 3)."""
+    """Return the rotation from ENU to Earth-fixed axes: (...) to (..., 3, 3)."""
     latitude, longitude = np.broadcast_arrays(latitude, longitude)
     sp, cp, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
     zero = np.zeros_like(sp)

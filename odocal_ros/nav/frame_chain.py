@@ -10,11 +10,11 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 
-# s between two transforms. Judgement: at 0.5 m/s and 1 rad/s a straight line between the positions
-# is up to v w T^2 / 8 = 16 mm off the path
+# longest interval of interpolation. Judgement: at 0.5 m/s and 1 rad/s a straight line between the
+# positions is up to v w T^2 / 8 = 16 mm off the path
 LONGEST_STEP_NS = 500_000_000
-RESTART_NS = 10**9        # judgement: stamps that step back by more start again
-MOST_WAITING = 10_000     # judgement: transforms of a frame, held while another one is missing
+RESTART_NS = 10**9        # judgement: a larger backward step of the stamps is a restart
+MOST_WAITING = 10_000     # judgement: transforms of a frame kept while another one is missing
 Known = tuple[Ints, Ints, Floats]      # stamps, arrivals, positions
 Values = Sequence[float]      # of a child in its parent: x y z, m, and quaternion x y z w
 
@@ -31,7 +31,7 @@ class _Moving:
 
     def add(self, stamp_ns: int, received_ns: int, values: Values) -> None:
         if stamp_ns <= self.newest_ns:
-            return      # sent again, or late
+            return      # repeated or late
         self.newest_ns = stamp_ns
         self.stamps.append(stamp_ns)
         self.received.append(received_ns)
@@ -45,12 +45,12 @@ class _Moving:
 
 class FrameChain:
     """
-    Transforms from ``child`` up to ``parent``; any other frame is dropped once they are known.
+    Transforms from ``child`` up to ``parent``; other frames are dropped once these are known.
 
-    A position has the stamp of a transform of the moving frame next to ``parent``: that is where
-    SLAM corrects. The others are interpolated to it. A correction that is sent again unchanged
-    gives none: such a position is the previous one plus wheel odometry. How the messages are
-    divided into blocks, and when static transforms come, has no effect.
+    A position has the stamp of a transform of the moving frame next to ``parent``, which SLAM
+    corrects. Other transforms are interpolated to this stamp. A correction that is repeated
+    unchanged gives no position: it would be the previous one plus wheel odometry. Block sizes and
+    the arrival of static transforms have no effect.
     """
 
     def __init__(self, parent: str, child: str) -> None:
@@ -63,7 +63,7 @@ class FrameChain:
 
     def add(self, child: str, parent: str, stamp_ns: int, received_ns: int, values: Values
             ) -> None:
-        """Take a transform with a stamp; the first parent of a child applies."""
+        """Add a transform with a stamp; the first parent of a child applies."""
         if self._path is None or child in self._path:
             edge = self._moving.setdefault(child, _Moving(parent))
             if edge.parent != parent:
@@ -79,7 +79,7 @@ class FrameChain:
             edge.add(stamp_ns, received_ns, values)
 
     def add_static(self, child: str, parent: str, values: Values) -> None:
-        """Take a transform that holds at all times; the first one of a child applies."""
+        """Add a static transform; the first one of a child applies."""
         self._static.setdefault(child, (parent, values))
 
     @property
@@ -113,13 +113,13 @@ class FrameChain:
         return here, path
 
     def take(self) -> Known:
-        """Return stamps and arrivals, ns, and positions (n, 3), m, that have become known."""
+        """Return stamps and arrivals, ns, and positions (n, 3), m, that are new since the last."""
         done, self._done = [*self._done, self._known()], []
         stamps, received, position = (np.concatenate(some) for some in zip(*done, strict=True))
         return stamps, received, position
 
     def _known(self) -> Known:
-        """Return the same, since the stamps started again."""
+        """Return the new positions since the last restart of the stamps."""
         nothing = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3))
         if self._path is None:
             top, path = self._walk()
@@ -147,13 +147,13 @@ class FrameChain:
                 good &= near
             position = _placed(values, position)
         first.drop(n)
-        for edge in others:     # the last one before is needed for what comes
+        for edge in others:     # the last one before is needed for later positions
             edge.drop(int(np.searchsorted(edge.stamps, stamps[-1], side='right')) - 1)
         return stamps[good], received[good], position[good]
 
 
 def _interpolated(edge: _Moving, stamps: Ints) -> tuple[Floats, Bools]:
-    """Return the transforms of a frame at stamps (n, 7), and where their neighbours are near."""
+    """Return the transforms of a frame at stamps, (n, 7), and a mask of usable ones, (n,)."""
     t, values = np.array(edge.stamps), np.array(edge.values)
     before = np.searchsorted(t, stamps, side='right') - 1
     good = before >= 0
@@ -171,7 +171,7 @@ def _interpolated(edge: _Moving, stamps: Ints) -> tuple[Floats, Bools]:
 
 def _placed(values: Floats, position: Floats) -> Floats:
     """
-    Return positions (n, 3) in the parent frame of positions in the child frame.
+    Convert positions (n, 3) from the child frame to the parent frame.
 
     values : (n, 7) or (1, 7). By products of columns: the last bits of a matrix product depend on
     the number of rows, so replay would differ.

@@ -32,7 +32,7 @@ class HeldSpeed(CoarseSpeed):
 
     @property
     def truncation(self) -> float:
-        """Return the truncation of all values: 0."""
+        """Return the common error of all values by truncation: 0."""
         return 0.0
 
     def mirrored(self, sign: Floats) -> 'HeldSpeed':

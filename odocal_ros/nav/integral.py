@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Integrals of long columns, some rows at a time; to the last bit as if at once."""
+"""Integrals of long columns in pieces, bitwise equal to integrals at once."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,13 +12,13 @@ from odocal_ros.data.pieces import pieces
 
 
 class Integral:
-    """The integral of (n, ...) by the trapezoid rule, over times that come in pieces."""
+    """The integral of (n, ...) by the trapezoid rule, over consecutive pieces."""
 
     def __init__(self) -> None:
         self.end = 0.0
 
     def over(self, t: Floats, x: Floats) -> Floats:
-        """Return it at the times of a piece, whose first row is the last of that before."""
+        """Return the integral at a piece's rows; its first row is the last of the one before."""
         out = np.empty_like(x)
         out[0] = self.end
         np.multiply((x[:-1] + x[1:]) / 2, np.diff(t).reshape(-1, *(1,) * (x.ndim - 1)),
@@ -35,7 +35,7 @@ def running_integral(t: Floats, x: Floats) -> Floats:
 
 def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     """
-    Return the integral of x, (n, ...), from t[0] on, linear between rows.
+    Return the integral of x, (n, ...), from t[0] to times, linear between rows.
 
     times : (m,) array, rising.   t : (n,) array, n > 1.   Returns (m, ...).
     """
@@ -43,7 +43,7 @@ def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
 
 
 def integrals_at(times: Sequence[Floats], t: Floats, x: Floats) -> list[Floats]:
-    """Return the same at each of several arrays of times."""
+    """Return ``integral_at`` for each of several arrays of times."""
     return _at(times, t, x, Integral().over)
 
 
@@ -53,7 +53,7 @@ def twice_integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
 
 
 def twice_integrals_at(times: Sequence[Floats], t: Floats, x: Floats) -> list[Floats]:
-    """Return the same at each of several arrays of times."""
+    """Return ``twice_integral_at`` for each of several arrays of times."""
     once, twice = Integral(), Integral()
     return _at(times, t, x, lambda t, x: twice.over(t, once.over(t, x)))
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Odometer: counters, increments and speeds to travel, with rollover and resets undone."""
+"""Odometer: travel from counters, increments and speeds, with rollovers and resets corrected."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +16,9 @@ from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed
 from odocal_ros.nav.held_speed import held_speed, HeldSpeed
 from odocal_ros.reasons import Code, Reason
 
-# judgement: a step this many times the 95th percentile of the moving rate is no motion
+# judgement: a step this many times the 95th percentile of the moving rate is not motion
 RESET_FACTOR = 5.0
-FEWEST_STEPS = 20     # judgement: steps below which no reset is looked for
+FEWEST_STEPS = 20     # judgement: least number of steps for a search for resets
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +29,10 @@ class Travel:
     t : (n,) s since the start mark, rising.
     s : (n,) signed travel from the first row, in scale units (pulses, rad or configured m).
     quantum : size of one count in s, 0 for speeds and floats.
-    coarse : the speeds sent, where they lie on a grid and are those of one wheel.
-    name : of the wheel, '' of a single one or of a mean.
-    ahead : by how much a steered wheel is ahead of the axle that does not steer, scale units; 0:
-    it does not steer.
+    coarse : the measured speeds, if they are on a grid and of one wheel.
+    name : of the wheel, '' for a single one or a mean.
+    ahead : distance of a steered wheel ahead of the axle that does not steer, scale units; 0: the
+    wheel does not steer.
     """
 
     t: NDArray[np.float64]
@@ -47,7 +47,7 @@ class Travel:
         return np.interp(t, self.t, self.s)
 
     def mirrored(self, spans: Floats) -> 'Travel':
-        """Return it with the counts in spans, (m, 2) s, reversed."""
+        """Return the travel with the counts in spans, (m, 2) s, reversed."""
         def sign(t: Floats) -> Floats:
             return np.where(((t[:, None] >= spans[:, 0]) & (t[:, None] < spans[:, 1])).any(axis=1),
                             -1.0, 1.0)
@@ -59,11 +59,11 @@ class Travel:
 def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool = False,
            name: str = 'the counter') -> tuple[Travel, tuple[Reason, ...]]:
     """
-    Return the travel of an odometer's rows, and reasons.
+    Return the travel from an odometer's rows, and reasons.
 
-    t : (n,) times, s, rising.   value : (n,) as sent: int64 counters or float64.   form : what the
-    value means.   reversed_counts : positive values mean backwards.   name : of the counter in
-    reasons. Rollovers are undone, resets bridged at the speed beside them.
+    t : (n,) times, s, rising.   value : (n,) raw: int64 counters or float64.   form : meaning of
+    the values.   reversed_counts : positive values mean backwards.   name : of the counter in
+    reasons. Rollovers are corrected, resets interpolated by the adjacent speed.
     """
     whole = np.issubdtype(value.dtype, np.integer)
     reasons: tuple[Reason, ...] = ()
@@ -84,16 +84,16 @@ def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool =
 
 
 def _coarse(t: Floats, value: Floats) -> CoarseSpeed | None:
-    """Return the steps of a speed; a held speed takes precedence over a finer grid."""
+    """Return the grid of a speed; a held speed takes precedence over a finer grid."""
     coarse, held = coarse_speed(t, value), held_speed(t, value)
     return held if held and (coarse is None or coarse.step < held.step / 2) else coarse
 
 
 def mean_travel(travels: Sequence[Travel]) -> Travel:
     """
-    Return the mean travel of wheels, on the rows of the first one that all have.
+    Return the mean travel of wheels, at the rows of the first one within the time span of all.
 
-    n wheels round independently: their mean errs like a count of 1 / sqrt(n) of one.
+    n wheels round independently: the rounding error of their mean is that of a count over sqrt(n).
     """
     first, *others = travels
     if not others:
@@ -109,7 +109,7 @@ def mean_travel(travels: Sequence[Travel]) -> Travel:
 
 def without_rollover(step: Values, modulus: int) -> Values:
     """
-    Return steps of a counter (n,) with its rollovers undone.
+    Return steps of a counter, (n,), with rollovers corrected.
 
     modulus : span of the counter in counts, 0 for floats. 64 bits wrap in the subtraction.
     """
@@ -119,7 +119,7 @@ def without_rollover(step: Values, modulus: int) -> Values:
 
 def _counter_steps(t: Floats, value: Values, modulus: int,
                    name: str) -> tuple[Floats, tuple[Reason, ...]]:
-    """Return steps of a counter as floats, rollover undone, resets bridged; and what was found."""
+    """Return steps of a counter as floats, rollovers and resets corrected; and the reasons."""
     whole = np.issubdtype(value.dtype, np.integer)
     raw = np.diff(value)
     counted = without_rollover(raw, modulus)
@@ -148,12 +148,12 @@ def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
     if len(step) < FEWEST_STEPS or not step.any():
         return np.zeros(len(step), bool)
     usual = np.median(dt)
-    size = np.abs(step) / np.maximum(dt, usual)    # bursts of stamps are no speed
+    size = np.abs(step) / np.maximum(dt, usual)    # for bursts of stamps
     if not (size > 0).any():       # steps so small that their rates are zero
         return np.zeros(len(step), bool)
     limit = RESET_FACTOR * np.percentile(size[size > 0], 95)
     far = size > (max(limit, 3 / usual) if whole else limit)
-    # motion comes in long runs, even if the vehicle mostly stands; a reset or a false row does not
+    # motion has long runs, even if the vehicle is mostly at rest; a reset or a false row has not
     for begin, end in runs(far):
         if end - begin > 2:
             far[begin:end] = False
@@ -161,7 +161,7 @@ def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
 
 
 def _bridged(t: Floats, step: Floats, resets: Bools) -> Floats:
-    """Return steps with the resets replaced by the rate beside them."""
+    """Return steps with the resets replaced by the adjacent rate."""
     dt = np.diff(t)
     step = step.copy()
     good = np.flatnonzero(~resets & (dt > 0))

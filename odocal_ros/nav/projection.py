@@ -31,7 +31,7 @@ class Plane:
     false_easting: float = 500000.0
 
     def forward(self, latitude: Floats, longitude: Floats) -> tuple[Floats, Floats]:
-        """Return northing, easting, m (eq. 1-5 of Shi et al. 2015), of rad: (...)."""
+        """Return northing, easting, m (eq. 1-5 of Shi et al. 2015), from rad: (...)."""
         from pyproj import Proj
         a, rf = ELLIPSOIDS[self.ellipsoid]
         proj = Proj(proj='tmerc', lat_0=0, lon_0=self.central_meridian, k_0=self.scale,
@@ -54,7 +54,7 @@ class Projection(Protocol):
 
 
 def plane_for(projection: Projection, longitude: float) -> Plane:
-    """Return the plane the projection settings ask for about a longitude, rad."""
+    """Return the plane by the projection settings for a longitude, rad."""
     degrees = float(np.rad2deg(longitude))
     meridian = projection.central_meridian
     if np.isnan(meridian):

@@ -26,7 +26,7 @@ def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: fl
     """
     Return the errors of filtered positions, (k, 3) m, and their derivatives by ``square``.
 
-    t, place, velocity : (n,) s, (n, 3) m and m/s, rising; cubics lie between.
+    t, place, velocity : (n,) s, (n, 3) m and m/s, rising, with cubics in between.
     at : (k,) s, stamps minus the mean age of the content of a fix.   square : s^2, as above.
     """
     def off(square: float) -> Floats:

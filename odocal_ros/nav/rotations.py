@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Rotations: matrices, quaternions (x y z w, as ROS sends them) and fixed-axis roll, pitch, yaw.
+Rotations: matrices, quaternions (x y z w, as in ROS) and fixed-axis roll, pitch, yaw.
 
-``q_nb`` and ``C_nb`` take a vector from b to n. All functions take (..., 3), (..., 4) or
+``q_nb`` and ``C_nb`` rotate a vector from b to n. All functions accept (..., 3), (..., 4) or
 (..., 3, 3) arrays.
 """
 
@@ -34,7 +34,7 @@ def exp_so3(phi: Floats) -> Floats:
 
 
 def rotvec(C: Floats) -> Floats:
-    """Return the rotation vector of (..., 3, 3), well below pi."""
+    """Return the rotation vector of (..., 3, 3), rad, for angles well below pi."""
     axis = np.stack([C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0],
                      C[..., 1, 0] - C[..., 0, 1]], -1) / 2
     sine = np.linalg.norm(axis, axis=-1)
@@ -54,7 +54,7 @@ def turn(C: Floats, vectors: Floats) -> Floats:
 
 
 def level_left(forward_n: Floats) -> Floats:
-    """Return the level axes to the left of others in n: (K, 3)."""
+    """Return the level unit axes to the left of forward axes in n: (K, 3)."""
     left = np.stack([-forward_n[:, 1], forward_n[:, 0], np.zeros(len(forward_n))], -1)
     out: Floats = left / np.linalg.norm(left, axis=1, keepdims=True)
     return out
@@ -96,9 +96,9 @@ def quat_conjugate(q: ArrayLike) -> Floats:
 
 def quat_at(t_new: Floats, t: Floats, q: Floats) -> Floats:
     """
-    Return attitude at times, of attitudes that turn little from one to the next: (k, 4).
+    Return attitudes interpolated to times, for small rotations between rows: (k, 4).
 
-    t, q : (m,) rising, (m, 4).   Outside of t the first and the last are held.
+    t, q : (m,) rising, (m, 4).   Outside of t, attitude is constant.
     """
     sides = np.einsum('ki,ki->k', q[1:], q[:-1])
     q = q * np.cumprod(np.append(1.0, np.where(sides < 0, -1.0, 1.0)))[:, None]
@@ -126,7 +126,7 @@ def matrix_from_quat(q: ArrayLike) -> Floats:
 
 
 def yaw_from_quat(q: Floats) -> Floats:
-    """Return the yaw of the matrix of a quaternion, rad: (..., 4) to (...), as b's x axis lies."""
+    """Return the yaw of b's x axis from a quaternion, rad: (..., 4) to (...)."""
     x, y, z, w = np.moveaxis(q, -1, 0)
     s = 2 / np.einsum('...i,...i->...', q, q)
     return arctan2(s * (x * y + z * w), 1 - s * (y * y + z * z))
@@ -136,7 +136,7 @@ def quat_from_matrix(C: ArrayLike) -> Floats:
     """
     Return the quaternion (w >= 0) of a rotation matrix: (..., 3, 3) to (..., 4).
 
-    The row of the symmetric 4 x 4 matrix 4 q q^T with the largest diagonal is taken, so that no
+    The row of the symmetric 4 x 4 matrix 4 q q^T with the largest diagonal is used, so that no
     attitude loses digits.
     """
     C = np.asarray(C, dtype=float)
@@ -171,7 +171,7 @@ def rpy_from_matrix(C: ArrayLike) -> Floats:
     locked = level < 1e-12
     yaw = np.where(locked, arctan2(-C[..., 0, 1], C[..., 1, 1]),
                    arctan2(C[..., 1, 0], C[..., 0, 0]))
-    # roll is what is left once this yaw is undone: near the lock its error cancels that of the yaw
+    # roll after rotation by -yaw: near gimbal lock its error cancels that of the yaw
     s, c = np.sin(yaw), np.cos(yaw)
     roll = np.where(locked, 0.0, arctan2(s * C[..., 0, 2] - c * C[..., 1, 2],
                                          c * C[..., 1, 1] - s * C[..., 0, 1]))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Standstill: when the vehicle stands, from odometer and gyro."""
+"""Detection of standstills from odometer and gyro."""
 
 from functools import reduce
 
@@ -14,8 +14,8 @@ from odocal_ros.nav.odometer import Travel
 
 REST_GRID = 0.1       # s, judgement: grid of the detector
 REST_WINDOW = 0.5     # s, judgement: each side
-REST_TRAVEL = 0.03    # m, judgement: travel in the window that still counts as standing
-REST_TURN = 0.02      # rad/s, judgement: drift of the gyro that still counts as standing
+REST_TRAVEL = 0.03    # m, judgement: largest travel in the window at rest
+REST_TURN = 0.02      # rad/s, judgement: largest drift of the gyro at rest
 MOST_BIAS = 0.12      # rad/s, each axis, physical: largest bias of a gyro (cheap phones: 0.1)
 
 
@@ -24,10 +24,10 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     """
     Return begin and end of the standstills in order: (k, 2) s.
 
-    t_imu, w_b : (n,), (n, 3) IMU times, s, and turn rates, rad/s, bias and all.   travel :
-    odometer travel.   metres_per_unit : rough scale of it, above 0.   shortest : least duration,
-    s. The edges lie inside the true standstill by up to the window; of a start so slow that it
-    takes longer than that to move REST_TRAVEL, or a count and a half, that part is included.
+    t_imu, w_b : (n,), (n, 3) IMU times, s, and turn rates with bias, rad/s.   travel : odometer
+    travel.   metres_per_unit : its approximate scale, above 0.   shortest : least duration, s.
+    The edges are inside the true standstill by up to the window; if a slow start needs longer than
+    that for REST_TRAVEL, or for a count and a half, its begin is included.
     """
     if len(t_imu) < 2 or len(travel.t) < 2:
         return np.empty((0, 2))
@@ -42,27 +42,27 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     spans = _spans(quiet, edges, shortest)
     moved = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * metres_per_unit
     allowed = _allowed(travel, metres_per_unit)
-    creep_speed = 0.02    # m/s, mean speed at which a long slow stretch is no standstill
+    creep_speed = 0.02    # m/s, largest mean speed of a long standstill
     return spans[moved <= creep_speed * (spans[:, 1] - spans[:, 0]) + allowed]
 
 
 def _allowed(travel: Travel, metres_per_unit: float) -> float:
-    """Return the travel, m, of one that stands: REST_TRAVEL, or a count or so of jitter."""
+    """Return the largest travel at rest, m: REST_TRAVEL, or the jitter of counts."""
     count = travel.quantum * metres_per_unit
-    coarse_count = 0.5    # m, a count beyond which one is motion
-    # of a counter with few counts per turn of the wheel one count is motion, not jitter
+    coarse_count = 0.5    # m, larger counts are coarse
+    # one count of a coarse counter (few per turn of the wheel) is motion, not jitter
     return max(REST_TRAVEL, (1.5 if count <= coarse_count else 0.5) * count)
 
 
 def _spans(quiet: Bools, edges: Floats, shortest: float) -> Floats:
-    """Return begin and end of the runs of quiet cells that last: (k, 2)."""
+    """Return begin and end of the runs of quiet cells of ``shortest`` s or more: (k, 2)."""
     spans: Floats = edges[runs(quiet)]
     return spans[spans[:, 1] - spans[:, 0] >= shortest - 1e-9]
 
 
 def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
-    """Return a mask of windows with the travel of a vehicle at rest."""
-    # range of the travel in the window by a few probes, so that rocking is detected
+    """Return a mask of windows with travel as at rest."""
+    # range of the travel at a few times in the window, so that rocking is detected
     probes = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
     reach = np.max(probes, axis=0) - np.min(probes, axis=0)
     still: Bools = reach * metres_per_unit <= _allowed(travel, metres_per_unit)
@@ -70,7 +70,7 @@ def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Boo
 
 
 def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
-    """Return the mean turn rate about each cell, (m, 3), and where it is steady to REST_TURN."""
+    """Return the mean turn rate around each cell, (m, 3), and a mask of spread < REST_TURN."""
     rate = np.diff(integral_at(edges, t_imu, w_b), axis=0) / np.diff(edges)[:, None]
     reach = round(REST_WINDOW / REST_GRID)
     padded = np.pad(rate, ((reach, reach), (0, 0)), mode='edge')
@@ -81,16 +81,16 @@ def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
     if by_step(lambda t: np.diff(t) > REST_WINDOW, t_imu).any():
         dt = np.diff(t_imu)
         unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > REST_WINDOW, dt, 0.0))])
-        seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # nothing known within a gap
+        seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # no data within a gap
     return mean, across(np.logical_and, spread < REST_TURN) & seen
 
 
 def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> Bools:
     """
-    Return a mask of windows in which the gyro reads as at rest.
+    Return a mask of windows in which the gyro measures the rate of the standstill.
 
-    If a vehicle turns on the spot at an even rate, gyro and wheels (their mean) are as steady as
-    at rest. The steady interval with the lowest rate is the standstill: its reading is the bias,
+    If a vehicle turns on the spot at a constant rate, gyro and wheels (their mean) are as steady
+    as at rest. The steady interval with the lowest rate is the standstill: its rate is the bias,
     and the others must agree with it.
     """
     means = [np.median(rate[(edges[:-1] >= a) & (edges[1:] <= b)], axis=0)

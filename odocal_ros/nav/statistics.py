@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sigmas by a median, of which half of the values may be wrong, and gaps in times of rows."""
+"""Robust sigmas by medians, and gaps in the times of rows."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from odocal_ros.data.pieces import by_step
 # statistical: medians of |x|, x normal with sigma 1, and of the length of two such, sqrt(2 ln 2)
 NORMAL_MEDIAN, RAYLEIGH_MEDIAN = 0.6745, 1.1774
 MISSING_INTERVALS = 2.5  # judgement: median intervals, a message or more is missing
-GAP_INTERVALS = 5.0      # judgement: of the median interval: what is longer is a gap
+GAP_INTERVALS = 5.0      # judgement: median intervals, a longer step is a gap
 
 
 def robust_sigma(residual: NDArray[np.float64]) -> float:
@@ -22,14 +22,14 @@ def robust_sigma(residual: NDArray[np.float64]) -> float:
 
 
 def gaps_longer(t: Floats, limit: float) -> Floats:
-    """Return begin and end of the steps of times, (n,) s, longer than ``limit`` s: (k, 2)."""
+    """Return begin and end of the steps in times, (n,) s, longer than ``limit`` s: (k, 2)."""
     k = np.flatnonzero(by_step(lambda t: np.diff(t) > limit, t))
     return np.stack([t[k], t[k + 1]], -1)
 
 
 def gaps_in_rhythm(t: Floats) -> Floats:
-    """Return begin and end of the steps far beyond the stream's own rhythm: (k, 2) s."""
-    fewest_intervals = 10    # rows that show a rhythm
+    """Return begin and end of the steps far longer than the median interval: (k, 2) s."""
+    fewest_intervals = 10    # least number of rows for an interval
     if len(t) < fewest_intervals:
         return np.empty((0, 2))
     shortest_gap = 0.2    # s

@@ -4,7 +4,7 @@
 """
 Strapdown attitude: gyro rates to q_nb, as a blocked prefix product of quaternions.
 
-n is fixed to the Earth at the leg's start, so there is no transport rate; the Earth's own turn is
+n is fixed to the Earth at the leg's start, so there is no transport rate; the Earth's rotation is
 one closed-form rotation per output epoch, and the product of body increments is a prefix scan
 without any per-sample loop.
 """
@@ -16,11 +16,11 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_row
 
 Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
-# judgement: quaternions a scan multiplies up in step; 40 to 800 make no difference
+# judgement: quaternions that a scan multiplies in sequence; 40 to 800 are equally fast
 SCAN_BLOCK = 64
 SAMPLES_AT_A_TIME = 16384    # judgement: intervals at a time, whose arrays stay in the cache
 LEAST_INTERVAL = 1e-9    # s; judgement: of the stamps, keeps the slope of equal stamps finite
-# judgement: ratio of neighbouring intervals up to which a cubic is laid through them
+# judgement: largest ratio of adjacent intervals for a cubic through them
 EVEN_RATIO = 2.0
 
 
@@ -28,12 +28,12 @@ def rotation_increments(t: Floats, w_b: Floats, begin: int = 0, end: int | None 
     """
     Return the rotation vectors of b between samples: (n,), (n, 3) to (3, n - 1) rad.
 
-    begin, end : of which intervals, to the last bit as if of all; by default of all.
+    begin, end : range of intervals, by default all; bitwise equal to a computation of all.
 
     Rate as a cubic through four samples, with the coning term of the same order
-    (Bortz: phi = int w + 1/2 int alpha x w); at the ends, and where stamps are uneven by more
-    than a factor of two, as a straight line (the classic two-sample form). Algorithm error
-    falls with the fourth power of the step, two-sample with the second.
+    (Bortz: phi = int w + 1/2 int alpha x w); at the ends, and if stamps are uneven by more
+    than a factor of two, as a straight line (the classic two-sample form). The algorithm error
+    falls with the fourth power of the step, that of two samples with the second.
     """
     t, w_b = np.asarray(t, dtype=float), np.asarray(w_b, dtype=float)
     end = max(len(t) - 1, 0) if end is None else end
@@ -48,7 +48,7 @@ def rotation_increments(t: Floats, w_b: Floats, begin: int = 0, end: int | None 
 def _increments(t: Floats, w_b: Floats, first: int, last: int,
                 bias: float | Floats = 0.0) -> Floats:
     """Return the rotation vectors of the intervals from first up to last: (3, last - first)."""
-    low, high = max(first - 1, 0), min(last + 1, len(t) - 1)     # with a neighbour each side
+    low, high = max(first - 1, 0), min(last + 1, len(t) - 1)     # with an adjacent row each side
     h = np.diff(t[low:high + 1])
     w = np.ascontiguousarray((w_b[low:high + 1] - bias).T)
     rise = w[:, 1:] - w[:, :-1]
@@ -71,8 +71,8 @@ def _bow(h: Floats, rise: Floats) -> tuple[Floats, Floats]:
     """
     Return the excess of a cubic over its chord in each inner interval: (3, m - 2).
 
-    bow : how far the middle lies under the middle of the chord.
-    twist : how much less the middle slope, times the interval, rises than the chord.
+    bow : chord minus cubic in the middle.
+    twist : rise of the chord minus slope of the cubic in the middle times the interval.
     From divided differences of the rates over intervals h, (m,), with rises (3, m) over them.
     """
     safe = np.maximum(h, LEAST_INTERVAL)
@@ -141,7 +141,7 @@ def _scan(a: Complexes, b: Complexes) -> Pairs:
 
 
 def _products(t: Floats, w_b: Floats, every: int, bias: float | Floats) -> Pairs:
-    """Return the rotation over each ``every`` intervals, the last group may be short: pairs."""
+    """Return the rotation over each ``every`` intervals; the last group may be shorter: pairs."""
     n = len(t) - 1
     groups = -(-n // every)
     a, b = np.empty(groups, complex), np.empty(groups, complex)
@@ -164,10 +164,10 @@ def _products(t: Floats, w_b: Floats, every: int, bias: float | Floats) -> Pairs
 def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every: int = 1,
              bias: float | Floats = 0.0) -> tuple[Floats, Floats]:
     """
-    Return times (m,), s, and attitudes (m, 4), unit quaternions, of propagated gyro samples.
+    Return times (m,), s, and attitudes (m, 4), unit quaternions, propagated by gyro samples.
 
-    t : (n,) sample times, s, rising; the attitude ``q_nb0`` holds at ``t[0]``.   w_b : (n, 3) turn
-    rate of b against inertial space, rad/s.   q_nb0 : (4,) attitude at t[0], x y z w.
+    t : (n,) sample times, s, rising.   w_b : (n, 3) turn rate of b relative to inertial space,
+    rad/s.   q_nb0 : (4,) attitude at t[0], x y z w.
     earth_rate_n : (3,) Earth rate in n, rad/s (n is fixed to the Earth).   every : keep one epoch
     in this many: t[0], t[every], ... and the last sample.   bias : (3,) of the gyro, subtracted,
     rad/s.
@@ -180,6 +180,6 @@ def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every:
     a0, b0 = _pairs(q_nb0)
     a, b = _products(t, w_b, every, bias)
     a, b = _scan(np.append(a0, a), np.append(b0, b))
-    # n turns with the Earth under the inertial frame it was at t[0]
+    # n rotates with the Earth relative to the inertial frame that it equals at t[0]
     e, f = _pairs_from_rotvec(np.multiply.outer(np.asarray(earth_rate_n), t[0] - t_out))
     return t_out, _quats(*_times(e, f, a, b))

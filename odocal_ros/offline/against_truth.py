@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Show a calibration beside the truth of its drive.
+Compare a calibration with the truth of its drive.
 
-``python -m odocal_ros.offline.against_truth calibration.json truth.yaml``: exit 0 where every
-figure agrees, 1 where one does not, 2 where the files cannot be read. A figure agrees inside the
+``python -m odocal_ros.offline.against_truth calibration.json truth.yaml``: exit 0 if every
+value agrees, 1 if one does not, 2 if the files cannot be read. A value agrees inside the
 truth's ``accept`` interval if it has one, else within four sigmas.
 """
 
@@ -24,7 +24,7 @@ from odocal_ros.output.summary import DEG
 
 @dataclass(frozen=True)
 class Row:
-    """One figure beside its truth, both in the unit shown."""
+    """A value and its truth, both in the printed unit."""
 
     name: str
     value: float | None
@@ -35,7 +35,7 @@ class Row:
 
     @property
     def sigmas_off(self) -> float | None:
-        """Return the error over its sigma, None where there is none."""
+        """Return the error divided by its sigma, None without value or sigma."""
         if self.value is None or self.sigma is None:
             return None
         return (self.value - self.truth) / max(math.hypot(self.sigma, self.truth_sigma), 1e-300)
@@ -47,17 +47,17 @@ class Row:
             return True
         if self.accept is not None:
             return self.accept[0] <= self.value <= self.accept[1]
-        limit = 4.0    # sigmas: by chance in one of 16 000
+        limit = 4.0    # sigmas: exceeded by chance in one of 16 000
         return self.sigmas_off is not None and abs(self.sigmas_off) <= limit
 
 
 def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[Row]:
     """
-    Return each figure whose truth is known.
+    Return each value with a known truth.
 
     calibration : content of calibration.json.   truth : content of a truth.yaml: of odocal
-    simulate, where ``scale`` holds the scale factor and its ratio, or of a real drive, where its
-    value is the ratio to the nominal scale.
+    simulate, with scale factor and ratio in ``scale``, or of a real drive, with the ratio to the
+    nominal scale as its value.
     """
     result, found = calibration['result'], []
     if 'scale' in truth:
@@ -99,7 +99,7 @@ def _truth(row: Row) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Print the table; return 0 where all agree, 1 where not, 2 on wrong use."""
+    """Print the table; return 0 if all agree, 1 if not, 2 on wrong use."""
     argv = sys.argv[1:] if argv is None else argv
     try:
         if len(argv) != 2:

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The odocal command: one door for all subcommands, one place where errors become a line."""
+"""The odocal command: entry point of all subcommands; reports errors in one line."""
 
 import argparse
 import importlib
@@ -16,7 +16,7 @@ from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.offline import cli
 from odocal_ros.offline.say import warn
 
-# name: (its module, or the package that has it as an entry point; what it does)
+# name: (module, or package with it as an entry point; description)
 COMMANDS = {
     'try': ('odocal_ros.offline.try_bag', 'inspect a bag, calibrate, open the report'),
     'replay': ('odocal_ros.offline.replay', 'calibrate from recorded bags'),
@@ -56,12 +56,12 @@ class _Parser(argparse.ArgumentParser):
     """Print errors in one line instead of the whole usage."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise what the door turns into one line and exit code 2."""
+        """Raise an error that ``main`` reports in one line, with exit code 2."""
         raise _Usage(f'{self.prog}: {message} (see {self.prog} --help)')
 
 
 class _Usage(OdocalError):
-    """The command line does not parse."""
+    """The command line cannot be parsed."""
 
 
 def _parser(names: set[str]) -> argparse.ArgumentParser:
@@ -71,7 +71,7 @@ def _parser(names: set[str]) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', parser_class=_Parser)
     for name, (_, help_line) in COMMANDS.items():
         sub = commands.add_parser(name, help=help_line, description=help_line)
-        if name in names:      # only the asked command is imported: --help stays quick
+        if name in names:      # only this command is imported: --help stays quick
             command = _module_of(name)
             command.add_arguments(sub)
             sub.set_defaults(run=command.run)
@@ -118,7 +118,7 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except OSError as error:       # a full disk, a stream that went away
+    except OSError as error:       # a full disk, a closed stream
         what = error.filename or 'output'
         warn(f'odocal: {what}: {error.strerror or error}')
         return WRONG_USE
@@ -126,7 +126,7 @@ def main(argv: list[str] | None = None) -> int:
         warn('odocal: out of memory; close other programs, or replay a shorter bag or a section '
              '(--leg A:B)')
         return WRONG_USE
-    except Exception as error:     # noqa: BLE001 a person gets a line and a file, never a trace
+    except Exception as error:     # noqa: BLE001 users get a line and a file, no trace
         return _internal(error)
 
 
@@ -140,7 +140,7 @@ def _internal(error: Exception) -> int:
 
 
 def trace_file(text: str) -> str:
-    """Write what a developer needs to a file of its own; return its path."""
+    """Write a trace for developers to a new file; return its path."""
     with tempfile.NamedTemporaryFile('w', prefix='odocal_trace_', suffix='.txt', delete=False,
                                      encoding='utf-8', errors='backslashreplace') as f:
         f.write(f'odocal_ros {__version__}, Python {sys.version}\n{" ".join(sys.argv)}\n\n{text}')

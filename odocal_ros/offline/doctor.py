@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal doctor: what is installed and where data would go, as one screen to paste."""
+"""odocal doctor: installed packages and output folders, as one screen to paste."""
 
 import argparse
 from importlib.metadata import PackageNotFoundError, version
@@ -20,7 +20,7 @@ NEEDED = ('numpy', 'scipy', 'pyproj', 'PyYAML', 'matplotlib', 'jinja2', 'tqdm')
 OPTIONAL = {'rosbags': 'rosbag1 files, message types of a bag, written bags',
             'rich': 'odocal watch', 'pandas': 'to_frame', 'pyarrow': 'Parquet'}
 WORTH = ('ROS_DISTRO', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY',
-         'ROS_HOME', 'ODOCAL_LIMITS')     # of the environment; no other is shown
+         'ROS_HOME', 'ODOCAL_LIMITS')     # the only environment variables shown
 MISSING = 'MISSING'
 PROBE = ('import sys, rclpy\n'
          'from rclpy.utilities import get_rmw_implementation_identifier as rmw\n'
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what is there; return 0, 1 where something that is needed is not."""
+    """Print the installation; return 0, or 1 if a required package is missing."""
     rows = [('odocal_ros', f'{__version__}, {Path(__file__).resolve().parents[1]}'),
             ('Python', f'{platform.python_version()}, {sys.executable}'),
             ('system', f'{platform.platform()}, {os.cpu_count()} cores')]
@@ -61,7 +61,7 @@ def _ros() -> list[tuple[str, str]]:
     """Return the state of the ROS installation."""
     if find_spec('rclpy') is None:
         return [('rclpy', 'none: the node cannot run here, bags can be replayed')]
-    # in a process of its own, where a broken one breaks nothing
+    # in a separate process, so that a broken one does no harm
     found = subprocess.run([sys.executable, '-c', PROBE], capture_output=True, text=True)
     if found.returncode:
         return [('rclpy', f'BROKEN: {(found.stderr.strip().splitlines() or ["?"])[-1]}')]
@@ -70,7 +70,7 @@ def _ros() -> list[tuple[str, str]]:
 
 
 def _room(folder: Path) -> str:
-    """Return a folder, whether it can be written and how much room there is."""
+    """Return a folder, whether it is writable, and its free space, as text."""
     folder = folder.expanduser()
     there = next(p for p in (folder, *folder.parents) if p.exists())
     free = shutil.disk_usage(there).free / 1e9

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal inspect: what a bag holds, what is odd about it, how to replay it, what it lacks."""
+"""odocal inspect: content of a bag, its problems, missing data, and the replay command."""
 
 import argparse
 from pathlib import Path

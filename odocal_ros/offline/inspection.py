@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Look through a bag once and gather the content of ``odocal inspect``, as plain values."""
+"""Read a bag and return the content of ``odocal inspect`` as plain values."""
 
 from collections.abc import Sequence
 from datetime import datetime, UTC
@@ -32,12 +32,12 @@ from odocal_ros.screening.glitches import beyond
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config, SIDES
 
-# what only a method that begins with an alignment, or sees the ends alone, minds
+# they affect only methods with an initial alignment, or with the end points alone
 ENDS = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARABLE, Code.LEG_NOT_STRAIGHT}
 
 
 class _Tap:
-    """Keeps what one reader reads, for itself; what cannot be read is kept as ``trouble``."""
+    """Stores the samples of one reader; an error of reading is stored in ``trouble``."""
 
     unreadable = 0      # so that one bad topic does not end the reading of the others
 
@@ -67,7 +67,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     """
     taps, refused = _taps(bag, config, overrides)
     search = odometer_search.searched(bag.topics, taps, overrides.values())
-    bag.read({**taps, **search, **_static(taps, bag)}, print)       # a tap gives nothing on
+    bag.read({**taps, **search, **_static(taps, bag)}, print)       # a tap returns no rows
     mapping, config = likely_mapping(bag.topics, config, overrides)
     turn = _turn(taps[mapping['imu']]) if mapping.get('imu') in taps else None
     fixes = fix_path(taps[mapping['fix']].recorder.rows('fix'), config.gnss) if mapping.get(
@@ -123,7 +123,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
 
 def _taps(bag: Bag, config: Config,
           overrides: dict[str, str]) -> tuple[dict[str, _Tap], dict[Any, Any]]:
-    """Return topic -> tap for every topic that could be an input, and why others could not."""
+    """Return topic -> tap of every possible input, and topic -> error of unreadable ones."""
     asked = {topic: slot for slot, topic in overrides.items()}
     taps: dict[str, _Tap] = {}
     refused: dict[str, str] = {}
@@ -142,7 +142,7 @@ def _taps(bag: Bag, config: Config,
 
 
 def _static(taps: dict[str, _Tap], bag: Bag) -> dict[str, _Tap]:
-    """Return the taps of static transforms; what they make known is of the TF topic beside."""
+    """Return the taps of static transforms; they share the recorder of their TF topic."""
     found = {}
     readers = {name: tap.reader for name, tap in taps.items()}
     for name, reader in with_static(readers, bag.topics).items():
@@ -221,7 +221,7 @@ def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
 
 def _read_again(bag: Bag, taps: dict[str, _Tap], topic: str, config: Config,
                 topics: list[dict[str, Any]]) -> None:
-    """Read the odometer with the settings that were found."""
+    """Read the odometer again, with the found settings."""
     tap = taps[topic] = _Tap(make_reader('odometer', bag.topics[topic].msgtype, config))
     bag.read({topic: tap}, print)
     facts = next(facts for facts in topics if facts['name'] == topic)
@@ -229,7 +229,7 @@ def _read_again(bag: Bag, taps: dict[str, _Tap], topic: str, config: Config,
 
 
 def _turn(imu: _Tap) -> tuple[Ints, Floats] | None:
-    """Return stamps and the turn rate to the left, rad/s, None where no row is usable."""
+    """Return stamps and the turn rate to the left, rad/s, None without usable rows."""
     rows = imu.recorder.rows('imu')
     rows = take(rows, ~(beyond('f_i', rows.f_i) | beyond('w_i', rows.w_i)))
     if not len(rows.stamp_ns):

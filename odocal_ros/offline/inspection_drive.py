@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a bag's inputs show together: units, axes, standstills, legs."""
+"""Findings from the inputs of a bag together: units, axes, standstills, legs."""
 
 from dataclasses import replace
 import math
@@ -24,27 +24,27 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline import survey
 from odocal_ros.pipeline.calibrate import missing_data
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.clock_offset import screen_aligned
 from odocal_ros.screening.clocks import TOO_FAR
 from odocal_ros.screening.facing import imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.moved_imu import turned_over
-from odocal_ros.screening.screen import screen
 from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 from odocal_ros.settings.nominal import nominal_scale
 
-# judgement: no vehicle drives this share of a recording backwards; by a counter that counts down
-# the IMU would seem to look backwards
+# judgement: no vehicle drives this share of a recording backwards; with a counter that counts
+# down, the IMU would seem to be mounted backwards
 MOSTLY = 0.5
 
 
 def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
          findings: list[Reason]) -> list[str]:
     """
-    Look at the inputs together.
+    Inspect the inputs together.
 
     Fills mounting, drive, standstills and legs of ``found``, adds to ``findings``, and returns
     options for the replay: settings, and --leg.
@@ -58,7 +58,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
         findings.append(Reason(Code.CLOCKS_DIFFER, str(error), TOO_FAR))
         return []
     config = settings_by_frame(leg.fix, config)
-    inputs, reasons = screen(leg, config)
+    leg, inputs, reasons = screen_aligned(leg, config)
     findings += [r for r in reasons if r.code is not Code.NO_FIX or 'fix' in found['mapping']]
     if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:
         known = {reason.code for reason in findings}
@@ -69,9 +69,9 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     drive = survey.survey_drive(inputs, config)
     path_length, chord = way_and_chord(drive.t_fix, drive.fixes_n, inputs.least_motion)
     driven = _driven(inputs, drive)
-    long = path_length > 2.5 * inputs.least_motion      # judgement: then it is good to a per cent
+    long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %
     scale = path_length / driven if long and driven else drive.scale
-    # speeds by the scale that is shown
+    # speeds with the printed scale
     truer = scale / drive.scale if scale and drive.scale else 1.0
     found['drive'] = {
         'way': path_length, 'chord': chord, 'fix_sigma': drive.sigma,
@@ -89,7 +89,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
 
 
 def _driven(inputs: Inputs, drive: survey.Drive) -> float:
-    """Return the travel between the first and the last fix (else all), in units."""
+    """Return the travel between the first and the last fix (else all), in odometer units."""
     t, s = inputs.travel.t, inputs.travel.s
     if len(drive.t_fix) > 1:
         inside = (t > drive.t_fix[0]) & (t < drive.t_fix[-1])
@@ -100,7 +100,7 @@ def _driven(inputs: Inputs, drive: survey.Drive) -> float:
 
 def _units(inputs: Inputs, config: Config,
            findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
-    """Judge the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
+    """Check the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_axes(
         turned_over(inputs) or imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi,
                                           config.imu)[0] or unit_changes(inputs), inputs)
@@ -126,7 +126,7 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
 
 def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config: Config,
           found: dict[str, Any], findings: list[Reason]) -> list[str]:
-    """Return settings for odometer sign and IMU orientation; look whether the gyro is right."""
+    """Return settings for odometer sign and IMU orientation; check the gyro."""
     set_already = bool(np.any(config.imu.mounting_rpy))
     travel, step = inputs.travel, np.diff(inputs.travel.s)
     options = []
@@ -135,7 +135,7 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config:
         options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
     m = mounting(inputs.t_imu, w_i, f_i, travel, drive.scale or 1.0)
     if not inputs.has_accelerometer:
-        m = replace(m, C_bi=None)      # gravity is made up
+        m = replace(m, C_bi=None)      # gravity is assumed
     agrees = m.C_bi is not None and np.allclose(
         m.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
     found['mounting'] = {
@@ -180,7 +180,7 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, 
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
             _from_rest(drive.stops, *ends)
             for ends in survey.straight_stretches(inputs, drive, config.leg.min_distance)[:5])]
-    # of the whole drive the other methods make more than of its pieces
+    # the other methods gain more from the whole drive than from its sections
     if marks or config.method != 'two_point' or not all(closed(leg) for leg in found['legs']):
         return []
     open_legs = [leg for leg in found['each_stop']
@@ -196,13 +196,13 @@ def closed(leg: dict[str, Any]) -> bool:
 
 
 def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:
-    """Move ends that lie in a standstill to its end: there the marks of a leg belong."""
+    """Move an end inside a standstill to the end of the standstill, as the marks of a leg."""
     begin, end = (next((b for a, b in stops.tolist() if a <= t <= b), t) for t in (start, stop))
     return begin, end
 
 
 def lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
-    """Return the reasons for data that a calibration would miss."""
+    """Return the reasons on data that a calibration lacks."""
     out = [Reason(code, f'no topic for the {word}') for slot, code, word in (
         ('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER, 'odometer'),
         ('fix', Code.NO_FIX, 'fixes'))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What ``odocal inspect`` found, as a person reads it."""
+"""The findings of ``odocal inspect`` as text."""
 
 from collections.abc import Iterator
 import math
@@ -16,7 +16,7 @@ STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
 
 
 def text(found: dict[str, Any]) -> str:
-    """Return one screen for people, more where there is more to say."""
+    """Return the findings as text, one screen or more."""
     roles = {topic: slot for slot, topic in found['mapping'].items()}
     blocks = [_head(found), _topics(found, roles)]
     blocks += [_details(topic, roles) for topic in found['topics']
@@ -54,7 +54,7 @@ def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:
     if topic.get('trouble'):
         points.append(topic['trouble'])
     if topic['name'] not in roles and not any('warning:' in p for p in points):
-        points = points[:2 + len(topic.get('moves', ()))]     # of topics not used, a look
+        points = points[:2 + len(topic.get('moves', ()))]     # unused topics: short
     return [one_line(topic['name']), *(line for point in points for line in wrapped(point))]
 
 
@@ -196,7 +196,7 @@ def _drive(found: dict[str, Any]) -> list[str]:
 
 
 def _legs(legs: list[dict[str, Any]]) -> list[str]:
-    """Return a line for each leg, of many a table."""
+    """Return a line for each leg, or a table of many legs."""
     if not legs:
         return []
     whose = 'marked by the node' if legs[0]['marked'] else 'used by replay'
@@ -235,7 +235,7 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
 
 
 def whole_degrees(angle: float) -> str:
-    """Return an uncertainty, rad, in whole degrees, below half of one with one digit."""
+    """Return an uncertainty, rad, in whole degrees; below half a degree with one digit."""
     degrees = math.degrees(angle)
     return f'{degrees:.0f}' if degrees >= 0.5 else f'{degrees:.1g}'
 

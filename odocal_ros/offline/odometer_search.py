@@ -44,9 +44,9 @@ STANDARD = ('geometry_msgs', 'nav_msgs', 'tf2_msgs', 'visualization_msgs', 'diag
 
 
 class Fields:
-    """Collects the numbers of messages of one topic, evenly taken from all of them."""
+    """Collects the numbers in evenly selected messages of one topic."""
 
-    unreadable = 0       # as a reader of a bag: a topic that cannot be read is no error
+    unreadable = 0       # as of a reader of a bag: an unreadable topic is no error
 
     def __init__(self, count: int) -> None:
         self.count, self.trouble = count, ''
@@ -173,7 +173,7 @@ def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
 
 def _best(path: str, whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
           every: int) -> tuple[Field, Floats] | None:
-    """Return the meaning of a field that follows the path best, and its travel; None if none."""
+    """Return the meaning of a field that follows the path best, and its travel; or None."""
     per_message = any(word in path.lower() for word in INCREMENTS)
     found = []
     seconds: Floats = np.multiply(t_ns - t_ns[:1], 1e-9)
@@ -208,7 +208,7 @@ def searched(topics: Mapping[str, TopicInfo], known: Collection[str],
 
 
 def _possible(info: TopicInfo) -> bool:
-    """Return True for types without a meaning of their own, not of GNSS and not commands."""
+    """Return True for types without a fixed meaning, except GNSS and commands."""
     package = info.msgtype.partition('/')[0]
     words = re.split(r'[/_]', f'{info.name}/{info.msgtype}'.lower())
     return (info.msgtype not in (*ODOMETERS, IMU) and info.name not in NEVER
@@ -235,7 +235,7 @@ def still(matches: Mapping[str, Match]) -> set[str]:
 
 
 def only_near_best(fields: Sequence[dict[str, Any]]) -> None:
-    """Remove fields that leave much more of the variance than the best of all topics."""
+    """Remove fields that explain much less of the variance than the best of all topics."""
     best = max((one['explained'] for facts in fields for one in facts['found']), default=0.0)
     # removes all false signals of benchmarks/odometer_fields.py but energy with fixes of 2.5 m
     more, least = 3.0, 0.01
@@ -245,7 +245,7 @@ def only_near_best(fields: Sequence[dict[str, Any]]) -> None:
 
 
 def best_topic(topics: Sequence[dict[str, Any]], asked: str) -> dict[str, Any] | None:
-    """Return the topic whose field follows the path best, of the one asked for; None if none."""
+    """Return the topic whose field follows the path best, of topic ``asked`` if set, or None."""
     found = [facts for facts in topics if facts.get('fields', {}).get('found') and (
         not asked or facts['name'].strip('/') == asked.strip('/'))]
     return min(found, default=None, key=lambda facts: rank(facts['fields']['found'][0]))

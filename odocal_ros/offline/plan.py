@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal plan: how good a calibration will be, before it is driven, and what would help."""
+"""odocal plan: predicted accuracy of a calibration before the drive, and improvements."""
 
 import argparse
 import math
@@ -99,7 +99,7 @@ def _indoor(args: argparse.Namespace) -> int:
 
 
 def _config(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings asked for: --config < --set < the options named for a plan."""
+    """Return the requested settings: --config < --set < the options of a plan."""
     asked = asked_settings(args)
     if args.imu_grade:
         asked['imu.grade'] = args.imu_grade

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What odocal plan prints: the prediction as one screen, or as JSON."""
+"""Text of odocal plan: the prediction as one screen."""
 
 import math
 import textwrap
@@ -102,7 +102,7 @@ def _shown(parameter: str, sigma: float | None) -> str:
 
 
 def _budgets(before: Plan) -> list[str]:
-    """Return the sources that matter of each method that will give something."""
+    """Return the main error sources of each method that will provide a value."""
     out = []
     shown = 0.01    # share of the variance from which a source has its row
     for name in before.giving:

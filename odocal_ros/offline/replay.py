@@ -33,9 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the robot stands on a point of reference.points at T seconds from the first '
         'message; repeatable, in the order of the points')
     add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
-    add('--export', metavar='FILES', default='', help='time series files, separated by commas: '
-        'trajectory.tum, states.csv, residuals.parquet, track.kml, scale_by_speed.png, '
-        'debug.mcap, drive.rrd ...')
+    add('--export', metavar='FILES', action='append', default=[],
+        help='time series files, separated by commas or repeatable: trajectory.tum, states.csv, '
+        'residuals.parquet, track.kml, scale_by_speed.png, debug.mcap, drive.rrd ...')
     add('--force', action='store_true', help='replace an existing calibration.json')
     add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
@@ -54,7 +54,7 @@ def add_input_arguments(parser: argparse.ArgumentParser,
 
 
 def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) -> None:
-    """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
+    """Declare the calibration options, for one vehicle or for a fleet."""
     add_input_arguments(parser, **topics)
     add = parser.add_argument
     add('--leg', action='append', default=[], metavar='A:B',
@@ -69,13 +69,13 @@ def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) ->
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay bags; return 0 accepted or caution (of --accept: pass), else 1."""
+    """Replay bags; return 0 accepted or caution (with --accept: pass), else 1."""
     from odocal_ros.library.asked import legs_of
     config = asked_config(args)
     if args.marks:
         config['reference.marks'] = tuple(args.marks)
     legs_of(args.leg)
-    series = [name.strip() for name in args.export.split(',') if name.strip()]
+    series = [name.strip() for name in ','.join(args.export).split(',') if name.strip()]
     if series:
         from odocal_ros.library.export import check_names
         check_names(series)
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def output_folder(name: str | None, bag: str, force: bool) -> Path:
-    """Return the folder for the results; BadUsage if it holds one and ``force`` is false."""
+    """Return the folder for the results; BadUsage if it has results and ``force`` is false."""
     output = Path(name or f'odocal_{one_line(Path(bag).stem)}')
     if (output / 'calibration.json').exists() and not force:      # before the work
         raise BadUsage(f'{output}/calibration.json already exists; give --force to replace it, '
@@ -105,7 +105,7 @@ def output_folder(name: str | None, bag: str, force: bool) -> Path:
 
 
 class _Screen(Listener):
-    """Shows on the terminal how it goes."""
+    """Shows notes and progress on the terminal."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         self._quiet, self._silent = args.quiet, args.quiet or args.json
@@ -115,12 +115,12 @@ class _Screen(Listener):
             warn(f'odocal: {text}')
 
     def phase(self, title: str) -> Phase:
-        """Return a line that is gone when the phase is over."""
+        """Return a progress line that disappears after the phase."""
         return Phase(title, self._silent)
 
 
 def asked_config(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings asked for: --config < --set < --accept and --method, each checked."""
+    """Return the requested settings: --config < --set < --accept and --method, each checked."""
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.settings.config_groups import parse_accept
     asked = asked_settings(args)
@@ -142,7 +142,7 @@ def asked_settings(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def asked_topics(args: argparse.Namespace) -> dict[str, str]:
-    """Return slot -> topic of those asked for."""
+    """Return slot -> requested topic."""
     return {slot: topic for slot in TOPICS if (topic := getattr(args, f'{slot}_topic'))}
 
 
@@ -152,7 +152,7 @@ def _styled(stream: Any) -> bool:
 
 
 def _size(stream: Any) -> tuple[int, int | None]:
-    """Return the columns, 98 at most, and the rows of a terminal; no rows for what is none."""
+    """Return columns, at most 98, and rows of a terminal; None rows without a terminal."""
     if not stream.isatty():
         return 98, None
     columns, rows = get_terminal_size()      # 80, 24 if it gives none
@@ -203,7 +203,7 @@ def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespa
 
 
 def _show(calibration: 'Combined', args: Any) -> OSError | None:
-    """Print the result, for which a report need not be drawn; return what a stream raises."""
+    """Print the result before the report is drawn; return an error of the stream, or None."""
     from odocal_ros.output.summary import screen
     columns, rows = _size(sys.stdout)
     try:
@@ -218,7 +218,7 @@ def _show(calibration: 'Combined', args: Any) -> OSError | None:
 
 def _show_files(calibration: 'Combined', output: Path, written: list[Path],
                 report: list[Path]) -> None:
-    """Print where the result is."""
+    """Print the paths of the results."""
     from odocal_ros.output.summary import sentence
     columns, rows = _size(sys.stdout)
     text = f'written: {output}/ ({", ".join(p.name for p in written)})'
@@ -226,4 +226,4 @@ def _show_files(calibration: 'Combined', output: Path, written: list[Path],
                      break_on_hyphens=False) if rows else text))
     for path in report:
         say(f'report:  {path}')
-    say(sentence(calibration))      # what scrolled away, once more
+    say(sentence(calibration))      # again, since it scrolled away

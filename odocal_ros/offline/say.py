@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What commands print: the one door to the terminal, which names from outside must not steer."""
+"""Output of the commands: the only access to the terminal, safe for untrusted names."""
 
 import json
 from shutil import get_terminal_size
@@ -34,8 +34,8 @@ class Phase:
     """
     A phase of the work, as a context; called with the fraction done, if known.
 
-    title : what is being done.   quiet : show nothing. Nothing is shown either where the error
-    stream is no terminal.
+    title : of the work.   quiet : show nothing. Nothing is shown either if the error stream is no
+    terminal.
     """
 
     def __init__(self, title: str, quiet: bool = False) -> None:
@@ -55,7 +55,7 @@ class Phase:
         return self
 
     def __call__(self, share: float | None, title: str = '') -> None:
-        """Set the fraction done, None if unknown, and the name of the next phase if it has one."""
+        """Set the fraction done, None if unknown, and the new title if there is one."""
         if self._shown:
             self._bar.bar_format = CLOCK if share is None else BAR
             if title:

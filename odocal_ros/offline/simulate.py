@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal simulate: a bag of a drive whose truth is known."""
+"""odocal simulate: a bag of a drive with known truth."""
 
 import argparse
 import math
@@ -16,7 +16,7 @@ from odocal_ros.settings.levels import DAY_NS
 if TYPE_CHECKING:
     from odocal_ros.sim.options import SimOptions
 
-# option: (what follows it, help); its name is SimOptions' field
+# option: (metavar, help); its name is a field of SimOptions
 NUMBERS = {
     'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
     'imu_rate': ('HZ', 'rate of /imu/data (default 100)'),
@@ -143,7 +143,7 @@ def _span(text: str) -> tuple[float, float]:
 
 
 def options_of(args: argparse.Namespace) -> 'SimOptions':
-    """Return the SimOptions that parsed arguments ask for."""
+    """Return the SimOptions of parsed arguments."""
     from odocal_ros.sim.options import SimOptions
     plain = ['scenario', 'seed', 'imu', 'imu_grade', 'odometer', 'drive', 'two_wheels', 'wheels',
              'front_steers', 'reference', 'fix_noise', 'slip_walk', *NUMBERS]
@@ -154,7 +154,7 @@ def options_of(args: argparse.Namespace) -> 'SimOptions':
     for name in LEVER_ARMS:
         if getattr(args, name) is not None:
             given[name] = tuple(getattr(args, name))
-    # drives of two seeds are two drives, not one time driven twice
+    # each seed has its own date, so that drives do not overlap in time
     seed = given.get('seed', SimOptions.seed)
     days = 3650    # then the days of the seeds repeat
     given['start_ns'] = SimOptions.start_ns + (seed - 1) % days * DAY_NS
@@ -166,7 +166,7 @@ def options_of(args: argparse.Namespace) -> 'SimOptions':
 
 
 def _with_figures(args: argparse.Namespace, given: dict[str, Any]) -> 'SimOptions':
-    """Return SimOptions of what was given, with the vehicle drawn and the figures asked for."""
+    """Return SimOptions of the given options, the random vehicle and the requested figures."""
     from odocal_ros.sim.draw import drawn
     from odocal_ros.sim.options import DEFAULTS, SimOptions
     from odocal_ros.sim.real import parsed, Real
@@ -186,7 +186,7 @@ def _with_figures(args: argparse.Namespace, given: dict[str, Any]) -> 'SimOption
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate, write the bag and the two files beside it, or those of a fleet; return 0."""
+    """Simulate; write a bag with its two files, or those of a fleet; return 0."""
     if args.fleet is not None:
         from odocal_ros.offline.simulate_fleet import simulate_fleet
         return simulate_fleet(args, options_of(args))

@@ -27,7 +27,7 @@ def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
     """
     Write DIR/<vehicle>/bag_<nn>, DIR/<model>.yaml, DIR/manifest.csv and DIR/truth.yaml; return 0.
 
-    options : of each drive, but for what differs between vehicles.
+    options : of each drive, except values that differ between vehicles.
     """
     from odocal_ros.sim.fleet import fleet_of
     out = Path(args.out)
@@ -55,7 +55,7 @@ def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
 
 def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicle', bag: int,
          options: 'SimOptions') -> 'tuple[dict[str, str], Drive]':
-    """Write a bag; return its row of the manifest and the drive's options and truth."""
+    """Write a bag; return its row of the manifest, and its drive with options and truth."""
     from odocal_ros.bagio.write import drive_topics, write_bag
     from odocal_ros.sim.fleet import as_driven, drive_options, MODELS
     from odocal_ros.sim.scenarios import simulate
@@ -93,7 +93,7 @@ def _write(out: Path, rows: list[dict[str, str]], truth: list[dict[str, Any]]) -
     writer.writeheader()
     writer.writerows(rows)
     _yaml(out / 'truth.yaml', {'vehicles': truth}, 'Truth of a fleet; sizes relative or rad.')
-    write_text(out / MANIFEST, text.getvalue())      # last: it says that all is there
+    write_text(out / MANIFEST, text.getvalue())      # last: it marks a complete fleet
 
 
 def _yaml(path: Path, content: dict[str, Any], title: str) -> None:

@@ -36,7 +36,7 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
 
 
 def _rank(slot: str, info: TopicInfo, still: Collection[str]) -> tuple[int | str, ...]:
-    """Return a sort key: what grows, counters before speeds, usual names, more messages first."""
+    """Return a sort key: moving topics, counters, usual names, more messages first."""
     usual = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
     kinds = [i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype]
     worded = any(word in info.name.lower() for word in COUNTER_WORDS)
@@ -67,7 +67,7 @@ def why_before(topics: dict[str, TopicInfo], slot: str, topic: str, other: str,
 
 
 def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:
-    """Return the topics that replay cannot choose without options; '' if none."""
+    """Return the error of replay if it cannot choose the topics without options; '' if none."""
     try:
         choose_topics(topics, config, overrides)
     except BadUsage as error:
@@ -85,7 +85,7 @@ def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: 
     for slot, topic in mapping.items():
         others = {s: t for s, t in mapping.items() if s != slot}
         found = candidates(topics, slot, config, others)
-        local = slot == 'fix' and topics[topic].msgtype != FIX      # said, as it is unusual
+        local = slot == 'fix' and topics[topic].msgtype != FIX      # stated, as it is unusual
         if slot in overrides or len(found) > 1 or topic not in found or local:
             words += [topic_option(slot), topic]
     if 'odometer_right' in mapping and 'odometer_right' not in overrides:

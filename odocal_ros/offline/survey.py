@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What topics of a bag hold: timing, units and quality of samples; path, rests and stretches."""
+"""Survey of a bag's topics: timing, units, quality; path, standstills, straight sections."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -32,10 +32,10 @@ FEWEST_STEPS = 10      # judgement: cells of a path that can be compared
 def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
            headerless: bool) -> dict[str, Any]:
     """
-    Return rate, gaps and what is odd about the stamps of a topic.
+    Return rate, gaps and irregular stamps of a topic.
 
-    ``at`` is in seconds from the bag's first message; ``header_to_bag`` is how long after its
-    header stamp a message was recorded, None without a header; ``arrival_jitter`` is the standard
+    ``at`` is in seconds from the bag's first message; ``header_to_bag`` is the median delay from
+    header stamp to recording, s, None without a header; ``arrival_jitter`` is the standard
     deviation of arrivals without a header, s.
     """
     stamped = samples.stamp_ns > 0
@@ -48,7 +48,7 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
     gaps = np.flatnonzero(step > max(gap * usual, least_gap))
     order = gaps[np.argsort(-step[gaps], kind='stable')][:10]
     lag: Floats = np.multiply(received - stamp, 1e-9)
-    # mean of what lies between the gaps: bursts and gaps are no rate
+    # mean between the gaps: bursts and gaps are no rate
     running = float(rising.sum() - step[gaps].sum())
     return {
         'rate_hz': (len(rising) - len(gaps)) / running if running > 0 else None,
@@ -92,7 +92,7 @@ def imu(samples: ImuSamples) -> dict[str, Any]:
 
 
 def odometer(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
-    """Return the values that an odometer topic counts."""
+    """Return quantity, unit and range of an odometer topic."""
     finite = samples.value[~beyond('value', samples.value)]
     order = np.sort(finite)
     ends = {'first': finite[:1], 'last': finite[-1:], 'least': order[:1], 'most': order[-1:]}
@@ -121,7 +121,7 @@ def fixes(samples: FixSamples) -> dict[str, Any]:
 
 
 def _grid_step(latitude: Floats) -> float | None:
-    """Return the step, m, in which latitudes come, where it is coarser than 5 mm."""
+    """Return the resolution of latitudes, m, if it is coarser than 5 mm, else None."""
     steps = np.abs(np.diff(np.unique(latitude))) * 6.37e6
     steps = steps[steps > 1e-6]        # below that it is the last bit
     if len(steps) < 10 or np.median(steps) < 0.005:
@@ -146,7 +146,7 @@ class Match:
     follows: bool
 
 
-# definition: of no comparison
+# definition: result without a comparison
 NO_MATCH = Match(0.0, 0.0, False)
 
 
@@ -212,11 +212,11 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
 @dataclass(frozen=True, eq=False)
 class Drive:
     """
-    A recording seen as a drive.
+    The drive of a recording.
 
     scale : m per unit of travel, rough; None if the fixes do not determine it.
     stops : (k, 2) s, begin and end of standstills.
-    sigma : m, of a fix, horizontally, as sent.    white : m, what differs from fix to fix.
+    sigma : m, of a fix, horizontal, as stated.    white : m, white noise of the fixes.
     t_fix, fixes_n : (n,), (n, 3) s and m, usable fixes, east-north-up about the first.
     slowest, fastest : m/s.
     """
@@ -232,13 +232,13 @@ class Drive:
 
 
 def survey_drive(inputs: Inputs, config: Config) -> Drive:
-    """Return the drive that screened inputs show."""
+    """Return the drive of screened inputs."""
     placed = place(inputs, config)
     fixes_n, sigma, scale = placed.fixes_n, placed.fix_sigma, placed.rough or None
     stops, slowest, fastest = np.empty((0, 2)), 0.0, 0.0
     if len(inputs.travel.t) > 1 and len(inputs.t_imu) > 3:
         stops = inputs.standstills(scale or 1.0, config)
-        at_speed = 1.0    # s, over which a speed is taken
+        at_speed = 1.0    # s, over which a speed is computed
         t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - at_speed, at_speed / 2)
         if scale and len(t):
             speed = np.abs(inputs.travel.at(t + at_speed) - inputs.travel.at(t)) * scale / at_speed
@@ -248,10 +248,10 @@ def survey_drive(inputs: Inputs, config: Config) -> Drive:
 
 
 def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tuple[float, float]]:
-    """Return (start, stop) of stretches at least ``shortest`` m long, the longest first; s."""
+    """Return (start, stop), s, of straight sections of ``shortest`` m or more, longest first."""
     if drive.scale is None or len(drive.t_fix) < 3:
         return []
-    points = 600    # fixes looked at for straight stretches, evenly taken
+    points = 600    # fixes tested for straight sections, evenly selected
     pick = np.unique(np.linspace(0, len(drive.t_fix) - 1, points).astype(int))
     t, p = drive.t_fix[pick], drive.fixes_n[pick, :2]
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
@@ -263,12 +263,12 @@ def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tu
     path_length = travel * max(drive.scale, min(best, 1.2 * drive.scale))
     # chord over path length: a section at least this straight suits the two-point method
     straight = 0.97
-    # fixes are off by sigma at both ends: what that hides is given, not demanded
+    # both end points have errors of sigma: a section within these errors is accepted
     fit = np.triu((chord >= straight * path_length - drive.sigma) & (path_length >= shortest)
                   & (chord <= path_length / straight + 4 * drive.sigma))
     found: list[tuple[float, float]] = []
     while fit.any():
         i, j = np.unravel_index(np.argmax(np.where(fit, path_length, 0)), fit.shape)
         found.append((float(t[i]), float(t[j])))
-        fit[:j + 1, i:] = False            # whatever overlaps it
+        fit[:j + 1, i:] = False            # all that overlap it
     return found

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""How each value of a list (joints, an array of counters) moves: what could be wheels."""
+"""Motion of each value of a list (joints, an array of counters), to find the wheels."""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -29,7 +29,7 @@ class Values:
         self._blocks: dict[tuple[Any, ...], list[Any]] = {}     # (field, keys) -> (stamps, values)
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints) -> None:
-        """Take messages; those that are not read as columns are passed over."""
+        """Take messages; those that cannot be read as columns are skipped."""
         received = np.array(received_ns, np.int64)
         for layout, rows, table in tables(self.msgtype, raws):
             if layout is None:
@@ -51,8 +51,8 @@ class Values:
         """
         Return the motion of each value of the most frequent list.
 
-        imu : (t_ns, rate), stamps and the turn rate to the left, rad/s; None where there is none.
-        path : of the fixes; None where there is none.
+        imu : (t_ns, rate), stamps and the turn rate to the left, rad/s; None without one.
+        path : of the fixes; None without one.
         """
         if not self._blocks:
             return []
@@ -67,7 +67,7 @@ class Values:
         t = (stamp_ns - stamp_ns[0]) * 1e-9
         s = _travelled(t, value, field)
         path_length, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
-        turns = 4 * np.pi    # rad, range of an angle from which on it turns without bound
+        turns = 4 * np.pi    # rad: an angle of a larger range turns without limit
         alike = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
         rolls = (span > (turns if self.msgtype == JOINTS else 0)) & (span > alike * span.max())
         # a joint that turns without driving, such as a lidar, is no wheel
@@ -95,11 +95,11 @@ def _travelled(t: Floats, value: Floats, field: str) -> Floats:
 
 def sides(t: Floats, s: Floats, rolls: Bools,
           imu: tuple[Floats, Floats] | None) -> list[str]:
-    """Return 'left' or 'right' of each wheel that matches the gyro: the outer travels farther."""
+    """Return 'left', 'right' or '' of each value, by the gyro: the outer wheel travels farther."""
     k = len(rolls)
     none = [''] * k
     cell = 0.5    # s, cells in which the gyro determines the sides
-    # by damaged stamps a recording may last for years
+    # with damaged stamps a recording may seem to last for years
     grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MOST_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
         return none

@@ -35,12 +35,12 @@ HOLONOMIC_KEYS = {
 DEVICES = 'wheel_input.txt'
 MICRO = 1e6    # definition: millionths in 1
 TWIST, IMU_ERRORS = 'wheel_odometry_covariance.yaml', 'imu_errors.yaml'
-UNKNOWN = 1e6      # definition: variance of what wheels do not measure, as ROS drivers have it
+UNKNOWN = 1e6      # definition: variance of unmeasured components, as in ROS drivers
 
 
 def controllers(calibration: Calibration, config: Config,
                 content: dict[str, Any]) -> dict[str, str]:
-    """Return the file by name, nothing when no value of it was determined."""
+    """Return file name -> text, empty if none of its values is determined."""
     blocks = _blocks(calibration, config)
     if not blocks:
         return {}
@@ -56,7 +56,7 @@ def controllers(calibration: Calibration, config: Config,
 
 
 def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any]]:
-    """Return the parameters by controller, of those that fit the drive."""
+    """Return controller -> parameters, for controllers that fit the drive."""
     radius = wheel_radius(calibration, config)
     if config.odometer.drive in HOLONOMIC:
         lever = known(calibration.estimates, 'rotation_lever').value
@@ -78,7 +78,7 @@ def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any
 
 
 def _multipliers(calibration: Calibration, config: Config) -> dict[str, float]:
-    """Return those of diff_drive_controller: each wheel's own factor where there is one."""
+    """Return the multipliers of diff_drive_controller, with wheel factors if there are any."""
     estimates = calibration.estimates
     common = known(estimates, 'scale_ratio').value
     left, right = (known(estimates, f'scale_factor_{side}') for side in ('left', 'right'))
@@ -98,7 +98,7 @@ def _multipliers(calibration: Calibration, config: Config) -> dict[str, float]:
 
 
 def wheel_radius(calibration: Calibration, config: Config) -> float | None:
-    """Return the effective radius of the wheel, m; None where its pulses per turn are unknown."""
+    """Return the effective radius of the wheel, m; None if its pulses per turn are unknown."""
     scale = known(calibration.estimates, 'scale_factor')
     wheels = config.wheels
     if scale.value is None:
@@ -107,13 +107,13 @@ def wheel_radius(calibration: Calibration, config: Config) -> float | None:
         return scale.value
     if scale.unit == 'm/pulse' and wheels.pulses_per_revolution:
         return scale.value * wheels.pulses_per_revolution / math.tau
-    if scale.unit == '1' and wheels.radius:     # a speed made with that radius
+    if scale.unit == '1' and wheels.radius:     # a speed computed with that radius
         return scale.value * wheels.radius
     return None
 
 
 def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
-    """Return the file by name; nothing without a scale factor in metres per pulse."""
+    """Return file name -> text, empty without a scale factor in metres per pulse."""
     scale = known(calibration.estimates, 'scale_factor')
     if scale.value is None or scale.unit != 'm/pulse':
         return {}
@@ -130,7 +130,7 @@ def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -
 
 
 def _device_settings(scale: float, pulses: float) -> list[tuple[str, str]]:
-    """Return (where it goes, the line) for each system; a line is empty where it lacks a fact."""
+    """Return (description, setting) for each system; a setting without its data is empty."""
     per_metre = f'{1 / scale:.9g}'
     wheel, radius = '', ''
     if pulses and pulses == round(pulses):
@@ -156,7 +156,7 @@ def _device_settings(scale: float, pulses: float) -> list[tuple[str, str]]:
 
 def wheel_covariance(calibration: Calibration, config: Config,
                      content: dict[str, Any]) -> dict[str, str]:
-    """Return the file by name; nothing without a scale factor of the smoother."""
+    """Return file name -> text, empty without a scale factor of the smoother."""
     from odocal_ros.estimator.result.twist_noise import twist_noise
     noise = twist_noise(calibration)
     if noise is None:
@@ -194,7 +194,7 @@ def _diagonal(variances: np.ndarray[Any, Any]) -> list[float]:
 
 
 def _table(noise: 'TwistNoise') -> str:
-    """Return the variances by speed and turn rate, as parameters of a node of one's own."""
+    """Return the variances by speed and turn rate, as parameters of a custom node."""
     speeds = np.linspace(0.0, noise.fastest[0], 6)
     rates = np.linspace(0.0, noise.fastest[1], 4)
     rows = {f'turn_rate_{k}': {
@@ -209,7 +209,7 @@ def _table(noise: 'TwistNoise') -> str:
 
 def imu_errors(calibration: Calibration, config: Config,
                content: dict[str, Any]) -> dict[str, str]:
-    """Return the file by name; nothing if no error of the IMU is known better than its prior."""
+    """Return file name -> text, empty if no IMU error is known better than its prior."""
     found: dict[str, dict[str, float]] = {}
     for leg in calibration.legs:
         method = leg.methods.get('smoother')
@@ -257,7 +257,7 @@ def head(calibration: Calibration, content: dict[str, Any]) -> str:
 
 
 def about(calibration: Calibration, content: dict[str, Any]) -> str:
-    """Return two lines: what made the file, when, of what, and with which result."""
+    """Return two lines: software, date, legs and bags of the file; its result."""
     inputs = content['inputs']
     bags = ', '.join(str(i['bag']) for i in inputs if i.get('bag')) or 'live'
     bags += ''.join(f', node {i["node"]}' for i in inputs if i.get('node'))

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Figures of one look: as SVG parts of a page, or as files of their own."""
+"""Figures in one style: as SVG elements of a page, or as separate files."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +20,7 @@ from odocal_ros.errors import BadUsage
 # Okabe and Ito's colours, distinguishable with colour blindness, by shapes in grey
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
 GREY, BAND = '0.45', '0.90'
-Drawing = tuple[str, str, str]      # title, what it says, SVG
+Drawing = tuple[str, str, str]      # title, description, SVG
 MOST_POINTS = 1200   # judgement: of a line
 MOST_MARKS = 400     # judgement: of single marks
 LOOK: dict[Any, Any] = {
@@ -34,7 +34,7 @@ PICTURES = ('.png', '.svg', '.pdf')
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Hold the look while figures are made and written; nothing of it stays."""
+    """Apply the style while figures are made and written."""
     from matplotlib import rc_context
     with rc_context(LOOK):
         yield
@@ -56,7 +56,7 @@ def sheet(height: float, rows: int = 1, sharex: bool = True,
 
 
 def key(figure: Any, axes: Any) -> None:
-    """Put the legend above the axes, where it hides nothing."""
+    """Place the legend above the axes."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         figure.legend(handles, labels, loc='upper center', ncols=3, borderpad=0.1,
@@ -67,8 +67,8 @@ def svg(figure: Any, name: str, says: str) -> str:
     """
     Return a figure as an svg element.
 
-    figure : made under ``look``.   name : put before each id in it: a page holds many figures.
-    says : for those who cannot see it.
+    figure : made under ``look``.   name : prefix of each id: a page has many figures.
+    says : text alternative.
     """
     from html import escape
 
@@ -89,9 +89,9 @@ def svg(figure: Any, name: str, says: str) -> str:
 
 def thinned(y: Floats) -> Ints:
     """
-    Return rows of a line that keep its peaks, and both its ends: (m,) int.
+    Return row numbers of a line that keep its peaks and both ends: (m,) int.
 
-    Of each piece of equally many rows the least and the greatest y are kept (of all columns).
+    In blocks of equal size, the least and the greatest y of each column are kept.
     """
     y = np.asarray(y, float)
     n = len(y)
@@ -113,17 +113,17 @@ def evenly(n: int, most: int = MOST_MARKS) -> Ints:
 
 
 def lengths(metres: float) -> tuple[float, str]:
-    """Return the factor and the unit for lengths up to so many metres."""
+    """Return the factor and the unit for lengths up to ``metres``."""
     return (1e-3, 'km') if metres > 3000 else (1.0, 'm')
 
 
 def relative(most: float) -> tuple[float, str]:
-    """Return the factor and the unit for relative figures up to so much."""
+    """Return the factor and the unit for relative values up to ``most``."""
     return (100.0, '%') if most > 0.005 else (1e6, 'ppm')
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure, inches, that no window will show."""
+    """Return an empty figure, inches, without a window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     figure = Figure(figsize=(width, height), layout='constrained')

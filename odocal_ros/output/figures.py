@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers, reasons and decisions as people read them: digits by sigma, gravest first."""
+"""Numbers, reasons and decisions as text: digits by sigma, gravest first."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,9 +33,9 @@ def decimals(sigma: float) -> int:
 def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
                signed: bool = False) -> str:
     """
-    Return 'value ± sigma', both times ``factor``, with the digits that the sigma leaves.
+    Return 'value ± sigma', both times ``factor``, with the digits that the sigma determines.
 
-    Of a sigma of 100 or more two digits count too: -32000 ± 15000.
+    A sigma of 100 or more is rounded to two digits, too: -32000 ± 15000.
     """
     if value is None or not math.isfinite(value):
         return 'unknown'
@@ -51,7 +51,7 @@ def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
 
 
 def two_digits(x: float) -> str:
-    """Return a number with two digits that count, without an exponent where it is readable."""
+    """Return a number with two significant digits, without an exponent if readable."""
     if not math.isfinite(x):
         return 'unknown'
     if x == 0 or not 1e-4 <= abs(x) < 1e7:
@@ -61,14 +61,14 @@ def two_digits(x: float) -> str:
 
 
 def beyond_one(ratio: float, sigma: float | None) -> str:
-    """Return by how much a ratio differs from 1: ppm, or per cent where the sigma is 1 % or so."""
+    """Return a ratio minus 1 as text: in ppm, or in per cent if the sigma is 1 % or more."""
     coarse = sigma is not None and math.isfinite(sigma) and sigma >= 0.01
     factor, unit = (100.0, '%') if coarse else (1e6, 'ppm')
     return f'{with_sigma(ratio - 1, sigma, factor, signed=True)} {unit}'
 
 
 def share(relative: float) -> str:
-    """Return a relative sigma as people say it: ppm, or per cent from one on."""
+    """Return a relative sigma as text: ppm, or per cent from 1 % on."""
     return f'{two_digits(100 * relative)} %' if relative >= 0.01 else (
         f'{two_digits(1e6 * relative)} ppm')
 
@@ -87,7 +87,7 @@ def length(metres: float) -> str:
 
 
 def time_span(seconds: float) -> str:
-    """Return a duration as people say it."""
+    """Return a duration as text."""
     if seconds < 120:
         return f'{seconds:.1f} s'
     minutes, rest = divmod(round(seconds), 60)
@@ -112,7 +112,7 @@ def wrapped(text: str, indent: str = '  ', more: str = '  ', width: int = WIDTH)
 
 
 def known(estimates: dict[str, Estimate], name: str) -> Estimate:
-    """Return an estimate by name, with None in place of what is missing or no number."""
+    """Return an estimate by name, with None for missing or non-finite numbers."""
     found = estimates.get(name, NONE)
     value, sigma = (x if x is not None and math.isfinite(x) else None
                     for x in (found.value, found.sigma))
@@ -134,21 +134,21 @@ def inverse(scale: Estimate) -> str:
 
 
 def columns(rows: Sequence[Sequence[str]], indent: str = '  ') -> list[str]:
-    """Return a table with columns as wide as their widest cell, all cells to the left."""
+    """Return a table with columns as wide as their widest cell, left-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [indent + '  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)
                                ).rstrip() for row in rows]
 
 
 def table_row(cells: Sequence[str], widths: Sequence[int]) -> str:
-    """Return a line of a table of fixed widths: the name to the left, numbers to the right."""
+    """Return a line of a table of fixed widths: name left-aligned, numbers right-aligned."""
     name, *numbers = (f'{cell:{"<" if not k else ">"}{width}}' for k, (cell, width) in enumerate(
         zip(cells, widths, strict=True)))
     return f'  {name}{"".join(numbers)}'
 
 
 def shared(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
-    """Return reasons with those of several legs joined that differ in nothing but the leg."""
+    """Return reasons; those of several legs that differ only in the leg are joined."""
     joined: dict[tuple[Any, ...], list[str]] = {}
     for reason in reasons:
         match = OF_LEG.fullmatch(reason.text)
@@ -161,7 +161,7 @@ def shared(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
 
 
 def _of_legs(found: list[tuple[Reason, list[str]]]) -> list[Reason]:
-    """Return the reasons of a code with their legs; of many that differ, the first one."""
+    """Return the reasons of a code with their legs; of many different ones, the first."""
     if not found[0][1][0]:
         return [found[0][0]]
     few = 2    # reasons of a code that differ from leg to leg, listed one by one
@@ -175,7 +175,7 @@ def _of_legs(found: list[tuple[Reason, list[str]]]) -> list[Reason]:
 
 
 def _legs(numbers: list[str]) -> str:
-    """Return leg numbers, rising, as people say them."""
+    """Return increasing leg numbers as text."""
     if len(numbers) == 1:
         return f'leg {numbers[0]}'
     runs: list[list[str]] = []
@@ -200,7 +200,7 @@ def bag_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
 
 
 def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool = False) -> list[str]:
-    """Return reasons with their remedies for a terminal; brief: of notes the codes alone."""
+    """Return reasons with their remedies for a terminal; brief: only the codes of notes."""
     lines = []
     for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'warnings'),
                            (Verdict.ACCEPTED, 'notes')):
@@ -227,7 +227,7 @@ def accept_line(calibration: Calibration, acceptance: Acceptance, config: Config
 
 
 def accept_words(acceptance: Acceptance) -> list[str]:
-    """Return the decision, a line on each value, and what to do where it is open."""
+    """Return the decision, a line on each value, the cause and the action."""
     lines = [acceptance.decision.value, *(f'  {_value(held)}' for held in acceptance.values)]
     if acceptance.why:
         lines.append(f'  {acceptance.why}')

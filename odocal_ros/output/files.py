@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Result files: calibration.json (schema 1) and what other programs load."""
+"""Result files: calibration.json (schema 1) and files for other programs."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ from odocal_ros.settings.config import Config, flat
 
 SCHEMA = 1    # format: version of calibration.json
 MAIN = 'calibration.json'
-# what every result names, determined or not; a scale's unit is known only with its data
+# values in every result, determined or not; a scale's unit is known only with its data
 ALWAYS = {'scale_factor': None, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
           'pitch_mounting_angle': 'rad'}
 
@@ -34,10 +34,10 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
     """
     Return the content of calibration.json.
 
-    calibration : the combination of all legs.   config : settings it was made with.   inputs : one
-    a bag: its name, sha256 and topics.   created : ISO 8601 date and time.
+    calibration : the combination of all legs.   config : its settings.   inputs : name, sha256
+    and topics of each bag.   created : ISO 8601 date and time.
 
-    Returns plain dicts and lists, no NaN: a number that does not exist is None.
+    Returns plain dicts and lists, no NaN: a missing number is None.
     """
     result: dict[str, Any] = {name: {'value': None, 'sigma': None, 'unit': unit, 'method': None}
                     for name, unit in ALWAYS.items()}
@@ -54,7 +54,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
         left['acceptance'] = acceptance.as_dict()
     if calibration.carried:
         from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO
-        imu_keeps = 0.1    # of their prior: changes by temperature and time
+        imu_keeps = 0.1    # of their prior sigma: change by temperature and time
         left['imu'] = calibration.carried.only(
             (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_keeps).as_dict()
         if config.leg.automatic:
@@ -109,7 +109,7 @@ def _per_distance(legs: list[LegResult] | tuple[LegResult, ...]) -> list[dict[st
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON knows it: no numpy, no tuples, None for what is not finite."""
+    """Return a value in JSON types: no numpy, no tuples, None for non-finite numbers."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -129,8 +129,8 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
 
     ``tell`` receives a sentence if the report cannot be drawn.
 
-    Raises BadUsage: there is a calibration.json and no ``force``, or the folder cannot be written.
-    Raises KeyboardInterrupt: saying what was written, where something was.
+    Raises BadUsage: a calibration.json exists and no ``force``, or the folder is not writable.
+    Raises KeyboardInterrupt: its text names the written results, if any.
     """
     results = Results(calibration, config, directory, inputs, created)
     with results.said_when_interrupted():
@@ -142,9 +142,9 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
 
 class Results:
     """
-    The files of a calibration to be written to a folder, which is replaced as a whole.
+    The result files of a calibration, in a folder that is replaced as a whole.
 
-    The report takes seconds to draw: it is added, and the numbers do not wait for it.
+    The report takes seconds to draw: it is added after the other files.
     """
 
     def __init__(self, calibration: Calibration, config: Config, directory: Path,
@@ -184,7 +184,7 @@ class Results:
 
     @contextmanager
     def said_when_interrupted(self) -> Iterator[None]:
-        """Have an interruption say what it has left, where results were written."""
+        """Let an interruption name the written results, if any."""
         try:
             yield
         except KeyboardInterrupt:

@@ -4,9 +4,9 @@
 """
 A result folder: replaced as a whole, so that it never mixes two calibrations.
 
-Files are written into a sibling, and one rename puts it in the place of the folder. Where that
-cannot be (a mount, a folder that holds other things too), files are replaced one by one, the
-main file taken away first and put there last: it vouches for the others.
+Files are written into a sibling folder, which replaces the folder by one rename. If that is
+impossible (a mount, a folder with other files), files are replaced one by one. The main file,
+which marks a complete result, is removed first and written last.
 """
 
 from collections.abc import Iterator, Mapping
@@ -30,15 +30,15 @@ LEFT = re.compile(rf'\.(?P<place>.+)\.[0-9a-f]{{32}}\{PART}(?P<aside>\{ASIDE})?'
 
 class ResultFolder:
     """
-    The folder at a place.
+    A result folder.
 
-    main : the file that makes a folder a result.   ours : all that a result may have.
+    main : the file that marks a result.   ours : names of all possible files of a result.
     """
 
     def __init__(self, place: Path, main: str, ours: frozenset[str]) -> None:
         self.place = Path(os.path.realpath(place))
         self._main, self._ours = main, ours
-        self._main_file: tuple[Any, ...] = ()       # which file the one put there is
+        self._main_file: tuple[Any, ...] = ()       # identity of the written main file
 
     @property
     def written(self) -> bool:
@@ -49,9 +49,9 @@ class ResultFolder:
 
     def put(self, texts: Mapping[str, str], force: bool) -> None:
         """
-        Put a result there, or leave all as it was.
+        Write a result, or leave everything unchanged.
 
-        Raises BadUsage: there is one and no ``force``. Raises OSError: it cannot be written.
+        Raises BadUsage: a result exists and no ``force``. Raises OSError: it cannot be written.
         """
         self.place.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -66,7 +66,7 @@ class ResultFolder:
             self._file_by_file(new, texts, force)
 
     def add(self, name: str, text: str) -> bool:
-        """Add a file to what was put there; return False where another result has come since."""
+        """Add a file to the written result; return False if another result has replaced it."""
         with locked(self.place.parent):
             if self.written:
                 write_text(self.place / name, text)
@@ -74,13 +74,13 @@ class ResultFolder:
 
     @contextmanager
     def _sibling(self, parent: Path, texts: Mapping[str, str]) -> Iterator[Path]:
-        """Make a folder with the files; what is left of it after the block is removed."""
+        """Make a folder with the files; its remains are removed after the block."""
         new = parent / f'.{self.place.name}.{uuid.uuid4().hex}{PART}'
         with locked(self.place.parent):
             self._clear(parent)
             disk(os.mkdir, new)
             held = ExitStack()
-            held.enter_context(locked(new))     # before anybody may clear it away
+            held.enter_context(locked(new))     # before others may clear it away
         with held:
             try:
                 for name, text in texts.items():
@@ -92,7 +92,7 @@ class ResultFolder:
                 shutil.rmtree(new, ignore_errors=True)
 
     def _clear(self, parent: Path) -> None:
-        """Clear away what others were killed at; those at work hold theirs."""
+        """Remove or restore folders of killed writers; active writers lock theirs."""
         found = [(parent / name, LEFT.fullmatch(name)) for name in os.listdir(parent)]
         for one, left in ((one, left) for one, left in found if left):
             with suppress(OSError), locked(one, wait=False) as held:
@@ -149,7 +149,7 @@ def _swap(one: Path, other: Path) -> None:
         if rename(at_fdcwd, names[0], at_fdcwd, names[1], rename_exchange) == 0:
             return
         code = ctypes.get_errno()
-        if code not in (errno.EINVAL, errno.ENOSYS):      # a file system that cannot
+        if code not in (errno.EINVAL, errno.ENOSYS):      # not supported by the file system
             raise OSError(code, os.strerror(code), str(other))
     aside = one.with_name(f'{one.name}{ASIDE}')
     os.rename(other, aside)

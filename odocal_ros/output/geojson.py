@@ -19,7 +19,7 @@ from odocal_ros.output.summary import sentence
 from odocal_ros.settings.config import Config
 
 TRACK = 'track.geojson'
-MOST = 5000          # judgement: points of a feature: maps draw no more
+MOST = 5000          # judgement: points of a feature: maps do not show more
 ABOUT = ('For QGIS, Foxglove, geojson.io and other maps. corrected: dead reckoning with the '
          'calibrated values; as_configured: with the previous values; fixes: of the receiver; '
          'both tracks start at the start mark')
@@ -27,8 +27,8 @@ PLACES = 8     # judgement: 1e-8 deg: 1 mm
 
 
 def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
-    """Return the file by name, nothing when no leg has a track."""
-    most_of_all = 150_000    # of a file: it stays small however many legs there are
+    """Return file name -> text, empty if no leg has a track."""
+    most_of_all = 150_000    # points of a file: it stays small with many legs
     most = max(2, min(MOST, most_of_all // (3 * max(1, len(calibration.legs)))))
     shapes = [feature for n, leg in enumerate(calibration.legs, 1)
               for feature in features(n, leg, most)]
@@ -106,7 +106,7 @@ def _line(positions: Floats) -> dict[str, Any]:
 
 
 def _crossing(before: Floats, after: Floats) -> tuple[list[list[float]], list[list[float]]]:
-    """Return the point on the 180th meridian between two points, as seen from either side."""
+    """Return the point on the 180th meridian between two points, for either side."""
     side = 180.0 if before[0] > 0 else -180.0
     beyond = after[0] + 2 * side
     share = (side - before[0]) / (beyond - before[0])

@@ -26,12 +26,12 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
     """
     Draw a leg.
 
-    found : of the leg.   name : put before the ids of each figure.   scale_sigma : relative sigma
-    of the leg's scale: the band about zero of the sections.   before_word : what the track before
-    the correction rests on.   smoothed : details of the smoother: slips, and biases at its
+    found : of the leg.   name : prefix of the ids of each figure.   scale_sigma : relative sigma
+    of the leg's scale: the band about zero of the sections.   before_word : label of the track
+    before the correction.   smoothed : details of the smoother: slips, and biases at its
     keyframes.
 
-    Returns (title, what it shows, svg element) of each figure; to be called under
+    Returns (title, description, svg element) of each figure; to be called under
     ``drawing.look``.
     """
     if not len(found.t):
@@ -93,7 +93,7 @@ def _track(found: Evidence, name: str, before_word: str,
 
 def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
            slips: list[dict[str, float]] | tuple[Any, ...]) -> None:
-    """Mark on the track what is odd: fixes not used, gaps, slips, and where the fit ends."""
+    """Mark unused fixes, gaps, slips and the end of the fit on the track."""
     few = found.t_excluded[drawing.evenly(len(found.t_excluded))]
     if len(few):
         ax.plot(*at(few), '.', color=drawing.GREY, markersize=3, zorder=4, label='fix not used')
@@ -107,7 +107,7 @@ def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
         ends = np.clip((begin, end), found.t[0], found.t[-1])
         ax.plot(*at(np.linspace(ends[0], ends[1], 50)), '-', color=PAUSE[label], linewidth=4,
                 alpha=0.6, zorder=1, solid_capstyle='butt', label=None if label in said else label)
-        if label != 'no fix used':       # some are short: the cut is seen by its ends
+        if label != 'no fix used':       # its ends also show short ones
             ax.plot(*at(ends), '|', color=PAUSE[label], markersize=12, markeredgewidth=2)
         said.add(label)
     if found.t_fit < found.t[-1]:
@@ -119,7 +119,7 @@ def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
 
 
 def draw_residuals(ax: Any, found: Evidence) -> None:
-    """Draw on axes dead reckoning less fix along and across, as calibrated."""
+    """Draw on axes dead reckoning minus fix along and across, as calibrated."""
     factor, unit = drawing.lengths(found.distance[-1])
     path_length = factor * found.fix_distance
     _band(ax, path_length, found.fix_sigma)
@@ -135,7 +135,7 @@ def _band(ax: Any, path_length: Floats, sigma: Floats) -> None:
     ax.fill_between(path_length[band], -sigma[band], sigma[band], color=drawing.BAND, linewidth=0,
                     label='± sigma of a fix')
     ax.axhline(0.0, color=drawing.GREY, linewidth=0.8)
-    for edge in (-sigma[band], sigma[band]):      # seen through noise that fills the band
+    for edge in (-sigma[band], sigma[band]):      # visible through noise in the band
         ax.plot(path_length[band], edge, '--', color='black', linewidth=0.6)
 
 

@@ -18,7 +18,7 @@ from odocal_ros.output.summary import ANGLES, DEG
 STYLES = (('o', drawing.BLUE), ('s', drawing.RED), ('^', drawing.GREEN), ('D', drawing.PINK),
           ('v', 'black'), ('P', drawing.GREY))
 MOST_LEGS = 40    # judgement: bars that are distinguishable in a picture
-# title, (text, method, value, sigma) of what has one, band of the result: middle and half width
+# title, (text, method, value, sigma) of each value, band of the result: middle and half width
 Panel = tuple[str, list[tuple[str, str, float, float]], tuple[float, float] | None]
 
 
@@ -29,7 +29,7 @@ def draw_by_speed(ax: Any, found: SpeedScale) -> None:
                 linewidth=1.1, label='fixes / odometer as sent, ± sigma')
     if found.factor and found.offset:
         v = np.linspace(speed.min(), speed.max(), 100)
-        # reference = factor * sent + offset, over what is sent
+        # reference = factor * odometer + offset, divided by the odometer
         fit = found.factor[0] * v / (v - found.offset[0])
         ax.plot(3.6 * v, fit, '-', color=drawing.RED, linewidth=1.2, label='fit')
         ax.axhline(found.factor[0], color=drawing.GREY, linewidth=0.8, linestyle='--',
@@ -51,7 +51,7 @@ def fit_text(found: SpeedScale) -> str:
 
 
 def by_speed(found: SpeedScale, name: str) -> drawing.Drawing:
-    """Return the figure of a leg: title, what it shows, svg element."""
+    """Return the figure of a leg: title, description, svg element."""
     figure, (ax,) = drawing.sheet(2.7)
     draw_by_speed(ax, found)
     drawing.key(figure, ax)
@@ -80,7 +80,7 @@ def by_window(found: Floats, name: str) -> drawing.Drawing:
 
 
 def compared(calibration: Calibration, name: str) -> list[tuple[str, str, str]]:
-    """Draw scale, yaw and pitch by method and leg; empty where there is but one to show."""
+    """Draw scale, yaw and pitch by method and leg; empty for single values."""
     rows = [(f'all legs, {m.replace("_", " ")}', m, found.estimates)
             for m, found in calibration.methods.items()] if len(calibration.legs) > 1 else []
     for number, leg in list(enumerate(calibration.legs, 1))[-MOST_LEGS:]:

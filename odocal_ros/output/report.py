@@ -29,8 +29,8 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
     """
     Return the page of a calibration.
 
-    calibration : the combination of all legs; what a leg lacks (track, evidence) is left out.
-    config : settings it was made with.   content : of calibration.json, for bags and software.
+    calibration : the combination of all legs; missing parts (track, evidence) are left out.
+    config : its settings.   content : of calibration.json, for bags and software.
 
     Raises ImportError: matplotlib or jinja2 is missing.
     """
@@ -41,7 +41,7 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
         (folder / 'report.html').read_text(encoding='utf-8'))
     style = (folder / 'report.css').read_text(encoding='utf-8')
     legs, compared, missing = _drawn(calibration)
-    # the track stands beside the verdict, once
+    # the first track is next to the verdict only
     first = legs[0]['figures'][:1] if legs else []
     if first:
         legs[0]['figures'] = legs[0]['figures'][1:]
@@ -52,15 +52,15 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
 def report_or_why(calibration: Calibration, config: Config,
                   content: dict[str, Any]) -> tuple[str, str]:
     """
-    Return the page and why it could not be drawn, empty when it was.
+    Return the page and why it could not be drawn, empty if it could.
 
-    A picture must never cost a result: whatever goes wrong, the page says so instead.
+    A drawing error must not affect a result: the page states the error instead.
     """
     try:
         return report_html(calibration, config, content), ''
     except ImportError as error:
         why = f'{error.name or error} cannot be imported; install matplotlib and jinja2'
-    except Exception as error:     # noqa: BLE001 the numbers are written, whatever happens here
+    except Exception as error:     # noqa: BLE001 the numbers are written in any case
         why = f'{type(error).__name__}: {error}; please report it'
     return ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>No report</title>'
             f'</head><body><p>The report could not be drawn: {escape(why)}. All numbers are in '
@@ -91,7 +91,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
 
 
 def _why(reasons: tuple[Reason, ...]) -> Reason | None:
-    """Return the gravest reason that keeps a result from being accepted, the first of such."""
+    """Return the first of the gravest reasons against acceptance, those of a value first."""
     groups = grouped(reasons)
     if not groups or groups[0][0] == Verdict.ACCEPTED.value:
         return None
@@ -107,7 +107,7 @@ def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
 
 def _leading(methods: dict[str, MethodResult],
              estimates: dict[str, Estimate]) -> dict[str, MethodResult]:
-    """Return methods, those first that gave most of the result."""
+    """Return methods, those with most values of the result first."""
     given = Counter(e.method for e in estimates.values() if e.value is not None)
     return dict(sorted(methods.items(), key=lambda item: -given[item[0]]))
 
@@ -119,7 +119,7 @@ def _degrees(calibration: Calibration) -> str:
 
 
 def _made(created: str) -> str:
-    """Return a date as people write it, or as it is."""
+    """Return a date for people, unchanged if it cannot be parsed."""
     try:
         return f'{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC'
     except ValueError:
@@ -135,7 +135,7 @@ def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing
     """
     Return the content of each leg, the figure of all, and the legs without figures.
 
-    Of more legs than a page has room for, the newest have theirs.
+    If a page has no room for all legs, the newest have figures.
     """
     from odocal_ros.output.drawing import look
     from odocal_ros.output.plots import leg_figures
@@ -155,7 +155,7 @@ def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing
                 figures[number] = drawn
     legs = [_leg(number, leg, figures.get(number, []), several=len(numbered) > 1)
             for number, leg in numbered]
-    # one whose tracks were let go had some too
+    # legs whose tracks were dropped had figures, too
     had = [number for number, leg in numbered if leg.evidence is not None
            or leg.before is not None]
     return legs, together, [number for number in had if number not in figures]
@@ -179,7 +179,7 @@ def _leg(number: int, leg: LegResult, figures: list[Drawing],
 
 
 def _smoothed(leg: LegResult) -> dict[str, Any]:
-    """Return further smoother results of a leg besides its values, empty without it."""
+    """Return the details of the smoother for a leg, empty without it."""
     method = leg.methods.get('smoother')
     return method.details if method else {}
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The tables of the report as rows of text: values, methods, budget, what was left out, origin."""
+"""The tables of the report as rows of text: values, methods, budget, unused data, origin."""
 
 from collections import Counter
 import math
@@ -46,14 +46,14 @@ OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOP
 
 
 def label(name: str) -> str:
-    """Return the name of an estimate or a source as people say it."""
+    """Return the printed name of an estimate or a source."""
     if name in wheel_factors([name]):
         return f'scale factor, {name.removeprefix(FACTOR)} wheel'
     return LABELS.get(name, name.replace('_', ' '))
 
 
 def in_units(name: str, estimate: Estimate) -> tuple[str, str, str]:
-    """Return an estimate in its first unit, in another, and its relative sigma, as text."""
+    """Return an estimate in its main unit, in another, and its relative sigma, as text."""
     value, sigma, unit = estimate.value, estimate.sigma, estimate.unit
     if value is None:
         return LOST, '', ''
@@ -86,7 +86,7 @@ def value_rows(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def headline(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Return the four most important values: name, value, a second line."""
+    """Return the most important values, up to four: name, value, a second line."""
     found = []
     for name, words in (('scale_factor', 'scale factor'), ('yaw_mounting_angle', 'yaw mounting'),
                         ('pitch_mounting_angle', 'pitch mounting')):
@@ -102,10 +102,10 @@ def headline(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def undetermined(calibration: Calibration) -> list[str]:
-    """Return the values that were not determined, axes of one thing together."""
+    """Return the values that were not determined, axes of one quantity together."""
     axes: dict[str, list[str]] = {}
     for name in calibration.estimates:
-        # no nominal scale was given: nothing is missing
+        # without a nominal scale nothing is missing
         if known(calibration.estimates, name).value is None and name != 'scale_ratio':
             whole, _, axis = name.rpartition('_')
             one = axis in ('x', 'y', 'z')
@@ -121,9 +121,9 @@ def _largest(method: MethodResult | None, name: str) -> str:
 def method_table(methods: dict[str, MethodResult],
                  legs: tuple[LegResult, ...]) -> dict[str, Any] | None:
     """
-    Return any set of methods side by side: heads, verdicts, rows of (name, cells).
+    Return a table of methods: heads, verdicts, rows of (name, cells), reasons.
 
-    legs : those that the figures rest on.
+    legs : those of the values.
     """
     if not methods:
         return None
@@ -174,7 +174,7 @@ def _number(row: dict[str, Any], name: str) -> float:
 
 
 def _column(name: str, estimate: Estimate) -> tuple[str, float]:
-    """Return the head of a budget's column, and the factor on its numbers."""
+    """Return the head of a budget's column, and the factor of its numbers."""
     if name.startswith('scale'):
         return f'{label(name)}, ppm', 1e6 / abs(estimate.value or 1.0)
     if estimate.unit == 'rad':
@@ -185,7 +185,7 @@ def _column(name: str, estimate: Estimate) -> tuple[str, float]:
 
 
 def left_out(leg: LegResult) -> tuple[list[tuple[str, str]], list[Reason]]:
-    """Return fixes left out, counted by reason, and the findings about the leg's data."""
+    """Return the unused fixes, counted by reason, and the findings about the leg's data."""
     rows = []
     if leg.evidence is not None:
         seen = Counter(leg.evidence.excluded_because)
@@ -218,7 +218,7 @@ def _shown(value: Any) -> str:
 
 
 def full_digits(content: dict[str, Any]) -> list[tuple[str, str, str, str, str]]:
-    """Return each number of the result as calibration.json has it: name, value, sigma, ..."""
+    """Return each number of the result as in calibration.json: name, value, sigma, ..."""
     rows = []
     for name, entry in content['result'].items():
         if name in BESIDE:
@@ -233,7 +233,7 @@ def full_digits(content: dict[str, Any]) -> list[tuple[str, str, str, str, str]]
 
 
 def versions(software: str) -> list[tuple[str, str]]:
-    """Return the versions of what computed and drew."""
+    """Return the versions of the packages that compute and draw."""
     from importlib.metadata import PackageNotFoundError, version
     import platform
     found = [('odocal_ros', software.rpartition(' ')[2]), ('Python', platform.python_version())]

@@ -40,15 +40,15 @@ NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, CONTROLLERS, DEVICES, TRA
 # declared by the node for every drive; of one wheel they stay unknown
 TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width')
 AXES = 'xyz'
-IMU_FRAME = 'imu_link'      # REP-145, where nobody names one
+IMU_FRAME = 'imu_link'      # REP-145, by default
 
 
 def texts(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """
-    Return file texts by name for the formats asked.
+    Return file name -> text for the configured formats.
 
-    Files that a vehicle would act on are given only for values worth acting on: none when the
-    calibration is rejected, and each only if what it holds was determined.
+    Except calibration.yaml, files are for use on a vehicle: there are none for a rejected
+    calibration, and each only if its values are determined.
     """
     out: dict[str, str] = {}
     formats = config.output.formats
@@ -90,7 +90,7 @@ def _autoware(calibration: Calibration, config: Config, content: dict[str, Any])
 
 
 def _speed_factor(calibration: Calibration) -> float | None:
-    """Return the factor for speeds as they are sent; for pulses only with a nominal K0."""
+    """Return the factor for raw speeds; for pulses only with a nominal scale."""
     scale, ratio = (calibration.estimates.get(n) for n in ('scale_factor', 'scale_ratio'))
     if scale is not None and scale.unit == '1':
         return calibration.estimates.get('scale_factor_as_sent', scale).value
@@ -105,7 +105,7 @@ def _velocity_converter(factor: float, frame: str) -> str:
 
 
 def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
-    """Return the gyro bias in the IMU's own axes and unit as sent, (3,), None if unknown."""
+    """Return the gyro bias in the IMU's own axes and raw unit, (3,), None if unknown."""
     found = [calibration.estimates.get(f'gyro_bias_{axis}') for axis in AXES]
     bias = [e.value for e in found if e is not None and e.value is not None]
     C_bi = next((leg.C_bi for leg in calibration.legs if leg.C_bi is not None), None)
@@ -167,9 +167,9 @@ MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': contro
 
 def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibration, Config]:
     """
-    Return both with the IMU's frame in force.
+    Return both with the frame of the IMU set.
 
-    frame : of the IMU's headers, as somebody sent it; a note says if it is not used.
+    frame : untrusted frame_id of the IMU; a note states if it is replaced.
     """
     if config.frames.imu or not frame:
         return calibration, config

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reading calibration.json back, checked; whether a result is worse than the one before."""
+"""Checked reading of calibration.json; test whether a result is worse than the previous one."""
 
 from dataclasses import dataclass, field
 import json
@@ -18,14 +18,14 @@ from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, flat
 
 T = TypeVar('T')
-# what the IMU's constants are of
+# settings that identify the IMU of the constants
 SAME_IMU = ('imu.mounting_rpy', 'imu.gyro_scale', 'imu.accel_scale', 'imu.grade')
 
 
 @dataclass(frozen=True, eq=False)
 class Stored:
     """
-    A calibration as its file has it.
+    A calibration read from its file.
 
     budget : parameter to {source: (one-sigma share in the parameter's unit, shared by all legs)},
     of the method that gave the parameter. legs : (start, stop) ns. bags : sha256 of each known.
@@ -41,7 +41,7 @@ class Stored:
     config: dict[str, Any]
     budget: dict[str, dict[str, tuple[float, bool]]] = field(default_factory=dict)
     vehicle: str = ''
-    carried: Carried | None = None      # what it leaves for legs to come, with leg.automatic
+    carried: Carried | None = None      # information for later legs, with leg.automatic
     imu: Carried | None = None          # its information on the IMU
 
     @property
@@ -50,7 +50,7 @@ class Stored:
         return self.verdict is not Verdict.REJECTED
 
     def value(self, name: str) -> float | None:
-        """Return a value, None where it has none."""
+        """Return a value, None without one."""
         found = self.estimates.get(name)
         return None if found is None else found.value
 
@@ -85,7 +85,7 @@ def _no_constant(text: str) -> None:
 
 
 def stored_from(content: dict[str, Any], name: str) -> Stored:
-    """Return the calibration of the content of a calibration.json; ValueError where it is none."""
+    """Return the calibration in the content of a calibration.json, or raise ValueError."""
     if not isinstance(content, dict):
         raise ValueError('the top level is not an object')
     schema = content.get('schema')
@@ -155,7 +155,7 @@ def _estimate(entry: dict[str, Any], key: str) -> Estimate:
 
 
 def check_estimate(name: str, value: float | None, sigma: float | None) -> None:
-    """Raise ValueError where no calibration gives such a value, wherever it was kept."""
+    """Raise ValueError for a value that no calibration gives."""
     for part, number in (('value', value), ('sigma', sigma)):
         if number is not None and not math.isfinite(number):
             raise ValueError(f'result.{name}: its {part} is not finite')
@@ -179,7 +179,7 @@ def _number(value: float | None, what: str) -> float | None:
 
 def _shares(methods: dict[str, dict[str, Any]], method: str | None,
             parameter: str) -> dict[str, tuple[float, bool]]:
-    """Return the budget of a parameter; empty where the file has none that can be read."""
+    """Return the budget of a parameter; empty without a readable one."""
     entry = methods.get(method) if isinstance(method, str) else None
     budget = entry.get('budget') if isinstance(entry, dict) else None
     rows = budget.items() if isinstance(budget, dict) else ()
@@ -193,9 +193,9 @@ def is_worse(old: Stored, new: Stored) -> str:
     Return the objection to replacing an old calibration silently, empty without one.
 
     The old one is good unless rejected. The new one is worse when it is rejected, when it lacks a
-    value that the old one has, or gives it with a sigma more than twice as large. One that holds
-    all legs of the old one and more, or carries them on, knows better in any case: legs that
-    disagree widen a sigma, and the narrow one was wrong.
+    value that the old one has, or gives it with a sigma more than twice as large. A result with
+    all legs of the old one and more, or with its carried information, is never worse: legs that
+    disagree widen a sigma that was too small.
     """
     if not old.usable:
         return ''
@@ -227,14 +227,14 @@ def _worse(label: str, old: Estimate | None, new: Estimate | None) -> str:
 
 
 def said(estimate: Estimate) -> str:
-    """Return a value with sigma and unit as people read them; angles in deg."""
+    """Return a value with sigma and unit as text; angles in deg."""
     if estimate.unit == 'rad':
         return with_sigma(estimate.value, estimate.sigma, math.degrees(1.0), signed=True) + ' deg'
     return with_unit(estimate)
 
 
 def stored_in(folder: Path) -> Stored | None:
-    """Return the calibration in a result folder, None where there is none to lose."""
+    """Return the calibration in a result folder, None without a readable one."""
     try:
         return read_stored(folder)
     except BadUsage:

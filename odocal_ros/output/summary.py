@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A calibration in words: one screen for a terminal, one sentence for an answer."""
+"""A calibration as text: one screen for a terminal, one sentence for an answer."""
 
 from datetime import datetime, UTC
 import math
@@ -52,12 +52,12 @@ ORDER = list(Verdict)
 def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
            rows: int | None = None) -> str:
     """
-    Return everything a person needs to judge a calibration, as plain text.
+    Return the complete summary of a calibration as plain text.
 
     calibration : of all legs.   styled : the verdict in bold and in colour, for a terminal.
-    width : columns; below 98 what is said twice or is of less use is left out.   rows : lines
-    there are. Where they do not do, small errors, notes and the whole budget, in this order, are
-    left to the report: verdict, values and what to do are not.
+    width : columns; below 98 redundant or less useful parts are omitted.   rows : lines of the
+    screen. If they are too few, small errors, notes and the whole budget are omitted, in this
+    order; verdict, values and actions are not.
     """
     for small, notes, budget in ((True, True, True), (False, True, True), (False, False, True),
                                  (False, False, False)):
@@ -81,7 +81,7 @@ def sentence(calibration: Calibration) -> str:
 
 
 def values_in_words(estimates: dict[str, Estimate]) -> str:
-    """Return scale, angles and, where they are known, those of two wheels, with sigmas."""
+    """Return scale, angles and, if known, wheel factors and track width, with sigmas."""
     scale = known(estimates, 'scale_factor')
     parts = []
     if scale.value is None:
@@ -125,7 +125,7 @@ def _values(calibration: Calibration, width: int) -> list[str]:
     sent = known(estimates, AS_SENT)
     if sent.value is not None:
         lines.append(_line('  of speed as sent', _scale_text(sent)))
-    lines.append(_path_ratio(calibration, scale))
+    lines.append(_path_ratio(calibration, scale, sent))
     for name, word in _angles_of(estimates).items():
         lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name), width)))
     lines += _largest_errors(calibration, width)
@@ -155,12 +155,12 @@ def _values(calibration: Calibration, width: int) -> list[str]:
 
 
 def _angles_of(estimates: dict[str, Estimate]) -> dict[str, str]:
-    """Return the mounting angles that the method can have: the planar one has none."""
+    """Return the mounting angles that the method estimates: the planar one none."""
     return {} if known(estimates, 'scale_factor').method == PLANAR else ANGLES
 
 
 def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
-    """Return a line for each of more than two wheels, and what is in it: by name of estimate."""
+    """Return estimate -> line of its wheel, with '' for its position, for more than two wheels."""
     lines: dict[str, str] = {}
     for name in wheel_factors(estimates):
         wheel = name.removeprefix(FACTOR)
@@ -173,17 +173,18 @@ def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
     return lines
 
 
-def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
-    """Return the median ratio of fixes and odometer beside the scale factor, '' without one."""
+def _path_ratio(calibration: Calibration, scale: Estimate, sent: Estimate) -> str:
+    """Return the line that compares the path ratio of the legs with the factor it belongs to."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     way = sum(distance for _, distance in ratios)
-    if not scale.value or not way:
+    factor, word = (scale, 'scale factor') if sent.value is None else (sent, 'factor as sent')
+    if not factor.value or not way:
         return ''
     ratio = sum(r * distance for r, distance in ratios) / way
     unit = '' if scale.unit == '1' else f' {scale.unit}'
     plain = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'  # 4 digits
     return _line('  path ratio', f'{plain}{unit}   fixes / odometer, '
-                 f'{100 * (ratio / scale.value - 1):+.1f} % from the scale factor')
+                 f'{100 * (ratio / factor.value - 1):+.1f} % from the {word}')
 
 
 def _gyro_scale(calibration: Calibration) -> str:
@@ -250,7 +251,7 @@ def _leg_table(legs: tuple[LegResult, ...], width: int) -> list[str]:
 
 
 def _method_table(calibration: Calibration) -> list[str]:
-    """Return the methods side by side, nothing for one."""
+    """Return the table of methods, empty for a single one."""
     methods = calibration.methods
     if len(methods) < 2:
         return []

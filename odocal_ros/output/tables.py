@@ -38,7 +38,7 @@ LABEL, CELL = 22, 9      # judgement: columns
 
 
 def leg_table(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
-    """Return the file by name, nothing without legs."""
+    """Return file name -> text, empty without legs."""
     if not calibration.legs:
         return {}
     rows = [_row(n, leg, calibration) for n, leg in enumerate(calibration.legs, 1)]
@@ -50,7 +50,7 @@ def leg_table(calibration: Calibration, config: Config, content: dict[str, Any])
 
 
 def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any]:
-    """Return a row; what a leg does not know is an empty cell."""
+    """Return a row; missing values of a leg are empty cells."""
     giving = {e.method for e in calibration.estimates.values() if e.value is not None}
     reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
                                if m.name in giving or not giving)]
@@ -75,13 +75,13 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any
 
 
 def _estimate(leg: LegResult, calibration: Calibration, name: str) -> Estimate:
-    """Return a leg's value by the method whose value the calibration gives, else by its own."""
+    """Return a leg's value from the method of the calibration's value, else from its own."""
     method = leg.methods.get(calibration.estimates[name].method)
     return known(leg_estimates(leg) if method is None else method.estimates, name)
 
 
 def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
-    """Return a table of each leg's search, empty where there was none."""
+    """Return a table of each leg's search, empty without one."""
     lines = []
     for k, leg in enumerate(legs, 1):
         found = next((m.details['search'] for m in leg.methods.values()
@@ -106,12 +106,12 @@ def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
 
 def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
     """
-    Return the verdict of a method's figures, '(leg)' behind it where it is that of the leg.
+    Return the verdict of a method's values, followed by '(leg)' if it is that of the leg.
 
-    What is wrong with a leg's data is no method's reason, but touches each of them: a method that
-    found nothing to say of a dead wheel is no way round it.
+    Reasons on the data of a leg are not reasons of a method, but apply to each of them: a method
+    without reasons does not make the data of a dead wheel usable.
 
-    legs : those the figures rest on; of several that are good in part, the good ones count.
+    legs : those of the values; rejected ones count only if all are rejected.
     """
     twice = driven_twice([leg for leg in legs if verdict_of(leg.reasons) is not Verdict.REJECTED])
     of_data = [verdict_of(leg.reasons) for leg in legs if leg not in twice]
@@ -123,13 +123,13 @@ def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
 
 
 def leg_verdicts(legs: tuple[LegResult, ...]) -> list[str]:
-    """Return the verdict of each leg, 'not used' where it is good and an earlier one is used."""
+    """Return the verdict of each leg; 'not used' if an earlier good leg covers its time."""
     twice = driven_twice([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
     return ['not used' if leg in twice else leg.verdict.value for leg in legs]
 
 
 def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
-    """Return the largest source of an estimate's error, and its share of the variance; '' none."""
+    """Return the largest source of an estimate's error ('' if none), and its share of variance."""
     if method is None or name not in method.parameters:
         return '', 0.0
     row = method.parameters.index(name)
@@ -149,9 +149,9 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
     """
     Return the lines of a budget, none without one.
 
-    table : source to one-sigma share of each parameter, as calibration.json has it.   scale :
-    scale factor that its scale column belongs to.   shown : share of the variance below which a
-    source is but named.   hidden : parameters that are not determined: their column stays empty.
+    table : source to one-sigma share of each parameter, as in calibration.json.   scale : scale
+    factor of the scale column.   shown : share of the variance below which a source is only
+    named.   hidden : parameters that are not determined: their column stays empty.
     width : columns of the screen.   small_too : name the small ones.
     """
     if not table:
@@ -180,7 +180,7 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
 
 def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
     """
-    Return one check for many legs, each (check, fixes), None if there is none.
+    Return one check for many legs, each (check, fixes), None without one.
 
     rms and mean are pooled over fixes; max, end and percent are those of the worst leg.
     """
@@ -196,7 +196,7 @@ def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
 
 
 def in_pieces(legs: list[LegResult] | tuple[LegResult, ...]) -> list[PerDistance]:
-    """Return the error per distance driven of all legs, pooled over pieces."""
+    """Return the error per distance driven of all legs, pooled over sections."""
     found: dict[float, list[PerDistance]] = {}
     for one in (x for leg in legs for x in leg.per_distance):
         found.setdefault(one.length, []).append(one)
@@ -233,7 +233,7 @@ def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str,
 
 
 def track_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
-    """Return the table of dead reckoning against the fixes, as wide as there is room."""
+    """Return the table of dead reckoning against the fixes, limited to the width."""
     heads, rows = check_table(legs)
     if not rows:
         return []

@@ -1,4 +1,4 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Data from outside (names, YAML, sizes), and files for others."""
+"""Untrusted input (names, YAML, sizes), and files for other programs."""

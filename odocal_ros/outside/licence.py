@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Licence(NamedTuple):
-    """A licence as ament_copyright compares it with comments; the braces are the copyright."""
+    """A licence in the form of ament_copyright; the braces are the copyright line."""
 
     name: str
     file_headers: list[str]

@@ -12,19 +12,19 @@ from typing import Any
 
 from odocal_ros.errors import BadBag
 
-RAISE = 'ODOCAL_LIMITS'      # environment: a factor on all of them
+RAISE = 'ODOCAL_LIMITS'      # environment variable: factor of all limits
 DEFINITION = 2**16           # judgement: characters of a message definition
 MESSAGE = 2**26              # judgement: bytes of one requested message
 ELEMENTS = 100_000           # judgement: values in the fixed arrays of one message
 SECONDS = 20                 # judgement: to understand a definition
-# judgement: bytes given to a decompressor at first: after each frame, of which there may be one in
-# 9 bytes, what is left of them is copied
+# judgement: bytes first given to a decompressor: after each frame, possibly one in 9 bytes, the
+# rest of them is copied
 LEAST_PIECE = 2**10
-LATEST_NS = 2**62            # judgement: the year 2116: a later time of a message is none
+LATEST_NS = 2**62            # judgement: the year 2116: a later time is invalid
 
 
 class LimitReached(BadBag):
-    """A file asks for more than its size can explain."""
+    """A file needs more than its size can explain."""
 
 
 class Damaged(Exception):
@@ -32,7 +32,7 @@ class Damaged(Exception):
 
 
 def factor() -> float:
-    """Return by how much the user raises the limits, 1 unasked."""
+    """Return the user's factor of all limits, 1 by default."""
     try:
         return max(float(os.environ.get(RAISE, '')), 1.0)
     except ValueError:
@@ -49,7 +49,7 @@ def check(amount: float, limit: float, what: str, unit: str = 'bytes') -> None:
 
 class Allowance:
     """
-    Bytes that a file of a bag may unpack to in one pass.
+    Number of bytes that a file of a bag may decompress to in one pass.
 
     path : of the file as recorded.   total : bytes of all files of its bag.
     """
@@ -57,8 +57,8 @@ class Allowance:
     def __init__(self, path: Path, total: int) -> None:
         packed = path.stat().st_size
         self._what = f'{path}: unpacked, it'
-        unpacked = 2**26    # bytes that a bag may always unpack to
-        ratio = 40    # more for each of its own; sensors' messages pack to a tenth
+        unpacked = 2**26    # bytes that a bag may always decompress to
+        ratio = 40    # more for each byte of the file; sensor messages compress to a tenth
         self.most = int(unpacked * packed / max(total, packed, 1) + ratio * packed)
         self._used = 0
 
@@ -67,12 +67,12 @@ class Allowance:
         self._used = 0
 
     def take(self, count: int) -> None:
-        """Count bytes that came out; raise LimitReached beyond what is allowed."""
+        """Count decompressed bytes; raise LimitReached above the limit."""
         self._used += count
         check(self._used, self.most, self._what)
 
     def check_frames(self, frames: int, packed: int) -> None:
-        """Raise LimitReached for implausibly many frames in so many bytes."""
+        """Raise LimitReached for implausibly many frames in ``packed`` bytes."""
         few, bytes_a_frame = 1000, 1024
         check(frames, few + packed / bytes_a_frame, self._what, 'frames')
 
@@ -86,8 +86,8 @@ class Allowance:
         """
         Return decompressed data, up to the end of a truncated stream.
 
-        packing : '', 'zstd', 'lz4' or 'bz2'.   size : bytes that it is said to be, if it is.
-        Raises LimitReached, or what the decompressor raises on damage.
+        packing : '', 'zstd', 'lz4' or 'bz2'.   size : stated number of bytes, if any.
+        Raises LimitReached, or an error of the decompressor for damaged data.
         """
         most = self.left if size is None else min(size, self.left)
         if not packing:
@@ -127,7 +127,7 @@ def opener(packing: str) -> Any:
 @cache
 def zstd_module() -> ModuleType:
     """Return the zstd module that rosbags uses: the standard library's from Python 3.14 on."""
-    from importlib import import_module  # a module that is not there is looked for each time
+    from importlib import import_module  # a missing module is searched for each time
     try:
         return import_module('compression.zstd')
     except ModuleNotFoundError:

@@ -18,7 +18,7 @@ import threading
 from typing import Any, BinaryIO
 
 MOST_SAME_NAME = 1000             # judgement: folders of one name
-PART = '.part'                # of files being written: no ending that a result's or a bag's have
+PART = '.part'                # of files being written: not an ending of results or bags
 
 
 class Disk:

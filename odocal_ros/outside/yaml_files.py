@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""YAML: values of parameter files as every reader types them; trees from outside, with limits."""
+"""YAML: values of the same type for every reader; untrusted trees, with limits."""
 
 from collections.abc import Mapping
 from datetime import datetime, UTC
@@ -17,7 +17,7 @@ NODES = 30_000      # judgement: mappings, lists and values of a text: some seco
 
 
 def value_text(value: object) -> str:
-    """Return a value to its last bit; text in quotes, so that a joint may be named 0 or on."""
+    """Return a value as YAML in full; text in quotes, so that a joint may be named 0 or on."""
     if value is None or isinstance(value, float):
         return number(value)
     if isinstance(value, (tuple, list)):
@@ -31,7 +31,7 @@ def value_text(value: object) -> str:
 
 
 def number(value: float | None) -> str:
-    """Return a double as YAML that every reader types as one: 1e-05 is text to YAML 1.1."""
+    """Return a double as YAML that is a double for every reader: 1e-05 is text in YAML 1.1."""
     if value is None or not math.isfinite(value):
         return '.nan'
     text = repr(float(value))
@@ -41,9 +41,9 @@ def number(value: float | None) -> str:
 
 def no_date(iso: str) -> str:
     """
-    Return a date and time, UTC, as text that YAML takes for text even without its quotes.
+    Return a date and time, UTC, as text that YAML reads as text even without quotes.
 
-    ros2 param load reads each value twice, and a date it cannot set.
+    ros2 param load reads each value twice, and cannot set a date.
     """
     return f'{datetime.fromisoformat(iso).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC'
 
@@ -61,7 +61,7 @@ def _lines(values: Mapping[str, Any], indent: int) -> str:
 
 @cache
 def loader(aliases: bool = False) -> Any:
-    """Return a safe loader that refuses what is nested too deep, and ``*links`` unless asked."""
+    """Return a safe loader that refuses deep nesting, and ``*links`` unless ``aliases``."""
     import yaml
 
     class Plain(yaml.SafeLoader):       # type: ignore[misc]  # PyYAML has no types here

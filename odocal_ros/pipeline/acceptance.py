@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Pass or fail of a calibration against limits, as at the end of a production line.
+Comparison of a calibration with limits, as at the end of a production line: pass or fail.
 
-A value passes if its two-sigma interval lies within its limits, and fails if all of it lies
-outside; else it is undecided, and more must be driven. With a correct sigma a vehicle on a limit
-or beyond passes in at most 2.3 % of all cases, and one within its limits fails in no more
+A value passes if its two-sigma interval is within its limits, and fails if all of it is outside;
+otherwise it is undecided, and more must be driven. With a correct sigma a vehicle on a limit or
+beyond passes in at most 2.3 % of all cases, and one within its limits fails at most as often
 (docs/fleet.md).
 """
 
@@ -28,7 +28,7 @@ DRIVE_MORE = {'scale_factor': Code.SCALE_SIGMA_TOO_LARGE, 'scale_ratio':
 
 
 class Decision(Enum):
-    """Whether a vehicle passes, the best first."""
+    """Decision on a vehicle, the best first."""
 
     PASS = 'PASS'
     UNDECIDED = 'UNDECIDED'
@@ -109,7 +109,7 @@ def hold(name: str, found: Estimate, low: float, high: float) -> Held:
     value, sigma = found.value, found.sigma
     if value is None or sigma is None:
         return Held(name, found, low, high, Decision.UNDECIDED)
-    if found.unit == 'rad':      # half a turn from the limits is the same on either side
+    if found.unit == 'rad':      # wrapped to within half a turn of the limits
         middle = low if math.isinf(high) else high if math.isinf(low) else (low + high) / 2
         value = middle + float(wrap(value - middle))
     room = min(value - low, high - value)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Alignment of a leg: which standstill, which heading source."""
+"""Alignment of a leg: choice of the standstill and of the heading source."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -35,9 +35,9 @@ from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_as_seen, grade_of, with_turn_on_level
 
-FEWEST_AT_REST = 20     # statistical: IMU rows, a sigma by 20 is good to 16 %
+FEWEST_AT_REST = 20     # statistical: IMU rows, a sigma by 20 has an error of 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])
-Found = tuple[tuple[float, float] | None, str]      # yaw and sigma, rad; or None and why
+Found = tuple[tuple[float, float] | None, str]      # yaw, sigma, rad, ''; or None and the reason
 
 
 def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats, origin: Origin,
@@ -45,8 +45,8 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     """
     Return the alignment of a leg, and reasons.
 
-    inputs : screened leg.   spans : (k, 2) standstills, s.   metres_per_unit : rough scale.
-    fixes_n : (n, 3) fixes in n, m.   origin : where n is fixed.   config : heading source, grade.
+    inputs : screened leg.   spans : (k, 2) standstills, s.   metres_per_unit : approximate scale.
+    fixes_n : (n, 3) fixes in n, m.   origin : of n.   config : heading source, grade.
     """
     span = choose_standstill(spans)
     noise = {} if span is None else _noise_at_rest(inputs, span)
@@ -69,7 +69,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
 def with_seen_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
                    epochs: tuple[Floats, Floats], earth_rate_n: Floats) -> Alignment:
     """
-    Return an alignment whose gyro bias walks no less than later standstills show.
+    Return an alignment whose gyro bias walk is at least that observed at later standstills.
 
     A gyro warms up. spans : (k, 2) standstills, s.   epochs : attitude, t (m,) s and q_nb (m, 4).
     """
@@ -88,7 +88,7 @@ def with_seen_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
 
 
 def choose_standstill(spans: Iterable[Span]) -> Span | None:
-    """Return the standstill that holds or last ended before the start mark (t = 0), or None."""
+    """Return the last standstill that begins at or before the start mark (t = 0), or None."""
     before = [s for s in spans if s[0] <= 0.5]
     return before[-1] if before else None
 
@@ -96,9 +96,9 @@ def choose_standstill(spans: Iterable[Span]) -> Span | None:
 def _from_place(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes_n: Floats,
                 origin: Origin) -> Floats:
     """
-    Return C_np of the place of a standstill: east, north and up differ from those at the origin.
+    Return C_np at the position of a standstill, where east, north and up differ from the origin's.
 
-    They turn by 0.16 mrad per kilometre of path from there to the mark.
+    They rotate by 0.16 mrad per kilometre between the two.
     """
     if span is None or not len(fixes_n):
         return np.eye(3)
@@ -133,7 +133,7 @@ def _level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude
 
 
 def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
-    """Return a caution if the gyro at rest is far noisier than its grade: so are its walks."""
+    """Return a caution if the gyro noise at rest is far above its grade; so is its bias walk."""
     times = noise / max(grade.gyro_noise, 1e-12)
     noisier_at_rest = 10.0    # times the noise of the grade at rest: another gyro, or another unit
     if times <= noisier_at_rest:
@@ -156,7 +156,7 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
 
 def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
              config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
-    """Return yaw of L's x axis, sigma, source, shared, reasons; a course has no yaw yet."""
+    """Return yaw of L's x axis, sigma, source, shared, reasons; a course's yaw is set later."""
     asked = config.alignment.heading_source
     order = [asked] if asked != 'auto' else ['heading_topic', 'imu_orientation', 'gyrocompass']
     if asked == 'auto' and not np.isnan(config.alignment.heading):
@@ -215,9 +215,9 @@ def _heading_topic(inputs: Inputs, level: Level, latitude: float, grade: Grade,
 
 def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, config: Config,
                       to_b: Callable[[Floats], Floats], offset: float) -> Found:
-    """Return (yaw, sigma) at the level's epoch from orientations as sent, or None and why."""
-    heading_reach = 0.5    # s: a heading sample this near to a moving start is taken
-    # of hours only the rows that are looked at
+    """Return (yaw, sigma) at the level's epoch from published orientations, or None, reason."""
+    heading_reach = 0.5    # s, largest distance of a heading sample from a start in motion
+    # only the rows that are used, of possibly hours
     begin, end = level.standstill or (level.t - heading_reach, level.t + heading_reach)
     near = slice(np.searchsorted(t, begin), np.searchsorted(t, end, side='right'))
     t, q, variance = t[near], q[near], variance[near]
@@ -247,7 +247,7 @@ def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
         return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) causes a '
                       f'heading uncertainty of {np.rad2deg(min(sigma, np.pi)):.1f} deg')
     off = off_the_earth(level, latitude, grade)
-    no_earth_sigmas = 4.0    # sigmas: a gyro with such a bias is no compass
+    no_earth_sigmas = 4.0    # sigmas: with a larger bias there is no gyrocompass
     if off > no_earth_sigmas:
         return None, (f'the turn rate at rest differs from the Earth rate by {off:.0f} sigma: '
                       f'the gyro bias exceeds the {config.imu.grade} grade')
@@ -260,7 +260,7 @@ SOURCES = {'fixed': _fixed, 'imu_orientation': _imu_orientation, 'heading_topic'
 
 def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Floats, origin: Origin,
             grade: Grade) -> tuple[float, float, tuple[Reason, ...]]:
-    """Return the yaw that turns the first 30 m of track onto the fixes, its sigma, reasons."""
+    """Return the yaw that rotates the first 30 m of track onto the fixes, its sigma, reasons."""
     trial = complete(level, 0.0, np.pi, 'course', True, origin, grade, 0.0)
     course_time = 300.0    # s within which the path for a course must be driven
     pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + course_time)

@@ -6,8 +6,8 @@ Start and end of automatic legs (``leg.automatic``): one search for node and rep
 
 It only uses the stamps of the rows, so that a recording gives the legs of the node. A leg begins
 where the vehicle starts to move, and ends at the first standstill after half of
-``leg.automatic_minutes``, at any long one, or when the minutes are over, in motion: then the next
-one begins where it ended. A gap of the IMU that would reject a leg lies between two legs.
+``leg.automatic_minutes``, at any long one, or after these minutes, in motion: then the next one
+begins at its end. A gap of the IMU that would reject a leg separates two legs.
 """
 
 from collections import deque
@@ -26,7 +26,7 @@ from odocal_ros.screening.odometer_care import Steps
 from odocal_ros.settings.config import Config
 
 SECOND = 10**9    # definition: ns
-LEG_END_REST_NS = 10 * SECOND    # judgement: standstill that ends a leg, for place and biases
+LEG_END_REST_NS = 10 * SECOND    # judgement: standstill that ends a leg, for position and biases
 PARKED_NS = 120 * SECOND         # judgement: a longer standstill ends a leg of any length
 STOOD_NS = 1 * SECOND            # judgement: standstill before the first count of a start
 
@@ -41,10 +41,10 @@ class Span:
 
 class LegSearch:
     """
-    Finds legs in rows as they arrive; ``spans`` holds them, the open one last.
+    Search for legs in rows as they arrive; found legs are in ``spans``, the open one last.
 
-    The rows of the odometer decide, once there are later rows of the IMU. The division into blocks
-    has no effect.
+    Rows of the odometer are evaluated once there are later rows of the IMU. The division into
+    blocks has no effect.
     """
 
     def __init__(self, config: Config) -> None:
@@ -63,7 +63,7 @@ class LegSearch:
         self._gaps: deque[tuple[int, int]] = deque()         # of the IMU: both edges
         self._imu_ns = 0
         self._travel = 0.0
-        self._anchor: tuple[int, float] | None = None        # where it moved last
+        self._anchor: tuple[int, float] | None = None        # of the last motion
         self._newest_ns = self._from_ns = 0
         self._needs_rest = False
 
@@ -73,7 +73,7 @@ class LegSearch:
         return self.spans[-1] if self.spans and not self.spans[-1].stop_ns else None
 
     def feed(self, slot: str, block: Samples, form: OdometerForm | None = None) -> None:
-        """Take rows as recorded; those of the odometer are ignored without form."""
+        """Add unscreened rows; those of the odometer are ignored without form."""
         if slot not in self._first_ns or not len(block.stamp_ns):
             return
         self._first_ns[slot] = self._first_ns[slot] or int(block.stamp_ns[0])
@@ -91,9 +91,9 @@ class LegSearch:
 
     def begin_anew(self, after_ns: int, at_rest: bool) -> None:
         """
-        Remove the legs: the next begins after a stamp.
+        Remove the legs; the next one begins after a stamp.
 
-        at_rest : at the next start from a standstill, else as soon as the vehicle moves.
+        at_rest : at the next start from a standstill, otherwise as soon as the vehicle moves.
         """
         self.spans.clear()
         self._from_ns, self._needs_rest = after_ns, at_rest
@@ -105,7 +105,7 @@ class LegSearch:
         self._imu_ns = int(known.max())
 
     def _decide(self) -> None:
-        """Go through the rows that the IMU has passed."""
+        """Evaluate the odometer rows up to the newest IMU row."""
         if not all(self._first_ns.values()):
             return
         first_ns = max(self._first_ns.values())
@@ -172,7 +172,7 @@ def refusal(result: LegResult) -> Reason | None:
 
 def fold(legs: Iterable[LegResult], config: Config,
          carried: Carried | None = None) -> Carried | None:
-    """Return the carried information including some legs, by time."""
+    """Return the carried information with legs added, in order of time."""
     for leg in legs:
         carried = combine([leg], config, carried).carried or carried
     return carried

@@ -4,8 +4,8 @@
 """
 Errors that no method models (coarse speeds, slow wheel slip, unknown slopes), and delays.
 
-Errors of the scale go into the sigmas and the budget of a method, delays into a note with the
-setting that corrects them.
+Errors of the scale are added to the sigmas and the budget of a method; delays are reported with
+the setting that corrects them.
 """
 
 from collections.abc import Mapping
@@ -30,8 +30,8 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
     """
     Return a method's result with an error in the sigmas of its scales.
 
-    method, prepared : the result, and the leg.   name : of the source.   relative : 1 sigma of
-    each of SCALES, relative; of a wheel by default that of the scale factor.   shared : the same
+    method, prepared : the result, and the leg.   name : of the source.   relative : relative
+    1 sigma of each of SCALES; for a wheel by default that of the scale factor.   shared : the same
     in every leg of the vehicle.
     """
     relative = dict.fromkeys(wheel_factors(method.estimates),
@@ -58,27 +58,27 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
 
 def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """
-    Return a method's result with the change of one wheel in its sigmas, or as it was.
+    Return a method's result with the change of one wheel, if any, in its sigmas.
 
-    If a wheel slips from some moment on, or loses air, the estimated scale lies between those
+    If a wheel starts to slip continuously, or loses air, the estimated scale is between those
     before and after; the fixes do not determine which of them is the vehicle's.
     """
     change = abs(prepared.wheel_slips.change)
     if not change:
         return method
-    # halves of the path half the change apart in the mean of two wheels: the mean is a quarter off
+    # the mean of ``count`` wheels changes by change / count: the estimate is off by half of it
     mean, own = change / 2 / prepared.wheel_slips.count, change / 2
     return with_scale_error(method, prepared, 'slow_wheel_slip', dict.fromkeys(SCALES, mean)
                             | dict.fromkeys(wheel_factors(method.estimates), own))
 
 
 def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
-    """Return a result; without an accelerometer with the error of hills and no angles."""
+    """Return a result; without an accelerometer with the error of hills and without pitch."""
     if prepared.inputs.has_accelerometer:
         return method
     hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a path longer
     method = with_scale_error(method, prepared, 'hills', dict.fromkeys(SCALES, hills))
-    # what NO_ACCELEROMETER says of the angles, with another remedy
+    # reported by NO_ACCELEROMETER, with another remedy
     said = {Code.PITCH_NOT_DETERMINED} | (
         set() if prepared.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
     return replace(
@@ -89,10 +89,10 @@ def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
 
 def half_step(inputs: Inputs) -> float:
     """
-    Return half a step of the speed relative to the path length, 0.0 without steps.
+    Return half a step of the speed relative to the mean speed, 0.0 without steps.
 
-    On average, speeds are too low by it if the sender truncates, and correct if it rounds; the
-    grid does not determine which.
+    Speeds are on average too low by this share if the sender truncates, and correct if it rounds;
+    the grid does not determine which.
     """
     coarse = _coarse(inputs)
     if coarse is None:
@@ -103,7 +103,7 @@ def half_step(inputs: Inputs) -> float:
 
 
 def held_steps(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
-    """Return the result of a method that adds up speeds, with truncation in its sigmas."""
+    """Return a method's result, with truncation in its sigmas if the method integrates speeds."""
     size = half_step(prepared.inputs)
     if method.name != 'two_point' or not size:
         return method
@@ -115,12 +115,12 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     """Return the reasons for coarse steps of speed or counts."""
     K, size = placed.nominal or placed.rough, half_step(inputs)
     count = inputs.travel.quantum * K
-    coarse_count_m = 0.2    # m, a count that is
+    coarse_count_m = 0.2    # m, least size of a coarse count
     if count > coarse_count_m:
         return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m, so each reading lags '
                        'by up to this distance')]
     coarse = _coarse(inputs)
-    coarse_worth = 5e-4    # of the scale: half a step that is worth a word
+    coarse_worth = 5e-4    # of the scale: least half step that is reported
     if coarse is None or coarse.truncation and size < coarse_worth:
         return []
     metres = coarse.step * K
@@ -135,7 +135,7 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
 
 
 def _coarse(inputs: Inputs) -> CoarseSpeed | None:
-    """Return the grid of the speed, of one of several wheels, None where there is none."""
+    """Return the grid of the speed, of the first wheel that has one, None if there is none."""
     return next((one.coarse for one in (inputs.travel, *inputs.travels) if one.coarse), None)
 
 
@@ -149,13 +149,14 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
     """
     speed = _speed(prepared) * scale
     notes = []
-    least_delay_path = 0.1    # m: a lever arm need not be known better either
-    hidden_by_fix = 0.25    # of a fix's sigma: what a delay makes of less, no fix shows
+    least_delay_path = 0.1    # m, as the required accuracy of a lever arm
+    hidden_by_fix = 0.25    # of a fix's sigma: smaller effects of a delay are not observable
     for name, (late, sigma) in seen.items():
         metres = abs(late) * speed
         worth = max(least_delay_path, hidden_by_fix * prepared.fix_sigma)
-        if not (abs(late) > REMARK_SIGMAS * sigma and metres > worth):
-            continue
+        if name in prepared.inputs.aligned or not (
+                abs(late) > REMARK_SIGMAS * sigma and metres > worth):
+            continue        # the first is reported: this is the rest of it
         set_to = getattr(prepared.config, name).time_offset
         notes.append(Reason(
             Code.DELAY_SEEN, f'{WHAT[name]} stamps are {abs(late):.3f} s (± {sigma:.3f} s) '
@@ -167,7 +168,7 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
 
 
 def _speed(prepared: PreparedLeg) -> float:
-    """Return the speed driven, scale units per s: nine tenths of the leg are slower."""
+    """Return the 90th percentile of the speed, scale units per s."""
     travel = prepared.inputs.travel
     grid = np.arange(max(0.0, travel.t[0]), min(prepared.inputs.t_stop, travel.t[-1]), 1.0)
     if len(grid) < 2:

@@ -4,8 +4,8 @@
 """
 The pipeline: one pure function from a leg to its result, one from results to a calibration.
 
-No state, no clock, no files: the live node and the replay call these and nothing else. A leg is
-cut at gaps of the IMU, and where the vehicle was carried; its parts are legs of the same vehicle.
+No state, no clock, no files: the live node and the replay only call these. A leg is cut at gaps of
+the IMU, and at sections where the vehicle was carried; its parts are legs of the same vehicle.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,23 +29,24 @@ from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.clock_offset import screen_aligned
 from odocal_ros.screening.facing import imu_sanity, UNUSABLE
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.moved_imu import turned_over
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
-from odocal_ros.screening.screen import screen
 from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
 
 __all__ = ['calibrate', 'calibrate_parts', 'combine', 'faults', 'Screened', 'screened']
-# of a leg that is not over
+# reasons that disappear with more driving
 NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX}
 
 
 class Screened(NamedTuple):
-    """Inputs of a leg, their reasons, and True if it can be calibrated."""
+    """A leg with its clocks aligned, its inputs, reasons, and True if it can be calibrated."""
 
+    leg: Leg
     inputs: Inputs
     reasons: tuple[Reason, ...]
     usable: bool
@@ -55,19 +56,19 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
               notes: tuple[Reason, ...] = (), holdout: bool = False,
               progress: Callable[[Stage], None] | None = None) -> LegResult:
     """
-    Return the result of one leg; if it cannot be calibrated, its reasons say why.
+    Return the result of one leg; if it cannot be calibrated, with the reasons for that.
 
     leg : raw samples between two marks, with pre-roll.   config : settings in force.   alignment :
-    used instead of the leg's own (a simulation puts errors in it).   notes : what the door knows
-    of the data already (a truncated bag).   holdout : keep the last fifth of the distance back
-    from the fit and check the correction on it.   progress : called with each stage of the work,
-    and with each pass of a fit.
+    used instead of the leg's own (in simulations with errors).   notes : reasons of the caller on
+    the data (a truncated bag).   holdout : hold the last fifth of the distance out of the fit and
+    check the correction on it.   progress : called with each stage of the work, and with each pass
+    of a fit.
     """
     progress, config = progress or (lambda stage: None), settings_by_frame(leg.fix, config)
     if is_planar(leg, config):
         return planar_leg(leg, config, notes, progress)
     seen = screened(leg, config, notes)
-    inputs = seen.inputs
+    leg, inputs = seen.leg, seen.inputs
 
     def result_of(inputs: Inputs, reasons: Sequence[Reason]) -> LegResult:
         prepared, found = prepare(leg, inputs, config, reasons, alignment, holdout)
@@ -83,16 +84,17 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
         *seen.reasons, *said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)))
 
 
-def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
+def faults(seen: Screened, config: Config) -> tuple[Reason, ...]:
     """
     Return the reasons of a leg as in ``calibrate``, without those of its methods.
 
-    The leg, as ``screened`` returns it, may not be over: reasons that disappear with more driving
+    The leg, with ``screened`` of it, may be incomplete: reasons that disappear with more driving
     are left out.
     """
     reasons = seen.reasons
     if seen.usable:
-        _, reasons = prepare(leg, seen.inputs, settings_by_frame(leg.fix, config), reasons)
+        config = settings_by_frame(seen.leg.fix, config)
+        _, reasons = prepare(seen.leg, seen.inputs, config, reasons)
     return tuple(r for r in reasons
                  if r.code.gravity is not Verdict.ACCEPTED and r.code not in NOT_YET)
 
@@ -100,24 +102,25 @@ def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
 def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
     """Return the inputs of a leg, z up."""
     config = settings_by_frame(leg.fix, config)
-    inputs, found = screen(leg, config)
+    leg, inputs, found = screen_aligned(leg, config)
     reasons = (*notes, *found)
     missing = missing_data(leg, inputs)
     if missing or not len(inputs.t_fix):
         seen = {r.code for r in reasons}
-        return Screened(inputs, (*reasons, *(r for r in missing if r.code not in seen)), False)
+        return Screened(leg, inputs, (*reasons, *(r for r in missing if r.code not in seen)),
+                        False)
     sanity, z_down = imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
-    moved = turned_over(inputs)     # or else its mean gravity is judged, which it never measures
+    moved = turned_over(inputs)     # before imu_sanity, whose mean gravity is then meaningless
     sanity, z_down = (moved, False) if moved else (sanity or unit_changes(inputs), z_down)
     reasons += tuple(with_axes(sanity, inputs))
     let_go()
     if z_down:
         inputs = _turned_over(inputs)
-    return Screened(inputs, reasons, not UNUSABLE & {r.code for r in sanity})
+    return Screened(leg, inputs, reasons, not UNUSABLE & {r.code for r in sanity})
 
 
 def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
-    """Return intervals of an unsigned counter in the smoother's slips, (m, 2) s, and the scale."""
+    """Return reversed sections by the smoother's slips, (m, 2) s, and the smoother's scale."""
     smoother = result.methods.get('smoother')
     scale = None if smoother is None else smoother.estimates['scale_factor'].value
     if smoother is None or not scale:
@@ -126,7 +129,7 @@ def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
 
 
 def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:
-    """Return the data that a leg lacks for any method."""
+    """Return the reasons for data that every method needs and that a leg lacks."""
     missing = []
     if leg.stop_ns <= leg.start_ns:
         missing.append(Reason(Code.LEG_TOO_SHORT, 'the stop mark is not after the start mark'))
@@ -135,24 +138,24 @@ def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:
             (len(inputs.travel.t), 2, Code.NO_ODOMETER, 'odometer')):
         if n < least:
             missing.append(Reason(code, f'{n} usable {what} messages'))
-    if not len(inputs.t_fix) and len(leg.fix.stamp_ns):     # none sent is said already
+    if not len(inputs.t_fix) and len(leg.fix.stamp_ns):     # none received: reported already
         missing.append(Reason(Code.FIXES_UNUSABLE, 'no usable fix'))
     return missing
 
 
 def _turned_over(inputs: Inputs) -> Inputs:
-    """Return inputs of a forward-right-down IMU, turned to forward-left-up."""
+    """Return inputs of a forward-right-down IMU, rotated to forward-left-up."""
     C = matrix_from_rpy([np.pi, 0.0, 0.0])
     return replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)
 
 
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
-    """Return a leg cut where its IMU is silent for longer; itself without gaps, or of many."""
+    """Return the parts of a leg between IMU gaps over ``limit_s``; the leg if none or many."""
     return _beside(leg, _gaps(leg, limit_s))
 
 
 def _beside(leg: Leg, gaps: Ints) -> list[Leg]:
-    """Return the parts of a leg beside gaps, (k, 2) ns; itself without gaps, or of many."""
+    """Return the parts of a leg between gaps, (k, 2) ns; the leg itself if none or many."""
     most_parts = 20    # with more gaps the leg is rejected
     if not 0 < len(gaps) < most_parts:
         return [leg]
@@ -160,17 +163,17 @@ def _beside(leg: Leg, gaps: Ints) -> list[Leg]:
     ends = [*gaps[:, 0].tolist(), leg.stop_ns]
     spans = [(max(first or leg.start_ns, leg.start_ns), last, first)
              for first, last in zip(begins, ends, strict=True)]
-    shortest_ns = 10**9    # of a part: less is lost with the gap
+    shortest_ns = 10**9    # of a part: shorter ones are dropped
     return [part_of(leg, *span) for span in spans if span[1] - span[0] >= shortest_ns] or [leg]
 
 
 def _gaps(leg: Leg, limit_s: float) -> Ints:
-    """Return begin and end of the gaps of the IMU, ns: (k, 2); one up to a mark is one, too."""
-    near_start_ns = 60 * 10**9    # what lies nearer to the start mark belongs to the leg
+    """Return begin and end of the gaps of the IMU, ns: (k, 2), including those at the marks."""
+    near_start_ns = 60 * 10**9    # before the start mark, for the search for gaps
     near = _near(leg.imu.stamp_ns, leg.start_ns - near_start_ns, leg.stop_ns)
     if len(near) < 2:
         return np.empty((0, 2), np.int64)
-    gap_margin_ns = 1000    # below the limit: more than seconds in floating point are off
+    gap_margin_ns = 1000    # below the limit: larger than the rounding of seconds
     least_ns = round(limit_s * 1e9) - gap_margin_ns
     k = np.flatnonzero(by_step(lambda stamps: np.diff(stamps) > least_ns, near))
     begin, end = np.append(near[k], near[-1]), np.append(near[k + 1], leg.stop_ns)
@@ -189,7 +192,7 @@ def _carried(leg: Leg, config: Config) -> Ints:
 
 
 def _near(stamps: Ints, first_ns: int, stop_ns: int) -> Ints:
-    """Return the rising stamps between two: a view where they rise as they came."""
+    """Return the stamps between two, in rising order; a view if all of them are rising."""
     if by_step(lambda stamps: np.diff(stamps) > 0, stamps).all():
         return stamps[slice(*np.searchsorted(stamps, [first_ns, stop_ns + 1]))]
     return np.unique(stamps[(stamps >= first_ns) & (stamps <= stop_ns)])
@@ -199,9 +202,9 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
                     holdout: bool = False,
                     progress: Callable[[Stage], None] | None = None) -> list[LegResult]:
     """
-    Return the results of a leg: one, or one of each part long enough to calibrate.
+    Return the results of a leg: one, or one for each part that can be calibrated.
 
-    Arguments as for ``calibrate``. If no part can be calibrated, the result is that of the whole.
+    Arguments as for ``calibrate``. If no part can be calibrated, the result is that of the leg.
     """
     def good_of(parts: list[Leg]) -> list[LegResult]:
         results = []
@@ -220,7 +223,7 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
         if not good:
             return [whole]
     if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:
-        return good      # the gap lay before the mark
+        return good      # the gap is before the mark
     return [replace(one, reasons=(*one.reasons, _cut(leg, one, len(good), why)),
                     cut_from_ns=leg.start_ns) for one in good]
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Several legs to one calibration: which legs are used, and the reasons of the whole."""
+"""Combination of legs to a calibration: selection of the legs, and the reasons."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -34,9 +34,9 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     """
     Return the calibration of one vehicle from its legs.
 
-    legs : at least one. Rejected legs are left out, and named, unless all are.   config :
-    limits, frames.   carried : information of earlier legs on the vehicle.   imu : information of
-    other legs on its IMU, if nothing is carried.
+    legs : at least one. Rejected legs are reported and left out, unless all are rejected.
+    config : limits, frames.   carried : information of earlier legs on the vehicle.   imu :
+    information of other legs on its IMU, if nothing is carried.
     """
     legs = tuple(legs)
     good = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]
@@ -74,7 +74,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
 
 
 def _belongs(carried: Carried, legs: Sequence[LegResult]) -> bool:
-    """Return True if legs have the odometer of earlier ones and were driven after them."""
+    """Return True if legs have the scale unit of earlier ones and were driven after them."""
     smoothed = [leg.methods[SMOOTHER] for leg in legs if SMOOTHER in leg.methods]
     return all(m.estimates['scale_factor'].unit == carried.unit for m in smoothed) \
         and min(leg.start_ns for leg in legs) > carried.last_ns
@@ -99,7 +99,7 @@ def _carried_on(methods: Mapping[str, MethodResult], good: Sequence[LegResult],
 
 
 def driven_twice(legs: Sequence[LegResult]) -> list[LegResult]:
-    """Return legs that share more than a tenth of their time with one before: not independent."""
+    """Return legs that share over a tenth of their time with an earlier one: not independent."""
     start, stop = (np.array([getattr(leg, at) for leg in legs], np.int64)
                    for at in ('start_ns', 'stop_ns'))
     twice = np.zeros(len(legs), bool)
@@ -131,7 +131,7 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
 
 def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
               carried: Carried | None = None) -> MethodResult:
-    """Return a method's combination of the legs that do not reject it; of all if all do."""
+    """Return a method's combination of the legs without rejection; of all if all have one."""
     good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(good or driven), strict=True)
     whole = together(name, list(results), times_ns, config, numbers, carried if good else None)
@@ -145,7 +145,7 @@ def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config
 def _leg_reasons(legs: Sequence[LegResult], good: Sequence[LegResult], twice: Sequence[LegResult],
                  giving: Sequence[str], estimates: Mapping[str, Estimate],
                  carried: bool) -> list[Reason]:
-    """Return the legs' own reasons, numbered where there are several."""
+    """Return the legs' own reasons, numbered if there are several."""
     alone = len(legs) == 1 and not carried
     reasons = []
     for number, leg in enumerate(legs, 1):
@@ -172,7 +172,7 @@ def _leg_reasons(legs: Sequence[LegResult], good: Sequence[LegResult], twice: Se
 
 
 def _further(method: MethodResult, leg: LegResult) -> list[Reason]:
-    """Return a method's reasons without what rejects the leg already, in other words."""
+    """Return a method's reasons, except those whose code already rejects the leg."""
     known = {r.code for r in leg.reasons if r.code.gravity is Verdict.REJECTED}
     return [r for r in method.reasons if r.code not in known]
 

@@ -16,8 +16,8 @@ from odocal_ros.settings.config import Config
 
 # s before and after a mark, and positions in between. Judgement: a fit needs ten positions
 WITHIN, ROWS = 0.5, 5
-# s at the mean motion of the wheels, in which a time-correlated error is forgotten: the errors of
-# two marks are independent, those of the positions of one mark are equal. Judgement
+# s at the mean motion of the wheels, correlation time of errors: the errors of two marks are
+# independent, those of the positions of one mark are equal. Judgement
 FORGOTTEN = 5.0
 
 
@@ -26,7 +26,7 @@ class FloorMark:
     """
     The robot stands on a point of ``reference.points``.
 
-    point : its number from 0.   received_ns : arrival of what was sent at the end of the mark.
+    point : its number from 0.   received_ns : arrival of a message sent at the end of the mark.
     """
 
     stamp_ns: int
@@ -34,32 +34,32 @@ class FloorMark:
     received_ns: int
 
     def __str__(self) -> str:
-        """Return it as in the status of the node."""
+        """Return the mark as in the status of the node."""
         return f'{self.stamp_ns}:{self.point}:{self.received_ns}'
 
     @classmethod
     def of(cls, text: str) -> 'FloorMark':
-        """Return the mark of such a text, or raise ValueError."""
+        """Return the mark from the text of ``__str__``, or raise ValueError."""
         stamp_ns, point, received_ns = map(int, text.split(':'))
         return cls(stamp_ns, point, received_ns)
 
 
 def marks_at(config: Config, stamps_ns: Sequence[int]) -> list[FloorMark]:
-    """Return marks in order of time, given in the order of the points."""
+    """Return marks in order of time, from stamps in the order of the points."""
     late_ns = round(WITHIN * 1e9)
     return sorted(FloorMark(t, next_point(config, k), t + late_ns)
                   for k, t in enumerate(stamps_ns))
 
 
 def check_points(config: Config) -> None:
-    """Raise BadUsage if ``reference.points`` are no pairs."""
+    """Raise BadUsage if ``reference.points`` are not pairs."""
     if not config.reference.points or len(config.reference.points) % 2:
         raise BadUsage(f'reference.points has {len(config.reference.points)} values; required '
                        'with marks: x and y of each point in the order of the marks, m')
 
 
 def next_point(config: Config, marks: int) -> int:
-    """Return the number of the point of the next mark, after so many."""
+    """Return the number of the point of the next mark, after ``marks`` marks."""
     return marks % (len(config.reference.points) // 2)
 
 
@@ -70,7 +70,7 @@ def place_of(config: Config, point: int) -> tuple[float, float]:
 
 
 def with_marks(config: Config) -> Config:
-    """Return the settings of a recording with marks; of those again the same."""
+    """Return the settings for a recording with marks; a second call changes nothing."""
     check_points(config)
     gnss, sigma = config.gnss, config.reference.points_sigma
     return replace(config, gnss=replace(
@@ -80,7 +80,7 @@ def with_marks(config: Config) -> Config:
 
 
 def mark_positions(config: Config, marks: Sequence[FloorMark]) -> FixSamples:
-    """Return the positions of marks as a reader gives those of SLAM."""
+    """Return the positions of marks as samples, as those of SLAM."""
     places = np.array([(*place_of(config, mark.point), 0.0) for mark in marks])
     stamps = np.array([mark.stamp_ns for mark in marks])[:, None] + np.round(
         1e9 * np.linspace(-WITHIN, WITHIN, ROWS)).astype(np.int64)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The methods of a leg: each a pure function of it; their results are that of the leg."""
+"""The methods, each a pure function of a leg, and the result of the leg by theirs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -29,7 +29,7 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.inputs import Inputs
 
-# judgement: of the time that methods take, and of the tracks after them
+# judgement: relative computing time of the methods, and of the tracks after them
 METHOD_EFFORT = {'two_point': 1, 'smoother': 20}
 TRACKS = 2
 
@@ -56,10 +56,10 @@ UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
 def run_methods(names: Iterable[str], prepared: PreparedLeg,
                 begun: Callable[[str], Passed]) -> dict[str, MethodRun]:
     """
-    Return the runs of methods on a leg; an error in one costs this method, not the leg.
+    Return the runs of methods on a leg; an error in one rejects this method, not the leg.
 
-    names : in any order.   begun : called with the name of each before it runs, returns what to
-    call with each pass of its fit.
+    names : in any order.   begun : called with the name of each method before it runs; returns
+    the function to call after each pass of its fit.
     """
     runs = {}
     for name in names:
@@ -74,8 +74,8 @@ def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
     """
     Return the reasons of methods on the data, each once.
 
-    Delays are by the best method that estimates them. Slip and lateness of the odometer are by the
-    best method that checks them and is not rejected, else by the first.
+    Delays are by the best method that estimates them. Slip and delay of the odometer are by the
+    best method that checks them and is not rejected, otherwise by the first.
     """
     found: list[Reason] = []
     notes: list[Reason] = []
@@ -110,13 +110,13 @@ def _guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) ->
         return MethodRun(UNKNOWN[name](inputs, Reason(
             Code.NOT_CONVERGED, f'{name} diverged ({error}). Likely cause: invalid or missing '
             'samples')))
-    except Exception as error:      # its reasons may be wrong too: nothing of it is kept
+    except Exception as error:      # its reasons may be wrong too and are dropped
         return MethodRun(failed(lambda why: UNKNOWN[name](inputs, why), name, error))
 
 
 def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
                methods: dict[str, MethodResult] | None = None, **more: Any) -> LegResult:
-    """Return the result of a leg: its counts, findings and what more there is."""
+    """Return the result of a leg: counts, reasons, methods, and further fields of LegResult."""
     between = (inputs.t_fix >= -0.5) & (inputs.t_fix <= inputs.t_stop + 0.5)
     if 'distance' not in more:
         more['distance'] = _path_of(inputs.t_fix[between], inputs.geodetic[between],
@@ -149,12 +149,12 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     estimates, _ = choose(methods, asked)
     scale = estimates.get('scale_factor')
     paths = None if scale is None else runs[scale.method].paths
-    plain = None if prepared.rough == prepared.nominal else prepared.rough
     if scale is None or paths is None:
         return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
-                          distance=prepared.distance, deciding=deciding(asked), path_ratio=plain)
-    distance_sigma = 0.05    # relative sigma up to which a scale gives the distance
-    # more accurate than the rough scale; the travel is that of a speed as sent
+                          distance=prepared.distance, deciding=deciding(asked),
+                          path_ratio=prepared.path_ratio)
+    distance_sigma = 0.05    # largest relative sigma of a scale for the distance
+    # more accurate than the approximate scale; the travel is that of the uncorrected speed
     if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
         prepared = judged_by(prepared, estimates.get(AS_SENT, scale).value or scale.value)
     shown, said = tracks(prepared, paths)
@@ -165,8 +165,8 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
             methods[name] = replace(run.result, details=run.result.details | check)
             found += said
     return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
-                      distance=prepared.distance, deciding=deciding(asked), path_ratio=plain,
-                      **shown)
+                      distance=prepared.distance, deciding=deciding(asked),
+                      path_ratio=prepared.path_ratio, **shown)
 
 
 def _once(found: Sequence[Reason]) -> list[Reason]:

@@ -37,12 +37,12 @@ from odocal_ros.settings.nominal import nominal_scale
 
 LEAST_NODE, MOST_NODES = 0.1, 20_000      # s between nodes, judgement: 0.1 rad of a turn
 FEWEST_POSITIONS = 10       # judgement: as for other methods
-# m and sigmas of a height between places for a slope, judgement: longer than a room is high
+# least distance for a slope, m and in sigmas of a height, judgement: longer than a room is high
 SLOPE_LENGTH, HEIGHT_SIGMAS = 5.0, 30.0
-# rad/sqrt(s), judgement: tilt and vibration of a robot, which the grade does not have
+# rad/sqrt(s), judgement: effect of tilt and vibration of a robot, not included in the grade
 GYRO_LEAST = 1e-3
 BY_AXLE = 'left before right of each axle from front to rear.'
-# codes of an IMU that the planar estimator can do without
+# reasons about the IMU, which the planar estimator does not need
 OF_IMU = {Code.NO_IMU, Code.NO_ACCELEROMETER, Code.IMU_GAP, Code.LOCAL_FRAME}
 
 
@@ -68,7 +68,7 @@ def planar_leg(leg: Leg, config: Config, notes: Sequence[Reason],
 
 def _guarded(run: Run, inputs: Inputs, config: Config, progress: Callable[[Stage], None],
              ) -> tuple[MethodResult, dict[str, Any]]:
-    """Return the method's result and what a report draws; what breaks costs the method alone."""
+    """Return the method's result and plot data; an error only rejects the method."""
     from odocal_ros.calib.planar.fit import fit
     unit = inputs.scale_unit
 
@@ -92,7 +92,7 @@ def _guarded(run: Run, inputs: Inputs, config: Config, progress: Callable[[Stage
 
 
 def _run_of(inputs: Inputs, config: Config) -> tuple[Run | None, list[Reason]]:
-    """Return the run on nodes, or None and why."""
+    """Return the run on nodes, or None and the reasons."""
     travels, kind = inputs.travels, config.odometer.drive
     if lacking := _lacking_wheels(kind, len(travels)):
         return None, [lacking]
@@ -118,7 +118,7 @@ def _run_of(inputs: Inputs, config: Config) -> tuple[Run | None, list[Reason]]:
 
 
 def _lacking_wheels(kind: str, count: int) -> Reason | None:
-    """Return the reason if a drive does not have so many wheels with known places."""
+    """Return the reason if the number of wheels with known sides does not fit the drive."""
     needed, fits, order = {
         MECANUM: ('4', count == len(MECANUM_ROWS), BY_AXLE),
         OMNI: (f'{FEWEST_OMNI} or more', count >= FEWEST_OMNI,
@@ -130,7 +130,7 @@ def _lacking_wheels(kind: str, count: int) -> Reason | None:
 
 
 def shortened_by_slopes(inputs: Inputs) -> float:
-    """Return by how much slopes shorten the path, relative: mean slope^2 / 2, less its noise."""
+    """Return the relative shortening of the path by slopes: mean slope^2 / 2, minus its noise."""
     have = ~np.isnan(inputs.geodetic[:, 2])
     if have.sum() < FEWEST_POSITIONS:
         return 0.0
@@ -140,14 +140,14 @@ def shortened_by_slopes(inputs: Inputs) -> float:
     length = max(SLOPE_LENGTH, HEIGHT_SIGMAS * float(np.sqrt(variance[2])))
     ends = np.searchsorted(path[:-1], np.arange(0.0, path[-1], length))
     run = np.hypot(*np.diff(place[ends, :2], axis=0).T)
-    straight = run > length / 2      # judgement: else it turned back, or the path is noise
+    straight = run > length / 2      # judgement: otherwise it turned back, or is noise
     slope = np.diff(place[ends, 2])[straight] / run[straight]
     noise = 2 * variance[2] / np.maximum(run[straight], 1e-9)**2
     return float(max(np.mean(slope**2 - noise), 0.0) / 2) if straight.any() else 0.0
 
 
 def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
-    """Return times of nodes, those with a position, and the positions: at most one each 0.1 s."""
+    """Return times of nodes, nodes with a position, and rows of positions, one per 0.1 s."""
     gap = max(LEAST_NODE, float(t_fix[-1] - t_fix[0]) / MOST_NODES)
     slot = np.floor((t_fix - t_fix[0]) / gap + 1e-6)
     used = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0)
@@ -160,11 +160,11 @@ def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
 
 
 def _gyro(inputs: Inputs, t: Floats) -> Floats:
-    """Return the integral of the turn rate about the up axis in each interval, () without."""
+    """Return the integral of the turn rate about up in each interval, rad; empty without IMU."""
     if not inputs.has_accelerometer or len(inputs.t_imu) < 2 or inputs.t_imu[0] > t[0] \
             or inputs.t_imu[-1] < t[-1]:
         return np.empty(0)
-    rate = np.einsum('ij,j->i', inputs.w_b, inputs.up_b)       # by BLAS it depends on its threads
+    rate = np.einsum('ij,j->i', inputs.w_b, inputs.up_b)       # BLAS: depends on its threads
     return np.diff(integral_at(t, inputs.t_imu, rate))
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From screened inputs to a leg for the methods: placed, oriented, aligned, dead reckoned."""
+"""Preparation of a screened leg for the methods: orientation, alignment, dead reckoning."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,7 +34,7 @@ from odocal_ros.screening.moved_imu import turned_about
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config
 
-BY_SCALE = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # what is judged in metres
+BY_SCALE = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # limits in metres
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
 
@@ -44,9 +44,9 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     """
     Return a leg prepared for the methods, None if none can be run on it, and all reasons.
 
-    leg, inputs, config : the leg, screened, and the settings in force.   reasons : what was found
-    of it so far.   alignment : used instead of the leg's own.   holdout : keep the last fifth of
-    the distance back from the fit.
+    leg, inputs, config : raw and screened leg, and the settings in force.   reasons : those found
+    so far.   alignment : used instead of the leg's own.   holdout : hold the last fifth of the
+    distance out of the fit.
     """
     placed = place(inputs, config)
     let_go()
@@ -98,7 +98,7 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
 
 
 def judged_by(prepared: PreparedLeg, scale: float) -> PreparedLeg:
-    """Return a leg with distance and speed checked by a better scale than the rough one."""
+    """Return a leg with distance and speed checked by a more accurate scale."""
     distance, judged = judge_way(prepared.track, prepared.inputs.t_stop, scale,
                                  prepared.config.leg)
     return replace(prepared, metres_per_unit=scale, distance=distance, reasons=(
@@ -106,7 +106,7 @@ def judged_by(prepared: PreparedLeg, scale: float) -> PreparedLeg:
 
 
 def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
-    """Return the explanation why there is no usable drive, None if there is one."""
+    """Return the reasons why there is no usable drive, None if there is one."""
     still = not_moving(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
                        inputs.t_stop, inputs.least_motion)
     if still or not placed.rough:

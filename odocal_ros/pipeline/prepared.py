@@ -1,10 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A leg prepared for the methods, which does not change later; the result of a method on it."""
+"""A leg prepared for the methods, which is not changed later; the result of a method on it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from math import nan
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
+from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, section_ratio, Track
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.strapdown import attitude
@@ -28,17 +29,17 @@ from odocal_ros.screening.facing import Facing
 from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.settings.config import Config
 
-Passed = Callable[[int, float], None]      # called with the passes made, and Stage.change
+Passed = Callable[[int, float], None]      # called with the number of passes, and Stage.change
 Path = Callable[[Floats], Floats]     # t (n,) s to (n, 3) m, or t () to (3,)
-WHOLE_FROM = 10.0     # judgement: sigmas from which their decimals mean nothing
+WHOLE_FROM = 10.0     # judgement: sigmas, larger ones are shown without decimals
 
 
 class Paths(NamedTuple):
     """
-    The antenna's path as configured and as calibrated: t (n,) to (n, 3) m, but for a constant.
+    The antenna's path as configured and as calibrated: t (n,) to (n, 3) m, up to a constant.
 
-    Both have the same attitude, and the fit's angles if it determines none: they only differ in
-    the calibrated values.
+    Both have the same attitude and undetermined mounting angles: they only differ in the
+    calibrated values.
     """
 
     before: Path
@@ -49,9 +50,9 @@ class MethodRun(NamedTuple):
     """
     A method's result and its other findings.
 
-    paths : None if it refuses.   found : reasons of the leg.   delays : 'gnss' or 'odometer' to s
-    late and sigma; None from a method that estimates none.   odometer : reasons on slip or
-    lateness of its track relative to the IMU, used unless a better method has checked; None: not
+    paths : None if it refuses.   found : reasons of the leg.   delays : 'gnss' or 'odometer' to
+    delay, s, and sigma; None from a method that estimates none.   odometer : reasons on slip or
+    delay of its track relative to the IMU, used unless a better method has checked; None: not
     checked.
     """
 
@@ -78,7 +79,7 @@ class Stage:
     change: float = nan
 
     def words(self) -> str:
-        """Return it for people."""
+        """Return the stage as text."""
         if not self.passes:
             return self.name
         change = f'{self.change:.0f}' if self.change >= WHOLE_FROM else f'{self.change:.2f}'
@@ -89,16 +90,16 @@ class Stage:
 @dataclass(frozen=True, eq=False)
 class PreparedLeg(Placed):
     """
-    All that methods read. They do not change it, so their order has no effect.
+    Input of all methods. They do not change it, so their order has no effect.
 
-    leg, inputs, config : as screened, and the settings.   facing : IMU orientation, None if not
+    leg, inputs, config : raw and screened leg, settings.   facing : IMU orientation, None if not
     determined.   lever_b : (3,) m, from the odometer's point to the antenna.   spans : (s, 2) s,
-    standstills.   alignment, about_alignment : and its reasons.   epochs : the attitude as
-    aligned, t (m,) s and q_nb (m, 4).   track : dead reckoned from these and the odometer (mean of
-    the wheels).   wheel_slips : of one wheel against the other.   metres_per_unit : the rough
-    scale, until a method estimates a better one.   distance : m, by it.   t_fit : s; if
-    ``holdout``, later fixes are held out.   reasons : of the leg.   of_ends : those that only
-    concern its ends.
+    standstills.   alignment, about_alignment : alignment and its reasons.   epochs : attitude
+    after alignment, t (m,) s and q_nb (m, 4).   track : dead reckoned from these and the odometer
+    (mean of the wheels).   wheel_slips : of one wheel relative to the other.   metres_per_unit :
+    approximate scale, until a method estimates a better one.   distance : m, by it.   t_fit : s;
+    if ``holdout``, later fixes are held out.   reasons : of the leg.   of_ends : those that only
+    concern methods by its ends.
     """
 
     leg: Leg
@@ -120,7 +121,7 @@ class PreparedLeg(Placed):
     of_ends: tuple[Reason, ...]
 
     def path(self, f: Floats, track: Track | None = None) -> Path:
-        """Return the path of the antenna, t (n,) to (n, 3) m but for a constant, for f = K d."""
+        """Return the path of the antenna, t (n,) to (n, 3) m up to a constant, for f = K d."""
         track = self.track if track is None else track
 
         def at(t: Floats) -> Floats:
@@ -129,18 +130,30 @@ class PreparedLeg(Placed):
         return at
 
     def level_path(self, t: Floats) -> Floats:
-        """Return travel along the gyro's heading on level ground, but for a rotation: (n, 2)."""
+        """Return travel along the gyro's heading on level ground, up to a rotation: (n, 2)."""
         inputs, epochs = self.inputs, self.track.t
         turned = integral_at(epochs, inputs.t_imu, by_row(
             lambda w_b: (w_b - self.alignment.gyro_bias) @ inputs.up_b, inputs.w_b))
         path = level_track(self.track.s, turned)
         return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
 
+    @cached_property
+    def path_ratio(self) -> float | None:
+        """
+        Return metres per unit of travel by the fixes against ``level_path``, None if they stand.
+
+        Its distances turn and reverse as those of the fixes do, unlike the rough scale's.
+        """
+        t, travel = self.inputs.t_fix, self.inputs.travel
+        k = (t >= max(travel.t[0], self.track.t[0])) & (t <= min(travel.t[-1], self.track.t[-1]))
+        return section_ratio(travel.at(t[k]), self.level_path(t[k]), self.fixes_n[k, :2],
+                             max(self.inputs.least_motion, 8 * self.fix_sigma))
+
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
         """
-        Return the antenna's position at t, None without any.
+        Return the antenna's position at t, None if there is none.
 
-        By the fixes about it, or the surveyed point of the mark 'start' or 'end'.
+        It is by the fixes around t, or the surveyed point of the mark 'start' or 'end'.
         """
         point = self._surveyed(name, t)
         if point:
@@ -160,20 +173,20 @@ class PreparedLeg(Placed):
             return ()
         t_mark = 0.0 if name == 'start' else self.inputs.t_stop
         span = standing_at(t_mark, self.spans)
-        at_mark = 0.05    # s from a mark at which a surveyed point still holds
+        at_mark = 0.05    # s, largest distance from a mark for its surveyed point
         if abs(t - t_mark) <= at_mark or (span and span == standing_at(t, self.spans)):
             point: tuple[float, ...] = getattr(self.config.reference, name)
             return point
         return ()
 
     def reckon(self, travel: Travel) -> Track:
-        """Return the track of a travel (of the mean of the wheels, or of one) as aligned."""
+        """Return the track of a travel (mean of the wheels, or one) with attitude ``epochs``."""
         return dead_reckon(*self.epochs, travel)
 
 
 def attitude_of(inputs: Inputs, origin: Origin, t_begin: float, q_nb: Floats,
                 gyro_bias: Floats) -> tuple[Floats, Floats]:
-    """Return the attitude of inputs from a time, s, on: t (m,) s, q_nb (m, 4)."""
+    """Return the attitude from ``t_begin``, s, to the end: t (m,) s, q_nb (m, 4)."""
     rows = slice(np.searchsorted(inputs.t_imu, t_begin - 1e-9),
                  np.searchsorted(inputs.t_imu, inputs.t_stop + 1.0, side='right'))
     t = inputs.t_imu[rows]

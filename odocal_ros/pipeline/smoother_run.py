@@ -30,8 +30,8 @@ def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
     """
     Run the smoother on a leg.
 
-    The Paths are by the smoother's own attitude, the calibrated one with all values found, delays
-    and lever arms too; t is as the fixes stamp it.
+    The paths have the smoother's attitude; the calibrated one uses all estimated values, including
+    delays and lever arms. Their times are stamps of the fixes.
     """
     leg = smoother_leg(ready.inputs, ready.config, ready.origin, ready.fixes_n, ready.spans,
                        ready.rough, ready.t_fit)
@@ -54,10 +54,10 @@ def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
     track = dead_reckon(t, q_nb, replace(travel, t=travel.t - late['odometer']))
     lever_b, f = _lever(method.estimates, ready.config), method.details['f']
     sent = method.estimates.get('scale_factor_as_sent')
-    if sent is not None:        # the travel here is that of the speeds as sent
+    if sent is not None:        # the travel here is that of uncorrected speeds
         f = f * (sent.value or 0.0) / np.linalg.norm(f)
     before = ready.path(as_configured(ready, f, method.estimates), dead_reckon(t, q_nb, travel))
-    # of a speed in coarse steps the fit uses the steps alone: slip it sees by this track only
+    # of coarse speeds the fit only uses the steps: slip is detected by this track
     odometer = slip_reasons(slip_check(ready, track, f, (0.0, ready.t_fit)),
                             ready.config.odometer.time_offset) if leg.by_steps else ()
     return MethodRun(method, Paths(before, _late_path(track, f, lever_b, late['gnss'])),
@@ -65,11 +65,11 @@ def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
 
 
 def _with_search(method: MethodResult, ready: PreparedLeg) -> MethodResult:
-    """Return the result with the patent's search beside it, where the leg allows one."""
+    """Return the result with the patent's search in its details, if the leg allows one."""
     found = search_of(ready, method.estimates['pitch_mounting_angle'].value or 0.0)
     if found is None:
         return method
-    # the gyro may determine what positions do not: the smoother reports that itself
+    # left and right may be separable by the gyro: the smoother reports that itself
     said = (r for r in found.reasons if r.code is not Code.WHEELS_NOT_SEPARABLE)
     return replace(method, reasons=(*method.reasons, *said),
                    details=method.details | {'search': found.as_dict()})
@@ -79,7 +79,7 @@ def _attitude(ready: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, F
     """
     Return the smoother's attitude at the IMU's rate: t (m,) s, q_nb (m, 4).
 
-    Between keyframes the gyros turn it; where they end, beyond the fixes fitted, by them alone.
+    It is by the gyros, corrected at keyframes; beyond the fitted fixes by the gyros alone.
     """
     t_key, C_nb = details['key_t'], details['key_C_nb']
     t, q_nb = attitude_of(ready.inputs, ready.origin, t_key[0], quat_from_matrix(C_nb[0]),
@@ -89,7 +89,7 @@ def _attitude(ready: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, F
 
 
 def _late_path(track: Track, f: Floats, lever_b: Floats, late: float) -> Path:
-    """Return the path by stamps that are so many s late; beyond the track's ends it runs on."""
+    """Return the path for stamps that are ``late`` s late; extrapolated at the track's ends."""
     def path(t: Floats) -> Floats:
         t = t - late
         inside = np.clip(t, track.t[0], track.t[-1])
@@ -98,7 +98,7 @@ def _late_path(track: Track, f: Floats, lever_b: Floats, late: float) -> Path:
         onward = 0.2    # s of extrapolation beyond the data, for the delay
         before = track.at(inside - np.copysign(onward, beyond))
         P = P + (P - before) * (np.abs(beyond) / onward)[..., None, None]
-        let_go()        # of hours of sums, before hours of attitude are read
+        let_go()        # releases the sums before the attitudes are read
         at: Floats = P @ f + track.C_nb_at(inside) @ lever_b
         let_go()
         return at
@@ -106,7 +106,7 @@ def _late_path(track: Track, f: Floats, lever_b: Floats, late: float) -> Path:
 
 
 def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
-    """Return the antenna from the odometer's point as found, else as set: (3,) m, in b."""
+    """Return odometer point to antenna, as estimated, otherwise as configured: (3,) m, in b."""
     antenna, odometer = (
         np.array([given if (e := estimates[f'{name}_lever_arm_{axis}']).value is None else e.value
                   for axis, given in zip('xyz', section.lever_arm, strict=True)])
@@ -117,9 +117,9 @@ def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
 
 def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
     """
-    Return a leg as the patent sees it: two tracks in the plane, and fixes.
+    Return a leg as input of the patent's search: two tracks in the plane, and fixes.
 
-    pitch : rad, of the IMU on the vehicle. None without two wheels, or a fix at the start.
+    pitch : mounting angle, rad. None without two wheels, or without a fix at the start.
     """
     inputs = ready.inputs
     if len(inputs.travels) != 2:
@@ -144,5 +144,5 @@ def search_of(ready: PreparedLeg, pitch: float) -> SearchResult | None:
     if leg is None:
         return None
     a, wheels = ready.alignment, ready.config.wheels
-    course = None if a.heading_separable else a.heading_sigma     # holds the mounting angle too
+    course = None if a.heading_separable else a.heading_sigma     # includes the mounting angle
     return search(leg, ranges_of(wheels, course), wheels.robust)

@@ -25,20 +25,20 @@ FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
 
 def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimate]) -> Floats:
     """
-    Return f = K0 d0 of the settings, (3,) m per unit of travel.
+    Return f = K0 d0 of the settings, (3,) m per unit of travel; without K0 the path ratio's.
 
-    f : as found; of its angles those are kept that ``estimates`` do not hold.
+    f : as estimated; its angles are kept if ``estimates`` has no value of them.
     """
     found = mounting_from_forward(f)
     determined = {name for name, e in estimates.items() if e.value is not None}
     angles = [0.0 if name in determined else angle for name, angle in zip(
         ('yaw_mounting_angle', 'pitch_mounting_angle'), found, strict=True)]
-    return (ready.nominal or ready.rough) * forward_b(*angles)
+    return (ready.nominal or ready.path_ratio or ready.rough) * forward_b(*angles)
 
 
 def near(ready: PreparedLeg, path: Path, pin: MarkFix,
          between: Bools) -> tuple[Bools, tuple[Reason, ...]]:
-    """Return a mask of fixes, (k,), without gross outliers from a fitting path, and reasons."""
+    """Return a mask of fixes, (k,), without gross outliers from a fitted path, and reasons."""
     if not between.any():
         return between, ()
     off = np.hypot(*stray(path, pin, (ready.inputs.t_fix, ready.fixes_n))[:, :2].T)
@@ -61,7 +61,7 @@ def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reas
     more: dict[str, Any] = {
         name: start.position_n + path(t) - path(np.array(start.t))
         for name, path in (('track_before_n', before), ('track_n', after))}
-    if not ready.origin.local:       # else no place on the Earth is known
+    if not ready.origin.local:       # else the position on the Earth is unknown
         more |= {'origin': (ready.origin.latitude, ready.origin.longitude, ready.origin.height)}
     pin, between, path_length, found = _checked(ready, after, start)
     more['reference_n'] = ready.fixes_n[between]
@@ -82,7 +82,7 @@ def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reas
 
 
 def check_of(ready: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reason, ...]]:
-    """Return the check of a method's own path as an entry of its details, and what it says."""
+    """Return the check of a method's own path as an entry of its details, and reasons."""
     start = _start(ready, path)
     if start is None:
         return {}, ()
@@ -102,7 +102,7 @@ def _start(ready: PreparedLeg, path: Path) -> MarkFix | None:
 
 def _checked(ready: PreparedLeg, path: Path,
              start: MarkFix) -> tuple[MarkFix | None, Bools, float, tuple[Reason, ...]]:
-    """Return start points of the path, the fixes to compare it with, the path in m; reasons."""
+    """Return the pin of the path, a mask of fixes to compare, path length, m, and reasons."""
     pin: MarkFix | None = start
     begin, end = start.t, ready.t_fit
     found: tuple[Reason, ...] = ()
@@ -117,7 +117,7 @@ def _checked(ready: PreparedLeg, path: Path,
 
 
 def driven(ready: PreparedLeg) -> tuple[Floats, Floats]:
-    """Return times of the track, s, and the path length until then, m."""
+    """Return times of the track, s, and the path length up to them, m."""
     path_length = np.append(0.0, np.cumsum(np.abs(np.diff(ready.track.s))))
     return ready.track.t, path_length * ready.metres_per_unit
 
@@ -125,7 +125,7 @@ def driven(ready: PreparedLeg) -> tuple[Floats, Floats]:
 def slip_check(ready: PreparedLeg, track: Track, f: Floats,
                between: tuple[float, float]) -> Slips:
     """
-    Return the slips of the mean of the wheels, without those of one wheel, which are named.
+    Return the slips of the mean of the wheels, without those already attributed to one wheel.
 
     track : of a method.   f : (3,) scale times forward axis.   between : s.
     """

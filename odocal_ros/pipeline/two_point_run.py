@@ -33,7 +33,7 @@ NAMES = ('start', 'end')
 
 
 def two_point(ready: PreparedLeg, passed: Passed | None = None) -> MethodRun:
-    """Run the two-point method on a leg; it makes no passes."""
+    """Run the two-point method on a leg; it is not iterative."""
     return TwoPointRun(ready).result()
 
 
@@ -73,13 +73,13 @@ class TwoPointRun:
         return MethodRun(method, paths, tuple(self.found), odometer=self.slip)
 
     def _slips(self, chord: Chord, f: Floats) -> tuple[Floats, Floats]:
-        """Return slips of the mean between the marks, s and m; name those not named already."""
+        """Return slips of the mean between the marks, s and m; set ``slip`` to their reasons."""
         if not self.inputs.has_accelerometer:
             return np.empty(0), np.empty(0)
         ends = chord.start.t, chord.end.t
         slips = slip_check(self.ready, self.track, toward(self.ready.facing, f), ends)
         self.slip = slip_reasons(slips, self.config.odometer.time_offset)
-        one = self.ready.wheel_slips      # of one wheel: its share goes into the mean
+        one = self.ready.wheel_slips      # of one wheel: its share in the mean
         inside = (one.t >= ends[0]) & (one.t <= ends[1])
         in_mean = one.size[inside] / one.count
         return np.append(slips.t, one.t[inside]), np.append(slips.size, in_mean)
@@ -102,12 +102,12 @@ class TwoPointRun:
         still = all(m.standing or m.surveyed for m in (start, end))
         if still or refusal(chord, ready.rough):
             return chord
-        path = ready.path(solve(chord, np.inf)[0])      # marks in motion move with the solution
+        path = ready.path(solve(chord, np.inf)[0])      # marks in motion depend on the solution
         return replace(chord, start=ready.mark(start.t, path, 'start') or start,
                        end=ready.mark(end.t, path, 'end') or end)
 
     def _velocity_change(self, marks: Sequence[MarkFix]) -> Floats:
-        """Return C_nb s' at the end mark less that at the start, zero where it stands: (3, 3)."""
+        """Return C_nb s' at the end mark minus that at the start, zero at rest: (3, 3)."""
         change = np.zeros((3, 3))
         for mark, sign in zip(marks, (-1.0, 1.0), strict=True):
             if not mark.standing:
@@ -128,7 +128,7 @@ class TwoPointRun:
         residual[:, 2] = up[:, 2]              # without the error of the pitch
         covariance = self.inputs.covariance_n[between]
         factor = self._noise_factor(residual, covariance, drift, chord)
-        if np.isnan(self.config.gnss.correlation_time):     # else set, not judged
+        if np.isnan(self.config.gnss.correlation_time):     # else configured
             start, end = marks_no_better(
                 (chord.start, chord.end), ready.spans, fixes[0], self.track.at(fixes[0]) @ f,
                 chord.M @ f, residual / factor[0], covariance, drift_n / factor[0])
@@ -156,9 +156,9 @@ class TwoPointRun:
 
     def _judge_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
                      drift: float) -> None:
-        """Compare the corrected track with the fixes: reversing, sanity."""
+        """Compare the corrected track with the fixes: reversing, mismatch, bend."""
         ready, (t, p) = self.ready, fixes
-        keep, _ = check.steady(residual, ready.fix_sigma)     # as noisy as the track is wrong
+        keep, _ = check.steady(residual, ready.fix_sigma)     # track errors count as noise
         sigma = max(ready.fix_sigma, white_noise(p[keep]))
         found = against_travel(pieces(ready.level_path(t[keep]), p[keep, :2], t[keep], sigma),
                                self.config.odometer.signed)
@@ -171,7 +171,7 @@ class TwoPointRun:
                                                 ready.distance)
 
     def _reversed(self, chord: Chord) -> None:
-        """Return the reason for an odometer that counts down without a known IMU orientation."""
+        """Add the reason for an odometer that counts down without a known IMU orientation."""
         backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
         if backwards and self.ready.facing is None and not chord.alignment.heading_separable:
             self.found.append(Reason(

@@ -1,4 +1,4 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""From samples to inputs: what is usable, what is damaged, late, mirrored or turned."""
+"""Screening of samples: selection of usable rows, and detection of sensor faults."""

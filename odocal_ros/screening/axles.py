@@ -20,11 +20,11 @@ from odocal_ros.settings.levels import FAULT_SIGMAS
 
 T = TypeVar('T')
 Axle = tuple[Travel, ...]
-STEER_GRID = 0.1          # s, judgement: in which turn rates are squared
-CELL = 10                 # judgement: steps of a cell that is compared, 1 s
+STEER_GRID = 0.1          # s, judgement: steps in which turn rates are squared
+CELL = 10                 # judgement: steps of a compared cell, 1 s
 SMOOTH = np.full(11, 1 / 11)      # judgement: of the speed, 1.1 s; its counts are coarse
 SLOW = 0.05               # judgement: of the top speed, below which a turn rate is noise
-# judgement: of the path, by which a steered axle rolls farther; less is below any scale sigma
+# judgement: share of the path by which a steered axle rolls farther; less has no effect on scale
 LEAST_STEERED = 2e-5
 
 
@@ -36,19 +36,19 @@ def axles_of(wheels: Sequence[T]) -> list[tuple[T, ...]]:
 def judged_axles(wheels: Wheels, imu: Imu,
                  between: tuple[float, float]) -> tuple[Wheels, list[Reason]]:
     """
-    Return the wheels that count, with the distance ahead of steered ones, and reasons.
+    Return the usable wheels, with the distance of steered ones ahead, and reasons.
 
     imu : (t, w_b, f_b), (n,) s, (n, 3) rad/s, (n, 3) m/s^2.   between : s, the marks.
 
-    A broken axle is left out if another one counts and does not steer: without one of its wheels
-    its mean is not in the middle.
+    A broken axle is left out if another one is usable and does not steer: with one wheel its mean
+    is not that of the axle's middle.
     """
     axles = axles_of(wheels.each)
     faults = [_faults(axle, axles, imu, between) for axle in axles]
     reasons = [reason for why in faults for reason in why]
     if len(axles) < 2:
         return wheels, reasons
-    # of a broken axle the wheel that counts shows whether the others steer
+    # the working wheel of a broken axle is used to detect steering of the others
     seen = [axle if not why else _counting(axle, why) for axle, why in zip(
         axles, faults, strict=True)]
     ahead = iter(_ahead([axle for axle in seen if axle], imu, between, wheels.doubt_t))
@@ -69,7 +69,7 @@ def judged_axles(wheels: Wheels, imu: Imu,
 
 
 def _counting(axle: Axle, why: Sequence[Reason]) -> Axle:
-    """Return the wheel of a broken axle that counts, none if that is not certain."""
+    """Return the working wheel of a broken axle, () if it is not certain."""
     rolled = [_rolled(wheel) for wheel in axle]
     alone = len(axle) > 1 and {reason.code for reason in why} == {Code.WHEEL_DEAD}
     return (axle[int(np.argmax(rolled))],) if alone and max(rolled) > 0 else ()
@@ -106,7 +106,7 @@ def _ahead(axles: list[Axle], imu: Imu, between: tuple[float, float],
 
 def _square(own: Travel, other: Travel, imu: Imu, between: tuple[float, float],
             doubt_t: Floats) -> tuple[float, float]:
-    """Return the squared distance of an axle ahead of another, and its sigma; 0 if it is less."""
+    """Return the squared distance of an axle ahead of another, and its sigma; 0 if negligible."""
     two = pair((own, other), imu, between, STEER_GRID, doubt_t)
     if two is None:
         return 0.0, 0.0
@@ -124,10 +124,10 @@ def _square(own: Travel, other: Travel, imu: Imu, between: tuple[float, float],
 def steering_path(t: Floats, turn: Floats, s: Floats, ahead: float = 0.0,
                   left: float = 0.0) -> Floats:
     """
-    Return the path of a steered wheel beyond that of a fixed one, by its squared distance: (n,).
+    Return the additional path of a steered wheel over its squared distance ahead: (n,).
 
     t : (n,) equal steps, s.   turn, s : (n,) turn of the vehicle, rad, and travel of its unsteered
-    axle.   ahead, left : place of the wheel from the middle of that axle, in the unit of s.
+    axle.   ahead, left : position of the wheel from the middle of that axle, in the unit of s.
     """
     rate, speed = np.gradient(turn, t), np.gradient(s, t)
     speed = np.convolve(np.pad(speed, len(SMOOTH) // 2, mode='edge'), SMOOTH, mode='valid')

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Clocks: how far apart the topics' stamps are, and whether one was set during the leg."""
+"""Clocks: offsets between the stamps of topics, and clocks that were set during the leg."""
 
 from dataclasses import replace
 
@@ -16,8 +16,8 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_APART
 
-OFFSET_REACH = 1.0     # s, format: what a time_offset setting holds
-# judgement, s: less of a set shows no step among the rows; rows on each side that give the lag
+OFFSET_REACH = 1.0     # s, format: range of a time_offset setting
+# judgement, s: least step of a clock that is detected; rows on each side that give the lag
 CLOCK_SET, LAG_NEIGHBOURS = 0.01, 50
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
 TOO_FAR = ('Stamp all sensors with one clock: the difference exceeds the range of time_offset. '
@@ -36,8 +36,8 @@ def judge_clocks(leg: Leg, config: Config) -> list[Reason]:
     """
     Return reasons for clocks that differ from the IMU's at equal times of arrival.
 
-    leg : as recorded.   Positions of marks are not compared: they have IMU stamps and arrive late
-    by WITHIN.
+    leg : unchanged.   Positions of marks are not compared: they have IMU stamps and arrive late,
+    by up to WITHIN.
     """
     topics = [slot for slot in TOPICS if not (slot == 'fix' and config.reference.points)]
     offset = offsets(config)
@@ -59,7 +59,7 @@ def judge_clocks(leg: Leg, config: Config) -> list[Reason]:
 
 
 def remedy(ahead: float) -> str:
-    """Return the remedy for a clock that is this many seconds ahead of the IMU clock."""
+    """Return the remedy for a clock that is ``ahead`` s ahead of the IMU clock."""
     return TOO_FAR if abs(ahead) > OFFSET_REACH else Code.CLOCKS_DIFFER.remedy
 
 
@@ -69,7 +69,7 @@ def _stamped(samples: SomeSamples) -> SomeSamples:
 
 
 def _lag(samples: Samples) -> Floats:
-    """Return arrival less stamp, s: (n,)."""
+    """Return arrival minus stamp, s: (n,)."""
     lag: Floats = np.multiply(samples.received_ns - samples.stamp_ns, 1e-9)
     return lag
 
@@ -111,10 +111,10 @@ def _may_be_odd(stamp_ns: Ints) -> Bools:
 
 def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
     """
-    Return a leg whose clocks run on where they were set during it, and CLOCK_SET of each.
+    Return a leg with the steps of clocks that were set during it removed, and CLOCK_SET of each.
 
-    leg : as recorded. The stamps of most agreement with the arrivals are kept; the marks move with
-    those of the IMU.
+    leg : unchanged. The stamps with the smallest lag of arrival are kept; the marks are corrected
+    as those of the IMU.
     """
     rows: dict[str, Samples] = {}
     found: list[Reason] = []
@@ -123,7 +123,7 @@ def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
         at, moved = _sets(sent)
         if not len(at):
             continue
-        piece = np.searchsorted(at, np.arange(len(sent.stamp_ns)))     # a set ends it
+        piece = np.searchsorted(at, np.arange(len(sent.stamp_ns)))     # ends at a step
         lag = [abs(np.median(_lag(take(sent, piece == k)))) for k in range(len(at) + 1)]
         shift = np.append(0, np.cumsum(np.round(moved * 1e9).astype(np.int64)))
         shift -= shift[int(np.argmin(lag))]
@@ -143,18 +143,18 @@ def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
 
 def _sets(samples: Samples) -> tuple[Ints, Floats]:
     """
-    Return the rows after which a clock was set, and by how much, s: its stamps step for good.
+    Return the rows after which a clock was set, and its steps, s: stamps step permanently.
 
-    Their arrivals do not, and no stamp beside falls. Rows out of order or with a false stamp step
-    twice.
+    Their arrivals do not (if only these step, the recorder's clock was set), and adjacent stamps
+    do not decrease. Rows out of order or with a false stamp step twice.
     """
     if len(samples.stamp_ns) < 2 * LAG_NEIGHBOURS or not by_step(
             _may_be_odd, samples.stamp_ns).any():
         return np.empty(0, np.int64), np.empty(0)
     step, lag = np.diff(samples.stamp_ns) * 1e-9, _lag(samples)
     ahead = lag[:-1] - lag[1:]
-    odd = np.flatnonzero((np.abs(step - np.median(step)) > CLOCK_SET)
-                         & (np.abs(ahead) > CLOCK_SET / 2))
+    stamps = np.abs(step - np.median(step)) > np.maximum(CLOCK_SET, np.abs(ahead) / 4)
+    odd = np.flatnonzero(stamps & (np.abs(ahead) > CLOCK_SET / 2))
     at, moved = [], []
     for k in odd.tolist():
         before, after = slice(max(k + 1 - LAG_NEIGHBOURS, 0), k), slice(k + 1, k + LAG_NEIGHBOURS)
@@ -162,5 +162,5 @@ def _sets(samples: Samples) -> tuple[Ints, Floats]:
         if (abs(by) >= CLOCK_SET and abs(ahead[k] - by) <= 0.3 * abs(by)
                 and (step[before] >= 0).all() and (step[after] >= 0).all()):
             at.append(k)
-            moved.append(by)        # of the stamps, against arrival
+            moved.append(by)        # of the stamps, relative to arrival
     return np.array(at, np.int64), np.array(moved)

@@ -4,7 +4,7 @@
 """
 Orientation and units of an IMU in the vehicle.
 
-The body frame must be forward-left-up within some degrees. If it is turned by 90 or 180 deg, the
+The body frame must be forward-left-up within some degrees. If it is rotated by 90 or 180 deg, the
 odometer disagrees with the IMU at each start, as if wheels spun. Forward is the direction of the
 specific force when the vehicle accelerates; up is the direction of its median.
 """
@@ -26,13 +26,13 @@ from odocal_ros.settings.grades import G
 from odocal_ros.settings.levels import RAD_PER_DEG
 
 BIN_S = 1.0                        # s, judgement: accelerations are compared as means over it
-FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain is known to a sixth
+FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain has an error of 1/6
 WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
 AXES = 'xyz'
-# nothing follows from such an IMU; what is computed all the same says it in other words
+# no result from such an IMU; further reasons would repeat the cause
 UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
-ROUNDING = 1e-9                 # rad/s, definition: what rotations leave of a rate of zero
-MAX_RATE = 8.0                  # rad/s, physical: no vehicle on wheels turns so fast
+ROUNDING = 1e-9                 # rad/s, definition: rounding of a zero rate by rotations
+MAX_RATE = 8.0                  # rad/s, physical: vehicles on wheels turn more slowly
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Pushes:
     Accelerations of the IMU in the level plane, in bins of BIN_S seconds, complex: e1 + i e2.
 
     e1, e2 : (3,) level axes, in the frame of the IMU's data.   force : (m,) m/s^2.
-    onward, inward : (m,) of the vehicle, real m/s^2: along; to the left in turns.
+    onward, inward : (m,) by odometer and gyro, m/s^2: forward; centripetal, positive to the left.
     near : (m,) True if the bin before it is adjacent.   t : (m,) s, middle of the bin.
     """
 
@@ -59,9 +59,9 @@ class Facing:
     """
     Yaw mounting angle by the accelerations, rad, and its sigma.
 
-    inward, inward_sigma : force towards the inside of turns over the centripetal acceleration of
-    gyro and odometer, as a ratio to that of speeding up: 1; -1 if one of gyro and accelerometer
-    has a mirrored axis, nan if unknown.
+    inward, inward_sigma : gain of the centripetal acceleration (force over that by gyro and
+    odometer) relative to the gain of the forward acceleration: 1; -1 if gyro or accelerometer has
+    a mirrored axis, nan if unknown.
     """
 
     yaw: float
@@ -73,11 +73,11 @@ class Facing:
 def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
            metres_per_unit: float) -> Pushes | None:
     """
-    Return the pushes of a drive, None where it is too short.
+    Return the accelerations of a drive, None if it is too short.
 
     t, w, f : (n,), (n, 3), (n, 3) times, s, turn rate, rad/s, and specific force, in any one frame
-    fixed to the IMU.   up : (3,) unit vector, as gravity shows.   travel : odometer; positive is
-    taken as forward.   metres_per_unit : its rough scale.
+    fixed to the IMU.   up : (3,) unit vector, by gravity.   travel : odometer; positive means
+    forward.   metres_per_unit : its approximate scale.
     """
     t0, t1 = max(t[0], travel.t[0]) + BIN_S, min(t[-1], travel.t[-1]) - BIN_S
     if t1 - t0 < FEWEST_BINS_FACING * BIN_S:
@@ -100,7 +100,7 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
 @dataclass(frozen=True, eq=False)
 class Accelerations:
     """
-    Changes of accelerations from one bin to the next, so that slopes, which change slowly, cancel.
+    Changes of accelerations from bin to bin, in which slopes, which change slowly, cancel.
 
     e1, e2 : (3,) level axes, frame b.   t : (m,) s.   force, onward, inward : (m,) as in Pushes.
     """
@@ -113,7 +113,7 @@ class Accelerations:
     inward: Floats
 
     def __getitem__(self, rows: slice) -> 'Accelerations':
-        """Return those of some rows."""
+        """Return the accelerations of some rows."""
         return Accelerations(self.e1, self.e2, self.t[rows], self.force[rows], self.onward[rows],
                              self.inward[rows])
 
@@ -145,7 +145,7 @@ def facing_of(found: Accelerations) -> Facing | None:
     """
     Return the IMU orientation in the vehicle, None if the accelerations do not determine it.
 
-    The turns have a factor of their own, so that the sign of the gyro has no effect.
+    The centripetal acceleration has its own factor, so that the sign of the gyro has no effect.
     """
     force = found.force
     A = np.stack([found.onward, 1j * found.inward], -1)
@@ -155,7 +155,7 @@ def facing_of(found: Accelerations) -> Facing | None:
     inverse = np.linalg.inv(normal)
     gain = inverse @ (A.conj().T @ force)
     rest = force - A @ gain
-    # only half of the residual lies across, only every other change (they share bins) is a draw
+    # half of the residual is across, and every other change is independent (they share bins)
     variances = np.vdot(rest, rest).real / len(A) * np.diag(inverse).real
     sigma, inward_sigma = np.sqrt(variances) / max(abs(gain[0]), 1e-9)
     facing_sigma = np.deg2rad(10.0)    # limit of the 1 sigma of the IMU orientation
@@ -170,7 +170,7 @@ def facing_of(found: Accelerations) -> Facing | None:
 def toward(found: Facing | None, f: Floats) -> Floats:
     """Return scale times forward axis, (3,), turned to the IMU orientation if that is far off."""
     yaw, pitch = mounting_from_forward(f)
-    near_facing = np.deg2rad(10.0)    # off the forward axis of a method: no effect on slips
+    near_facing = np.deg2rad(10.0)    # from the forward axis of a method: no effect on slips
     if found is None or abs(float(wrap(found.yaw - yaw))) < max(near_facing, 3 * found.sigma):
         return f
     return np.linalg.norm(f) * forward_b(found.yaw, pitch)
@@ -204,18 +204,18 @@ def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
     """
     Return reasons about units and axes of an IMU, and True if it must be turned over (z down).
 
-    mean : (3,) specific force as it usually is (its median), m/s^2, in the configured body
-    frame.   w_b : (n, 3) turn rate there, rad/s.   C_bi : (3, 3) nominal rotation configured.
-    imu : its scales are in the figures already. An UNUSABLE one cannot be computed with.
+    mean : (3,) median specific force, m/s^2, in the configured body frame.   w_b : (n, 3) turn
+    rate in it, rad/s.   C_bi : (3, 3) configured nominal rotation.   imu : settings, whose scales
+    are already applied. With a reason of UNUSABLE no result is possible.
     """
     rest, size = medians(w_b), float(np.linalg.norm(mean))
     fast = float(np.percentile(by_row(lambda w: lengths(w - rest), w_b), 99.9,
                                overwrite_input=True))
     reasons = []
-    if not any(w_b[some].any() for some in chunks(len(w_b))):   # what messages hold that have none
+    if not any(w_b[some].any() for some in chunks(len(w_b))):   # as of messages without any
         reasons.append(Reason(Code.NO_IMU, 'all turn rates are zero: the IMU publishes none, or '
                               'imu.gyro_scale is 0'))
-    no_gravity = 0.01    # m/s^2, far below what gravity is in any unit
+    no_gravity = 0.01    # m/s^2, far below gravity in any unit
     if size < no_gravity:
         reasons.append(Reason(Code.NO_IMU, 'the acceleration contains no gravity: the IMU '
                               'publishes none or removes gravity, or imu.accel_scale is 0'))

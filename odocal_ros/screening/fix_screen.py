@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Which fixes and GNSS velocities can be used, and the uncertainty of each fix.
+Selection of usable fixes and GNSS velocities, and the uncertainty of each fix.
 
 Some receivers dead-reckon without satellites, and their position jumps when satellites return.
-Such fixes are smooth: the change of their displacement from second to second is what odometer and
-IMU predict, far better than elsewhere. The jump at the end is the sum of their errors, so these
-fixes contain no information on the scale.
+Such fixes are smooth: the change of their displacement from second to second agrees with odometer
+and IMU far better than elsewhere. The jump at the end is the sum of their errors, so these fixes
+contain no information on the scale.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 
 # m, judgement. Measured on eight zoo drives with blocks of fixes of 7 m among fixes of 0.01 to
 # 1.5 m: without a limit the sigma of the scale is 1.2 to 24 times as large, as correlated errors
-# have one level; error over sigma is the same. A drive with fixes of 3 to 7 m is lost with it
+# have one level; error over sigma is the same. A drive with fixes of 3 to 7 m fails with it
 USUAL_LIMIT = 3.0
 # s, length of compared displacements: judgement, longer than delays of receivers
 DISPLACEMENT_WINDOW = 10.0
@@ -36,13 +36,13 @@ COMPARED_EVERY = 1.0     # s between the fixes that are compared: judgement
 MOVED_LEAST = 1.0        # m in this time, judgement: displacements then have a direction
 # judgement: smooth is a quarter of the median, or half of it where gyro and odometer add 3 cm
 SMOOTH_LIMIT, FINE_SHARE, FINE_LIMIT = 0.25, 0.5, 0.03
-# judgement: of so many seconds this share is smooth; of white noise three times in 10^8 (a
+# judgement: rows, s, and smooth share of them; white noise reaches it three times in 10^8 (a
 # quarter), or in 10^4 (half)
 SMOOTH_ROWS, SMOOTH_SHARE = 10, 0.7
 # medians and m: a jump. Judgement: white noise exceeds three medians once in 500 seconds, after a
 # smooth section
 JUMP_SIZE, SHORTEST_JUMP = 3.0, 0.5
-SPANS_SAID = 3           # judgement: spans in a reason
+SPANS_SAID = 3           # judgement: number of spans in a reason
 
 
 def usable_fixes(fix: FixSamples, sent: int,
@@ -50,10 +50,10 @@ def usable_fixes(fix: FixSamples, sent: int,
     """
     Return a mask of usable fixes, (n,), all covariances, (n, 3, 3) m^2, and reasons.
 
-    fix : with stamps in order.   sent : how many there were before.   gnss : limits.
+    fix : with stamps in order.   sent : number of received fixes.   gnss : limits.
     """
     no_fix = fix.status < gnss.min_status
-    most_height = 1e5    # m, beyond it a fix is at no real position
+    most_height = 1e5    # m, above it a position is not real
     lost = ~placed(fix) | (abs(fix.height) > most_height)
     lost = lost | _away(fix, ~(lost | no_fix))
     covariance, unknown = covariances(fix, gnss.default_sigma)
@@ -116,24 +116,24 @@ def _away(fix: FixSamples, good: Bools) -> Bools:
     away = np.zeros(len(good), bool)
     if good.any():
         r_e = ecef_from_geodetic(fix.latitude[good], fix.longitude[good], 0.0)
-        away_from_most = 1e6    # m from where most fixes are: at no real position
+        away_from_most = 1e6    # m from the median fix: not a real position
         away[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > away_from_most
     return away
 
 
 def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
     """
-    Return covariances with the unknown ones replaced, and which those are.
+    Return covariances with the unknown ones replaced, and a mask of these, (n,).
 
     Unknown: type 0, zero or less, not finite, or not a covariance (a correlation of one or more).
-    If only the height's part is unknown, it is derived from the level part.
+    If only the height's part is unknown, it is derived from the horizontal part.
     """
     covariance = fix.covariance_n.copy()
     unknown = ~_proper(covariance[:, :2, :2]) | (fix.covariance_type == 0)
     flat = unknown | ~_proper(covariance)
     covariance[unknown] = np.eye(3) * default_sigma**2
     covariance[flat, 2, :] = covariance[flat, :, 2] = 0.0
-    # satellites are above only: a height is about twice as bad
+    # satellites are only above: the sigma of a height is about twice as large
     covariance[flat, 2, 2] = 4 * np.maximum(covariance[flat, 0, 0], covariance[flat, 1, 1])
     return covariance, unknown
 
@@ -141,20 +141,20 @@ def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
 def _proper(matrices: Floats) -> Bools:
     """Return a mask of invertible covariance matrices: (n, k, k) to (n,) bool."""
     variance = np.diagonal(matrices, axis1=1, axis2=2)
-    largest_sigma = 1e8    # m, a sigma beyond it says nothing
-    # products and roots of what is beyond any receiver would overflow
+    largest_sigma = 1e8    # m, larger ones are invalid
+    # products and roots of larger values would overflow
     small = np.abs(matrices) < largest_sigma**2
     sane: Bools = np.all(np.isfinite(matrices) & small, axis=(1, 2))
-    smallest_sigma = 1e-6    # m, a sigma below it says nothing
+    smallest_sigma = 1e-6    # m, smaller ones are invalid
     sane &= (variance > smallest_sigma**2).all(axis=1)
     with np.errstate(all='ignore'):
         sigma = np.sqrt(variance)
         unit = matrices / (sigma[:, :, None] * sigma[:, None, :])
     unit[~sane] = np.eye(matrices.shape[1])
     asymmetry = 1e-3    # correlations above and below the diagonal
-    # one that is not symmetric is damaged: the correct half is unknown
+    # an asymmetric matrix is damaged: the correct half is unknown
     sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < asymmetry).all(axis=(1, 2))
-    # least eigenvalue of the correlations: below it an axis adds nothing
+    # least eigenvalue of the correlations: below it the matrix is singular
     least_eigenvalue = 1e-6
     sane &= np.linalg.eigvalsh(unit)[:, 0] > least_eigenvalue
     return sane
@@ -162,7 +162,7 @@ def _proper(matrices: Floats) -> Bools:
 
 def origin_amid(t_fix: Floats, geodetic: Floats) -> Origin:
     """Return the origin of n: the median fix of those near the start, so it is not an outlier."""
-    about_start = 11    # fixes about the start mark that the origin is amid
+    about_start = 11    # fixes nearest to the start mark, whose median is used
     near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:about_start])
     r_e = ecef_from_geodetic(geodetic[near, 0], geodetic[near, 1], 0.0)
     amid = near[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
@@ -173,7 +173,7 @@ def origin_amid(t_fix: Floats, geodetic: Floats) -> Origin:
 def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
                  covariance_n: Floats) -> tuple[Reason, ...]:
     """
-    Return VELOCITY_UNUSABLE if the velocity contradicts the fixes, otherwise nothing.
+    Return VELOCITY_UNUSABLE if the velocity contradicts the fixes, otherwise ().
 
     Displacements between fixes, complex numbers D, are z times those from the velocity, V, with
     z = sum(conj(V) D) / sum(|V|^2), 1 for a correct velocity. Swapped axes, vehicle axes, a speed
@@ -194,7 +194,7 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
     path = running_integral(t, velocity_n[:, :2])
     V = np.diff(np.interp(t_fix[pick], t, path[:, 0]) + 1j * np.interp(t_fix[pick], t, path[:, 1]))
     D = np.diff(east + 1j * north)
-    # in a gap of the velocity, or of the fixes, what is between is not measured
+    # motion in a gap of the velocity, or of the fixes, is not measured
     gaps, at = np.append(0, np.cumsum(np.diff(t) > VELOCITY_GAP)), t_fix[pick]
     begin, end = np.searchsorted(t, at[:-1], side='right') - 1, np.searchsorted(t, at[1:])
     whole = (gaps[begin] == gaps[end]) & (np.diff(at) < 2 * DISPLACEMENT_WINDOW)
@@ -214,10 +214,10 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
 def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats,
              track: Complexes) -> tuple[Bools, tuple[Reason, ...]]:
     """
-    Return a mask of fixes that a receiver has reckoned, and FIXES_DEAD_RECKONED.
+    Return a mask of fixes that a receiver has dead-reckoned, and FIXES_DEAD_RECKONED.
 
     t_fix : (k,) s.   fixes_n : (k, 3) m.   sigma : (k,) stated, of an axis, m.   track : (k,)
-    positions of the antenna by odometer and gyro, m, its scale good to 30 %, any first heading.
+    positions of the antenna by odometer and gyro, m, with any first heading, scale within 30 %.
     """
     spans = _spans(t_fix, fixes_n[:, 0] + 1j * fixes_n[:, 1], sigma, track)
     found = np.zeros(len(t_fix), bool)
@@ -234,7 +234,7 @@ def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats,
 
 def _spans(t: Floats, place: Complexes, sigma: Floats,
            track: Complexes) -> list[tuple[float, float, float]]:
-    """Return of each span its first fix and the first after it, s, and the jump there, m."""
+    """Return for each span its first fix and the first after it, s, and the jump there, m."""
     if len(t) <= SMOOTH_ROWS:
         return []
     step = min(max(1, round(COMPARED_EVERY / float(np.median(np.diff(t))))), len(t) - 1)
@@ -253,23 +253,23 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
     usual, at = float(np.median(off[driven])), rows[driven]
     smooth = off[driven] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
     spans: list[tuple[float, float, float]] = []
-    # smaller ones than the stated error are of satellites that come and go
+    # jumps below the stated error are caused by changes of satellites
     least = np.maximum(max(JUMP_SIZE * usual, SHORTEST_JUMP), sigma[rows])
     for k in np.flatnonzero(off > least):
         last = int(np.searchsorted(at, rows[k]))
         first = _begin(smooth[:last])
         if first == last:
             continue
-        # fixes since the compared one before may be of the tunnel too
+        # fixes since the previous compared one may be dead-reckoned too
         begin = float(t[max(at[first] - 2, 0)])
-        # the row after a jump is as far off
+        # the row after a jump has the same deviation
         if not spans or begin > spans[-1][1]:
             spans.append((begin, float(t[rows[k] + 1]), float(off[k])))
     return spans
 
 
 def _begin(smooth: Bools) -> int:
-    """Return the first row of the smooth section that ends a series, its length without one."""
+    """Return the first row of the smooth section at the end, or the length if there is none."""
     begin = len(smooth)
     while begin >= SMOOTH_ROWS and smooth[begin - SMOOTH_ROWS:begin].mean() >= SMOOTH_SHARE:
         begin -= 1

@@ -17,23 +17,23 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
 
-# judgement: far beyond any sensor in any unit in use (deg/s, mm/s^2): wrong units stay to be named
+# judgement: far beyond any sensor in any unit in use (deg/s, mm/s^2): wrong units are kept
 BEYOND_SENSOR = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
 # judgement: rows beyond any sensor, each within CLUMP_REACH rows of the one before, are a clump
 CLUMP_ROWS = 5
-CLUMP_REACH = 50          # rows: a page or a packed block of a recording is about so many
-DAMAGED_SHARE = 0.01      # of the rows beyond any sensor: so many are a damaged recording, or
-SEVERAL_ROWS = 4          # rows, wherever: about as many are wrong beside them and do not show
-ROWS_BESIDE = 5          # rows to either side that are still where a single row is false
-# judgement: of a spike: least step from row to row, rad/s and m/s^2 (potholes stay), and in usual
-# steps; s within which it is over (longer, and motion itself may do it); share of the step that
-# is then left
+CLUMP_REACH = 50          # rows: about a page or a packed block of a recording
+DAMAGED_SHARE = 0.01      # share of rows beyond any sensor in a damaged recording, or
+SEVERAL_ROWS = 4          # their number at any places: adjacent rows may be false undetected
+ROWS_BESIDE = 5          # rows to either side of a single false row that show no motion
+# judgement: of a spike: least step from row to row, rad/s and m/s^2 (potholes are kept), and in
+# usual steps; s, its longest duration (motion may last longer); largest share of the step that
+# remains after it
 TURN_STEP, FORCE_STEP, USUAL_STEPS, GLITCH_TIME, BACK_SHARE = 0.8, 50.0, 20.0, 0.4, 0.5
-# judgement: of a single row: least that it is off by, rad/s (0.003 rad in 0.1 s) and m/s^2; times
-# as far from its neighbours as those beside it are from theirs; of that, how similar the two are
+# judgement: of a single row: least deviation, rad/s (0.003 rad in 0.1 s) and m/s^2; ratio to the
+# deviations of adjacent rows; share of it by which the rows before and after may differ
 SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES, EQUAL_NEIGHBOURS = 0.03, 2.0, 10.0, 0.3
-GLITCH_SHARE = 0.002      # of the rows: more of them are no glitches
-ROLLS = 0.1               # of the top speed: slower on the mean, a vehicle may as well stand
+GLITCH_SHARE = 0.002      # of the rows: more of them are not glitches
+ROLLS = 0.1               # of the top speed: with a lower mean, a vehicle may be at rest
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
@@ -42,7 +42,7 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
     column = np.asarray(column)
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
-    largest_value = 1e300    # of what no sensor bounds: sums and products with it stay finite
+    largest_value = 1e300    # of unbounded columns: sums and products with it stay finite
     most = BEYOND_SENSOR.get(name, largest_value)
 
     def odd(x: NDArray[Any]) -> Bools:
@@ -58,7 +58,7 @@ def oriented(samples: Oriented) -> Oriented:
     """Return IMU or heading rows without invalid orientations; their variance is NaN."""
     def no_attitude(wild: Bools, q_ni: Floats, variance: Floats) -> Bools:
         length = lengths(np.where(wild[:, None], 0.0, q_ni))
-        unit_length = 2.0    # times one, either way: a quaternion of another length is no attitude
+        unit_length = 2.0    # largest ratio of a quaternion's length to one, and of one to it
         widest_variance = 1e12    # rad^2, drivers use smaller values for unknown
         return ((length < 1 / unit_length) | (length > unit_length)
                 | (np.abs(variance) > widest_variance))
@@ -75,8 +75,8 @@ def about_clumps(wild: Bools) -> Bools:
     """
     Return a mask of rows in or near a group of impossible rows.
 
-    In a damaged recording only a part of the false rows is detected: rows beside them are false by
-    less than a sensor's range.
+    In a damaged recording only a part of the false rows is detected: the errors of others are
+    within a sensor's range.
 
     wild : (n,) bool.   Returns (n,) bool, the clumps and to either side twice as many rows as the
     longest interval in them without impossible rows.
@@ -94,8 +94,8 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
     """
     Return a mask of rows that jump away from their neighbours and back: (n,) bool.
 
-    t : (n,) times, s, rising.   x : (n, k) values.   least : smallest bound, from one row to the
-    next, that may be a glitch. All false where so many rows do so that it is the sensor's nature.
+    t : (n,) times, s, rising.   x : (n, k) values.   least : smallest jump, from one row to the
+    next, of a glitch. All false if so many rows jump that it is normal for the sensor.
     """
     found = np.zeros(len(x), bool)
     bound = by_step(lambda x: across(np.maximum, np.abs(np.diff(x, axis=0))), x)
@@ -105,7 +105,7 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
     size = bound[far]
     clear = size > USUAL_STEPS * median(bound)
     done = -1
-    most_bounds = 2000    # bounds looked at
+    most_bounds = 2000    # jumps that are tested
     for i, bound in zip(far[clear][:most_bounds], size[clear], strict=False):
         if i < done:
             continue
@@ -121,8 +121,8 @@ def single(x: Floats, least: float) -> Bools:
     """
     Return a mask of isolated outliers with no motion before and after.
 
-    x : (n, k).   least : smallest deviation of an outlier.   Returns (n,) bool, all false where
-    so many rows are that it is the sensor's nature.
+    x : (n, k).   least : smallest deviation of an outlier.   Returns (n,) bool, all false if
+    there are so many that it is normal for the sensor.
     """
     edge = ROWS_BESIDE + 1
 
@@ -159,17 +159,17 @@ def speed_glitches(t: Floats, speed: Floats) -> Bools:
     if len(speed) < 20:
         return np.zeros(len(speed), bool)
     top = np.percentile(np.abs(speed), 95)
-    speed_step = 0.3    # of the top speed, least bound from row to row that may be a glitch
+    speed_step = 0.3    # of the top speed, least jump from row to row of a glitch
     return alone(t, speed[:, None], max(speed_step * top, 1e-12))
 
 
 def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, ...]:
     """
-    Return IMU_GAP where the gyro repeats one value to the last bit while the wheels roll.
+    Return IMU_GAP if the gyro repeats exactly one value while the wheels roll.
 
-    t, w : (n,), (n, 3) IMU rows.   travel : Travel.   limit : s, as long as a gap may be.
-    A gyro that reads zero is accepted: some drivers have a dead band. So is one that often repeats
-    its value: it has coarse steps.
+    t, w : (n,), (n, 3) IMU rows.   travel : Travel.   limit : s, longest allowed gap.
+    A gyro that measures zero is accepted: some drivers have a dead band. So is one that often
+    repeats its value: it has coarse steps.
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()
@@ -181,7 +181,7 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
     rolled = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)
     held = np.flatnonzero((end - begin > limit) & (rolled > ROLLS * np.percentile(speed, 95)))
     elsewhere = len(same) - np.diff(where[held]).sum()
-    coarse_share = 0.2      # judgement: of the rows elsewhere; of a fine gyro none repeat
+    coarse_share = 0.2      # judgement: of the rows elsewhere; fine gyros have no repeats
     if not len(held) or same.sum() - np.diff(where[held]).sum() > coarse_share * elsewhere:
         return ()
     worst = held[np.argmax((end - begin)[held])]

@@ -5,13 +5,13 @@
 Fit of the direction of gravity to the gyro, one coefficient for each axis of the gyro.
 
 Hills, bumps and braking tilt a vehicle: gravity turns in the frame of the accelerometer, and the
-gyro must measure this turn. In level axes that the yaw psi of the gyro holds still, the specific
+gyro must measure this turn. In level axes stabilised by the yaw psi of the gyro, the specific
 force, as a complex number e1 + i e2, is
 
     F = F0 + i g int (w1 + i w2) exp(i psi) dt + d/dt (v exp(i psi)).
 
 Each gyro axis has a coefficient of its own, so the second term is
-``i g int (c1 w1 + c2 w2 + c3 w3) exp(i psi) dt`` with c = (1, i, 0) for a sound gyro. A mirrored
+``i g int (c1 w1 + c2 w2 + c3 w3) exp(i psi) dt`` with c = (1, i, 0) for a correct gyro. A mirrored
 axis has the opposite coefficient, swapped axes have swapped coefficients.
 """
 
@@ -30,7 +30,7 @@ ROW_S, ROWS_A_SECOND = 0.25, 4       # s, judgement: the yaw between rows stays 
 # tuned by benchmarks/zoo.py, 90 drives of 150 to 600 s: shorter or longer segments detect less
 SEGMENTS, SHORTEST_S, LONGEST_S = 12, 10, 30
 MOVING_SPEED = 0.5      # m/s, judgement: mean of a segment in which a vehicle drives
-WEIGHTING_PASSES = 4    # judgement: the weights of segments have settled
+WEIGHTING_PASSES = 4    # judgement: the weights of segments have converged
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,8 @@ class GravityFit:
     """
     Coefficients of the gyro axes w1, w2, w3.
 
-    coefficient : (3,) complex, 1, i and 0 for a sound gyro.   sigma : (3,) from the scatter of
-    the segments.   segments : (3,) how many segments determine it, effectively.
+    coefficient : (3,) complex, 1, i and 0 for a correct gyro.   sigma : (3,) from the scatter of
+    the segments.   segments : (3,) effective number of segments that determine it.
     """
 
     coefficient: Complexes
@@ -53,7 +53,7 @@ class Rows:
     A drive in rows of ROW_S seconds.
 
     w, f : (m, 3) rad/s and m/s^2, in e1, e2, up.   s : (m + 1,) m, travel at their edges.
-    full : (m,) whether the IMU has samples there.
+    full : (m,) True if the IMU has samples there.
     """
 
     w: Floats
@@ -65,7 +65,7 @@ class Rows:
 def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
                 metres_per_unit: float) -> GravityFit | None:
     """
-    Return the coefficients of the gyro axes, None where the drive is too short.
+    Return the coefficients of the gyro axes, None if the drive is too short.
 
     t, w, f : (n,), (n, 3), (n, 3) times, s, turn rate, rad/s, and specific force, m/s^2, in one
     frame fixed to the IMU.   axes : (3, 3) rows e1, e2, up in that frame: right-handed.   travel :
@@ -106,7 +106,7 @@ def _segments(rows: Rows) -> tuple[Complexes, Complexes]:
     onward = np.diff(speed) * (course[1:] + course[:-1]) / 2
     inward = np.diff(course) * (speed[1:] + speed[:-1]) / 2
     turn_rate, heading = _seconds(rows.w[:, 2]), _seconds(turned)
-    # the derivatives stand for delays, the last two for a lever arm of the IMU
+    # the derivatives model delays, the last two a lever arm of the IMU
     pushes = [onward, inward, np.gradient(onward), np.gradient(inward),
               np.gradient(turn_rate) * heading, turn_rate**2 * heading]
     observables = cut(np.stack([*tilts, *pushes], -1))
@@ -122,7 +122,7 @@ def _segments(rows: Rows) -> tuple[Complexes, Complexes]:
 
 
 def _fit(X: Complexes, force: Complexes) -> GravityFit | None:
-    """Return the least-squares coefficients; a segment weighs by its residuals."""
+    """Return the least-squares coefficients; segments are weighted by their residuals."""
     n, _, p = X.shape
     if n <= p:
         return None
@@ -132,7 +132,7 @@ def _fit(X: Complexes, force: Complexes) -> GravityFit | None:
     scale[scale == 0] = 1.0             # an acceleration that is always zero
     normal, right = normal / (scale[:, None] * scale), right / scale
     weight = np.ones(n)
-    tiny = 1e-9 * np.eye(p)    # of the unit diagonal, rounding: what the drive does not determine
+    tiny = 1e-9 * np.eye(p)    # of the unit diagonal, rounding: keeps undetermined ones invertible
     for _ in range(WEIGHTING_PASSES):
         used = weight / weight.mean()
         inverse = np.linalg.inv(np.einsum('k,kij->ij', used, normal) + tiny)

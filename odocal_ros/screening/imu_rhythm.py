@@ -6,8 +6,8 @@ Sampling times of IMU rows whose stamps have jitter.
 
 An IMU samples by its own crystal; stamps at arrival have jitter of some milliseconds, or come in
 pairs. The error of integrals is the change from row to row times the jitter: with the vibration of
-an engine many times the sensor noise. Rows are placed at even times if rate and force are smoother
-there, unlike those of an IMU that is polled at uneven times.
+an engine many times the sensor noise. Rows get even times if rate and force are smoother at these,
+which they are not for an IMU that is polled at uneven times.
 """
 
 from collections.abc import Iterable
@@ -19,11 +19,11 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks, PIECE_ROWS, runs
 
-BLOCK_TIME = 1.0          # s, judgement: of rows in whose mean a lost row shows
+BLOCK_TIME = 1.0          # s, judgement: of rows whose mean shows a lost row
 WINDOW_BLOCKS = 20        # judgement: of a mean: jitter over sqrt(2000) remains at 100 Hz
 JITTER_SHARE = 2e-3       # judgement: of an interval, smallest jitter that is corrected
-TESTED_ROWS = 20_000      # judgement: at the most, in as many
-TESTED_GROUPS = 40        # judgement: groups, whose sums give the significance
+TESTED_ROWS = 20_000      # judgement: largest number of tested rows
+TESTED_GROUPS = 40        # judgement: groups of them, whose sums give the significance
 BESIDE, HERE, NODES = np.arange(-2, 3), 2, (0, 1, 3, 4)     # definition: a row amid its cubic's
 APART = 1e-9              # s, judgement: minimum difference between rows
 SURE_SIGMAS = 4.0         # statistical: significance of smoother rows: by chance once in 30,000
@@ -49,24 +49,24 @@ def on_rhythm(t: Floats, w: Floats, f: Floats) -> Floats:
 
 
 def _interval(t: Floats) -> float:
-    """Return the time from row to row, s, of the median of stretches of 100."""
+    """Return the interval of rows, s, by the median duration of 100 intervals."""
     stretch = t[::100]
     return float(np.median(np.diff(stretch))) / 100 if len(stretch) > 1 else 0.0
 
 
 class _Rhythm:
     """
-    Even times through the means of rows where none is lost; elsewhere rows keep their stamps.
+    Even times by the mean stamps of blocks without lost rows; other rows keep their stamps.
 
-    lost : (b,) bool, blocks of ``per`` rows with a lost row in or beside them.   knots, late :
-    (k,) rows, and their delay relative to so many intervals, s.
+    lost : (b,) bool, blocks of ``per`` rows with a lost row in them or in an adjacent one.
+    knots, late : (k,) row numbers, and their time minus row number times interval, s.
     """
 
     def __init__(self, t: Floats, usual: float, per: int) -> None:
         self.usual, self.per = usual, per
         mean = self._means(t)
         self.lost = np.zeros(len(mean), bool)
-        # a row, over a block that it may be in
+        # a lost row: across the block that may contain it
         jump = np.abs(mean[2:] - mean[:-2]) > usual / 2
         for shift in range(3):
             self.lost[shift:shift + len(jump)] |= jump
@@ -74,7 +74,7 @@ class _Rhythm:
         self.knots, self.late = np.concatenate([np.zeros((2, 0)), *lines], axis=1)
 
     def _means(self, t: Floats) -> Floats:
-        """Return the mean lateness of the rows of each block, without the delayed ones."""
+        """Return the trimmed mean of stamp minus row number times interval, of each block, s."""
         blocks, found = len(t) // self.per, []
         for some in np.array_split(np.arange(blocks), 1 + len(t) // PIECE_ROWS):
             rows = np.arange(some[0] * self.per, (some[-1] + 1) * self.per)
@@ -96,7 +96,7 @@ class _Rhythm:
         return np.stack([knots, start + slope * knots + by])
 
     def at(self, t: Floats, rows: Ints) -> Floats:
-        """Return the times of rows: as rows are shaped, s."""
+        """Return the times of rows, s, in the shape of ``rows``."""
         if not len(self.knots):
             return t[rows]
         even = self.usual * rows + np.interp(rows, self.knots, self.late)
@@ -104,7 +104,7 @@ class _Rhythm:
         return np.where(lost, t[rows], even)
 
     def times(self, t: Floats) -> Floats:
-        """Return the times of all rows, rising, also where both kinds meet."""
+        """Return the times of all rows, rising, also between even times and stamps."""
         found, last = room(len(t)), -np.inf
         for rows in chunks(len(t)):
             own = np.arange(rows.start, rows.stop)
@@ -115,14 +115,14 @@ class _Rhythm:
 
 def _evener(sent: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
     """
-    Return True if rows are significantly more even at other times than their stamps.
+    Return True if rows are significantly smoother at other times than at their stamps.
 
-    sent, even : (m, 5) s of rows and those beside.   columns : (m, 5) each, what they measured.
+    sent, even : (m, 5) s, of rows and adjacent ones.   columns : (m, 5) each, measured values.
     """
     weights = _weights(sent), _weights(even)
     gain = np.zeros(len(sent))
     for near in columns:
-        # of noise alone both are its variance
+        # with noise alone, both are its variance
         off, left = (np.einsum('mk,mk->m', near, x)**2 / (x**2).sum(axis=1) for x in weights)
         rounding = 1e-18 * (near**2).mean() + 1e-30
         gain += np.clip((off - left) / max(np.median(off + left), rounding), -10.0, 10.0)

@@ -1,10 +1,10 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A leg as the methods use it: screened rows, fixes in metres, metres per count."""
+"""Inputs of the methods: screened rows of a leg, fixes in metres, metres per count."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from odocal_ros.settings.nominal import nominal_scale
 
 
 class UsableRows(NamedTuple):
-    """The usable rows of a topic, as sent, and their times from the start mark: (n,) s."""
+    """The usable rows of a topic, unchanged, and their times from the start mark: (n,) s."""
 
     sent: Any
     t: Floats
@@ -32,17 +32,17 @@ class UsableRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """A leg made usable: rising times since the start mark, SI, body frame."""
+    """A screened leg: rising times since the start mark, SI, body frame."""
 
     t_stop: float                      # s, the stop mark
     t_imu: NDArray[np.float64]         # (n,)
     w_b: NDArray[np.float64]           # (n, 3) rad/s
     f_b: NDArray[np.float64]           # (n, 3) m/s^2
-    q_ni: NDArray[np.float64]          # (n, 4) orientation as sent, of frame i
+    q_ni: NDArray[np.float64]          # (n, 4) published orientation of frame i
     yaw_variance: NDArray[np.float64]  # (n,) rad^2, NaN: no orientation
     C_bi: NDArray[np.float64]          # (3, 3) nominal mounting rotation
     travel: Travel                     # mean of the wheels
-    travels: tuple[Travel, ...]        # of each of several wheels; () of one, or of unknown sides
+    travels: tuple[Travel, ...]        # of several wheels; () if one, or if sides are unknown
     doubt_t: NDArray[np.float64]       # (d,) s, times of uncertain travel (resets, gaps)
     doubt_sigma: NDArray[np.float64]   # (d,) its sigma, scale units
     t_fix: NDArray[np.float64]         # (k,)
@@ -51,8 +51,10 @@ class Inputs:
     outside: Mapping[str, UsableRows]      # of the other sensors, by slot
     fixes_rejected: int
     scale_unit: str
-    has_accelerometer: bool = True     # False: f_b is made up
+    has_accelerometer: bool = True     # False: f_b is assumed gravity
     local: bool = False                # True: fixes are positions in a local frame
+    # clocks that were seconds from the IMU's, by group of settings: s, > 0 late; moved and said
+    aligned: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def usual_f_b(self) -> Floats:
@@ -61,7 +63,7 @@ class Inputs:
 
     @property
     def up_b(self) -> Floats:
-        """Return the direction of the usual specific force: (3,) unit vector, 0 of no force."""
+        """Return the direction of the median specific force: (3,) unit vector, 0 without force."""
         return self.usual_f_b / max(float(np.linalg.norm(self.usual_f_b)), 1e-9)
 
     @property
@@ -75,7 +77,7 @@ class Inputs:
                            config.leg.standstill)
 
     def mirrored(self, spans: Floats) -> 'Inputs':
-        """Return them with the counts in spans, (m, 2) s, reversed."""
+        """Return the inputs with the counts in spans, (m, 2) s, reversed."""
         if not len(spans):
             return self
         return replace(self, travel=self.travel.mirrored(spans),
@@ -85,11 +87,11 @@ class Inputs:
 @dataclass(frozen=True, eq=False)
 class Placed:
     """
-    Fixes in metres, and the scale as far as it is known.
+    Fixes in metres, and the approximate scale.
 
-    origin : of n.   fixes_n : (k, 3) m, NaN up where a fix has no height.   fix_sigma : m, usual
-    1 sigma of an axis in the plane, NaN without fixes.   nominal : K0, metres per unit of travel,
-    0 unknown.   rough : by the fixes, K0 where they move too little.
+    origin : of n.   fixes_n : (k, 3) m, NaN up if a fix has no height.   fix_sigma : m, median
+    1 sigma of a horizontal axis, NaN without fixes.   nominal : K0, metres per unit of travel,
+    0 unknown.   rough : scale by the fixes, K0 if they move too little.
     """
 
     origin: Origin

@@ -5,9 +5,9 @@
 Sampling times of odometer rows that arrive late: in bursts, or all with random delays.
 
 A counter without a header is stamped at arrival: a delayed message (serial line, busy machine)
-looks like a wheel that slides and then spins. No row is early, so the sender's even rhythm goes
-through the rows with the smallest delays. The median delay remains; the rest is removed if the
-travel is smoother on the rhythm. Rows of a burst that are not on it are placed by their travel.
+looks like a wheel that slides and then spins. The sender's rhythm (even times) is by the rows with
+the smallest delays. The median delay remains; the rest is removed if travel is smoother on the
+rhythm. Rows of a burst that are not on it get times by their travel.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ from odocal_ros.screening.imu_rhythm import APART, TESTED_ROWS
 from odocal_ros.screening.odometer_care import counter_steps
 
 ON_TIME_WINDOW = 5.0      # s, judgement: some row in it is on time
-EVEN_BESIDE = 5           # judgement: rows to either side that determine the place of a row
+EVEN_BESIDE = 5           # judgement: rows to either side that determine the time of a row
 # definition: with a line, half the acceleration would look like delay
 CUBIC = (-2 * EVEN_BESIDE, -EVEN_BESIDE, EVEN_BESIDE, 2 * EVEN_BESIDE)
 MIDDLE_WINDOW = 20.0      # s, judgement: minimum length for the median delay
@@ -34,13 +34,13 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
     """
     Return the sampling times of rows: (n,) s, late ones moved back.
 
-    samples : OdometerSamples, usable.   t : (n,) s by stamps.   found : list that findings join.
+    samples : OdometerSamples, usable.   t : (n,) s by stamps.   found : list, reasons are added.
     """
     if len(t) < 4 * EVEN_BESIDE:
         return t
     whole = np.issubdtype(samples.value.dtype, np.integer)
     if form.quantity == 'rate':
-        # a speed is as smooth as travel, but does not determine the place of a row in a burst
+        # a speed is as smooth as travel, but does not determine the time of a row in a burst
         _, even, evener = _rhythm(t, samples.value.astype(float))
         true = _rising(even) if evener else t
     else:
@@ -61,7 +61,7 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
 
 
 def arrival_jitter(t: Floats) -> float | None:
-    """Return the standard deviation of arrivals on the rhythm, s, None of few rows."""
+    """Return the standard deviation of arrivals from the rhythm, s, None with few rows."""
     if len(t) < 4 * EVEN_BESIDE or t[-1] <= t[0]:
         return None
     late = [t - _soonest(t, usual) for usual in intervals(t)]
@@ -70,17 +70,19 @@ def arrival_jitter(t: Floats) -> float | None:
 
 
 def intervals(t: Floats) -> list[float]:
-    """Return candidates of the sender's interval, s: that of sent rows, of received ones."""
+    """Return candidates of the sender's interval, s: by all sent rows, and by received ones."""
     interval_span = 5.0    # s over which means are taken
     n = max(1, int(interval_span * (len(t) - 1) / max(t[-1] - t[0], interval_span)))
     step = np.diff(t)
-    usual, mean = median(step), median(t[n:] - t[:-n]) / n
-    steady_share = 0.005    # by which they differ: rows are lost, or all are late by chance
+    # if most rows have the same stamp, the median over parts is zero
+    usual = median(step)
+    mean = median(t[n:] - t[:-n]) / n or float(t[-1] - t[0]) / len(step)
+    steady_share = 0.005    # larger difference: rows are lost, or all have random delays
     if abs(mean - usual) < steady_share * mean:
         return [mean]
     even_share = 0.3    # share of the intervals that are within a quarter of the usual one
     even = np.mean(np.abs(step - usual) < usual / 4) > even_share
-    # where more than half are lost the median is not the interval
+    # if more than half are lost, the median is not the interval
     if not even or usual < mean / 2:
         return [mean]
     sent = np.append(0.0, np.cumsum(np.round(step / usual)))    # with the lost rows
@@ -88,7 +90,7 @@ def intervals(t: Floats) -> list[float]:
 
 
 def _put_back(t: Floats, travel: Floats, least: float) -> Floats:
-    """Return times with late rows put back."""
+    """Return times, with late rows moved back."""
     usual, even, evener = _rhythm(t, travel)
     least_late, late_share = 0.004, 0.1    # s, of an interval: the larger is the limit
     late = t - even > (usual if evener else max(least_late, late_share * usual))
@@ -102,7 +104,7 @@ def _put_back(t: Floats, travel: Floats, least: float) -> Floats:
 
 
 def _rising(t: Floats) -> Floats:
-    """Return times none of which is before the last."""
+    """Return strictly rising times: each at least APART after the previous one."""
     order = APART * np.arange(len(t))
     out: Floats = np.maximum.accumulate(t - order) + order
     return out
@@ -110,12 +112,12 @@ def _rising(t: Floats) -> Floats:
 
 def _fitting(t: Floats, even: Floats, travel: Floats, late: Bools,
              least: float) -> list[tuple[int, int, bool]]:
-    """Return begin and end of the runs of late rows, and whether they fit the rhythm."""
+    """Return begin and end of the runs of late rows, and True if they fit the rhythm."""
     begin, end = runs(late).T
     if not len(begin):
         return []
     low, high = np.maximum(begin - EVEN_BESIDE, 0), np.minimum(end + EVEN_BESIDE, len(t))
-    about = np.zeros(len(t) + 1, bool)      # rows that are looked at
+    about = np.zeros(len(t) + 1, bool)      # tested rows
     for shift in range(-EVEN_BESIDE, EVEN_BESIDE + 1):
         about[np.clip(np.flatnonzero(late) + shift, 0, len(t) - 1)] = True
     off = np.zeros((2, len(t) + 1))
@@ -125,7 +127,7 @@ def _fitting(t: Floats, even: Floats, travel: Floats, late: Bools,
     ends = np.stack([low, high], -1).ravel()
     sent, put = np.sqrt(np.add.reduceat(off**2, ends, axis=1)[:, ::2])
     most = np.maximum.reduceat(np.abs(off[1]), ends)[::2]
-    fitting_share = 0.25    # of what rows are off as sent: a lost row in a burst leaves more
+    fitting_share = 0.25    # of the deviation at the stamps: more remains if a row is lost
     fits = (most <= least) | (put < fitting_share * sent)
     return list(zip(begin.tolist(), end.tolist(), fits.tolist(), strict=True))
 
@@ -134,10 +136,10 @@ def _rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
     """
     Return the interval, times on the rhythm with the smoothest travel, True if it is smoother.
 
-    Rows off a rhythm are late, on a busy machine, or early and late, by a coarse clock of the
-    sender.
+    Rows deviate from a rhythm by delays of a busy machine, which are positive, or by a coarse
+    clock of the sender, to both sides.
     """
-    # of two as even that of the middle: the soonest rows make a stair
+    # of two equally smooth ones, that of the median rows: the earliest rows have steps
     found = [(_unevenness(t, even, travel), usual, even) for usual in reversed(intervals(t))
              for even in (*_middle(t, usual), _soonest(t, usual))]
     least = min(ratio for ratio, _, _ in found)
@@ -148,14 +150,14 @@ def _rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
 
 
 def _unevenness(t: Floats, even: Floats, travel: Floats) -> float:
-    """Return the ratio of the unevenness of travel on a rhythm to that at t, of rows off it."""
+    """Return roughness of travel on a rhythm over that at t, by rows that are not on it."""
     rows = np.flatnonzero(np.abs(t - even) > LEAST_JITTER)
     rows = rows[::1 + len(rows) // TESTED_ROWS]
     off = np.array([np.abs(_off(x, travel, rows)) for x in (t, even)])
     off = off[:, off.any(axis=0)]       # of rows in motion
     if not off.size:
         return 1.0
-    most = 90    # percentile: a rhythm that is wrong at a lost row is so for some rows beside it
+    most = 90    # percentile: a lost row makes the rhythm wrong for some adjacent rows
     sent, put = np.percentile(off, most, axis=1)
     return float(put / max(sent, APART))
 
@@ -165,25 +167,25 @@ def _soonest(t: Floats, usual: float) -> Floats:
     Return the rhythm of the rows with the smallest delays, shifted by the median delay of all.
 
     By the morphological opening of the delays over ON_TIME_WINDOW: a shorter increase is a delay;
-    an increase that stays is a lost row, or another interval.
+    a permanent increase is a lost row, or another interval.
     """
     rows = usual * np.arange(len(t))
     window = min(int(ON_TIME_WINDOW / usual) + 1, len(t))
     least = _least_of_next(t - rows, window)
-    # within a window of the end, an increase by whole intervals is of lost rows
-    end, jitter = least[len(t) - window:], 0.25     # of an interval: the least jitter of few rows
+    # in the last window, an increase by whole intervals is caused by lost rows
+    end, jitter = least[len(t) - window:], 0.25     # of an interval: allowance for jitter
     end[:] = end[0] + usual * np.floor((end - end[0]) / usual + jitter)
     even = rows - _least_of_next(-least[::-1], window)[::-1]
     return even + np.median(t - even)      # a constant delay is not corrected
 
 
 def _middle(t: Floats, usual: float) -> list[Floats]:
-    """Return the rhythm of the median rows, some of them early; [] if rows are lost."""
+    """Return the rhythm by median times, with early and late rows; [] if rows are lost."""
     row = np.arange(len(t))
     late = t - usual * row
     at, middle = _medians(late, MIDDLE_WINDOW / usual)
     jitter = float(np.median(np.abs(late - np.interp(row, at, middle))))
-    # a lost row moves the middle by an interval; jitter moves it too, by a tenth of its size
+    # a lost row changes the median by an interval, jitter by a tenth of its size
     step = np.diff(middle)
     if len(step) and np.abs(step - np.median(step)).max() > max(usual / 2, jitter / 2):
         return []
@@ -194,7 +196,7 @@ def _middle(t: Floats, usual: float) -> list[Floats]:
 
 
 def _medians(x: Floats, per: float) -> tuple[Floats, Floats]:
-    """Return the middle rows of blocks of so many rows, and their medians."""
+    """Return the middle rows of blocks of ``per`` rows, and their medians."""
     blocks = np.array_split(x, max(1, int(len(x) / per)))
     size = np.array([len(block) for block in blocks])
     return np.cumsum(size) - size / 2, np.array([np.median(block) for block in blocks])
@@ -202,7 +204,7 @@ def _medians(x: Floats, per: float) -> tuple[Floats, Floats]:
 
 def _least_of_next(x: Floats, count: int) -> Floats:
     """Return the minimum of each value and those after it, ``count`` in total."""
-    n, count = len(x), min(count, len(x))       # a wild interval asks for any number
+    n, count = len(x), min(count, len(x))       # an invalid interval may give any number
     blocks = np.append(x, np.full(count - n % count + count, np.inf)).reshape(-1, count)
     since = np.minimum.accumulate(blocks, axis=1).ravel()       # from its block's first
     until = np.minimum.accumulate(blocks[:, ::-1], axis=1)[:, ::-1].ravel()   # to its last
@@ -219,7 +221,7 @@ def _off(t: Floats, travel: Floats, rows: Ints) -> Floats:
         weight = np.ones(len(rows))
         for other in times:
             if other is not time:
-                apart = time - other        # none of rows that came at once, or at an end
+                apart = time - other        # 0 for simultaneous rows, or at an end
                 weight *= (here - other) / np.where(np.abs(apart) > 1e-9, apart, 1e-9)
         meant += weight * (travel[at] - travel[rows])
     whole = (rows + CUBIC[0] >= 0) & (rows + CUBIC[-1] <= last)
@@ -227,7 +229,7 @@ def _off(t: Floats, travel: Floats, rows: Ints) -> Floats:
 
 
 def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Floats:
-    """Return the times of the rows between a and b, as sent where they do not catch up."""
+    """Return the times of the rows between a and b by travel; their stamps if no burst."""
     rows = np.arange(a + 1, b)
 
     def speed(first: int, last: int) -> float:
@@ -236,11 +238,11 @@ def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Float
         return size
 
     beside = max(speed(a - EVEN_BESIDE, a), speed(b, b + EVEN_BESIDE))
-    even_travel = 1.0    # s within which travel is as good as even
-    catching_up = 3.0    # times the speed beside: no wheel, so rows that catch up
+    even_travel = 1.0    # s within which speed is almost constant
+    catching_up = 3.0    # ratio to the adjacent speed, not of a wheel but of a burst
     if t[b] - t[a] > even_travel or not beside or speed(a + 1, b) < catching_up * beside:
         return t[rows]
-    if travel[a] == travel[b]:      # there and back: it gives no time
+    if travel[a] == travel[b]:      # forth and back: it gives no time
         return t[rows]
     # some rows of the burst are lost, so that its rhythm is useless
     by_travel = t[a] + (travel[rows] - travel[a]) * (t[b] - t[a]) / (travel[b] - travel[a])

@@ -5,12 +5,12 @@
 Legs without an accelerometer, or with positions in a local frame.
 
 An IMU may send turn rates only: the yaw rate of a car on the bus, the gyro of a robot. Without
-gravity in them, or without roll and pitch rate, accelerations are of no use. The ground is then
-assumed level and the IMU upright: gravity replaces the specific force, so the rest of the
-code needs no other case. The errors of this assumption are added to the level
-(``pipeline/align.py``) and to the scale (``pipeline/beyond_model.py``).
+gravity in them, or without roll and pitch rate, accelerations cannot be used. The ground is then
+assumed level and the IMU upright: gravity replaces the specific force, so that no other code
+depends on it. The errors of this assumption are added to the level (``pipeline/align.py``) and to
+the scale (``pipeline/beyond_model.py``).
 
-The y axis of a local frame does not point north: what needs north is left out.
+The y axis of a local frame does not point north: sensors that need north are not used.
 """
 
 from dataclasses import replace
@@ -36,23 +36,23 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G
 
 LEAST_GRAVITY = 0.5  # judgement: of 9.8 m/s^2, or of 1 g; a smaller median is motion only
-GRAVITY_ROWS = 20_000  # judgement: at the most, for the median
+GRAVITY_ROWS = 20_000  # judgement: largest number of rows in the median
 TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
 
 
 def has_accelerometer(f_i: Floats) -> bool:
-    """Return True if any of the (n, 3) forces is valid, or none has arrived yet."""
+    """Return True if any of the (n, 3) forces is valid, or if there are no rows."""
     if not len(f_i):
         return True
-    with np.errstate(invalid='ignore'):      # a NaN that signals
+    with np.errstate(invalid='ignore'):      # a signalling NaN
         return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all() for rows in chunks(len(f_i)))
 
 
 def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
     """
-    Return the cause for which the accelerations of a leg cannot be used, '' if they can.
+    Return the reason why the accelerations of a leg cannot be used, '' if they can.
 
-    They are level only with turn rates about all axes: an axis that is always zero has no gyro.
+    Levelling needs turn rates about all axes: an axis that is always zero has no gyro.
     """
     if not has_accelerometer(imu.f_i):
         return 'publishes turn rates but no acceleration'
@@ -63,7 +63,7 @@ def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
             return 'publishes accelerations without gravity'
     dead = np.logical_and.reduce([(imu.w_i[rows] == 0).all(axis=0) for rows in chunks(
         len(imu.w_i))] or [np.zeros(3, bool)])
-    # without that about the vertical there is no course either, which is another finding
+    # a missing rate about the vertical is reported elsewhere
     if dead.any() and len(some) and not dead[int(np.argmax(np.abs(np.median(some, axis=0))))]:
         axes = ' and '.join(name for name, axis in zip('xyz', dead, strict=True) if axis)
         return f'publishes no turn rate about {axes}, so accelerations cannot be levelled'
@@ -72,9 +72,9 @@ def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
 
 def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """
-    Return a leg; where its IMU has no usable force, it is upright on level ground; and why.
+    Return a leg, upright on level ground if its IMU has no usable force, and the reason.
 
-    None is sent where each value is zero or NaN (as REP-145's covariance[0] of -1 is read).
+    No force is published if each value is zero or NaN (as read if REP-145's covariance[0] is -1).
     """
     why = lacking(leg.imu, config.imu.accel_scale)
     if not why:
@@ -88,7 +88,7 @@ def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
 
 
 def settings_by_frame(fix: FixSamples, config: Config) -> Config:
-    """Return the settings that apply to positions, by their frame."""
+    """Return the settings for the frame of the positions."""
     return config.in_local_frame() if is_local(fix) else config
 
 
@@ -99,9 +99,9 @@ def is_local(fix: FixSamples) -> bool:
 
 def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """
-    Return a leg and LOCAL_FRAME if its positions are in a local frame, otherwise nothing.
+    Return a leg without sensors that need north, and LOCAL_FRAME, if its positions are local.
 
-    Without GNSS velocities, and without a heading topic unless the settings ask for it.
+    GNSS velocities are removed, and the heading topic unless the settings select it.
     """
     if not is_local(leg.fix):
         return leg, ()

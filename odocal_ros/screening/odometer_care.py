@@ -22,13 +22,13 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond, speed_glitches
 
 STEPS_BESIDE = 5    # judgement: steps next to a jump or gap that give the speed there
-# counts, rad, m: less is not called motion
+# counts, rad, m: less is not reported as motion
 STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
 def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
            name: str = 'odometer') -> tuple[OdometerSamples, Floats]:
-    """Return rows without the false ones, increments with the false ones smoothed."""
+    """Return rows without false counts, or with false increments interpolated."""
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)
         if false.any():
@@ -49,15 +49,15 @@ def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[
 
 
 def counter_steps(value: Values, modulus: int) -> Floats:
-    """Return the steps of a counter, rollover undone, as floats: (n,) to (n - 1,)."""
+    """Return the steps of a counter, rollovers corrected, as floats: (n,) to (n - 1,)."""
     return without_rollover(np.diff(value), modulus).astype(float)
 
 
 def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     """
-    Return a mask of false counter rows: frozen before a catch-up jump, or away and back.
+    Return a mask of false counter rows: frozen before a catch-up jump, or a jump and its reverse.
 
-    t : (n,) s.   value : (n,) as sent.   Returns (n,) bool.
+    t : (n,) s.   value : (n,) raw.   Returns (n,) bool.
     """
     false = np.zeros(len(t), bool)
     step = counter_steps(value, modulus)
@@ -68,11 +68,11 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     size = np.abs(rate)
     top = float(np.percentile(size[size > 0], 95))
     jumps = np.flatnonzero(size > max(RESET_FACTOR * top, 3 / np.median(dt))).tolist()
-    most_jumps = 200    # beyond it the counter is not corrected; the check decides
+    most_jumps = 200    # with more the counter is not corrected; the check decides
     if len(jumps) > most_jumps:
         return false
     done = -1
-    # s after which a counter that comes back is no longer taken for the same
+    # s, longest interval between a jump and its reverse
     excursion_time = 30.0
     for j in jumps:
         if j <= done:
@@ -89,7 +89,7 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
 
 
 def _goes_on(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
-    """Return True if the counter after step b continues that before step a at adjacent speeds."""
+    """Return True if the counter continues from step a to after step b at adjacent speeds."""
     length = t[b + 1] - t[a]
     travels = [_usual(r) * length for r in (rate[max(0, a - STEPS_BESIDE):a],
                                          rate[b + 1:b + 1 + STEPS_BESIDE])]
@@ -129,7 +129,7 @@ def doubted(travel: Travel, value: Values, form: OdometerForm) -> tuple[Travel, 
         step = step.copy()
         step[odd] += (before + after) / 2 * missing
         travel = Travel(travel.t, np.concatenate([[0.0], np.cumsum(step)]), travel.quantum)
-    # speeds within a gap: anything between those beside it, and more the longer it is
+    # speeds within a gap: uniform between adjacent ones, plus a part that grows with its length
     spread = np.abs(after - before) / np.sqrt(12) + np.minimum(missing / 50, 0.3) * np.maximum(
         np.abs(before), np.abs(after)) / np.sqrt(3)
     lost, sigma = travel.t[odd], spread * missing
@@ -145,13 +145,13 @@ def _hidden(travel: Travel, value: Values) -> Floats:
     """
     Return the travel in each step at speeds published as zero: (n - 1,).
 
-    In a dead band the speed continues to zero, or starts from there, at its adjacent rate: the
-    travel is v^2 / 2a, and the mean of the two rows contains half a step. A robot in a yard that
-    stops every ten metres would lose several per cent.
+    In a dead band the speed continues to zero, or starts from zero, at its adjacent rate: the
+    travel is v^2 / 2a, of which the mean of the two rows contains half a step. A robot in a yard
+    that stops every ten metres would lose several per cent.
     """
     hidden, size = np.zeros(len(value) - 1), np.abs(value)
     least = 2 * travel.coarse.step if travel.coarse else 0.0
-    # times the counted travel: this much travel at zero speed is a dead band
+    # least ratio to the counted travel in a dead band
     dead_band_ratio = 1.5
     for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
         stops = size[edge + 1] == 0
@@ -168,7 +168,7 @@ def _hidden(travel: Travel, value: Values) -> Floats:
 
 
 def _stall(step: Floats, j: int) -> int:
-    """Return the first of the steps of zero that end at step j, j where there are none."""
+    """Return the first of the zero steps directly before step j, or j if there are none."""
     moves = np.flatnonzero(step[:j])
     return int(moves[-1]) + 1 if len(moves) else 0
 
@@ -178,7 +178,7 @@ def _usual(rate: Floats) -> float:
 
 
 class Steps:
-    """Rows to steps, in odometer units; ``nav.odometer.travel`` does it for a whole leg."""
+    """Conversion of rows to steps, in odometer units; for a leg see ``nav.odometer.travel``."""
 
     def __init__(self, form: OdometerForm) -> None:
         self.form = form

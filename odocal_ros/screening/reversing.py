@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reversing with an unsigned counter: it counts up while accelerations point backwards.
+Detection of reversing with an unsigned counter: it counts up while accelerations point backwards.
 
 After a stop the specific force along the vehicle is proportional to the acceleration of the
 wheels, with the same ratio at every start. If the ratio has the opposite sign, the vehicle
@@ -34,10 +34,10 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     """
     Return begin and end of reversing in which the counter counts up: (m, 2) s.
 
-    travel : of the odometer, any unit.   t_imu, w_b, f_b : (n,), (n, 3), (n, 3) s, turn rate,
-    rad/s, bias and all, specific force, m/s^2.   between : (2,) the marks, s; earlier travel gives
-    the usual values. Travel that counts down in reverse gives none, nor does an IMU whose x axis
-    lies across the vehicle.
+    travel : of the odometer, any unit.   t_imu, w_b, f_b : (n,), (n, 3), (n, 3) s, turn rate with
+    bias, rad/s, specific force, m/s^2.   between : (2,) the marks, s; earlier travel is used for
+    the usual ratio. The result is empty if travel counts down in reverse, or if the IMU's x axis
+    points across the vehicle.
     """
     none = np.empty((0, 2))
     if len(travel.t) < 3 or len(t_imu) < 3:
@@ -60,11 +60,11 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     if not onward or not usual.any():
         return none
     level = np.median(np.abs(ratio[usual]))
-    usual_ratio = (0.5, 2.0)    # of the usual ratio: a start that is like the others
+    usual_ratio = (0.5, 2.0)    # limits of the ratio of a start over the usual one
     back = clear & ~usual & (np.abs(ratio) > usual_ratio[0] * level) & (
         np.abs(ratio) < usual_ratio[1] * level)
     back &= (t[ends] > between[0]) & (t[begins] < between[1])
-    # the grid's last step still moves
+    # at the last step of the grid the vehicle still moves
     return np.stack([t[begins[back]] - PUSH_TIME, t[ends[back]] + PUSH_TIME], -1)
 
 
@@ -72,8 +72,8 @@ def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: fl
     """
     Return the sections between stops with a slip of twice their length: reversed, (m, 2) s.
 
-    slips : of the smoother, dicts of t and duration, s, and metres that the wheel turned beyond
-    the ground.   A wheel that spins on the spot slips by its travel once.
+    slips : of the smoother, dicts of t and duration, s, and metres, wheel travel minus vehicle
+    travel.   A wheel that spins on the spot slips by once its travel.
     """
     t = np.arange(travel.t[0] + PUSH_TIME, travel.t[-1] - PUSH_TIME, REVERSING_STEP)
     begins, ends = _stretches(t, travel) if len(t) > 2 else (np.empty(0, int),) * 2
@@ -91,9 +91,9 @@ def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: fl
 def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
             signed: bool = True) -> tuple[Reason, ...]:
     """
-    Return REVERSING_UNSIGNED with the stretches that are counted backwards, none without.
+    Return REVERSING_UNSIGNED with the reversed sections, () if there are none.
 
-    metres_per_unit : of travel, rough, None unknown.   seen : BY_IMU or BY_FIT.
+    metres_per_unit : of travel, approximate, None unknown.   seen : BY_IMU or BY_FIT.
     signed : True if the counter is configured as signed.
     """
     if not len(spans):
@@ -111,7 +111,7 @@ def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: 
 
 
 def _stretches(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
-    """Return the first and the last step of each stretch between stops that begins with one."""
+    """Return the first and the last step of each section of motion that begins with a stop."""
     speed = np.abs(travel.at(t + PUSH_TIME / 2) - travel.at(t - PUSH_TIME / 2)) / PUSH_TIME
     top = np.percentile(speed, 95)
     # counts a second at top speed, below which a counter shows no acceleration
@@ -151,7 +151,7 @@ class _Forces:
 def _ratio(t: Floats, push: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:
     """Return the ratio of specific force to the odometer's acceleration, and its sigma."""
     low = max(0, a - round((STOP_BEFORE + PUSH_TIME) / REVERSING_STEP))
-    longest_start = 12.0    # s after a stop that are looked at: later the tilt drifts
+    longest_start = 12.0    # s after a stop that are used: later the tilt drifts
     high = min(len(t), b + 1, a + round(longest_start / REVERSING_STEP))
     span = t[low:high]
     # the up direction at rest: as the vehicle pitches, gravity enters x

@@ -26,7 +26,7 @@ NOTHING = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
 
 
 def topic_gap(slot: str, t: Floats) -> tuple[Reason, ...]:
-    """Return TOPIC_GAP for the longest gap of a topic far beyond its own rhythm."""
+    """Return TOPIC_GAP for the longest gap of a topic, far longer than its median interval."""
     gaps = gaps_in_rhythm(t)
     if not len(gaps):
         return ()
@@ -36,7 +36,7 @@ def topic_gap(slot: str, t: Floats) -> tuple[Reason, ...]:
 
 
 def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
-    """Return IMU_GAP where the IMU misses more than ``limit`` s between t_from and t_stop."""
+    """Return IMU_GAP if IMU data is missing for over ``limit`` s between t_from and t_stop."""
     t = t_imu[np.searchsorted(t_imu, t_from - 1e-9):
               np.searchsorted(t_imu, t_stop + 1e-9, side='right')]
     long = np.flatnonzero(by_step(lambda t: np.diff(t) > limit, t))
@@ -53,9 +53,9 @@ def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[
 def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
                 found: list[Reason]) -> tuple[Any, Floats]:
     """
-    Return the rows of a topic that can be used, and their times from the start mark, s: (n,).
+    Return the usable rows of a topic, and their times from the start mark, s: (n,).
 
-    offset : s, added to the stamps.   found : takes what is wrong with the others.
+    offset : s, added to the stamps.   found : list, to which reasons for others are appended.
     """
     sent = leg.rows(slot)
     if slot in WHEELS:
@@ -74,7 +74,7 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
         found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
                             f'{LABEL[slot]} messages are isolated outliers, first at t = '
                             f'{t[np.argmax(spikes)]:.2f} s; dropped'))
-        if not glitches.about_clumps(wild).any():      # else what is about them is left out
+        if not glitches.about_clumps(wild).any():      # else adjacent rows are already dropped
             at = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
             wild[at[spikes]] = True
             spikes |= _damaged(wild, good, slot, found)[at]
@@ -112,7 +112,7 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
         finite &= ~odd
         wild[odd] |= np.isfinite(column[odd]).all(axis=tuple(range(1, column.ndim)))
     if slot == 'fix':
-        finite |= samples.status < 0       # a receiver without a fix says NaN: not a fault
+        finite |= samples.status < 0       # a receiver without a fix publishes NaN: not a fault
     for bad, what in ((~stamped, 'have no stamp (zero or negative)'),
                       (stamped & ~finite, 'hold NaN, Inf or an impossible value')):
         if bad.any():
@@ -139,15 +139,15 @@ def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
 
 
 def _stood(samples: Any) -> Any:
-    """Return odometer samples with zero where a low-pass filter has faded to tiny values."""
+    """Return odometer samples with zero for the tiny values of a decaying low-pass filter."""
     least_value = 1e-30    # m/s or rad/s: a filter of 0.4 s reaches it after half a minute
     faded = (samples.value != 0) & (np.abs(samples.value) < least_value)
     return replace(samples, value=np.where(faded, 0, samples.value)) if faded.any() else samples
 
 
 def _one_by_one(samples: Any) -> Any:
-    """Return samples stamped at arrival, equal stamps 1 ns apart; those sent twice once."""
-    stamp, twice_share = samples.stamp_ns, 1 / 3    # of all, a half: what comes at once moves on
+    """Return samples stamped at arrival, equal stamps 1 ns apart; repeated samples unchanged."""
+    stamp, twice_share = samples.stamp_ns, 1 / 3    # of all; with each sample twice it is a half
     step = np.diff(stamp)
     if (step > 0).all() or (step < 0).any() or (stamp != samples.received_ns).any():
         return samples
@@ -159,7 +159,7 @@ def _one_by_one(samples: Any) -> Any:
 
 
 def _unpacked(imu: Any, found: list[Reason]) -> Any:
-    """Return IMU samples with those that share a stamp spread over the time since the last one."""
+    """Return IMU samples; those with one stamp are distributed over the time since the last."""
     stamp, packed_share = imu.stamp_ns, 1 / 3       # judgement: of all; fewer are duplicates
     step = np.diff(stamp)
     same = step == 0
@@ -170,10 +170,10 @@ def _unpacked(imu: Any, found: list[Reason]) -> Any:
         return imu
     first = np.flatnonzero(np.append(True, ~same))
     count = np.diff(np.append(first, len(stamp)))
-    # a packet after a gap took no longer than others
+    # a packet after a gap has the usual length
     usual = int(np.median(np.diff(stamp[first]))) if len(first) > 1 else 0
     took = np.minimum(np.diff(stamp[first], prepend=stamp[0] - usual), usual)
-    left = np.repeat(first + count - 1, count) - np.arange(len(stamp))      # until the last one
+    left = np.repeat(first + count - 1, count) - np.arange(len(stamp))      # to the last
     found.append(Reason(Code.STAMPS_NOT_RISING, f'{int(same.sum())} of {len(stamp)} '
                         f'{LABEL["imu"]} messages repeat the previous stamp: packets with one '
                         'stamp, spread evenly over the time since the packet before',
@@ -203,8 +203,8 @@ def _longest_rising(stamp: Ints) -> Ints:
     """
     Return the indices of a longest strictly rising subsequence (patience sorting).
 
-    The most rows are kept: one stamp in the future costs one row, a clock that is set back costs
-    the shorter side.
+    The largest number of rows is kept: for one stamp in the future one row is dropped, for a clock
+    that is set back the shorter side.
     """
     tails: list[int] = []
     ends: list[int] = []

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An axis of the IMU that stops at the limit of its range."""
+"""Detection of an axis of the IMU at the limit of its range."""
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
 from odocal_ros.settings.grades import G
 
-# physical: no range is smaller, and gravity at rest, also in coarse steps, is below it
+# physical: ranges are larger, and gravity at rest, also in coarse steps, is smaller
 LEAST_GYRO, LEAST_ACCELEROMETER = 1.0, 1.5 * G      # rad/s, m/s^2
-# statistical: coarse steps repeat the largest value too, but more seldom than the next smaller one
+# statistical: coarse steps also repeat the largest value, but less often than the next smaller one
 FEWEST_AT_LIMIT, TIMES_NEXT = 5, 3.0
 
 
@@ -20,7 +20,7 @@ def saturated(t_imu: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> tuple[
     """
     Return IMU_SATURATED for the axis that is at its limit most often.
 
-    t_imu : (n,) s.   w_i, f_i : (n, 3) turn rates and specific forces as sent.
+    t_imu : (n,) s.   w_i, f_i : (n, 3) raw turn rates and specific forces.
     """
     found = []
     for sensor, x_i, scale, unit, least in (

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Screening: from a raw leg to clean arrays on one time axis, with a reason for each fault.
+Screening: usable arrays of a raw leg on one time axis, with a reason for each fault.
 
-Times are s since the start mark, an IMU stamp: its time offset is subtracted from the others'.
+Times are s since the start mark, an IMU stamp: offsets of others are relative to that of the IMU.
 """
 
 from dataclasses import dataclass, replace
@@ -37,10 +37,10 @@ from odocal_ros.settings.config import Config, SIDES
 
 def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
     """
-    Return the usable arrays of a leg, empty where nothing is left, and reasons.
+    Return the usable arrays of a leg, empty if no row is usable, and reasons.
 
-    judged : False for its motion alone: clocks, gyro and wheels that fail are not looked for, and
-    orientations stay as sent.
+    judged : False if only its motion is needed: faults of clocks, gyro and wheels are not tested,
+    and orientations are unchanged.
     """
     leg, levelled = with_force(leg, config)
     leg, local = without_north(leg, config)
@@ -67,9 +67,9 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
 
 
 def _missing(leg: Leg, found: list[Reason]) -> list[Reason]:
-    """Return the reasons for required topics without messages, but for those found already."""
+    """Return the reasons for required topics without messages, except those in ``found``."""
     codes = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}
-    known = {reason.code for reason in found}      # a frame_id that is not sent
+    known = {reason.code for reason in found}      # a missing frame_id
     return [Reason(code, f'no {INPUTS[slot].label} message between the marks')
             for slot, code in codes.items()
             if not len(leg.rows(slot).stamp_ns) and code not in known]
@@ -77,7 +77,7 @@ def _missing(leg: Leg, found: list[Reason]) -> list[Reason]:
 
 @dataclass(frozen=True, eq=False)
 class Usable:
-    """Usable rows of each topic, as sent, and their times from the start mark, s."""
+    """Usable rows of each topic, unchanged, and their times from the start mark, s."""
 
     imu: ImuSamples
     t_imu: Floats
@@ -106,11 +106,11 @@ def _usable(leg: Leg, config: Config, judged: bool, found: list[Reason]) -> Usab
 
 
 def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[str, Any]:
-    """Return fixes and other sensors as fields of Inputs; add the reasons against others."""
+    """Return fixes and other sensors as fields of Inputs; add the reasons for unused ones."""
     fix, outside, velocity = rows.fix, rows.outside, rows.outside['fix_velocity']
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
     found += why
-    found += topic_gap('fix', rows.t_fix)       # of the stream: a rejected fix is no gap in it
+    found += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
     t_fix, covariance = rows.t_fix[use], covariance[use]
     geodetic = np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
     unlike = contradicted(velocity.t, velocity.sent.velocity_n, t_fix, geodetic, covariance) \
@@ -123,7 +123,7 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
 
 
 def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:
-    """Return the arrays of a leg, the IMU turned by its nominal mounting."""
+    """Return the arrays of a leg, the IMU rotated by its nominal mounting."""
     imu = rows.imu
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     return Inputs(
@@ -136,20 +136,20 @@ def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> I
 
 def _travel(leg: Leg, wheels: Wheels) -> dict[str, Any]:
     """Return the travel of wheels as fields of Inputs."""
-    # of two wheels of unknown sides only the mean has a meaning
+    # of two wheels with unknown sides only the mean is defined
     return {'travel': wheels.mean, 'travels': wheels.several if leg.form.sides else (),
             'doubt_t': wheels.doubt_t, 'doubt_sigma': wheels.doubt_sigma}
 
 
 def _wheel_gaps(leg: Leg, wheels: Wheels) -> list[Reason]:
-    """Return the gaps of the wheels; the mean stands on the rows of the first one."""
+    """Return the gaps of the wheels; the mean has the rows of the first one."""
     others = zip(leg.wheel_slots[1:], wheels.each[1:], strict=False)
     return [*topic_gap('odometer', wheels.mean.t),
             *(reason for slot, one in others for reason in topic_gap(slot, one.t))]
 
 
 def _axles(inputs: Inputs, wheels: Wheels) -> tuple[Wheels, list[Reason]]:
-    """Return the wheels that count, and reasons; of one axle only with an accelerometer."""
+    """Return the usable wheels, and reasons; one axle is only tested with an accelerometer."""
     if len(wheels.each) > (1 if inputs.has_accelerometer else len(SIDES)):
         return judged_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop))
     return wheels, []
@@ -165,12 +165,12 @@ def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> I
 
 
 def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
-    """Return inputs without fixes that the receiver has reckoned."""
+    """Return inputs without fixes that the receiver has dead-reckoned."""
     placed = place(inputs, config)
     if not placed.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs
     rate = inputs.w_b @ inputs.up_b
-    # straights, and turns to both sides: the median is the bias
+    # the median is the bias: drives have straights, and turns to both sides
     heading = np.exp(1j * running_integral(inputs.t_imu, rate - np.median(rate)))
     x, y, _ = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
     way = np.diff(inputs.travel.at(inputs.t_imu), prepend=0.0) * placed.rough

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Several IMUs on one topic: by their frame_ids, or by rows that alternate."""
+"""Detection of several IMUs on one topic: by their frame_ids, or by alternating rows."""
 
 from collections import Counter
 
@@ -13,14 +13,14 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
 
 MIXED_SHARE = 0.01     # judgement: of all messages; fewer are damaged ones, not a second IMU
-# judgement, of rows that may alternate: rows of a mean; means needed, and the most that are looked
-# at, which end with the leg; times the median, an outlier; share of rows that repeat
+# judgement, of rows that may alternate: rows of a mean; least number of means, and largest, at the
+# end of the leg; ratio of an outlier to the median; share of rows that repeat
 MEAN_ROWS, FEWEST_MEANS, MOST_MEANS, OUTLYING, REPEATED = 50, 40, 2000, 10.0, 0.2
-# statistical: F of a constant and the signals in the differences of odd and even rows. Of one IMU
-# it is 14 at most (25 zoo drives); with an axis 3 deg off or other biases 50 and more
+# statistical: F of a constant and the signals in the differences of odd and even rows. For one IMU
+# it is 14 at most (25 zoo drives); for two with axes 3 deg apart or other biases 50 and more
 SURE_F = 30.0
-# judgement: least size of what they explain, in variances of a mean of white noise; 2.7 is that of
-# a mean over that of a row. Smooth signals without noise have none of it
+# judgement: least explained variance, in variances of a mean of white noise; 8/3 is that of a mean
+# over that of a row. Smooth signals without noise are below it
 LEAST_POWER = 0.1 * 8 / 3
 
 
@@ -47,7 +47,7 @@ def other_imus(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
 
 def alternating(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
     """
-    Return SEVERAL_IMUS if every second row is of another IMU.
+    Return SEVERAL_IMUS if every second row is from another IMU.
 
     w_i, f_i : (n, 3) turn rates and specific forces, in any unit.
     """
@@ -61,7 +61,7 @@ def alternating(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
 
 
 def _share_of_two(x: Floats) -> float:
-    """Return the share of odd less even rows that a second IMU explains, 0: none; x (n, 3)."""
+    """Return the share of odd minus even rows that a second IMU explains, 0: none; x (n, 3)."""
     x = x[-MOST_MEANS * MEAN_ROWS - 2:]
     count = (len(x) - 2) // MEAN_ROWS
     if count < FEWEST_MEANS or (x[1:] == x[:-1]).all(axis=1).mean() > REPEATED:

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An accelerometer whose unit or range changes during the leg: gravity has another size."""
+"""Detection of a change of the accelerometer's unit or range during the leg, by gravity."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,8 @@ from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.grades import G
 
 TENTHS, TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
-# judgement: of a gravity as measured to the Earth's. Units and ranges differ by a factor of 2 at
-# least; in a bend at 1.2 g all through the force is 1.56 times gravity
+# judgement: limits of measured gravity over the Earth's. Units and ranges differ by a factor of 2
+# at least; in a continuous bend at 1.2 g the force is 1.56 times gravity
 LEAST_RATIO, MOST_RATIO = 0.6, 1.6
 
 
@@ -25,15 +25,15 @@ def tenths(inputs: Inputs) -> NDArray[np.intp]:
 
 def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
     """
-    Return IMU_UNITS where a tenth of the leg has another gravity than the Earth's.
+    Return IMU_UNITS if gravity in a tenth of the leg differs from the Earth's.
 
-    No vehicle accelerates so that the median of a tenth of its leg differs from gravity so much.
+    The median force over a tenth of a leg differs less from gravity by accelerations.
     """
     edges = tenths(inputs)
     size = [float(np.linalg.norm(medians(inputs.f_b[a:b])))
             for a, b in zip(edges[:-1], edges[1:], strict=True)]
     odd = [k for k, one in enumerate(size) if not LEAST_RATIO * G < one < MOST_RATIO * G]
-    if not odd or len(odd) == len(size):      # all of it: the unit of the leg
+    if not odd or len(odd) == len(size):      # all tenths: the unit of the whole leg
         return ()
     begin, end = inputs.t_imu[edges[odd[0]]], inputs.t_imu[edges[odd[-1] + 1] - 1]
     return (Reason(Code.IMU_UNITS, f'from t = {begin:.0f} to {end:.0f} s the IMU measures a '

@@ -4,8 +4,8 @@
 """
 Faults of wheels: one does not count, or counts in the opposite direction.
 
-They are detected from the wheels and the gyro, before attitude or scale is known: with them the
-mean of both wheels is not the travel.
+They are detected from the wheels and the gyro, before attitude or scale is known. With such a
+fault the mean of both wheels is not the travel.
 """
 
 from collections.abc import Sequence
@@ -23,16 +23,16 @@ from odocal_ros.settings.levels import FAULT_SIGMAS
 
 FAULT_GRID = 0.5          # s, judgement
 STILL_SHARE = 0.02        # judgement: of the other wheel's travel: limit for not moving
-OTHER_WHEEL_COUNTS = 8    # judgement: the other wheel makes meanwhile, at least
+OTHER_WHEEL_COUNTS = 8    # judgement: least counts of the other wheel meanwhile
 
 
 def broken_wheels(axle: Sequence[Travel], imu: Imu,
                   between: tuple[float, float]) -> tuple[Reason, ...]:
     """
-    Return WHEEL_DEAD and WHEEL_REVERSED, once each, where one wheel fails; () if both count.
+    Return WHEEL_DEAD and WHEEL_REVERSED, once each, if one wheel fails; () if both count.
 
     axle : (2,) Travel of the left and the right wheel, scale units.   imu : (t, w_b, f_b)
-    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.   between : (2,) the marks, s.
+    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, with bias.   between : (2,) the marks, s.
     """
     two = pair(axle, imu, between, FAULT_GRID)
     if two is None:
@@ -71,14 +71,14 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     """
     rolls = A[:, 0] != 0
     usual = float(np.median(y[rolls] / A[rolls, 0])) if rolls.any() else 1.0
-    # of the top speed: what a gyro bias times the track width may be, 1 sigma
+    # share of the top speed: gyro bias times track width, 1 sigma
     bias_of_top = 0.02
     drift = bias_of_top * float(np.percentile(np.abs(y), 95)) / FAULT_GRID
     fits = [robust_fit(A, y, floor, (np.inf, np.inf, drift), start)
             for start in (None, (usual, 0.0, 0.0))]
     least = min(sigma for _, _, sigma in fits)
-    # rad in a cell, of a consumer gyro that vibrates: judgement. With it a fit by the turns may
-    # differ more in straights than one without turns
+    # rad in a cell, noise of a vibrating consumer gyro: judgement. It allows larger residuals in
+    # straights to a fit with turns than to one without
     gyro_noise = 2e-4
     left_over = [np.minimum(1.0, ((y - A @ x) / (
         TUKEY * np.hypot(least, gyro_noise * x[1])))**2).sum() for x, _, _ in fits]
@@ -86,13 +86,13 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
 
 
 def _rolling(steps: Floats, quantum: float) -> Bools:
-    """Return a mask of the times at which each wheel certainly rolls: (2, n)."""
+    """Return a mask of the cells in which each wheel certainly rolls: (2, n)."""
     top = np.percentile(np.abs(steps), 95, axis=1, keepdims=True)
     return np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
 
 
 def _held(two: Pair, steps: Floats, k: int) -> Bools:
-    """Return a mask of cells in which wheel k stands for 2 s or longer while the other rolls."""
+    """Return a mask of cells in which wheel k is still for 2 s or more while the other rolls."""
     own, other = np.abs(steps[k]), np.abs(steps[1 - k])
     still: Bools = two.known & (own <= STILL_SHARE * other) & _rolling(steps, two.quantum)[1 - k]
     hang_time = 2.0    # s without a count while the other wheel rolls; shorter is slip
@@ -103,7 +103,7 @@ def _held(two: Pair, steps: Floats, k: int) -> Bools:
 
 
 def _not_pivoting(held: Bools, steps: Floats, A: Floats, x: Floats, k: int) -> Bools:
-    """Return the cells in which the wheel should have rolled, not been turned about."""
+    """Return the cells of ``held`` in which the wheel is not the centre of a turn."""
     held = held.copy()
     ratio, turn_part = x[0], A[:, 1:] @ x[1:]
     for a, b in runs(held):
@@ -117,7 +117,7 @@ def _not_pivoting(held: Bools, steps: Floats, A: Floats, x: Floats, k: int) -> B
 
 
 def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
-    """Return WHEEL_DEAD with where, for the wheel that stands longer."""
+    """Return WHEEL_DEAD with the times, for the wheel that is still for longer."""
     k = int(held[1].sum() > held[0].sum())
     spans = runs(held[k])
     if not len(spans):
@@ -165,7 +165,7 @@ def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance
 
 
 def _against_imu(two: Pair, steps: Floats, imu: Imu) -> int | None:
-    """Return the wheel whose speed changes against the IMU's x axis, None where that is unsure."""
+    """Return the wheel that accelerates opposite to the IMU's x axis, None if uncertain."""
     t_imu, _, f_b = imu
     push = np.diff(integral_at((two.t[:-1] + two.t[1:]) / 2, t_imu, f_b[:, 0]))
     push = push - np.median(push)
@@ -176,6 +176,6 @@ def _against_imu(two: Pair, steps: Floats, imu: Imu) -> int | None:
 
 
 def _correlation(a: Floats, b: Floats) -> float:
-    """Return the correlation of two series about zero, in sigmas of chance."""
+    """Return the correlation of two series about zero, in sigmas of uncorrelated ones."""
     power = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / power * np.sqrt(len(a)) if power else 0.0

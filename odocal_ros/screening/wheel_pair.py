@@ -27,7 +27,7 @@ class Pair:
     Travel of both wheels and the vehicle's turn at the edges of equal cells.
 
     t : (n,) s.   left, right : (n,) scale units.   turn : (n,) rad about the vehicle's up axis,
-    gyro bias and all.   known : (n - 1,) cells within no gap.   quantum : scale units.
+    with gyro bias.   known : (n - 1,) cells without a gap.   quantum : scale units.
     names : of left and right.
     """
 
@@ -53,7 +53,7 @@ class Pair:
 def pair(axle: Sequence[Travel], imu: Imu, between: tuple[float, float], step: float,
          doubt_t: Sequence[float] | Floats = ()) -> Pair | None:
     """
-    Return the wheels on a grid of ``step`` s, None where they share less than 20 cells.
+    Return the wheels on a grid of ``step`` s, None with fewer than 20 common cells.
 
     imu : (t, w_b, f_b), (n,) s, (n, 3), (n, 3).   between : s, the marks.   doubt_t : (d,) s.
     """
@@ -86,8 +86,8 @@ def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floa
     Return x of y = A x by least squares with Tukey's weights, its covariance, sigma of a value.
 
     A, y : (n, k), (n,) design and values.   floor : least sigma of a value.   prior : (k,) sigmas
-    of the coefficients about zero, inf: free.   start : (k,) coefficients that many rows are known
-    to follow; default: least squares. The sigma is by the median of the residuals.
+    of the coefficients about zero, inf: free.   start : (k,) coefficients that fit many rows;
+    default: least squares. The sigma is by the median of the residuals.
     """
     size = np.abs(A).max(axis=0)
     size[size == 0] = 1.0

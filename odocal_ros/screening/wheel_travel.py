@@ -5,8 +5,8 @@
 Travel of one or more wheels: each counter corrected separately, then their mean.
 
 Wheel counters can roll over below the range of their message type, each differently: one driver
-sends 64 bits, the other 16 in a message of 64. Such a rollover leaves jumps against the travel,
-all of one size: the span.
+uses 64 bits, the other 16 in a message of 64. Such rollovers are jumps opposite to the travel, all
+of the same size: the span.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ NAMED_SPANS = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """Where a counter rolls over: its span in counts, exact or not, and the rows before."""
+    """Rollovers of a counter: its span in counts, its sigma, and the rows before them."""
 
     size: float
     sigma: float                 # 0: certain
@@ -42,9 +42,9 @@ class Span:
 
 def hidden_span(value: Values, step: Floats) -> Span | None:
     """
-    Return the span of a counter whose rollovers are not undone yet, None where it has none.
+    Return the span of a counter with uncorrected rollovers, None if there are none.
 
-    value : (n,) as sent.   step : (n - 1,) its steps, known rollovers undone.
+    value : (n,) raw.   step : (n - 1,) its steps, known rollovers corrected.
     """
     if len(step) < FEWEST_STEPS or not step.any():
         return None
@@ -64,8 +64,8 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     known = float(spans[np.argmin(np.abs(spans - middle))])
     typical = float(np.median(slack))
     sigma = 0.0
-    fewest_jumps = 3    # jumps of one size that make a span which is no power of two
-    power_slack = 0.01    # of the span, slack up to which one jump makes a power of two
+    fewest_jumps = 3    # least number of jumps for a span that is no power of two
+    power_slack = 0.01    # of the span, largest slack for a power of two by one jump
     if abs(known - middle) <= typical and (len(rows) > 1 or slack[0] < power_slack * known):
         span = known
     elif len(rows) >= fewest_jumps:
@@ -73,7 +73,7 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
             middle, typical / np.sqrt(3 * len(rows)))
     else:
         return None
-    if whole and span > spans[-1]:       # damaged values: no counter is as wide
+    if whole and span > spans[-1]:       # damaged values: wider than any counter
         return None
     agree = np.abs(size - span) <= 2 * slack
     same_span_share = 0.8    # share of the jumps that must agree
@@ -86,14 +86,14 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
 
 
 def _running_median(step: Floats) -> Floats:
-    median_reach = 7    # steps on each side of the running median for the step replaced by a jump
+    median_reach = 7    # steps on each side of a jump, whose median is the usual step
     padded = np.pad(step, median_reach, mode='edge')
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * median_reach + 1)
     return np.median(windows, axis=-1)
 
 
 def _taken(value: Values, rows: Ints) -> float:
-    """Return the range of the values before and after the jumps: within one span."""
+    """Return the range of the values before and after the jumps, which is within one span."""
     return float(np.ptp(np.stack([value[rows], value[rows + 1]]).astype(float)))
 
 
@@ -114,8 +114,8 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats, name: str, *,
     Return rows with hidden rollovers corrected, reasons, times and sigmas of uncertain travel.
 
     t, samples : (n,) s, and usable rows of a running count.   step : (n - 1,) its
-    steps, rollovers of the type's span undone.   name : of the counter, in reasons.   of_one : it
-    is the only one. Times are (k,) s, sigmas (k,) counts.
+    steps, rollovers of the type's span corrected.   name : of the counter, in reasons.   of_one :
+    it is the only one. Times are (k,) s, sigmas (k,) counts.
     """
     span = hidden_span(samples.value, step)
     none = np.empty(0)
@@ -145,8 +145,8 @@ class Wheels:
     """
     Travel of the wheels, and its uncertain parts.
 
-    each : the only wheel or all.   doubts : of each, where it is uncertain and by how much, (k,) s
-    and (k,) scale units.
+    each : the only wheel or all.   doubts : of each, times of uncertain travel and its sigmas,
+    (k,) s and (k,) scale units.
     """
 
     each: tuple[Travel, ...]
@@ -160,7 +160,7 @@ class Wheels:
 
     @property
     def several(self) -> tuple[Travel, ...]:
-        """Return each of several wheels, () of one."""
+        """Return each of several wheels, () for a single one."""
         return self.each if len(self.each) > 1 else ()
 
     @property
@@ -179,7 +179,7 @@ class Wheels:
         return [k for k, one in enumerate(self.each) if not one.ahead]
 
     def only(self, wheels: Sequence[Travel]) -> 'Wheels':
-        """Return some of the wheels, as given."""
+        """Return the travel of the given wheels, a part of ``each``, and their uncertain parts."""
         doubts = {one.name: doubt for one, doubt in zip(self.each, self.doubts, strict=True)}
         return Wheels(tuple(wheels), tuple(doubts[one.name] for one in wheels))
 
@@ -189,7 +189,7 @@ def wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
     """
     Return the travel of the wheels of a leg.
 
-    rows : callable, a slot's usable rows and their times, s.   found : list that findings join.
+    rows : function of a slot to its usable rows and times, s.   found : list, reasons are added.
     """
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
@@ -240,6 +240,6 @@ def _kind(form: OdometerForm) -> tuple[str, str]:
 
 
 def _words(form: OdometerForm) -> str:
-    """Return the meaning of the values of a form, for people."""
+    """Return the meaning of the values of a form as text."""
     what = {'cumulative': 'a running count', 'increment': 'increments', 'rate': 'a speed'}
     return f'{what[form.quantity]} ({form.scale_unit})'

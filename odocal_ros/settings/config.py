@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Settings: each one written once with its default, unit, range and meaning.
+Settings: each one is defined once with its default, unit, range and meaning.
 
 ROS parameters, ``config/calibrator.yaml``, ``--config``, ``--set`` and docs/settings.md are all
-made from these dataclasses. A setting's name is ``group.field``, as its ROS parameter's.
+made from these dataclasses. The name of a setting and of its ROS parameter is ``group.field``.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from odocal_ros.data.inputs import TOPICS
 from odocal_ros.settings import config_groups
 from odocal_ros.settings.setting import (
     setting,
-    settings_of as settings_of,  # for others too: they are its other half
+    settings_of as settings_of,  # re-exported: the functions on these dataclasses
     with_settings as with_settings,
 )
 
@@ -25,7 +25,7 @@ HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'c
 NAN = math.nan
 SIDES = ('left', 'right')     # names of two wheels
 DRIVES = DIFFERENTIAL, SKID, MECANUM, OMNI = 'differential', 'skid', 'mecanum', 'omni'
-HOLONOMIC, FEWEST_OMNI = (MECANUM, OMNI), 3    # definition: move sideways; fewest wheels of omni
+HOLONOMIC, FEWEST_OMNI = (MECANUM, OMNI), 3    # definition: move sideways; least omni wheels
 
 TYPICAL = 'typical value of IMUs sold in this grade'
 
@@ -36,7 +36,7 @@ def _place(about: str) -> Any:
 
 
 def _figure(unit: str, high: float, about: str, nan: str = 'value of the grade') -> Any:
-    """Declare a quality figure of an IMU; ``nan`` : meaning of NaN, its default."""
+    """Declare an error figure of an IMU; ``nan`` : meaning of NaN, its default."""
     return setting(NAN, unit, 0.0, high, about=f'{about}; NaN: {nan}.')
 
 
@@ -60,7 +60,7 @@ class OdometerConfig:
                                          'the nominal scale; beyond it the verdict is caution.')
     lever_arm: tuple[float, ...] = _place('Wheel contact point in base_link (forward, left, up).')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to odometer stamps.')
-    # a bus and a middleware seldom deliver within less; u-blox asks for 10 ms or better
+    # latency of a bus and a middleware is rarely less; u-blox requires 10 ms or better
     time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown latency of the odometer, 1 '
                                 'sigma; matters in turns and at marks set in motion.')
     wheels: tuple[str, ...] = setting((), ro=True, item=str, about=(
@@ -81,7 +81,7 @@ class OdometerConfig:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Return the wheels as configured, none if they are found by name."""
+        """Return the configured keys of the wheels, () if they are selected by name."""
         return self.wheels or tuple(filter(None, (self.left, self.right)))
 
     @property
@@ -95,7 +95,7 @@ class OdometerConfig:
         return len(self.keys) < len(SIDES) and self.drive == DIFFERENTIAL
 
     def names(self, count: int) -> tuple[str, ...]:
-        """Return the names of so many wheels, for people and results: '' of a single one."""
+        """Return the names of ``count`` wheels in texts and results: '' for a single one."""
         if count <= len(SIDES):
             return SIDES if count == len(SIDES) else ('',)
         return self.keys if len(self.keys) == count else tuple(map(str, range(1, count + 1)))
@@ -227,7 +227,7 @@ class ProjectionConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """All settings of the calibrator; see the module for how they are named."""
+    """All settings of the calibrator; the module docstring defines their names."""
 
     method: str = setting('auto', choices=(
         'auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'), about=(
@@ -254,7 +254,7 @@ class Config:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Return the inputs that these settings use, with optional ones."""
+        """Return the inputs that these settings use, including optional ones."""
         used = {'odometer_right': self.odometer.own_topics, 'fix_velocity': self.gnss.use_velocity,
                 'pressure': self.imu.use_pressure,
                 'heading': self.alignment.heading_source in ('auto', 'heading_topic')}

@@ -4,9 +4,9 @@
 """
 Settings from ROS parameter files and from ``key=value``, read as the node reads them.
 
-A file means the same to ``odocal replay --config`` as to ``--params-file``: blocks are matched
-and taken in file order as rcl does it, and plain scalars are typed by rcl's rules, which are not
-those of YAML 1.1 (``1e-3`` is a number, ``1_000`` is text).
+A file has the same meaning for ``odocal replay --config`` as for ``--params-file``: blocks are
+matched and applied in file order as in rcl, and plain scalars have types by rcl's rules, which
+differ from YAML 1.1 (``1e-3`` is a number, ``1_000`` is text).
 """
 
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ from odocal_ros.settings.setting import with_settings
 NODE = '/calibrator'
 PARAMETERS = 'ros__parameters'
 WANTED = "'/**', '/**/calibrator', '/calibrator' or 'calibrator'"
-# what a node knows besides our settings: left by ros2 param dump and by ~/save
+# other parameters of a node, written by ros2 param dump and by ~/save
 NOT_OURS = re.compile(r'(result|qos_overrides)\.|(use_sim_time|start_type_description_service)$')
 TRUE = {'y', 'Y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
 FALSE = {'n', 'N', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
@@ -37,8 +37,8 @@ def read_config_file(path: Path) -> dict[str, object]:
     """
     Return the settings of a ROS parameter file by dotted name, each checked.
 
-    Raises BadUsage: the file cannot be read. Raises BadConfig: it is no parameter file, has no
-    block for the calibrator, or holds an unknown setting or a wrong value; the text names file and
+    Raises BadUsage: the file cannot be read. Raises BadConfig: it is not a parameter file, has no
+    block for the calibrator, an unknown setting or an invalid value; the text contains file and
     line.
     """
     return _settings(Path(path), _root(Path(path)))
@@ -82,8 +82,8 @@ def parse_set(text: str) -> tuple[str, object]:
     """
     Return (name, value) of ``key=value``; the value is YAML, checked against its setting.
 
-    Raises BadUsage: there is no ``=``, or the value is no YAML. Raises BadConfig: the setting is
-    unknown or the value wrong.
+    Raises BadUsage: there is no ``=``, or the value is not YAML. Raises BadConfig: the setting is
+    unknown or the value invalid.
     """
     name, equals, value = text.partition('=')
     name = name.strip()
@@ -95,7 +95,7 @@ def parse_set(text: str) -> tuple[str, object]:
         raise BadUsage(str(error)) from None
     if name in SETTINGS and SETTINGS[name].kind == 'str' and not _is_quoted(node):
         return name, _checked(name, value.strip(), '--set ')      # a joint may be named 0 or on
-    where = '--set ' if name in SETTINGS else '--set: '           # then the setting's name
+    where = '--set ' if name in SETTINGS else '--set: '           # followed by the setting's name
     return name, _checked(name, '' if node is None else _value(node), where)
 
 
@@ -119,7 +119,7 @@ def _blocks(node: Node, prefix: str) -> dict[str, list[Node]]:
     """
     Return the parameter mappings by node key; namespaces may be nested.
 
-    A key that comes again joins the block of its first appearance, as in rcl.
+    A repeated key is added to the block of its first appearance, as in rcl.
     """
     found: dict[str, list[Node]] = {}
     for key, value in _pairs(node):
@@ -162,7 +162,7 @@ def _value(node: Node) -> Any:
 
 
 def scalar(text: str) -> bool | int | float | str:
-    """Return a plain scalar as rcl types it (measured on rcl 9.2)."""
+    """Return a plain scalar with the type that rcl gives it (measured on rcl 9.2)."""
     if text in TRUE or text in FALSE:
         return text in TRUE
     if len(text) > LONGEST:

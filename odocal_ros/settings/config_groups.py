@@ -12,7 +12,7 @@ from odocal_ros.settings.setting import setting
 NAN = math.nan
 FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'covariance', 'imu',
            'track', 'legs', 'report')
-# results that limits may be set for
+# results that can have limits
 ACCEPTED = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')
 WANTED = ('--accept NAME=LOW:HIGH, such as --accept scale_ratio=0.995:1.005; either limit can be '
           'omitted')
@@ -116,7 +116,7 @@ class AcceptConfig:
 
     @property
     def limits(self) -> dict[str, tuple[float, float]]:
-        """Return lower and upper limit by result, of those that have one; the other is inf."""
+        """Return (lower, upper) limit by result, for results with any; a missing one is inf."""
         pairs = {name: (getattr(self, f'{name}_min'), getattr(self, f'{name}_max'))
                  for name in ACCEPTED}
         return {name: (-math.inf if math.isnan(low) else low,
@@ -127,9 +127,9 @@ class AcceptConfig:
 
 def parse_accept(text: str) -> dict[str, float]:
     """
-    Return the settings of one ``NAME=LOW:HIGH``; of ``NAME_deg`` the limits are in degrees.
+    Return the settings of one ``NAME=LOW:HIGH``; the limits of ``NAME_deg`` are in degrees.
 
-    Raises BadUsage: not of that form, or of no result that has limits.
+    Raises BadUsage: another form, or a result that cannot have limits.
     """
     name, equals, limits = (part.strip() for part in text.partition('='))
     low, colon, high = limits.partition(':')

@@ -25,8 +25,8 @@ class Grade:
     accel_bias_walk: float  # m/s^2/sqrt(s)
     gyro_scale_error: float = 0.0    # relative
     accel_scale_error: float = 0.0   # relative
-    misalignment: float = 0.0        # rad, of each axis from where it should point
-    gyro_by_force: float = 0.0       # rad/s per m/s^2, what a force makes a gyro show
+    misalignment: float = 0.0        # rad, of each axis from its nominal direction
+    gyro_by_force: float = 0.0       # rad/s per m/s^2, g-sensitivity of the gyro
 
     @property
     def axis_error(self) -> float:
@@ -35,7 +35,7 @@ class Grade:
 
     @property
     def level_bias(self) -> float:
-        """Return the bias of a level accelerometer, m/s^2: its own and what its axis has of g."""
+        """Return the bias of a level accelerometer, m/s^2: its own and g by axis misalignment."""
         return math.hypot(self.accel_bias, math.sqrt(2) * G * self.misalignment)
 
 
@@ -62,10 +62,10 @@ def _from_data_sheet(gyro_noise: float, gyro_bias: float, gyro_bias_walk: float,
 
 
 # Gyro scale: data sheets of consumer MEMS give limits of 3 % for a new chip (MPU-6050: +-3 % at
-# 25 C, 2 % more over temperature), taken as 3 sigma; MEMS calibrated by its maker is good to some
-# 0.3 %, fibre gyros to some hundred ppm, ring lasers to some ppm: orders of size, no product's.
-# Accelerometer scale: 3 % at most for a new consumer chip (MPU-6050 again); calibrated 0.3 %;
-# those beside fibre gyros some hundred ppm, beside ring lasers a hundred.
+# 25 C, 2 % more over temperature), used as 3 sigma; factory-calibrated MEMS have about 0.3 %,
+# fibre gyros some hundred ppm, ring lasers some ppm: orders of magnitude, not of one product.
+# Accelerometer scale: 3 % at most for a new consumer chip (MPU-6050); calibrated 0.3 %; combined
+# with fibre gyros some hundred ppm, with ring lasers a hundred.
 GRADES: dict[str, Grade] = {
     'consumer': _from_data_sheet(0.3, 100.0, 10.0, 0.1, 0.05, 5e-3, 0.01, 0.01, 0.5, 0.06),
     'industrial': _from_data_sheet(0.15, 20.0, 5.0, 0.03, 0.02, 1e-3, 3e-3, 3e-3, 0.1, 0.01),
@@ -75,9 +75,9 @@ GRADES: dict[str, Grade] = {
                                    2e-3, 1e-5),
 }
 
-# Turn-on biases of IMUs as they are sold, 1 sigma: gyro rad/s, accelerometer m/s^2. Physical: by
-# data sheets and what is measured (docs/zoo.md), ten and more times those of a grade above, which
-# removed by a driver or measured at a standstill
+# Turn-on biases of IMUs as sold, 1 sigma: gyro rad/s, accelerometer m/s^2. Physical: by data
+# sheets and measurements (docs/zoo.md), ten and more times those of the grades above, which remain
+# if a driver removes the bias or it is measured at a standstill
 TURN_ON = {'consumer': (math.radians(1.0), 25e-3 * G), 'industrial': (math.radians(0.1), 3e-3 * G),
            'tactical': (math.radians(5.0) / 3600.0, 1e-3 * G)}
 
@@ -98,14 +98,14 @@ def with_turn_on_level(grade: Grade, imu: ImuConfig) -> Grade:
 SETTINGS = {'gyro_scale_error': 'gyro_scale_sigma',
             'accel_scale_error': 'accel_scale_sigma',
             'misalignment': 'misalignment_sigma',
-            'gyro_by_force': 'gyro_by_force_sigma'}     # named otherwise than the figure
+            'gyro_by_force': 'gyro_by_force_sigma'}     # setting of a figure, if its name differs
 
 
 def grade_as_seen(imu: ImuConfig, variance: Mapping[str, float]) -> Grade:
     """
-    Return the grade of the imu settings, or a worse one that its noise at rest is nearer to.
+    Return the grade of the imu settings, or a worse one that fits its noise at rest better.
 
-    One taken for better than it is would have its bias and its scale held to what they are not.
+    With too good a grade, the priors of bias and scale would be too narrow.
 
     variance : dict, white noise of 'gyro' and 'accel' at rest, per s; empty: not known.
     """
@@ -120,7 +120,7 @@ def grade_as_seen(imu: ImuConfig, variance: Mapping[str, float]) -> Grade:
 
 
 def grade_of(imu: ImuConfig) -> Grade:
-    """Return the grade of the imu settings with its single figures replaced where given."""
+    """Return the grade of the imu settings, with the single figures that the settings give."""
     grade = GRADES[imu.grade]
     names = [f.name for f in dataclasses.fields(Grade)]
     given = {name: getattr(imu, SETTINGS.get(name, name)) for name in names}

@@ -4,31 +4,31 @@
 """
 Limits of several packages: sigmas for a remark, and motions of land vehicles.
 
-The comment beside a level is the probability that chance exceeds it, on two sides.
+The comment on a level is the two-sided probability of exceeding it by chance.
 
-Beside a number stands where it is from: physical, with its source; statistical, with how often
-chance does so; tuned, with the benchmark that shows it; judgement, where nothing was measured;
-format, of a specification; or definition: a unit, a layout, a quadrature, what a source has set.
+The comment on a number states its origin: physical, with its source; statistical, with its
+frequency by chance; tuned, with the benchmark; judgement, if nothing was measured; format, of a
+specification; or definition: a unit, a layout, a quadrature, a convention of a source.
 """
 
 import math
 
-REMARK_SIGMAS = 3.0     # statistical: to say that something is there: once in 370
-FAULT_SIGMAS = 5.0      # statistical: to call a sensor or a setting wrong: once in 1.7 million
-# statistical: robust sigmas from which one value of many is not of them: the same
+REMARK_SIGMAS = 3.0     # statistical: for a remark: once in 370
+FAULT_SIGMAS = 5.0      # statistical: for a fault of a sensor or a setting: once in 1.7 million
+# statistical: robust sigmas of an outlier among many values: the same
 OUTLIER_SIGMAS = 5.0
-FASTEST = 100.0         # m/s, physical: no land vehicle is so fast: a counter reset, another unit
+FASTEST = 100.0         # m/s, physical: beyond any land vehicle: a counter reset or a wrong unit
 # physical: wear changes a tyre's radius by 2 %, pressure and load by 1 %, another make by 3 %
-TYRE_SPREAD = 0.05      # relative, by which scales of one vehicle's wheels, or drives, may differ
-SCALE_LIMIT = 0.05      # judgement: relative sigma, a scale no better is not known
-# judgement: of a prior sigma; a posterior one below it says that the data determined the value,
-# at half the data weigh three times the prior
+TYRE_SPREAD = 0.05      # relative, largest difference of scales of one vehicle's wheels, or drives
+SCALE_LIMIT = 0.05      # judgement: relative sigma, above it a scale is not determined
+# judgement: ratio of posterior to prior sigma below which the data determined the value: at half,
+# the data have three times the weight of the prior
 INFORMED_SHARE = 0.5
 # m/s, judgement: to the side and up, of a sprung body, not measured by wheels
 SWAY = 0.05
-# judgement: stamps further back, so many in turn, mean that time restarted
+# judgement: a larger backward step, of this number of stamps in sequence, is a restart of time
 TIME_ANEW_NS, TIME_ANEW_ROWS = 10**9, 3
-CLOCK_APART = 0.5      # s between the stamps of two topics, judgement: no driver is as late
+CLOCK_APART = 0.5      # s between the stamps of two topics, judgement: drivers have smaller delays
 # definition: units
 DAY_NS = 86_400 * 10**9
 RAD_PER_DEG = math.pi / 180

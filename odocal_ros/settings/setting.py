@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""One setting: how it is declared in a dataclass, and how a value for it is checked."""
+"""Declaration of a setting in a dataclass, and the check of its values."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, Field, field, fields, is_dataclass, replace
@@ -30,8 +30,8 @@ class Setting:
     """
     One setting: source of a parameter descriptor, a YAML line and a table row.
 
-    default : NaN is accepted where it is NaN.   ro : fixed at start-up.   frame : the name of a
-    coordinate frame.   item : type of the values of a list.   many : a list of any length.
+    default : if NaN, the value may be NaN.   ro : fixed at start-up.   frame : the value is the
+    name of a coordinate frame.   item : type of the values of a list.   many : any length.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Setting:
         return f'{self.item.__name__}s'
 
     def checked(self, value: Any) -> Any:
-        """Return value as this setting's type, or raise BadConfig with what it wants."""
+        """Return value as this setting's type, or raise BadConfig with the requirement."""
         if isinstance(self.default, tuple):
             if isinstance(value, str) or not hasattr(value, '__len__'):
                 raise BadConfig(f'{self.name}: {value!r} is not a list')
@@ -82,7 +82,7 @@ class Setting:
                 raise BadConfig(f'{self.name}: NaN is not a value')
             if not unset and not math.isfinite(value):
                 raise BadConfig(f'{self.name}: {value} is not finite')
-            # no setting in SI units means a number beyond it; sums with it stay finite
+            # larger than any value in SI units; sums with it stay finite
             largest = 1e9
             if kind is float and abs(value) > largest:
                 raise BadConfig(f'{self.name} = {value:g}: the limit is {largest:g}')
@@ -97,7 +97,7 @@ class Setting:
         """Refuse text with invisible characters, and names of frames that ROS does not allow."""
         if one_line(value) != value:
             raise BadConfig(f"{self.name}: '{one_line(value)}' has invisible characters")
-        # empty is one where that means something: as the default
+        # empty is allowed if it is the default
         if self.frame and not is_frame(value) and value != self.default:
             raise BadConfig(f'{self.name}: {value!r} is not a frame name; allowed: letters, '
                             'digits and _ . / -, without a leading /')

@@ -21,7 +21,7 @@ from odocal_ros.sim.zoo import G
 FREQUENCY = 2 * np.pi * 1.3   # rad/s
 DAMPING = 0.3
 STILL = 1e-9          # m/s, judgement: rounding
-KNEELING_TIME = 2.0   # s, judgement: in which a bus kneels, and rises
+KNEELING_TIME = 2.0   # s, judgement: of the kneeling or rising of a bus
 
 
 def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = None,
@@ -29,12 +29,12 @@ def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = N
     """
     Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles.
 
-    lean : of the road, which the roll includes. The force that holds the body on a slope or a lean
-    acts like an acceleration. Both axles stand on the road: the body lies along the chord of the
-    wheelbase, the rear axle moves along the road below it.
+    lean : of the road, included in the roll. The component of gravity along a slope or a lean acts
+    like an acceleration. Both axles are on the road: the body is parallel to the chord of the
+    wheelbase, and the rear axle moves along the road below it.
     """
     hills, wheelbase = hills or Hills(), real.wheelbase
-    # s; a cubic between is then good to (w h)^4 / 384 = 2e-6; a kerb is over within 0.2 s
+    # s; the error of a cubic is then (w h)^4 / 384 = 2e-6; a kerb is passed within 0.2 s
     step = 0.005 if hills.kerbs else 0.02
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
     v, s = speed(t), speed.integral()(t)
@@ -52,12 +52,12 @@ def tilts(speed: Profile, yaw_rate: Profile, real: Real, hills: Hills | None = N
 
 
 def side_force(speed: Profile, yaw_rate: Profile, lean: Profile | None, t: Floats) -> Floats:
-    """Return the force of the tyres to the left over the mass at times t, m/s^2."""
+    """Return the tyre force to the left divided by the mass at times t, m/s^2."""
     return speed(t) * yaw_rate(t) + (G * np.sin(lean(t)) if lean else 0.0)
 
 
 def kneels(speed: Profile, t: Floats) -> Floats:
-    """Return the share by which a bus kneels at its stops, 0 to 1: (n,)."""
+    """Return the degree of kneeling of a bus at its stops, 0 to 1: (n,)."""
     still = np.concatenate([[0], np.abs(speed(t)) < STILL, [0]]).astype(int)
     begin, end = (np.flatnonzero(np.diff(still) == sign) for sign in (1, -1))
     down = np.zeros(len(t))

@@ -4,7 +4,7 @@
 """
 Draw a realistic vehicle: first its properties, then effects of its sensors (docs/zoo.md).
 
-Each effect draws from a stream of its own name: alone or with others, it is the same.
+Each effect has its own random stream: it is the same alone or with others.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from odocal_ros.sim.real import Real
 from odocal_ros.sim.zoo import GRADES, plain, ROWS, SIZES, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')
-ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each asks for an odometer of its own
+ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each needs an odometer of its own
 
 
 def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None,
@@ -31,8 +31,8 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
 
     seed : of the vehicle, and of the noise of its drive.   kind, grade : scenario, and class of
     the IMU: consumer, industrial or tactical.   effects : those to be drawn; None: all, ``()``:
-    the clean vehicle.   given : SimOptions that are not drawn but as given; ``real`` a dict of its
-    figures.
+    the clean vehicle.   given : SimOptions that are set, not drawn; ``real``: a dict of its
+    fields.
 
     Raises BadUsage: a name is unknown.
     """
@@ -81,7 +81,7 @@ def _clean(seed: int, kind: str, grade: str, alone: bool) -> tuple[Vehicle, dict
     size = 0.5 if robot else 1.0
     antenna = size * rng.normal((0.8, 0.0, 1.3), (0.8, 0.3, 0.2))
     imu = size * rng.normal((0.8, 0.0, 0.4), (0.6, 0.3, 0.2))
-    scale = 1 / (500.0 if robot else 1000.0)     # fine counts, but for a coarser odometer
+    scale = 1 / (500.0 if robot else 1000.0)     # fine counts, unless the odometer is coarser
     options: dict[str, Any] = {
         'scenario': kind, 'seed': seed, 'imu_grade': grade, 'heading': heading, 'slope': slope,
         'roll': roll, 'pitch': float(np.clip(pitch, -0.2, 0.2)), 'yaw': yaw,

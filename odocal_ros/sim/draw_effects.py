@@ -12,13 +12,13 @@ from odocal_ros.sim.zoo import DEG, Drawn, G, KMH, lognormal, plain, Vehicle
 
 
 def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Scale of each axis, axes that are not square, a gyro turned against its accelerometer."""
+    """Draw scale and misalignment of each axis, and a rotation between gyro and accelerometer."""
     x, y, z = rng.normal(0.0, vehicle.size('between') / math.sqrt(2), 3)
-    turned = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])    # half of it to each side
+    turned = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])    # half of it for each triad
     figures = {}
     for name, sensor, sign in (('gyro_matrix', 'gyro', 1), ('accel_matrix', 'accelerometer', -1)):
         M = rng.normal(0.0, vehicle.size('cross'), (3, 3)) + sign * turned / math.sqrt(2)
-        # the limit of a data sheet cuts at three sigmas
+        # a data sheet limits it to three sigmas
         np.fill_diagonal(M, vehicle.size(f'{sensor} scale')
                          * np.clip(rng.standard_normal(3), -3.0, 3.0))
         figures[name] = plain(M)
@@ -31,7 +31,7 @@ def g_sensitivity(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def bias(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Turn-on biases of the vehicle's table, and their drift during the run."""
+    """Draw turn-on biases by the vehicle's class, and their drift during the run."""
     return {}, {
         'gyro_bias': plain(rng.normal(0.0, vehicle.size('gyro bias'), 3)),
         'accel_bias': plain(rng.normal(0.0, vehicle.size('accelerometer bias'), 3) * [1, 1, 1.3]),
@@ -40,7 +40,7 @@ def bias(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Biases that ramp while the IMU warms; it may have been on for some minutes."""
+    """Draw biases that change while the IMU warms up; it may have been on for some minutes."""
     tau = lognormal(rng, 300.0, 0.5)
     since = rng.uniform(0.0, 600.0)
     figures = {}
@@ -54,14 +54,14 @@ def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def vibration(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Vibration of the IMU by road and engine."""
+    """Draw the vibration of the IMU by road and engine."""
     rms = G * rng.uniform(0.02, 0.1)
     return {}, {'vibration': float(rms), 'gyro_vibration': float(DEG * rng.uniform(0.1, 0.5)),
                 'rectification': float(vehicle.size('rectified') * rng.choice([-1, 1]))}
 
 
 def imu_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Stamps late by filter and transport delay, with jitter, in batches."""
+    """Delay stamps by filter and transport, with jitter, in batches."""
     shortest, longest = vehicle.row('filter')
     latency = rng.uniform(shortest, longest) + lognormal(rng, *vehicle.row('latency'))
     batches = vehicle.grade == 'industrial' and rng.uniform() < 0.3
@@ -78,9 +78,9 @@ def grade(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Send speeds in steps of a bus, with a dead band; at times whole km/h at 1 to 10 Hz."""
-    whole = vehicle.alone or rng.uniform() < 0.3      # as OBD-II gives them
-    least_bits = (0.0075, 0.01, 0.031, 0.056, 0.06)     # km/h, of buses of cars
+    """Quantise speeds as a vehicle bus, with a dead band; at times whole km/h at 1 to 10 Hz."""
+    whole = vehicle.alone or rng.uniform() < 0.3      # as in OBD-II
+    least_bits = (0.0075, 0.01, 0.031, 0.056, 0.06)     # km/h, of vehicle buses
     real = {'speed_step': KMH * (1.0 if whole else float(rng.choice(least_bits))),
             'speed_rounding': str(rng.choice(['floor', 'round']))}
     chance = rng.uniform()
@@ -97,26 +97,26 @@ def coarse_pulses(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def odometer_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Stamps late by filter and bus, with jitter."""
+    """Delay stamps by filter and bus, with jitter."""
     late = lognormal(rng, *((0.015, 0.6) if vehicle.robot else (0.04, 0.5)
                             if vehicle.grade != 'tactical' else (0.005, 0.3)))
     return {'odometer_delay': late}, {'odometer_jitter': 0.003}
 
 
 def speed_law(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Tyres that grow with the square of the speed."""
+    """Let tyres grow with the square of the speed."""
     return {}, {'speed_law': lognormal(rng, 0.002, 0.6)}
 
 
 def warming(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Tyres that grow as they warm."""
+    """Let tyres grow as they warm up."""
     half = 0.5 if vehicle.grade == 'tactical' else 1.0
     return {}, {'warming': float(half * rng.uniform(0.001, 0.004)),
                 'warming_time': lognormal(rng, 600.0, 0.4)}
 
 
 def slip(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Tyres that slip as they pull and brake."""
+    """Let tyres slip under traction and braking."""
     return {}, {'tyre_slip': 1 / lognormal(rng, 30.0, 0.4), 'driven': bool(rng.uniform() < 0.5)}
 
 
@@ -127,14 +127,14 @@ def sideslip(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def squat(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Put the body on springs."""
+    """Let the body pitch and roll on its springs."""
     pitch, roll = (0.2, 0.5) if vehicle.robot else (lognormal(rng, 1.3, 0.4),
                                                     lognormal(rng, 4.5, 0.3))
     return {}, {'squat': float(pitch * DEG / G), 'body_roll': float(roll * DEG / G)}
 
 
 def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Arms measured with a tape, by eye, or left at zero."""
+    """Draw errors of lever arms: measured with a tape, by eye, or left at zero."""
     zero, real = rng.uniform() < vehicle.size('arm at zero'), {}
     for name in ('imu', 'antenna', 'odometer'):
         off = vehicle.size('arm error') * rng.standard_normal(3)
@@ -149,14 +149,14 @@ def receiver_lag(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def fix_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Stamps of the arrival, by half of the drivers."""
+    """Stamp fixes at their arrival, as half of the drivers do."""
     if vehicle.grade == 'tactical' or not (vehicle.alone or rng.uniform() < 0.5):
         return {}, {}
     return {'fix_delay': lognormal(rng, 0.12, 0.4)}, {'fix_jitter': 0.01}
 
 
 def slow_errors(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Errors that stay for minutes: most in one, the rest in a quarter of an hour."""
+    """Draw correlated errors: most with a time of one minute, the rest of 15 minutes."""
     if vehicle.rtk:
         return {'fix_sigma': 0.008}, {'slow_errors': ((0.01, 100.0),)}
     sbas = 0.6 if rng.uniform() < 0.4 else 1.0
@@ -166,7 +166,7 @@ def slow_errors(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def multipath(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Bursts of wrong positions in a city; of RTK, a false fix now and then."""
+    """Draw bursts of wrong positions in a city; with RTK, occasional wrong fixes."""
     if vehicle.rtk:
         return {}, {'bursts': 12.0 if vehicle.city else 1.0, 'burst_size': 0.6, 'burst_time': 60.0}
     if not (vehicle.city or vehicle.alone):
@@ -181,7 +181,7 @@ def covariance(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def outages(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Outages, and a loss of one fix in a hundred."""
+    """Draw outages, and a loss of one fix in a hundred."""
     spans, span = [], 500.0
     for _ in range(int(rng.poisson(3.0 if vehicle.city else 1.0)) + vehicle.alone):
         begin = float(rng.uniform(30.0, span))
@@ -206,13 +206,13 @@ def held_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def filtered_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Send speeds behind a low-pass filter, as most speed signals of cars are."""
+    """Send speeds after a low-pass filter, like most speed signals of cars."""
     return (vehicle.speed_options | {'odometer_rate': 20.0},
             {'speed_filter': float(rng.uniform(0.2, 0.6))})
 
 
 def clocks(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Stamp each topic by a quartz of its own."""
+    """Stamp odometer and fixes by clocks of their own."""
     odometer, fix = rng.uniform(2e-5, 1e-4, 2) * rng.choice((-1, 1), 2)
     return {}, {'odometer_clock_rate': float(odometer), 'fix_clock_rate': float(fix)}
 
@@ -231,12 +231,12 @@ def tunnels(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def reflections(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Receive only reflections beside a wall for half a minute, which come and go slowly."""
+    """Receive only reflections near a wall for half a minute, with slow onset and end."""
     return {}, {'bursts': 20.0, 'burst_size': 12.0, 'burst_time': 30.0, 'burst_onset': 10.0}
 
 
 def kerbs(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Drive on ground that leans to the sides; in a yard over kerbs too."""
+    """Drive on ground with cross slopes; in a yard over kerbs too."""
     lean = {'cross_slope': float(DEG * rng.uniform(1.0, 2.0))}
     if vehicle.kind != 'yard':
         return {}, lean | {'cross_slope_length': 200.0, 'wheelbase': 2.7}

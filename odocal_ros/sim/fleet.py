@@ -29,7 +29,7 @@ class Model:
     pitch: float
 
 
-# judgement: some fleet's models
+# judgement: models of an example fleet
 MODELS = (Model('shuttle', 0.0210, 0.0213, math.radians(1.0), math.radians(0.4)),
           Model('van', 0.0245, 0.0243, math.radians(-0.5), math.radians(0.8)),
           Model('truck', 0.0310, 0.0312, math.radians(0.2), math.radians(-0.6)))
@@ -37,7 +37,7 @@ MODELS = (Model('shuttle', 0.0210, 0.0213, math.radians(1.0), math.radians(0.4))
 
 @dataclass(frozen=True)
 class FleetChange:
-    """A change of a vehicle before one of its bags, the first being 0."""
+    """A change of a vehicle before one of its bags, which count from 0."""
 
     bag: int
     what: str            # scale_factor, yaw_mounting_angle or counter
@@ -62,7 +62,7 @@ class FleetVehicle:
 
 
 def fleet_of(vehicles: int, bags: int, seed: int) -> list[FleetVehicle]:
-    """Return so many vehicles with so many drives each, a week from one to the next."""
+    """Return ``vehicles`` vehicles with ``bags`` drives each, one per week."""
     rng = stream(seed, 'fleet')
     order = rng.permutation(vehicles).tolist()
     fates: dict[int, str] = {}
@@ -105,7 +105,7 @@ def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOpti
 
 
 def as_driven(drive: Drive, broken: bool) -> Drive:
-    """Return a drive as in its bag: a broken counter stops after a third of it."""
+    """Return a drive as in its bag: a broken counter stops after a third of the drive."""
     if not broken:
         return drive
     rows = drive.odometer

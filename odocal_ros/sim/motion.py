@@ -6,7 +6,7 @@ True motion of a vehicle on the WGS 84 ellipsoid, from a speed and a turn-rate p
 
 The rear axle's centre moves along the vehicle's x axis, except for an optional sway to the side
 and up. Speed, turn rate and sway are piecewise polynomials, so travel and yaw are exact; position
-is their integral by four-point Gauss rule between breaks, good to 1e-8 m over tens of kilometres.
+is their integral by four-point Gauss rule between breaks, with errors of 1e-8 m over tens of km.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class State:
     speed: np.ndarray            # m/s
     acceleration: np.ndarray     # m/s^2, of the speed
     yaw: np.ndarray              # rad, ENU, not wrapped
-    yaw_rate: np.ndarray         # rad/s, against the local level
+    yaw_rate: np.ndarray         # rad/s, relative to the local level
     yaw_acceleration: np.ndarray
     slope: np.ndarray            # rad, nose up
     slope_rate: np.ndarray
@@ -57,8 +57,8 @@ class State:
     latitude: np.ndarray         # rad
     longitude: np.ndarray        # rad
     height: np.ndarray           # m
-    turned: np.ndarray           # rad, integral of the turn rate against Earth about v's z axis
-    sway: np.ndarray             # (n, 2) m/s, velocity along v's y and z axes: no wheel rolls it
+    turned: np.ndarray           # rad, integral of the turn rate about v's z relative to Earth
+    sway: np.ndarray             # (n, 2) m/s, along v's y and z axes: not measured by wheels
     sway_acceleration: np.ndarray   # (n, 2) m/s^2
 
 
@@ -68,7 +68,7 @@ class Motion:
 
     sway : velocities along v's y and z axes (m/s).
     tilt : roll and pitch (rad) of the body on the vehicle; empty: the body is rigid.
-    lean : roll (rad) of the road under its wheels, which ``tilt`` includes.
+    lean : roll (rad) of the road under its wheels, included in ``tilt``.
     """
 
     def __init__(self, speed: Profile, yaw_rate: Profile, start: Start,
@@ -110,7 +110,7 @@ class Motion:
             sway_acceleration=np.stack([profile.mean(t) for profile in self._jolt], -1))
 
     def _place_nodes(self) -> None:
-        # 0.1 s: at 0.5 rad/s a four-point Gauss rule is then below round-off
+        # 0.1 s: at 0.5 rad/s the error of the Gauss rule is then below round-off
         steps = np.arange(0.0, self.duration, 0.1)
         breaks = [p.breaks for p in (self.speed, self.yaw_rate, *self.sway)]
         nodes = np.unique(np.concatenate([steps, [self.duration], *breaks]))
@@ -125,12 +125,12 @@ class Motion:
             latitude = _running(self.start.latitude, step)
         self._latitude = latitude
         self._longitude = _running(self.start.longitude, longitude)
-        # going east turns the local level against the Earth by dlon * sin(lat)
+        # moving east turns the local level relative to the Earth by dlon * sin(lat)
         self._turned = _running(
             0.0, turned + longitude * np.sin((latitude[1:] + latitude[:-1]) / 2))
 
     def _section(self, t: Floats, h: Floats) -> list[Floats]:
-        """Return metres east, north, up and rad turned against the level, from t to t + h."""
+        """Return m east, north, up and rad of rotation relative to the level, from t to t + h."""
         sums = [np.zeros(np.shape(t)) for _ in range(4)]
         for node, weight in GAUSS:
             at, w = t + (node + 1) / 2 * h, weight / 2
@@ -158,13 +158,13 @@ def _walk_about(latitude: Floats, height: Floats, east: Floats,
 
 
 def _walk(latitude: Floats, height: Floats, east: Floats, north: Floats) -> tuple[Floats, Floats]:
-    """Return the change of latitude and longitude of steps of metres that begin at latitude."""
+    """Return the change of latitude and longitude of steps, m, that begin at latitude."""
     step, _ = _walk_about(latitude, height, east, north)
     return _walk_about(latitude + step / 2, height, east, north)
 
 
 def attitude(state: State) -> Floats:
-    """Return C_nv, n being the local level where the vehicle is: (n, 3, 3)."""
+    """Return C_nv, with n the local level at the vehicle: (n, 3, 3)."""
     return matrix_from_rpy(np.stack([np.zeros_like(state.yaw), -state.slope, state.yaw], -1))
 
 
@@ -183,7 +183,7 @@ def inertial_v(state: State,
     """
     Return the output of a perfect IMU at ``lever_arm_v`` (m, in v), in axes v: w_v, f_v.
 
-    w_v : (n, 3) turn rate against inertial space, rad/s.   f_v : (n, 3) specific force, m/s^2: +g
+    w_v : (n, 3) turn rate in inertial space, rad/s.   f_v : (n, 3) specific force, m/s^2: +g
     along z at rest on the level.
     """
     C_nv, v_n = attitude(state), velocity_n(state)
@@ -223,7 +223,7 @@ def _into(C_nv: Floats, a_n: Floats) -> Floats:
 
 
 def _gravity_change(state: State, d_n: Floats, gamma: Floats) -> Floats:
-    """Return gravity at d_n (m) from the vehicle less gravity there, in the vehicle's ENU."""
+    """Return gravity at d_n (m) from the vehicle minus that at the vehicle, in its ENU."""
     meridian, normal = radii(state.latitude)
     tilt_e, tilt_n = d_n[:, 0] / (normal + state.height), d_n[:, 1] / (meridian + state.height)
     there = gravity(state.latitude + tilt_n, state.height + d_n[:, 2])
@@ -235,7 +235,7 @@ def point(state: State, lever_arm_v: tuple[float, float, float],
     """
     Return latitude, longitude (rad), height (m) of a point fixed to the vehicle: (n,) each.
 
-    tilt : (n, 3, 3), takes the body, which the point is fixed to, to the vehicle.
+    tilt : (n, 3, 3) rotation from the body, to which the point is fixed, to the vehicle.
     """
     C = C_en(state.latitude, state.longitude) @ attitude(state)
     C = C if tilt is None else C @ tilt
@@ -246,9 +246,9 @@ def point(state: State, lever_arm_v: tuple[float, float, float],
 def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float],
                    lean: Floats | float = 0.0) -> Floats:
     """
-    Return the metres that a wheel touching the ground at lever_arm_v has rolled: (n,).
+    Return the path rolled by a wheel with its contact point at lever_arm_v, m: (n,).
 
-    lean : rad, (n,) roll of the road, which turns the arm about the vehicle's x axis.
+    lean : rad, (n,) roll of the road, which rotates the arm about the vehicle's x axis.
     """
     _, y, z = lever_arm_v
     if not np.any(lean):
@@ -261,7 +261,7 @@ def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float
 
 def contact_speed(state: State, lever_arm_v: Floats | tuple[float, float, float],
                   lean: Floats | float = 0.0) -> Floats:
-    """Return the speed of such a wheel, m/s: (n,)."""
+    """Return the speed of a wheel with its contact point at lever_arm_v, m/s: (n,)."""
     _, y, z = lever_arm_v
     y = y * np.cos(lean) - z * np.sin(lean)
     return state.speed - y * turn_rate(state) - z * state.slope_rate

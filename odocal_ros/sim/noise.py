@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sample times, random numbers with a stream for each sensor, and the noises made of them."""
+"""Sample times, random numbers with a stream for each sensor, and noise processes."""
 
 import zlib
 
@@ -11,11 +11,11 @@ from odocal_ros.data.arrays import Floats, Ints
 
 # s from the first IMU sample, so that no two topics sample together
 PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004, 'pressure': 0.005}
-TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measuring to arriving
+TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measurement to arrival
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """Return the named generator of a seed; no setting of one sensor moves another's numbers."""
+    """Return the named generator of a seed; settings of one sensor do not affect another's."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 

@@ -28,7 +28,7 @@ class SimOptions:
 
     Lever arms are positions in base_link (rear axle, forward-left-up), m. Mounting angles are
     those of docs/conventions.md; ``mounting_rpy`` is the nominal rotation from the IMU's frame to
-    b that comes on top.
+    b, applied in addition.
     """
 
     scenario: str = 'straight'
@@ -81,7 +81,7 @@ class SimOptions:
     fix_sigma: float = BY_SCENARIO   # m, horizontal, each axis; up: twice
     fix_correlation_time: float = BY_SCENARIO    # s, of kind correlated
     reference_drift: float = BY_SCENARIO   # m/sqrt(m) of path
-    drift_length: float = BY_SCENARIO      # m of path in which it is forgotten; 0: never
+    drift_length: float = BY_SCENARIO      # m of path, correlation length; 0: random walk
     closure_time: float = BY_SCENARIO      # s, mean, between loop closures; 0: none
     fix_delay: float = 0.0                 # s, delay of the stamps
     antenna_lever_arm: Vector = NONE3
@@ -106,11 +106,11 @@ class SimOptions:
 
     @property
     def wheel_count(self) -> int:
-        """Return the number of wheels that are sent."""
+        """Return the number of published wheels."""
         return max(self.wheels, 1 + self.two_wheels)
 
 
-# what differs by scenario
+# values that depend on the scenario
 DEFAULTS = {
     'paper': {'duration': 930.0, 'imu_grade': 'navigation', 'pitch': 0.0},
     'straight': {'duration': 720.0, 'imu_grade': 'industrial'},
@@ -150,7 +150,7 @@ ANGLES = {'latitude': 85.0, 'longitude': 180.0, 'heading': 360.0, 'slope': 20.0,
 
 
 def resolved(options: SimOptions) -> SimOptions:
-    """Return options with the scenario's own values; BadUsage for a wrong name or figure."""
+    """Return options with the scenario's own values; BadUsage for a wrong name or value."""
     _choice('--scenario', options.scenario, DEFAULTS)
     _choice('--odometer', options.odometer, ODOMETERS)
     defaults: dict[str, Any] = COMMON | DEFAULTS[options.scenario]
@@ -176,7 +176,7 @@ def resolved(options: SimOptions) -> SimOptions:
         nominal = options.scale * nominal / scale
     filled = _filled(options, {'scale': scale, 'nominal_scale': nominal,
                                'fix_sigma': 0.02 if options.fix_noise == 'rtk' else 1.5})
-    if isinstance(options.real, dict):      # as truth.yaml holds it
+    if isinstance(options.real, dict):      # as in truth.yaml
         filled = replace(filled, real=Real(**options.real))
     _check(filled)
     return filled

@@ -37,7 +37,7 @@ class Profile:
     def mean(self, t: ArrayLike) -> Floats:
         """Return the values, at a jump the mean of both sides (a trapezoid rule is then exact)."""
         t = np.asarray(t, dtype=float)
-        near = 1e-9    # s, a sample this near a break lies on it
+        near = 1e-9    # s, a sample this near a break counts as on it
         before, after = self._piece(t - near), self._piece(t + near)
         return (self._on(before, t) + self._on(after, t)) / 2
 
@@ -90,7 +90,7 @@ def hermite(breaks: Floats, values: Floats, slopes: Floats) -> Profile:
 
 
 def chain(pieces: Iterable[Piece]) -> Profile:
-    """Join pieces end to end from time 0; pieces of no duration vanish."""
+    """Join pieces end to end from time 0; pieces without duration are dropped."""
     kept = [(d, p) for d, p in pieces if d > 0]
     # breaks rounded to ns, so that a break meant for a sample's stamp is on it
     breaks = np.round(np.cumsum([0.0] + [d for d, _ in kept]), 9)
@@ -101,7 +101,7 @@ def ramp(duration: float, gain: float, blend: float = 1.0) -> list[Piece]:
     """
     Return the acceleration pieces that change speed by ``gain`` within ``duration``.
 
-    It rises and falls in straight lines of ``blend`` seconds (0: at once, as in the paper).
+    The acceleration rises and falls linearly in ``blend`` s (0: at once, as in the paper).
     """
     peak = gain / (duration - blend)
     return [line(blend, 0.0, peak), line(duration - 2 * blend, peak, peak), line(blend, peak, 0.0)]
@@ -137,7 +137,7 @@ class Hills:
                 -k**2 * wave + by2 / cosine + by**2 * sine / cosine**3)
 
     def chord(self, travel: Floats, wheelbase: float) -> tuple[Floats, Floats]:
-        """Return the slope of a line from there to a wheelbase ahead, and its derivative."""
+        """Return the slope of the line from ``travel`` to a wheelbase ahead and its derivative."""
         k, ahead = 2 * np.pi / self.length, travel + wheelbase
         mean = self.slope * (np.cos(k * travel) - np.cos(k * ahead)) / (k * wheelbase)
         mean_by = self.slope * (np.sin(k * ahead) - np.sin(k * travel)) / wheelbase

@@ -33,19 +33,19 @@ POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_fa
 @dataclass(frozen=True, kw_only=True)
 class Real:
     """
-    Figures of a vehicle, SI and radians; those of the IMU in its own frame i (the housing).
+    Parameters of a vehicle, SI and radians; those of the IMU in its own frame i (the housing).
 
     The IMU reads ``w_m = (I + M_g) w + b_g + G f + n`` and ``f_m = (I + M_a) f + b_a + n``.
     """
 
-    gyro_matrix: Matrix = NONE9      # M_g: scale on the diagonal, misalignment beside it
+    gyro_matrix: Matrix = NONE9      # M_g: scale on the diagonal, misalignment off it
     accel_matrix: Matrix = NONE9     # M_a
     g_sensitivity: Matrix = NONE9    # G, rad/s per m/s^2
     gyro_bias: Vector | None = None  # rad/s at the first sample; None: drawn by the grade
     accel_bias: Vector | None = None   # m/s^2
     gyro_slope: Vector = NONE3       # rad/s per K
     accel_slope: Vector = NONE3      # m/s^2 per K
-    warm_rise: float = 0.0           # K that it still warms from the first sample on
+    warm_rise: float = 0.0           # K of warming after the first sample
     warm_time: float = 300.0         # s
     gyro_wander: float = 0.0         # rad/s, in-run instability, first order Markov
     accel_wander: float = 0.0        # m/s^2
@@ -53,36 +53,36 @@ class Real:
     vibration: float = 0.0           # m/s^2 rms of each axis, reached at speed
     gyro_vibration: float = 0.0      # rad/s rms
     rectification: float = 0.0       # m/s^2 of bias per (m/s^2)^2 of vibration
-    imu_latency: float = 0.0         # s by which its stamps are late, in the mean
+    imu_latency: float = 0.0         # s, mean delay of its stamps
     imu_jitter: float = 0.0          # s, 1 sigma
     imu_batch: int = 1               # samples that arrive, and are stamped, together
 
-    speed_step: float = 0.0          # step of the speed sent, in its unit; 0: fine
+    speed_step: float = 0.0          # resolution of the published speed, in its unit; 0: none
     speed_rounding: str = 'floor'    # floor or round
-    dead_band: float = 0.0           # speeds below are sent as 0
-    speed_hold: float = 0.0          # change of speed that is published
+    dead_band: float = 0.0           # speeds below are published as 0
+    speed_hold: float = 0.0          # least change of speed that is published
     speed_filter: float = 0.0        # s, time constant of a low-pass filter on the speed
     odometer_jitter: float = 0.0     # s, 1 sigma, on top of odometer_delay
-    odometer_clock_rate: float = 0.0    # relative, of its clock against that of the IMU
+    odometer_clock_rate: float = 0.0    # relative rate error of its clock to that of the IMU
     speed_law: float = 0.0           # relative growth of the tyres at 36 m/s, as v^2
-    warming: float = 0.0             # relative growth of the tyres, warm against cold
+    warming: float = 0.0             # relative growth of the tyres, from cold to warm
     warming_time: float = 600.0      # s of driving
     tyre_slip: float = 0.0           # slip by tyre force over load: 1 / stiffness
     driven: bool = True              # the wheel that is counted drives (else it only brakes)
 
     sideslip: float = 0.0            # rad per m/s^2 to the side, rear axle drifts outwards
     squat: float = 0.0               # rad per m/s^2, nose up
-    wheelbase: float = 0.0           # m, on whose chord the body lies over a crest; 0: as the road
+    wheelbase: float = 0.0           # m, the body is parallel to its chord; 0: to the road
     body_roll: float = 0.0           # rad per m/s^2, outwards
-    banking: float = 0.0             # share of a curve's force that its bank takes
-    crossfall: float = 0.0           # rad, the whole road leans to the right by
-    kneeling: float = 0.0            # rad, a bus leans to the right by at a stop
-    kerbs: float = 0.0               # m up and down by turns
+    banking: float = 0.0             # share of the lateral force taken by banking
+    crossfall: float = 0.0           # rad, constant lean of the road to the right
+    kneeling: float = 0.0            # rad, lean of a bus to the right at a stop
+    kerbs: float = 0.0               # m, alternately up and down
     kerb_distance: float = 15.0      # m, mean, between them
-    cross_slope: float = 0.0         # rad, largest, to either side by turns
-    cross_slope_length: float = 20.0    # m of one turn of it
+    cross_slope: float = 0.0         # rad, largest, alternating in side
+    cross_slope_length: float = 20.0    # m, its wavelength
 
-    imu_arm_error: Vector = NONE3        # m, configured less true
+    imu_arm_error: Vector = NONE3        # m, configured minus true
     odometer_arm_error: Vector = NONE3
     antenna_arm_error: Vector = NONE3
 
@@ -95,17 +95,17 @@ class Real:
     bursts: float = 0.0              # multipath bursts per hour
     burst_size: float = 12.0         # m, median
     burst_time: float = 8.0          # s, median
-    burst_onset: float = 2.0         # s, mean, in which one comes and goes
+    burst_onset: float = 2.0         # s, mean rise and fall time
     burst_spread: float = 0.9        # of the logarithm of size and length, 1 sigma
     # (begin, length) s each, in which the receiver dead-reckons by an odometer and a gyro
     tunnels: tuple[tuple[float, float], ...] = ()
     tunnel_odometer: float = 0.0     # relative scale error of this odometer
     tunnel_heading: float = 0.0      # rad, heading error at the end of a tunnel's first minute
-    drops: float = 0.0               # share of the fixes that never come
+    drops: float = 0.0               # share of lost fixes
     fix_jitter: float = 0.0          # s, 1 sigma, on top of fix_delay
-    fix_clock_rate: float = 0.0      # relative, of its clock against that of the IMU
+    fix_clock_rate: float = 0.0      # relative rate error of its clock to that of the IMU
     stated_factor: float = 1.0       # stated sigma over true sigma
-    told_grade: str | None = None    # imu.grade as set; None: the right one
+    told_grade: str | None = None    # configured imu.grade; None: the true one
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -118,7 +118,7 @@ class Real:
 
 
 def _checked(name: str, value: Any, default: Any) -> Any:
-    """Return a figure as numbers and tuples of them, or raise BadUsage."""
+    """Return a parameter as numbers and tuples of them, or raise BadUsage."""
     if name in WORDS:
         if value not in WORDS[name] and value != default:
             raise BadUsage(f'--real {name}={value}: required: one of {", ".join(WORDS[name])}')
@@ -138,7 +138,7 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 
 
 def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
-    """Return the numbers of a figure of the required form."""
+    """Return the numbers of a parameter, or raise BadUsage for a wrong form."""
     if name in PAIRS:
         if not (isinstance(value, tuple) and all(isinstance(v, tuple) and len(v) == 2
                                                  and v[1] for v in value)):
@@ -151,7 +151,7 @@ def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
 
 
 def parsed(text: str) -> tuple[str, Any]:
-    """Return name and value of ``NAME=VALUE``; BadUsage without such a figure or value."""
+    """Return name and value of ``NAME=VALUE``; raise BadUsage for an unknown name."""
     import ast
     name, _, value = text.partition('=')
     names = [f.name for f in fields(Real)]

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a real IMU and a real receiver add: triads, vibration, filters, multipath, wrong sigmas."""
+"""Errors of a real IMU and receiver: triads, vibration, filters, multipath, wrong sigmas."""
 
 from dataclasses import replace
 
@@ -29,8 +29,8 @@ AVERAGING /= AVERAGING.sum()
 # definition: of a second-order filter of position and velocity, damped by sqrt(1/2)
 TRACKING = np.exp(-NODES / 2**0.5) * np.cos(NODES / 2**0.5) * np.repeat(np.diff(EDGES) / 2, 2)
 TRACKING /= TRACKING.sum()
-UP = 2.0             # judgement: errors of the height over those of east and north
-ONSET = (0.5, 1.5)   # judgement: of the mean time in which a burst comes and goes
+UP = 2.0             # judgement: ratio of height errors to those of east and north
+ONSET = (0.5, 1.5)   # judgement: range, of the mean rise and fall time of a burst
 HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e-4 m/s
 OUTLIER = 5.0           # m/s, judgement: a wrong Doppler in a street
 
@@ -51,7 +51,7 @@ def turn_and_push(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
     gyro, accel = np.eye(3) + gyro_matrix, np.eye(3) + accel_matrix
     z = np.linalg.solve(gyro, [0.0, 0.0, 1.0])
     z /= np.linalg.norm(z)
-    x = np.cross(accel[1], z)      # not measured by the y accelerometer, perpendicular to z
+    x = np.cross(accel[1], z)      # perpendicular to the y accelerometer and to z
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z], -1)
 

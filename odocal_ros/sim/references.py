@@ -49,7 +49,7 @@ def drift(t: Floats, travel: Floats, options: Any) -> Floats | float:
     """
     Return errors that change with the path, and jump as loops are closed: (n, 3) m ENU, or 0.0.
 
-    travel : (n,) m, driven by t.
+    travel : (n,) m, at t.
     """
     if not options.reference_drift:
         return 0.0
@@ -69,5 +69,5 @@ def drift(t: Floats, travel: Floats, options: Any) -> Floats | float:
 
 
 def stationary_sigma(options: Any) -> float:
-    """Return the sigma of a drift that is forgotten with the path, m, 0 of one that is not."""
+    """Return the stationary sigma of a correlated drift, m; 0 for a random walk."""
     return float(options.reference_drift * np.sqrt(options.drift_length / 2))

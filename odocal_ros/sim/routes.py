@@ -14,7 +14,7 @@ from odocal_ros.sim.profile import chain, hold, Piece, Profile, ramp, turn
 # judgement: of a run of a minute with a small robot
 STILL = 5.0         # s at standstill, at the start and at the end
 LONGEST = 19.0      # s of a cycle with the shortest straight
-BLEND = 0.4         # s in which an acceleration or a turn rate sets in
+BLEND = 0.4         # s, rise time of an acceleration or a turn rate
 
 Stretch = tuple[list[Piece], list[Piece]]     # accelerations and turn rates of equal duration
 
@@ -23,8 +23,8 @@ def robot_stretches(duration: float, rng: np.random.Generator) -> list[Stretch]:
     """
     Return cycles of a move and a turn on the spot, 5 s still before and after.
 
-    A move of 2 to 8 s at 0.2 to 1.2 m/s is straight or an arc of up to 90 deg by turns. Turns on
-    the spot are of 45 to 200 deg at 0.5 to 1.2 rad/s, to the left and to the right by turns.
+    A move of 2 to 8 s at 0.2 to 1.2 m/s is alternately straight or an arc of up to 90 deg. Turns
+    on the spot are of 45 to 200 deg at 0.5 to 1.2 rad/s, alternately to the left and the right.
     """
     found, left, side = [(hold(STILL), hold(STILL))], duration - 2 * STILL, rng.choice([-1.0, 1.0])
     k = 0
@@ -37,7 +37,7 @@ def robot_stretches(duration: float, rng: np.random.Generator) -> list[Stretch]:
 
 
 def sideways(found: list[Stretch]) -> list[tuple[list[Piece], list[Piece], list[Piece]]]:
-    """Return stretches with every third move to the left, and its turns."""
+    """Return stretches in which every third move is to the left, with the same turns."""
     return [(hold(sum(d for d, _ in speed)), rate, speed) if k % 3 == 2 else
             (speed, rate, hold(sum(d for d, _ in speed))) for k, (speed, rate) in enumerate(found)]
 
@@ -50,7 +50,7 @@ def square_stretches() -> list[Stretch]:
     """
     found = [(hold(10.0), hold(10.0))]
     for side in [1.0] * 4 + [-1.0] * 4:
-        # 4 m: a ramp of 1 s with such flanks is half a second of the speed
+        # 4 m: a ramp of 1 s is as long as half a second at full speed
         speed = ramp(1.0, 0.5, BLEND) + hold(7.0) + ramp(1.0, -0.5, BLEND)
         found.append((speed + hold(8.0), hold(12.0) + turn(2.0, side * math.pi / 2, BLEND)
                       + hold(3.0)))
@@ -113,9 +113,9 @@ def town(duration: float, rng: np.random.Generator) -> Route:
 
     A cycle of a minute or so: 5 to 12 s up to 9 to 14 m/s, cruise, one turn of 60 to 110 deg in
     6 s or more, 6 to 12 s down, 4 to 15 s still. Turns keep the heading within 110 deg of the
-    first, so that the end lies well away from the start.
+    first, so that the end is well away from the start.
     """
-    enough = 135.0    # s that hold a cycle, whatever is drawn
+    enough = 135.0    # s, enough for any drawn cycle
     left = _rest('town', duration, 20 + 15, enough=enough)
     stretches, off = [(hold(20), hold(20))], 0.0
     while left >= 90.0 or not stretches[1:]:
@@ -204,7 +204,7 @@ def indoor(duration: float, rng: np.random.Generator) -> Route:
 
 
 def square(duration: float, rng: np.random.Generator) -> Route:
-    """Return a square of 4 m in both directions, as of UMBmark, with turns on the spot."""
+    """Return a square of 4 m in both directions, as in UMBmark, with turns on the spot."""
     rest = _rest('square', duration, 10 + 8 * 17, least=5.0)
     return _route([*square_stretches(), (hold(rest), hold(rest))])
 
@@ -224,9 +224,9 @@ def _town_cycle(rng: np.random.Generator,
     before, turning, between = (_tenth(rng.uniform(*r)) for r in ((1, 8), (6, 10), (2, 8)))
     weave, after, stop = (_tenth(rng.uniform(*r)) for r in ((4, 6), (1, 6), (4, 15)))
     angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(60, 110))
-    side_limit, blend = 3.0, 1.5    # m/s^2 to the side; s in which a turn rate sets in
+    side_limit, blend = 3.0, 1.5    # m/s^2 to the side; s, rise time of a turn rate
     turning = max(turning, _tenth(abs(angle) * top / side_limit + blend))
-    if abs(off + angle) > math.radians(110.0):    # so that the drive gets away
+    if abs(off + angle) > math.radians(110.0):    # so that the drive leads away
         angle = -angle
     side = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(4, 10))
     cruise = before + turning + between + 2 * weave + after

@@ -40,9 +40,9 @@ class Truth:
     """
     True values of the drive, which a calibration should estimate.
 
-    The scale of tyres that grow or slip is the mean of the leg by travel: true metres rolled
-    between the marks over the change of the count there, before quantisation; likewise its ratio
-    and those of the wheels. Yaw and pitch are those of the IMU's own axes (turn-and-push frame,
+    The scale of tyres that grow or slip is the mean of the leg by travel: the true path between
+    the marks divided by the change of the count, before quantisation; likewise its ratio and the
+    scales of the wheels. Yaw and pitch are those of the IMU's own axes (turn-and-push frame,
     ``real_sensors.py``), which equal those of its housing for perpendicular triads.
     """
 
@@ -97,7 +97,7 @@ class Drive:
         return REFERENCES[self.options.reference]
 
     def leg(self) -> Leg:
-        """Return the drive as one leg between its marks, with all that came before."""
+        """Return the drive as one leg between its marks, with all earlier samples."""
         fix = self.fix
         if self.options.reference != 'fix':
             stated = [fix.covariance_n] if self.reference.stated else []
@@ -110,7 +110,7 @@ class Drive:
                    form=self.form, **wheels)
 
     def positions(self) -> Floats:
-        """Return the fixes as a SLAM has them: from the start on, x forward there; (n, 3) m."""
+        """Return the fixes in a local frame at the start, x forward there: (n, 3) m."""
         start = self.options
         position_n = Origin(start.latitude, start.longitude, start.height).to_n(
             np.stack([self.fix.latitude, self.fix.longitude, self.fix.height], -1))
@@ -143,7 +143,7 @@ def motion_of(options: SimOptions) -> Motion:
 
 
 def _kerbs(route: Route, options: SimOptions) -> tuple[tuple[float, float], ...]:
-    """Return the kerbs along the path, up and down by turns: (distance, height) m each."""
+    """Return the kerbs along the path, alternately up and down: (distance, height) m each."""
     real = options.real
     if not real.kerbs:
         return ()
@@ -157,7 +157,7 @@ def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Prof
     """
     Return velocities to the side and up: linear between draws, smaller below 1 m/s.
 
-    On a road that leans the axle's centre turns about the contact of the wheels below it.
+    On a leaning road the axle's centre rotates about the wheels' contact below it.
     """
     step = 0.1      # s between draws
     breaks = np.round(np.arange(0.0, route.speed.end + step, step), 9)
@@ -199,7 +199,7 @@ def simulate(options: SimOptions | None = None) -> Drive:
 
 def _truth(motion: Motion, options: SimOptions, imu: samples.ImuSamples) -> Truth:
     gyro_bias, accel_bias = sensors.turn_on_biases(options)
-    _, t = stamps(motion.duration, options.imu_rate)    # true, however late the stamps
+    _, t = stamps(motion.duration, options.imu_rate)    # true times, not stamps
     start = int(np.searchsorted(t, _first_move(motion) + 1e-9, side='right')) - 1
     C_vb = matrix_from_rpy([options.roll, options.pitch, options.yaw])
     x_n = (attitude(motion.at(t[start:start + 1])) @ C_vb)[0, :, 0]

@@ -34,13 +34,13 @@ from odocal_ros.sim.real import NONE3
 from odocal_ros.sim.references import drift, REFERENCES, stationary_sigma
 
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
-WHITE_SHARE = 0.2        # judgement: of the correlated sigma: receiver noise on top
+WHITE_SHARE = 0.2        # judgement: of the correlated sigma: additional receiver noise
 SIGMA_FLOOR = 0.001      # m, judgement: no receiver reports zero
 AT_REST = 1e-9           # m/s and rad/s, judgement
 
 
 def imu_rotation(options: SimOptions) -> Floats:
-    """Return C_vi, which takes the IMU's own frame to the vehicle: C_vb C_bi."""
+    """Return C_vi, the rotation from the IMU's own frame to the vehicle: C_vb C_bi."""
     return (rotations.matrix_from_rpy([options.roll, options.pitch, options.yaw])
             @ rotations.matrix_from_rpy(options.mounting_rpy))
 
@@ -96,7 +96,7 @@ def _imu_stamps(ns: Ints, options: SimOptions) -> Ints:
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:
-    """Return an external heading of b's x axis, as a dual-antenna receiver sends it."""
+    """Return an external heading of b's x axis, as from a dual-antenna receiver."""
     ns, t = stamps(motion.duration, options.heading_rate, PHASE['heading'])
     q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=NONE3), sigma, 'heading')
     stamp = options.start_ns + ns
@@ -172,14 +172,14 @@ def _reading(state: State, options: SimOptions, wheel: wheels.SimWheel,
         between = (grown + np.roll(grown, 1)) / 2
         rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / between)
     rolled = rolled / scale
-    phase = stream(options.seed, f'pulse phase {wheel.draws}').uniform()   # where the disc stands
+    phase = stream(options.seed, f'pulse phase {wheel.draws}').uniform()   # angle of the disc
     if options.odometer == 'angle':
         return rolled + phase
     return FIRST_COUNT + np.floor(rolled + phase).astype(np.int64)
 
 
 def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
-    """Return the metres a wheel has spun beyond the ground by each time: (n,)."""
+    """Return the accumulated slip of a wheel at each time, m: (n,)."""
     spun = np.zeros(len(state.t))
     moving = (np.abs(state.speed) > AT_REST) | (np.abs(state.yaw_rate) > AT_REST)
     if options.drive in HOLONOMIC:
@@ -199,7 +199,7 @@ def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
 
 
 def _travel_after_starts(state: State, moving: Bools, seconds: float) -> Floats:
-    """Return the metres rolled within so many seconds after each start, summed up: (n,)."""
+    """Return the accumulated travel within ``seconds`` s after each start, m: (n,)."""
     starts = np.flatnonzero(moving & ~np.roll(moving, 1)) - 1    # the last sample at rest
     starts = starts[starts >= 0]
     since = np.searchsorted(starts, np.arange(len(moving)), side='right') - 1

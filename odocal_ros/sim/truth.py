@@ -102,8 +102,8 @@ def settings(drive: Drive,
     """
     Return the settings an operator of this vehicle would give, by group.
 
-    ``known_heading_sigma`` (rad): the heading at the start mark is known too, with an error drawn
-    of that size.
+    ``known_heading_sigma`` (rad): the heading at the start mark is known too, with a random error
+    of this sigma.
     """
     options = drive.options
     grade = options.real.told_grade or options.imu_grade

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wheels of a simulated vehicle: places, paths that they roll, growth, slip, published speeds."""
+"""Wheels of a simulated vehicle: positions, rolled paths, growth, slip, published speeds."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ AXLES = {1: ('rear',), 2: ('front', 'rear'), 3: ('front', 'middle', 'rear'),
 # of skid steering: effective over geometric track width in a turn on the spot and straight on.
 # Judgement: published centres of rotation are 1.3 to 2 times as far apart as the wheels
 SPOT, STRAIGHT = 1.7, 1.4
-SIDEWAYS = 0.95     # judgement: motion over rolling of mecanum wheels sideways: rollers slip
+SIDEWAYS = 0.95     # judgement: sideways motion over rolled path of mecanum wheels: rollers slip
 REST = 0.01          # physical: rolling resistance over load, of tyres on asphalt
 AIR = 1e-5           # judgement: air drag over load, per (m/s)^2
 
@@ -46,8 +46,8 @@ def wheels_of(options: SimOptions) -> list[SimWheel]:
     """
     Return the wheels of resolved options, left before right of each axle from front to rear.
 
-    An odd number has a single front wheel, the last one. ``options.scale`` turns the mean of the
-    wheels that do not steer into metres: it is the harmonic mean of theirs.
+    An odd number has a single front wheel, the last one. ``options.scale`` converts the mean count
+    of the wheels that do not steer to metres: it is the harmonic mean of their scales.
     """
     n, middle = options.wheel_count, np.asarray(options.odometer_lever_arm, dtype=float)
     if n == 1:
@@ -105,12 +105,12 @@ def effective_width(options: SimOptions, radius: float = 0.0) -> float:
 
 
 def _widening(radius: Floats, width: float) -> Floats:
-    """Return the effective over the geometric track width of skid steering, by turn radii."""
+    """Return the ratio of effective to geometric track width of skid steering, by turn radii."""
     return SPOT + (STRAIGHT - SPOT) * radius / (radius + width)
 
 
 def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
-    """Return the metres that a wheel of skid steering, mecanum or omni has rolled: (n,)."""
+    """Return the path rolled by a wheel of skid steering, mecanum or omni, m: (n,)."""
     if options.drive == OMNI:       # it rolls clockwise about the middle, seen from above
         x, y, _ = wheel.arm - np.asarray(options.odometer_lever_arm)
         radius = np.hypot(x, y)
@@ -131,10 +131,10 @@ def robot_path(state: State, options: SimOptions, wheel: SimWheel) -> Floats:
 
 
 def growth(state: State, real: Real) -> Floats | float:
-    """Return by how much the rolling radius exceeds that of a cold, slow tyre: (n,), or 0.0."""
+    """Return the relative growth of the rolling radius from a cold, slow tyre: (n,), or 0.0."""
     grown: Floats | float = 0.0
     if real.speed_law:
-        grown = grown + real.speed_law * (state.speed / 36.0)**2    # as stated
+        grown = grown + real.speed_law * (state.speed / 36.0)**2    # as defined in Real
     if real.warming:
         steps = np.diff(state.t, prepend=state.t[:1]) * (np.abs(state.speed) > 1e-9)
         grown = grown - real.warming * np.expm1(-np.cumsum(steps) / real.warming_time)
@@ -142,9 +142,9 @@ def growth(state: State, real: Real) -> Floats | float:
 
 
 def slip_share(state: State, real: Real) -> Floats:
-    """Return the metres spun beyond each metre of ground as the tyres pull or brake: (n,)."""
+    """Return the slip per metre of path under traction and braking: (n,)."""
     forward = np.where(state.speed < 0, -1.0, 1.0)
-    # over load; up a slope they pull too
+    # force over load; a slope adds to it
     force = forward * (state.acceleration / G + state.slope) + REST + AIR * state.speed**2
     # half of the load is on the driven axle; all wheels brake
     pull = 2 * np.maximum(force, 0.0) if real.driven else np.zeros_like(force)
@@ -153,14 +153,14 @@ def slip_share(state: State, real: Real) -> Floats:
 
 
 def tyre_slip(state: State, real: Real) -> Floats:
-    """Return the metres spun beyond the ground by then: (n,)."""
+    """Return the accumulated tyre slip at each time, m: (n,)."""
     path_length = np.diff(state.travel, prepend=state.travel[:1])
     return np.cumsum(slip_share(state, real) * path_length)
 
 
 def leg_factor(state: State, real: Real) -> float:
     """
-    Return true metres rolled over those of a wheel that neither grew nor slipped.
+    Return the true path divided by that of the count with the scale of a cold wheel.
 
     state : between the marks of the leg. The mean is by travel in both directions.
     """
@@ -174,7 +174,7 @@ def leg_factor(state: State, real: Real) -> float:
 
 
 def low_passed(speed: Floats, t: Floats, time: float) -> Floats:
-    """Return speeds behind a first-order filter of a time constant, s; 0: none."""
+    """Return speeds after a first-order filter of a time constant, s; 0: none."""
     if not time:
         return speed
     out, share = speed.tolist(), -np.expm1(-np.diff(t) / time)
@@ -195,7 +195,7 @@ def coarse(speed: Floats, real: Real) -> Floats:
 
 
 def held(speed: Floats, step: float) -> Floats:
-    """Return speeds that repeat until one is 0 or differs by a step."""
+    """Return speeds, each held until the next is 0 or differs by a step."""
     out = speed.tolist()
     for k, now in enumerate(out[1:], 1):
         if now and abs(now - out[k - 1]) < step:

@@ -12,9 +12,9 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 
 Pair = tuple[float, float]
-Drawn = tuple[dict[str, Any], dict[str, Any]]    # of an effect: SimOptions, figures of Real
+Drawn = tuple[dict[str, Any], dict[str, Any]]    # of an effect: SimOptions, fields of Real
 GRADES = ('consumer', 'industrial', 'tactical')
-# definition: units of data sheets in SI; G: as they round it, far within any distribution here
+# definition: units of data sheets in SI; G as rounded there, far within any distribution here
 G, MG, DEG, DEG_H, KMH = 9.81, 9.81e-3, math.radians(1.0), math.radians(1.0) / 3600, 1 / 3.6
 
 # one number for each class: a sigma (normal), a share or a size
@@ -75,7 +75,7 @@ class Vehicle:
 
 
 def lognormal(rng: np.random.Generator, median: float, spread: float) -> float:
-    """Return a draw of a log-normal law. spread: sigma of the logarithm."""
+    """Return a draw of a log-normal distribution. spread: sigma of the logarithm."""
     return float(median * np.exp(spread * rng.standard_normal()))
 
 

@@ -239,6 +239,23 @@ def test_speeds_that_are_multiplied_as_sent_have_their_own_factor():
     assert vehicle.scale_sigma == pytest.approx(4e-4 / 0.995)
 
 
+def test_covariances_of_many_poses_are_those_of_few(counted):
+    """At 50 Hz they are up to 0.05 s old, but for the twist's interval."""
+    few, many = (poses_of(odometry_of(counted, publish__rate=rate), samples_of(counted),
+                          counted.form) for rate in (10.0, 50.0))
+    same = {p.stamp_ns: p for p in few}
+    pairs = [(p, same[p.stamp_ns]) for p in many if p.stamp_ns in same
+             and np.linalg.norm(same[p.stamp_ns].velocity) > 1.0]
+    assert len(pairs) > 300
+    sigmas = np.sqrt([[np.diag(p.pose_cov) for p in pair] for pair in pairs])
+    ratio = sigmas[:, 0] / sigmas[:, 1]
+    # grown by the rest of 0.05 s in minutes; more while the speed changes, by the delay
+    assert np.abs(np.median(ratio, axis=0) - 1).max() < 0.005
+    assert ratio.min() > 0.8
+    # of rows 0.02 s apart every third is 0.05 s after the last
+    assert len({p.pose_cov.tobytes() for p in many}) == pytest.approx(len(many) / 3, rel=0.1)
+
+
 @pytest.mark.core
 def test_after_the_wait_the_next_pose_has_all_it_needs():
     made = simulate(SimOptions(scenario='straight', duration=180.0, imu_rate=100.0,

@@ -78,15 +78,12 @@ def test_other_readers_read_a_segment(tmp_path, monkeypatch, zstd):
             assert [(t, bytes(raw)) for _, t, raw in reader.messages(mine)] == sent
 
 
-def test_what_cannot_be_read_by_its_index_is_read_by_its_records(tmp_path):
+def test_records_are_read_without_an_index_and_chunks_come_back_as_packed(tmp_path):
     packed, messages = second(0)
     write_file(tmp_path / 'cut.mcap', CHANNELS, packed)
     whole = (tmp_path / 'cut.mcap').read_bytes()
     (tmp_path / 'cut.mcap').write_bytes(whole[:-40])
     assert read(tmp_path / 'cut.mcap') == messages
-
-
-def test_chunks_come_back_as_they_were_packed(tmp_path):
     packed, _ = second(3)
     write_file(tmp_path / 'part.mcap', CHANNELS, packed)
     assert [vars(chunk) for chunk in read_chunks(tmp_path / 'part.mcap')] == [

@@ -172,12 +172,15 @@ def test_an_existing_bag_is_kept_unless_forced(tmp_path):
     assert len(messages(path)['/odometer']) == 2
 
 
-def test_force_never_replaces_what_is_no_bag(tmp_path):
+def test_no_other_folder_is_replaced_and_a_bad_one_is_one_sentence(tmp_path):
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.txt').write_text('ten years')
     with pytest.raises(BadUsage, match='is not a bag; choose another'):
         write_bag(tmp_path / 'home', counts(), force=True)
     assert (tmp_path / 'home' / 'thesis.txt').read_text() == 'ten years'
+    (tmp_path / 'file').touch()
+    with pytest.raises(BadUsage, match='cannot be written'):
+        write_bag(tmp_path / 'file' / 'bag', counts())
 
 
 @pytest.mark.parametrize(('storage', 'compression', 'told'), [
@@ -188,12 +191,6 @@ def test_what_cannot_be_written_is_said(tmp_path, storage, compression, told):
     with pytest.raises(BadUsage, match=told):
         write_bag(tmp_path / 'bag', counts(), storage, compression)
     assert not (tmp_path / 'bag').exists()
-
-
-def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
-    (tmp_path / 'file').touch()
-    with pytest.raises(BadUsage, match='cannot be written'):
-        write_bag(tmp_path / 'file' / 'bag', counts())
 
 
 def test_a_writer_that_fails_half_way_leaves_nothing(tmp_path):

@@ -53,12 +53,9 @@ def test_a_pitch_that_the_smoother_cannot_tell_is_not_given_by_end_points():
     assert choose(methods, 'two_point')[0]['pitch_mounting_angle'].value == 0.02
 
 
-def test_a_rejected_method_gives_nothing_while_another_is_sound():
+def test_values_of_rejected_methods_are_given_only_where_all_are():
     methods = several(method('smoother', 2.1, reasons=[REFUSED]), method('two_point'))
     assert choose(methods, 'auto')[0]['scale_factor'].value == 2.0
-
-
-def test_where_all_are_rejected_the_values_computed_stay():
     methods = several(method('smoother', 2.1, reasons=[REFUSED]),
                       method('two_point', None, None, [REFUSED]))
     estimates, giving = choose(methods, 'auto')
@@ -118,14 +115,11 @@ def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause():
     assert 'by -5.0 %, ' in found.text
 
 
-def test_a_yaw_that_differs_points_at_the_heading():
+def test_a_yaw_that_differs_points_at_the_heading_and_rejected_methods_are_not_compared():
     far = several(method('smoother'), method('two_point', yaw=0.01 + 5e-3))
     (found,) = disagreements(far)
     assert '+0.286 deg' in found.text
     assert 'heading' in found.text
-
-
-def test_a_rejected_method_is_not_compared():
     assert disagreements(several(method('smoother'), method('two_point', 3.0,
                                                             reasons=[REFUSED]))) == []
 
@@ -136,7 +130,7 @@ def leg(number, *methods, reasons=(), deciding=()):
                      several(*methods), C_bi=np.eye(3), deciding=deciding)
 
 
-def test_a_leg_good_by_another_method_is_good_and_the_refusal_is_not_the_result():
+def test_a_leg_is_good_by_one_method_unless_another_is_asked_for():
     one = leg(1, method('two_point', None, None, [REFUSED]), method('smoother'))
     assert one.verdict is Verdict.ACCEPTED
     whole = combine([one], ALL)
@@ -144,9 +138,6 @@ def test_a_leg_good_by_another_method_is_good_and_the_refusal_is_not_the_result(
     assert whole.estimates['scale_factor'].method == 'smoother'
     assert REFUSED not in whole.reasons
     assert REFUSED in whole.methods['two_point'].reasons
-
-
-def test_a_leg_is_judged_by_the_methods_asked_for():
     one = leg(1, method('two_point', reasons=[REFUSED]), method('smoother'))
     assert replace(one, deciding=('two_point',)).verdict is Verdict.REJECTED
 

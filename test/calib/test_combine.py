@@ -201,14 +201,11 @@ def test_a_rejected_leg_is_left_out_and_named():
     assert len(whole.legs) == 3
 
 
-def test_when_all_are_rejected_the_values_are_kept_and_the_verdict_stands():
+def test_values_of_rejected_legs_are_kept_and_no_method_at_all_is_a_reason():
     whole = combine([leg(method(), Code.IMU_GAP), leg(method(), Code.TRACK_MISMATCH)], CONFIG)
     assert whole.verdict.value == 'rejected'
     assert whole.estimates[SCALE].value == pytest.approx(0.02)
     assert {Code.IMU_GAP, Code.TRACK_MISMATCH} <= {r.code for r in whole.reasons}
-
-
-def test_legs_without_any_method_are_rejected_with_a_reason():
     whole = combine([leg(None)], CONFIG)
     assert whole.verdict.value == 'rejected'
     assert Code.NO_METHOD in {r.code for r in whole.reasons}
@@ -216,15 +213,12 @@ def test_legs_without_any_method_are_rejected_with_a_reason():
     assert whole.imu_rotation_rpy is None
 
 
-def test_too_few_legs_are_a_caution():
+def test_too_few_legs_are_a_caution_and_the_limits_are_asked_of_the_whole():
     config = with_settings(CONFIG, {'verdict.min_legs': 3})
     whole = combine([leg(method()) for _ in range(2)], config)
     assert [r.text for r in whole.reasons] == ['2 good legs of 3']
     assert whole.verdict.value == 'caution'
     assert combine([leg(method()) for _ in range(3)], config).reasons == ()
-
-
-def test_the_limits_are_asked_of_the_whole_not_of_each_leg():
     wide = method(own=1.5e-3, heading=0.0, reasons=[Reason(Code.SCALE_SIGMA_TOO_LARGE, 'leg')])
     assert combine([leg(wide)], CONFIG).verdict.value == 'caution'
     assert combine([leg(wide) for _ in range(4)], CONFIG).reasons == ()

@@ -42,7 +42,7 @@ def of_gyro(made, M, C=None, **options):
     imu = changed(made.imu, w_i=lambda w: w @ C.T @ M.T, f_i=lambda f: f @ C.T)
     config = with_settings(settings(made), options)
     leg = replace(made.leg(), imu=imu)
-    return {r.code: r for r in faults(leg, screened(leg, config), config)}
+    return {r.code: r for r in faults(screened(leg, config), config)}
 
 
 @pytest.mark.parametrize('name', AXES)
@@ -72,7 +72,7 @@ def test_turns_the_fixes_do_not_show_still_show_a_mirrored_gyro():
         leg = replace(made.leg(), fix=take(made.fix, few),
                       imu=changed(made.imu, w_i=lambda w, s=sign: w * [1.0, 1.0, s]))
         said[name] = {r.code: r.text for r in faults(
-            leg, screened(leg, settings(made)), settings(made))}
+            screened(leg, settings(made)), settings(made))}
     assert Code.GYRO_SIGN not in said['sound']
     assert 'accelerations in turns' in said['mirrored'][Code.GYRO_SIGN]
 

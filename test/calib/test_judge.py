@@ -36,9 +36,11 @@ def codes(reasons):
     return [r.code for r in reasons]
 
 
-def test_good_values_say_nothing():
+def test_good_and_undetermined_values_say_nothing():
     assert judge(estimates(), 0.021, CONFIG) == ()
     assert judge(estimates(), 0.0, CONFIG) == ()
+    assert judge({'scale_factor': Estimate(None, None, 'm/pulse'),
+                  'yaw_mounting_angle': Estimate(None, None, 'rad')}, 0.02, CONFIG) == ()
 
 
 @pytest.mark.parametrize(('values', 'nominal', 'code', 'text'), [
@@ -76,11 +78,6 @@ def test_a_scale_of_no_use_is_rejected():
     assert '1200 %, too large to state' in reason.text
 
 
-def test_what_is_not_determined_is_not_judged():
-    assert judge({'scale_factor': Estimate(None, None, 'm/pulse'),
-                  'yaw_mounting_angle': Estimate(None, None, 'rad')}, 0.02, CONFIG) == ()
-
-
 def test_the_nominal_scale_is_the_first_that_is_known():
     wheel = with_settings(CONFIG, {'wheels.radius': 0.3, 'wheels.pulses_per_revolution': 100.0})
     both = with_settings(wheel, {'odometer.nominal_scale': 0.5})
@@ -108,19 +105,15 @@ class TestImu:
         assert self.say([0, 0, 1]) == ((), False)
         assert self.say([np.sin(0.2), 0, np.cos(0.2)]) == ((), False)      # parked on a hill
 
-    def test_g_is_known_and_told_the_factor(self):
+    def test_units_are_known_by_their_size_and_the_factor_holds_what_is_set(self):
         reasons, _ = self.say([0, 0, 1], size=1.0)
         assert codes(reasons) == [Code.IMU_UNITS]
         assert 'probably g: set imu.accel_scale to 9.80665' in reasons[0].text
         reasons, _ = self.say([0, 0, 1], size=0.5)
         assert 'a gravity of 0.5 m/s^2 instead of 9.8' in reasons[0].text
-
-    def test_deg_per_second_is_known_by_its_speed(self):
         reasons, _ = self.say([0, 0, 1], fast=20.0)
         assert codes(reasons) == [Code.IMU_UNITS]
         assert '0.017453292519943295' in reasons[0].text
-
-    def test_what_is_set_already_is_in_the_factor(self):
         imu = ImuConfig(gyro_scale=180 / np.pi, accel_scale=2.0)
         assert 'set imu.gyro_scale to 1.0' in self.say([0, 0, 1], fast=20.0, imu=imu)[0][0].text
         assert 'set imu.accel_scale to 19.6133' in self.say([0, 0, 1], 1.0, imu=imu)[0][0].text

@@ -133,11 +133,16 @@ def test_errors_of_each_leg_alone_are_unknowns_of_the_fit(toy):
     assert apart(found.value, value, covariance) < 1e-9
 
 
-def test_where_a_leg_was_linearised_is_no_matter(toy):
+def test_linearisation_and_order_of_legs_are_no_matter(toy):
     moved = [toy.border(j, TRUTH - 0.2 * j) for j in range(LEGS)]
     a, b = of(toy.borders()), of(moved)
     assert apart(a.value, b.value, a.covariance) < 1e-9
     assert a.chi2 == pytest.approx(b.chi2, rel=1e-6)
+    borders = toy.borders()
+    one = of(borders, np.zeros(LEGS - 1))
+    other = of([borders[j] for j in (3, 0, 4, 1, 2)], np.zeros(LEGS - 1))
+    assert apart(one.value, other.value, one.covariance) < 1e-6
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-6)
 
 
 def test_the_prior_counts_once(toy):
@@ -156,14 +161,6 @@ def test_some_constants_of_a_leg_are_told_as_with_beliefs_about_the_rest(toy):
     assert some.names == ('z1', 'z2')
     assert np.linalg.inv(H)[2:4, 2:4] == pytest.approx(C, rel=1e-9)
     assert some.value + C @ some.pull == pytest.approx(x[2:4], abs=1e-9)
-
-
-def test_the_order_of_legs_is_no_matter_where_nothing_walks(toy):
-    borders = toy.borders()
-    one = of(borders, np.zeros(LEGS - 1))
-    other = of([borders[j] for j in (3, 0, 4, 1, 2)], np.zeros(LEGS - 1))
-    assert apart(one.value, other.value, one.covariance) < 1e-6
-    assert one.chi2 == pytest.approx(other.chi2, rel=1e-6)
 
 
 def test_a_leg_without_information_changes_nothing(toy):
@@ -265,15 +262,13 @@ SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
 
 
-def steady(config):
-    return with_settings(config, {'verdict.scale_drift_per_day': 0.0, 'method': 'smoother'})
-
-
 @pytest.fixture(scope='module')
 def legs():
     """Return the truth, settings, and the smoother's results of three town drives."""
     drives = [made(**SHORT, seed=seed) for seed in (1, 2, 3)]
-    return drives[0][0].truth, steady(drives[0][1]), [smooth(leg, c) for _, c, leg in drives]
+    steady = with_settings(drives[0][1], {'verdict.scale_drift_per_day': 0.0,
+                                          'method': 'smoother'})
+    return drives[0][0].truth, steady, [smooth(leg, c) for _, c, leg in drives]
 
 
 def test_a_leg_of_the_smoother_is_what_its_border_and_its_beliefs_say(legs):

@@ -28,20 +28,12 @@ def _pages():
 
 
 @pytest.mark.parametrize('letter', 'STW')
-def test_equations_are_numbered_in_order(letter):
+def test_equations_are_in_order_and_cited_and_no_others_are(letter):
     assert list(range(1, len(TAGS[letter]) + 1)) == TAGS[letter]
     assert len(TAGS[letter]) > MOST[letter]
-
-
-@pytest.mark.parametrize('letter', 'STW')
-def test_each_equation_that_is_cited_exists(letter):
     for page in _pages():
         lacks = _cited(page.read_text(encoding='utf-8'), letter) - set(TAGS[letter])
         assert not lacks, f'{page} cites {lacks} of {letter}'
-
-
-@pytest.mark.parametrize('letter', 'STW')
-def test_the_code_cites_each_equation(letter):
     code = {n for page in _pages() if page.suffix == '.py'
             for n in _cited(page.read_text(encoding='utf-8'), letter)}
     assert set(TAGS[letter]) - code == set()

@@ -53,20 +53,13 @@ def noisy(moving, rest, rest_s=60.0, n=20_000):
     return problem(one, rest_s)
 
 
-def test_samples_that_vary_more_in_motion_are_vibration():
+def test_noise_in_motion_only_is_vibration_noise_at_rest_the_sensors_else_unknown():
     text = noise_remedy(noisy(1e-2, 1e-3), {'gyro': 5e-3, 'accel': 1.0}, ['gyro'])
     assert 'vibration: gyro samples vary 10 times as much in motion as at rest' in text
     assert 'imu.gyro_noise' not in text
-
-
-def test_samples_that_vary_alike_are_the_noise_of_the_sensor():
     text = noise_remedy(noisy(1e-2, 8e-3), {'gyro': 1e-2, 'accel': 1.0}, ['gyro'])
     assert 'If this is its normal noise, set imu.gyro_noise to 0.01 (rad/s/sqrt(Hz)).' in text
     assert 'cause is vibration' not in text
-
-
-def test_noise_that_single_samples_do_not_have_is_neither():
-    """What adds up over seconds is no white noise of the sensor, and no vibration."""
     text = noise_remedy(noisy(1e-3, 1e-3), {'gyro': 1e-2, 'accel': 1.0}, ['gyro'])
     assert 'unknown: single samples vary less' in text
     assert 'at rest it is similar' not in text

@@ -38,14 +38,15 @@ def test_legs_of_one_vehicle_are_fine():
     assert said(leg(1)) == said() == []
 
 
-def test_a_scale_that_no_tyre_makes():
+def test_legs_of_two_vehicles_are_named_by_scale_mounting_and_unit():
     text, = said(leg(1, scale=0.0203), leg(2, scale=0.02), leg(3, scale=0.022))
     assert text.startswith('the scale of leg 3 is 10.0 % above that of leg 2: larger than')
-
-
-def test_a_mounting_that_was_moved():
     text, = said(leg(1), leg(2, yaw=0.01 - 6 * DEG))
     assert text.startswith('the yaw mounting of leg 1 is 6.0 deg above that of leg 2')
+    text, = said(leg(1), leg(2, scale=0.03, yaw=0.5))
+    assert ' and the yaw mounting of leg 2 is ' in text
+    text, = said(leg(1), leg(2, scale=1.02, sigma=1e-4, unit='1'), leg(3))
+    assert text.endswith('so their scales cannot be combined: m/pulse in leg 1, 3; 1 in leg 2')
 
 
 def test_an_imu_that_faces_backwards_is_one_vehicle():
@@ -54,30 +55,17 @@ def test_an_imu_that_faces_backwards_is_one_vehicle():
     assert text.startswith('the yaw mounting of leg 2 is 6.0 deg above that of leg 1')
 
 
-def test_both_are_said_in_one():
-    text, = said(leg(1), leg(2, scale=0.03, yaw=0.5))
-    assert ' and the yaw mounting of leg 2 is ' in text
-
-
 @pytest.mark.parametrize('more', [
     {'scale': 0.03, 'sigma': 0.0021}, {'yaw': 0.5, 'yaw_sigma': 0.1}, {'yaw': None}])
 def test_what_sigmas_allow_is_no_other_vehicle(more):
     assert said(leg(1), leg(2, **more)) == []
 
 
-def test_counts_and_speeds_have_no_mean():
-    text, = said(leg(1), leg(2, scale=1.02, sigma=1e-4, unit='1'), leg(3))
-    assert text.endswith('so their scales cannot be combined: m/pulse in leg 1, 3; 1 in leg 2')
-
-
-def test_the_combination_is_rejected_and_its_sigma_judged():
+def test_the_combination_is_rejected_or_its_sigma_judged():
     whole = combine([leg(1), leg(2, scale=0.03)], Config())
     assert whole.verdict is Verdict.REJECTED
     assert [r.code for r in whole.reasons if r.code.gravity is Verdict.REJECTED] == [
         Code.LEGS_UNLIKE]
-
-
-def test_a_combined_sigma_that_is_too_large_is_said():
     # 3 % apart: one vehicle, but a mean good to no 0.1 %
     whole = combine([leg(1), leg(2, scale=0.0206)], Config())
     assert {Code.LEGS_DISAGREE, Code.SCALE_SIGMA_TOO_LARGE} <= {r.code for r in whole.reasons}

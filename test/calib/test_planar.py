@@ -89,7 +89,6 @@ def test_offset_of_the_tracked_point_is_estimated_exactly():
 
 
 def test_mecanum_straight_sideways_and_turn_are_exact():
-    """Four unequal wheels, which couple the motions; the run has all three."""
     found = fit(run_of(body(SIDEWAYS * 2), 'mecanum', lateral=0.9), Known())
     assert_allclose(found.value[:6], (*SCALES, 1 / WIDTH, 0.9), rtol=1e-5)
 
@@ -105,7 +104,6 @@ def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch)
 
 @pytest.mark.parametrize(('count', 'offset'), [(3, 0.0), (4, 0.0), (3, 0.5), (4, -2.0)])
 def test_omni_wheels_are_exact(count, offset):
-    """Unequal wheels in a circle, the first of them at an angle."""
     found = fit(run_of(body(SIDEWAYS * 2), 'omni', offset=offset, count=count), Known())
     assert_allclose(found.value[:count + 1], (*SCALES[:count], 1 / WIDTH), rtol=1e-5)
 
@@ -134,7 +132,6 @@ def test_width_of_skid_steering_on_the_spot_and_on_arcs_is_exact():
 
 
 def test_gyro_scale_and_bias_are_exact():
-    """The gyro reads 2 % too much and drifts by 0.01 rad/s."""
     run = run_of(body(SQUARES))
     turn = body(SQUARES)[:, 2]
     found = fit(replace(run, gyro=1.02 * turn + 0.01 * STEP), Known())
@@ -182,13 +179,8 @@ def test_truth_is_within_sigma(kind):
         truth = {'left': LEFT, 'right': RIGHT, 'curvature': 1 / WIDTH, 'arc': 0.5,
                  'lateral': 0.95} | {f'wheel_{k}': one for k, one in enumerate(SCALES, 1)}
         off.append([(value(found, n)[0] - truth[n]) / value(found, n)[1]
-                    for n in run_names(found)])
+                    for n in found.names[:found.names.index('ahead')]])
     rms = np.sqrt(np.mean(np.square(off), axis=0))
     # the rms of 10 is 1 +- 0.22; left and right are nearly one draw
     assert (rms < 1.6).all(), rms
     assert (rms > 0.4).all(), rms
-
-
-def run_names(found):
-    """Return the constants of the wheels."""
-    return found.names[:found.names.index('ahead')]

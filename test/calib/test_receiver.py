@@ -1,8 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What receivers do to their fixes: filters, an odometer of their own, errors whose rate lasts."""
+"""What receivers, their clocks and drifting heights do to fixes: found, within the sigmas."""
 
+from dataclasses import replace
 import re
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ from smoother_legs import leg_of, made
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.long_run import long_run
+from odocal_ros.estimator.state import BY_SIGMA, CONSTANTS, HEIGHT_DRIFT
 from odocal_ros.reasons import Code
 from odocal_ros.sim.noise import gauss_markov
 from odocal_ros.sim.options import SimOptions
@@ -21,10 +23,13 @@ from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.slow
-
 # quadratic sums and expectations of levels that are as the rows have them
 AS_IT_IS = dict.fromkeys(('fix', 'fix_up', 'slow', 'slow_up'), (1.0, 1.0))
 DRIVE = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'fix_noise': 'rtk'}
+FAST = 1e-4         # relative
+STATED, CHANGE = 1.0, 1.5           # m: stated sigma of heights, and change of their error
+START, WHITE, TIME = 1.2, 0.02, 300.0       # m, m, s
+IN_SIGMAS = np.array([0.8, -1.2, 0.5])      # east, north, up
 
 
 def smoothed(seed=4, **real):
@@ -112,3 +117,80 @@ def test_errors_whose_rate_lasts_grow_more_than_their_steps_say():
     assert seconds / 3 < min(factors) < max(factors) < 1.5 * seconds
     # 20 less what chance may do at spans of 50 s or more: a quarter, or more
     assert np.mean(factors) > 0.6 * seconds
+
+
+@pytest.fixture(scope='module', params=['fix', 'odometer'])
+def drifting(request):
+    """Return the name, the drive and the result of a leg in motion with one fast clock."""
+    name = request.param
+    drive, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01,
+                              duration=300.0, real=Real(**{f'{name}_clock_rate': FAST}))
+    return name, drive, smooth(replace(leg, t_begin=60.0, t_stop=240.0), config)
+
+
+def test_the_scale_is_that_of_the_wheel(drifting):
+    _, drive, result = drifting
+    scale = result.estimates['scale_factor']
+    assert abs(scale.value - drive.truth.scale) < 3 * scale.sigma
+    assert scale.sigma / scale.value < FAST / 3     # an error of FAST would show
+
+
+def test_the_rate_is_stated(drifting):
+    name, _, result = drifting
+    text, = (r.text for r in result.reasons if r.code is Code.CLOCKS_DRIFT)
+    ppm = int(text.split('clock is ')[1].split(' ppm')[0])
+    sigma = int(text.split('(± ')[1].split(')')[0])
+    assert text.startswith(f'{name} stamps')
+    assert 'fast' in text
+    assert abs(ppm - 1e6 * FAST) <= 3 * sigma + 1    # rounded to whole ppm
+    assert not {Code.WHEEL_SLIP, Code.SCALE_VARIES, Code.FIXES_NOISIER_THAN_SAID} & {
+        r.code for r in result.reasons}
+
+
+def test_clocks_that_agree_are_not_named():
+    _, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01, duration=300.0)
+    assert Code.CLOCKS_DRIFT not in {r.code for r in smooth(leg, config).reasons}
+
+
+@pytest.fixture(scope='module')
+def drifting_heights():
+    """Return the drive and the result of a town whose heights drift, else good to 5 cm."""
+    drive, config, leg = made(scenario='town', duration=500.0, fix_noise='white', fix_sigma=0.05)
+    covariance = leg.covariance_n.copy()
+    covariance[:, 2, 2] = STATED**2
+    fixes = leg.fixes_n.copy()
+    fixes[:, 2] += CHANGE * leg.t_fix / leg.t_fix[-1]
+    return drive, leg, smooth(replace(leg, fixes_n=fixes, covariance_n=covariance), config)
+
+
+def test_the_drift_is_found_and_the_pitch_is_within_its_sigma(drifting_heights):
+    drive, leg, result = drifting_heights
+    found = result.details[CONSTANTS[HEIGHT_DRIFT]]
+    assert abs(found['value'] - CHANGE / leg.t_fix[-1]) < 3 * found['sigma']
+    pitch = result.estimates['pitch_mounting_angle']
+    assert abs(pitch.value - drive.truth.pitch) < 3 * pitch.sigma
+    # if the rise were the pitch's, it would show
+    path = drive.truth.scale * np.abs(np.diff(drive.odometer.value.astype(float))).sum()
+    assert pitch.sigma < CHANGE / path / 2
+
+
+@pytest.fixture(scope='module')
+def converging():
+    """Return a drive along a motorway whose fixes converge, its leg and its result."""
+    drive, config, leg = made(scenario='motorway', duration=500.0, fix_noise='white',
+                              fix_sigma=WHITE, imu_grade='industrial')
+    stated = np.hypot(WHITE, START * np.exp(-leg.t_fix / TIME))[:, None] * np.ones(3)
+    return drive, leg, smooth(replace(
+        leg, fixes_n=leg.fixes_n + IN_SIGMAS * stated,
+        covariance_n=stated[:, :, None]**2 * np.eye(3)), config)
+
+
+def test_the_error_is_found_and_the_scale_is_within_its_sigma(converging):
+    drive, leg, result = converging
+    scale = result.estimates['scale_factor']
+    assert abs(scale.value - drive.truth.scale) < 3 * scale.sigma
+    # if the error were the scale's, it would show
+    path = drive.truth.scale * np.abs(np.diff(drive.odometer.value.astype(float))).sum()
+    assert scale.sigma / drive.truth.scale < START / path / 2
+    for name, true in zip(CONSTANTS[BY_SIGMA], IN_SIGMAS, strict=True):
+        assert abs(result.details[name]['value'] - true) < 3 * result.details[name]['sigma']

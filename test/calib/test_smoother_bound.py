@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The bound of the chain against an independent dense covariance of the same rows."""
+"""The block solver against dense algebra; the bound of the chain against all rows stacked."""
 
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ import pytest
 from smoother_legs import made, truth
 
 from odocal_ros.estimator import bound
+from odocal_ros.estimator.chain import Normal, NotPositive, solve
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.priors import SIZE, START_SIGMAS
 from odocal_ros.estimator.factors.rests import STILL_SPEED, STILL_TURN
@@ -17,6 +18,8 @@ from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import BARE, E, IMPERFECT, M, SLOW, WITH_SLOW
 
 pytestmark = pytest.mark.core
+N, STATES, BORDER = 6, 4, 3
+TOTAL = N * STATES + BORDER
 
 
 @pytest.mark.parametrize('correlation_time', [0.0, 40.0])
@@ -101,3 +104,78 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     # the normal equations of the chain lose what their condition costs: 1e-6 of a sigma
     np.testing.assert_allclose(got / np.outer(sigma, sigma), dense / np.outer(sigma, sigma),
                                atol=1e-5)
+
+
+def _dense(seed=0, rows=8):
+    """Return a dense normal matrix and right side with the chain's pattern, badly scaled."""
+    rng = np.random.default_rng(seed)
+    A = np.zeros((0, TOTAL))
+    for k in range(N - 1):
+        block = np.zeros((rows, TOTAL))
+        block[:, k * STATES:(k + 2) * STATES] = rng.standard_normal((rows, 2 * STATES))
+        block[:, N * STATES:] = rng.standard_normal((rows, BORDER))
+        A = np.concatenate([A, block])
+    A = A * np.exp(5 * rng.standard_normal(TOTAL))
+    return A.T @ A, A.T @ rng.standard_normal(len(A))
+
+
+def _as_chain(H, g):
+    b = [slice(k * STATES, (k + 1) * STATES) for k in range(N)]
+    c = slice(N * STATES, TOTAL)
+    out = Normal(N, STATES, BORDER)
+    out.diagonal[:] = [H[s, s] for s in b]
+    out.beside[:] = [H[b[k], b[k + 1]] for k in range(N - 1)]
+    out.border[:] = [H[s, c] for s in b]
+    out.g[:] = g[:N * STATES].reshape(N, STATES)
+    out.corner[:], out.g_border[:] = H[c, c], g[c]
+    return out
+
+
+def test_step_and_covariances_are_those_of_a_dense_solve():
+    H, g = _dense()
+    solved = solve(_as_chain(H, g))
+    # the dense inverse of the scaled matrix: its condition is 1e4, so 1e-10 leaves room
+    s = 1 / np.sqrt(np.diag(H))
+    P = np.linalg.inv(H * np.outer(s, s)) * np.outer(s, s)
+    x = P @ g
+    np.testing.assert_allclose(np.append(solved.step.ravel(), solved.step_border), x, rtol=1e-9)
+    c = np.arange(N * STATES, TOTAL)
+    np.testing.assert_allclose(solved.covariance, P[np.ix_(c, c)], rtol=1e-9)
+    assert solved.log_determinant == pytest.approx(np.linalg.slogdet(H)[1], abs=1e-9)
+    near = solved.marginals()
+    for k in range(N - 1):
+        i = np.r_[k * STATES:(k + 2) * STATES, c]
+        np.testing.assert_allclose(near[k], P[np.ix_(i, i)], rtol=1e-8,
+                                   atol=1e-10 * np.sqrt(np.outer(P[i, i], P[i, i])).min())
+
+
+def test_absent_constants_have_their_priors_as_if_they_were_in_the_border():
+    H, g = _dense()
+    solved = solve(_as_chain(H, g))
+    normal, weights = _as_chain(H, g), np.array([4.0, 0.25])
+    normal.absent = weights
+    some = solve(normal)
+    whole, part = Normal(N, STATES, BORDER + 2), _as_chain(H, g)
+    for to, of in zip((whole.diagonal, whole.beside, whole.g),
+                      (part.diagonal, part.beside, part.g), strict=True):
+        to[:] = of
+    whole.border[:, :, :BORDER], whole.corner[:BORDER, :BORDER] = part.border, part.corner
+    whole.corner[[-2, -1], [-2, -1]], whole.g_border[:BORDER] = weights, part.g_border
+    all_of = solve(whole)
+    for name in ('step', 'step_border', 'covariance', 'reduced', 'g_reduced'):
+        np.testing.assert_allclose(getattr(some, name), getattr(all_of, name), rtol=1e-9,
+                                   atol=1e-12, err_msg=name)
+    assert some.log_determinant == pytest.approx(all_of.log_determinant, abs=1e-9)
+    sides, border = np.ones((N, STATES, 2)), np.ones((BORDER, 2))
+    squares, moves = some.products(sides, border)
+    wide = np.concatenate([border, np.zeros((2, 2))])
+    for found, want in zip((squares, moves), all_of.products(sides, wide), strict=True):
+        np.testing.assert_allclose(found, want, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(some.marginals()[1], solved.marginals()[1], rtol=1e-12)
+
+
+def test_what_nothing_holds_is_said():
+    H, g = _dense()
+    H[N * STATES + 1, :] = H[:, N * STATES + 1] = 0.0
+    with pytest.raises(NotPositive):
+        solve(_as_chain(H, g))

@@ -37,17 +37,11 @@ def walked(slope, passes):
     return float(np.abs(off).max())
 
 
-def test_full_steps_that_would_go_to_and_fro_for_ever_converge():
+def test_steps_that_would_oscillate_are_damped_and_others_taken_as_they_are():
     # a step twice too long turns back on itself whole: half of it leads to the zero
     assert walked(2.0, 1) == pytest.approx(1.0)
     assert walked(2.0, 2) < 1e-12
-
-
-def test_a_step_that_goes_on_is_taken_as_it_is():
     assert walked(0.4, 3) == pytest.approx(0.6**3)
-
-
-def test_the_first_step_is_taken_as_it_is():
     step = np.array([3.0, -1.0])
     found = damped(Step(step[None, :], step, np.eye(2)), np.zeros(2))
     assert np.array_equal(found.step_border, step)

@@ -97,14 +97,10 @@ def test_surveyed_points_take_the_place_of_fixes():
     assert scale == pytest.approx(made.truth.scale, rel=1e-6)
     assert yaw == pytest.approx(made.truth.yaw, abs=1e-5)
     sources = {s.name: s for s in two_point(replace(leg, fix=off), config).sources}
-    length = np.hypot(*(two_point_chord(leg, config)))
+    track_n = calibrate(leg, config).track_n
+    length = np.hypot(*(track_n[-1][:2] - track_n[0][:2]))
     # 1 cm at each end; residuals of the bad fixes may widen it
     assert sources['fix_end'].effects[0] @ sources['fix_end'].effects[0] >= (0.009 / length)**2
-
-
-def two_point_chord(leg, config):
-    result = calibrate(leg, config)
-    return result.track_n[-1][:2] - result.track_n[0][:2]
 
 
 def test_a_surveyed_end_is_not_taken_for_where_a_holdout_ends():

@@ -129,15 +129,12 @@ def test_an_increment_that_says_nothing_is_as_good_as_none():
     assert abs(line.x[0] - clean.x[0]) < np.sqrt(clean.covariance[0, 0])
 
 
-def test_the_gain_is_what_increments_make_of_x():
+def test_the_gain_is_what_increments_make_of_x_and_mirrored_wheels_have_its_negative():
     """What lies along the unknowns comes out as it is, where no prior holds it."""
     seen = increments(reading=1e-3**2)
     line = fit_line(seen)
     assert_allclose(line.gain @ seen.X, np.eye(1), rtol=1e-9)
     assert line.gain @ seen.y == pytest.approx(line.x, rel=1e-9)
-
-
-def test_both_wheels_of_a_pair_are_mirrored():
     seen = increments(reading=1e-3**2)
     one, other = fit_line(seen), fit_line(replace(seen, y=-seen.y))
     assert_allclose(other.x, -one.x, rtol=1e-12)

@@ -1,18 +1,31 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples: frozen blocks, checked at birth, cut and joined without a trace."""
+"""Samples: checked at birth, cut, joined; in pieces and in files the same to the last bit."""
+
+import errno
+import os
+from pathlib import Path
+import re
+import tracemalloc
 
 import numpy as np
 import pytest
 
-from odocal_ros.data import samples as s
+from odocal_ros.data import mapped, samples as s, spool
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.mapped import let_go
+from odocal_ros.data.pieces import across, lengths, median, medians, PIECE_ROWS
+from odocal_ros.data.samples import ImuSamples, take
 from odocal_ros.errors import BadData
+from odocal_ros.nav.integral import integral_at, integrals_at, twice_integral_at
 
 pytestmark = pytest.mark.core
+ROW = 104      # bytes of an IMU row
+N = 20_000
 
 
-def imu(n, first=0):
+def imu_of(n, first=0):
     row = np.arange(first, first + n)
     return s.ImuSamples(row * 10**7, row * 10**7 + 5, np.outer(row, [1.0, 2.0, 3.0]),
                         np.outer(row, [0.1, 0.2, 9.8]), np.tile([0.0, 0, 0, 1], (n, 1)),
@@ -48,7 +61,7 @@ def test_a_wrong_shape_is_refused_by_name(bad):
 
 
 def test_what_is_cut_and_joined_is_the_whole():
-    whole = imu(7)
+    whole = imu_of(7)
     parts = [s.take(whole, slice(a, b)) for a, b in ((0, 1), (1, 1), (1, 5), (5, 7))]
     again = s.join(parts)
     for name in ('stamp_ns', 'received_ns', 'w_i', 'f_i', 'q_ni', 'yaw_variance'):
@@ -60,3 +73,164 @@ def test_what_is_cut_and_joined_is_the_whole():
 def test_an_empty_block_has_no_rows_and_joins_with_others(empty):
     assert len(empty().stamp_ns) == 0
     assert len(s.join([empty(), empty()]).stamp_ns) == 0
+
+
+def wild(*shape):
+    """Return values of all sizes, some of them zero, NaN or infinite."""
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=shape) * 10.0**rng.integers(-160, 150, shape)
+    for value in (0.0, -0.0, np.nan, np.inf):
+        x[rng.random(shape) < 0.02] = value
+    return x
+
+
+@pytest.mark.parametrize('columns', [1, 3, 4])
+@pytest.mark.parametrize('ufunc', [np.maximum, np.add, np.logical_and, np.logical_or])
+def test_across_is_what_numpy_reduces_rows_to(ufunc, columns):
+    x = np.abs(wild(1000, columns))
+    x = x > 1 if ufunc in (np.logical_and, np.logical_or) else x
+    np.testing.assert_array_equal(across(ufunc, x), ufunc.reduce(x, axis=1))
+
+
+@pytest.mark.parametrize('columns', [3, 4])
+def test_lengths_are_numpys_norms_of_rows(columns):
+    x = wild(1000, columns)
+    with np.errstate(over='ignore'):
+        np.testing.assert_array_equal(lengths(x), np.linalg.norm(x, axis=1))
+
+
+def unlike(kind, n):
+    """Return values of which those taken to tell the median say much, little, or nothing."""
+    rng = np.random.default_rng(5)
+    x = rng.normal(size=n)
+    return {'noise': x, 'steps': np.round(x), 'one': np.full(n, 2.0), 'sorted': np.sort(x),
+            'misled': np.where(np.arange(n) % 64, x, 9.0), 'infinite': np.where(x > 0, np.inf, x),
+            'nan': np.where(x > 4, np.nan, x)}[kind]
+
+
+@pytest.mark.parametrize('kind', ['noise', 'steps', 'one', 'sorted', 'misled', 'infinite', 'nan'])
+def test_a_median_of_many_rows_is_numpys(kind):
+    for n in (PIECE_ROWS, PIECE_ROWS + 1):
+        x = unlike(kind, n)
+        np.testing.assert_array_equal(median(x), np.median(x))
+        both = np.stack([x, -x], -1)
+        np.testing.assert_array_equal(medians(both), np.median(both, axis=0))
+
+
+def test_an_integral_over_pieces_is_that_at_once_at_each_of_several_times():
+    rng = np.random.default_rng(4)
+    t = np.cumsum(rng.uniform(0.5, 1.5, 2 * PIECE_ROWS + 100))
+    x = rng.normal(size=(len(t), 2))
+    slices = (x[:-1] + x[1:]) / 2 * np.diff(t)[:, None]
+    whole = np.concatenate([np.zeros((1, 2)), np.cumsum(slices, axis=0)])
+    times = [np.linspace(t[0] - 2, t[-1] + 2, 500), np.sort(rng.uniform(t[0], t[-1], 77))]
+    for each, found in zip(times, integrals_at(times, t, x), strict=True):
+        want = np.stack([np.interp(each, t, whole[:, k]) for k in (0, 1)], -1)
+        np.testing.assert_array_equal(found, want)
+        np.testing.assert_array_equal(integral_at(each, t, x), want)
+    again = np.append(0.0, np.cumsum((whole[:-1, 0] + whole[1:, 0]) / 2 * np.diff(t)))
+    np.testing.assert_array_equal(twice_integral_at(times[0], t, x[:, 0]),
+                                  np.interp(times[0], t, again))
+
+
+@pytest.fixture(scope='module')
+def imu():
+    rng = np.random.default_rng(3)
+    stamp = 10**9 + np.arange(N) * 1_000_000
+    x = rng.standard_normal((N, 11))
+    return ImuSamples(stamp, stamp + 5, x[:, :3], x[:, 3:6], x[:, 6:10], x[:, 10])
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Let rows go to the file from 200 kB on."""
+    for name, size in (('MEMORY_BYTES', 200_000), ('TAIL_BYTES', 50_000),
+                       ('MERGED_BYTES', 20_000)):
+        monkeypatch.setattr(spool, name, size)
+    monkeypatch.setattr(mapped, 'HELD_BYTES', 0)
+
+
+def fed(recorder, imu, first, last):
+    for k in range(first, last, 50):
+        recorder.feed('imu', take(imu, slice(k, k + 50)))
+    return recorder
+
+
+def assert_same(rows, imu, first, last):
+    for name, column in vars(imu).items():
+        np.testing.assert_array_equal(getattr(rows, name), column[first:last], err_msg=name)
+
+
+def test_rows_of_a_file_are_those_that_came(imu):
+    recorder = fed(LegRecorder(), imu, 0, 9_025)
+    copy = recorder.snapshot()
+    fed(recorder, imu, 9_050, 15_000)
+    rows = copy.rows('imu')
+    assert_same(rows, imu, 0, 9_050)
+    let_go()
+    assert_same(rows, imu, 0, 9_050)
+    assert_same(recorder.rows('imu'), imu, 0, 15_000)
+    # the pre-roll of the next leg is what is left, and the copy is as it was
+    recorder.forget_before(int(imu.stamp_ns[14_000]))
+    assert_same(fed(recorder, imu, 15_000, N).rows('imu'), imu, 14_000, N)
+    assert_same(copy.rows('imu'), imu, 0, 9_050)
+
+
+def test_a_large_room_is_zeros_that_can_be_let_go(monkeypatch):
+    monkeypatch.setattr(mapped, 'ROOM_BYTES', 4_000)
+    for dtype in (float, bool, np.int64):
+        array = mapped.room(1000, 5, dtype=dtype)
+        assert array.dtype == dtype
+        assert not array.any()
+        assert not array.flags.owndata
+        array[3:] = 1
+        let_go()
+        assert array.sum() == 997 * 5
+    whole = mapped.room(10)
+    assert whole.flags.owndata
+
+    def full(*_):
+        raise OSError(28, 'no space left on device')
+    monkeypatch.setattr(mapped.os, 'posix_fallocate', full)
+    assert mapped.room(1000, 5).sum() == 0.0        # in memory, then
+
+
+def test_arrays_in_files_are_let_go_once_they_are_large(monkeypatch):
+    array = mapped.room(mapped.ROOM_BYTES // 8)
+    array[:] = 1
+
+    def resident():
+        (block,) = re.findall(rf'^{array.ctypes.data:x}-.*\n(?:\w+:.*\n)*?Rss: +(\d+)',
+                              Path('/proc/self/smaps').read_text(), re.MULTILINE)
+        return int(block) * 1024
+
+    monkeypatch.setattr(mapped, 'HELD_BYTES', array.nbytes)
+    let_go()
+    assert resident() == array.nbytes
+    monkeypatch.setattr(mapped, 'HELD_BYTES', array.nbytes - 1)
+    let_go()
+    assert resident() == 0
+    assert array.sum() == len(array)
+
+
+def test_a_leg_takes_no_more_memory_as_it_grows(imu):
+    tracemalloc.start()
+    recorder = fed(LegRecorder(), imu, 0, N // 2)
+    before = tracemalloc.get_traced_memory()[0]
+    fed(recorder, imu, N // 2, N)
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert grown < 5 * N // 2 < ROW * N // 2      # bytes for each row
+
+
+def test_a_full_disk_costs_memory_only(imu, monkeypatch):
+    write, left = os.pwrite, [40]
+
+    def full(*args):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        return write(*args)
+
+    monkeypatch.setattr(os, 'pwrite', full)
+    assert_same(fed(LegRecorder(), imu, 0, N).rows('imu'), imu, 0, N)

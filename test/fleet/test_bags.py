@@ -1,22 +1,24 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which bags are meant: manifests, folders, globs, patterns, URLs."""
+"""Which bags are meant: manifests, folders, globs, patterns, URLs; and legs kept as text."""
 
 import shutil
 import zipfile
 
+from drives import drive, settings
 import pytest
-
-pytest.importorskip('fsspec')
 
 from odocal_ros.errors import BadBag, BadData, BadUsage
 from odocal_ros.fleet import bags as bags_module
 from odocal_ros.fleet.bags import at_hand, find_bags, FleetBag, seen_as
-from odocal_ros.fleet.rows import key_of, Row, rows_of, RowStore
+from odocal_ros.fleet.rows import key_of, leg_text, legs_from, Row, rows_of, RowStore
 from odocal_ros.fleet.second_stage import file_name
+from odocal_ros.output.files import as_json
+from odocal_ros.pipeline.calibrate import calibrate, combine
 
 pytestmark = pytest.mark.core
+pytest.importorskip('fsspec')
 
 
 def test_a_manifest_is_read_as_csv_and_as_parquet_alike(fleet, tmp_path):
@@ -119,3 +121,22 @@ def test_a_row_that_was_cut_is_computed_again(tmp_path, spoil):
     for odd in (b'../../x', b'\xff\xfe', b''):
         (tmp_path / 'seen' / 'ab' / ('ab' * 20)).write_bytes(odd)
         assert store.known('ab' * 20) is None
+
+
+def test_legs_from_text_combine_to_the_same_digits():
+    """Of the smoother too, whose legs are combined on their border."""
+    legs = []
+    for seed in (1, 2):
+        made = drive(scenario='town', duration=135.0, fix_noise='rtk', imu_rate=25.0,
+                     odometer_rate=10.0, fix_rate=2.0, seed=seed, start_ns=seed * 10**18)
+        config = settings(made, heading_sigma=None, method='auto')
+        legs.append(calibrate(made.leg(), config))
+    text = leg_text(legs)
+    again = legs_from(text)
+    assert leg_text(again) == text
+    kept = [leg.numbers() for leg in legs]      # what is drawn is left out
+    told, known = (as_json(combine(some, config), config, [], '') for some in (again, kept))
+    assert told == known
+    assert told['result']['scale_factor']['method'] == 'smoother'
+    assert again[0].methods['smoother'].border.information.tobytes() == \
+        legs[0].methods['smoother'].border.information.tobytes()

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal fleet --kpi: rates counted by hand, and by the normal law of drawn legs."""
+"""odocal fleet: --kpi and changes of a vehicle, by the normal law."""
 
 import json
 import math
@@ -11,12 +11,16 @@ import numpy as np
 import pytest
 
 from odocal_ros.fleet.kpi import FEWEST, kpi
+from odocal_ros.fleet.statistics import covariance, FAR, history, population
 from odocal_ros.fleet.tables import VALUES
 from odocal_ros.offline.cli import main
 
 pytestmark = pytest.mark.slow
 LIMITS = {'scale_ratio': (0.99, 1.01)}
 NONE = {f'{name}{part}': None for name in VALUES for part in ('', '_sigma')}
+N = 10
+DAYS = 7.0 * np.arange(N)
+V = covariance(np.full(N, 1e-5**2), [], DAYS, 1e-4)      # the walk rules: 265 ppm in a week
 
 
 def row(vehicle, value, sigma, **more):
@@ -89,3 +93,81 @@ def test_the_command_writes_them(fleet, tmp_path, capsys):
     assert found['limits'] == {'scale_ratio': [0.9, 1.1]}
     assert sum(found['vehicles'].values()) == len(fleet.truth)
     assert f'written: {tmp_path / "out" / "kpi.json"}' in out
+
+
+def drawn(rng):
+    return np.linalg.cholesky(V) @ rng.standard_normal(N)
+
+
+def test_nothing_is_invented_more_often_than_said():
+    rng = np.random.default_rng(4)
+    found = [history(drawn(rng), V) for _ in range(2000)]
+    # one in 1000 at most, by Bonferroni: 2 of 2000, and 3 sigma of that count
+    assert sum(bool(h.changes or h.odd) for h in found) <= 2 + 3 * 2**0.5
+
+
+def test_a_change_is_found_where_it_is_with_an_honest_sigma():
+    rng, off = np.random.default_rng(5), []
+    for k in range(300):
+        leg = 1 + k % (N - 1)
+        change, = history(drawn(rng) + 0.005 * (np.arange(N) >= leg), V).changes
+        assert change.leg == leg
+        off.append((change.size - 0.005) / change.sigma)
+        # what a step between two neighbours of a walk is known to: the walk of a week
+        assert change.sigma == pytest.approx(np.hypot(1e-4 * 7**0.5, 2**0.5 * 1e-5), rel=0.03)
+    assert abs(np.mean(off)) < 3 / 300**0.5
+    assert abs(np.std(off) - 1) < 3 / 600**0.5
+
+
+def test_two_changes_and_an_odd_leg_are_told_apart():
+    y = 0.004 * (np.arange(N) >= 3) - 0.006 * (np.arange(N) >= 7) + 0.02 * (np.arange(N) == 5)
+    found = history(y, V)
+    assert [(c.leg, round(c.size, 4)) for c in found.changes] == [(3, 0.004), (7, -0.006)]
+    assert found.odd == (5,)
+    # nothing comes after the last leg that could say it was odd
+    assert history(0.02 * (np.arange(N) == N - 1), V).changes[0].leg == N - 1
+
+
+def test_an_error_that_all_legs_share_is_no_reason_to_doubt_a_change():
+    """It moves the level and no step: what is the same in all legs drops out, exactly."""
+    own = np.full(N, 1e-5**2)
+    y = 2e-4 * (np.arange(N) >= 4)
+    alone, = history(y, covariance(own)).changes
+    shared, = history(y, covariance(own, [np.full((N, 1), 1e-2)])).changes
+    assert shared.sigma == pytest.approx(alone.sigma, rel=1e-6)
+    # the mean of 4 against that of 6
+    assert alone.sigma == pytest.approx(1e-5 * (1 / 4 + 1 / 6)**0.5, rel=1e-12)
+    # half of the legs have it and the others do not: then it may be the step
+    half = np.where(np.arange(N) >= 4, 1e-2, 0.0)[:, None]
+    assert history(y, covariance(own, [half])).changes == ()
+
+
+def test_the_slope_of_a_drift_has_the_sigma_of_the_regression():
+    own = np.full(N, 1e-5**2)
+    t = DAYS / 365.25
+    found = history(1e-3 * t, covariance(own), t)
+    assert found.slope == pytest.approx(1e-3, rel=1e-9)
+    assert found.slope_sigma == pytest.approx(1e-5 / np.sqrt(((t - t.mean())**2).sum()), rel=1e-9)
+
+
+def test_the_population_is_that_of_the_many_and_names_the_few():
+    rng = np.random.default_rng(6)
+    means, spreads = [], []
+    for _ in range(60):
+        sigma = rng.uniform(0.2, 1.0, 60)
+        x = 5 + np.hypot(sigma, 1.0) * rng.standard_normal(60)
+        x[:2] = 40.0
+        found = population(x, sigma)
+        outliers = np.flatnonzero(np.abs(found.deviates) > FAR)
+        assert {0, 1} <= set(outliers)
+        assert len(outliers) <= 3           # 4 sigma: one of 16,000 by chance
+        means.append((found.mean - 5) / found.sigma)
+        spreads.append(found.spread)
+    assert FAR == 4
+    # Huber's mean yields to 2 of 60 by HUBER * 2 / 60 of a spread, 0.4 of its sigma
+    assert abs(np.mean(means)) < 0.4 + 3 / 60**0.5
+    assert abs(np.std(means) - 1) < 3 / 120**0.5
+    # the median of |x| has 2 of 60 more above it: 5 % wider; a draw scatters by 0.18
+    assert np.mean(spreads) == pytest.approx(1.05, abs=3 * 0.18 / 60**0.5)
+    few = population(np.array([1.0, 9.0]), np.array([0.1, 0.1]))
+    assert np.isnan(few.deviates).all()

@@ -161,15 +161,12 @@ def test_the_metres_foreseen_are_those_it_takes(drive, config):
     assert later[0].scale.metres < 0.8 * metres
 
 
-def test_a_yaw_asked_better_than_its_heading_is_never_there(drive, config):
+def test_a_yaw_beyond_its_heading_is_never_there_nor_one_by_course_alone(drive, config):
     asked = with_settings(config, {'verdict.max_yaw_sigma': 0.9 * HEADING})
     yaw = foreseen(drive, asked, 150.0).yaw
     assert yaw.metres is None
     assert yaw.words('yaw', 'deg', math.degrees(1)) == (
         'yaw: limited by the heading uncertainty (0.17 deg)')
-
-
-def test_the_only_heading_is_the_course(drive, config):
     course = with_settings(config, {'alignment.heading_source': 'course'})
     yaw = foreseen(drive, course, 150.0).yaw
     assert (yaw.sigma, yaw.metres) == (None, None)
@@ -204,12 +201,9 @@ def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
     assert forecast.yaw.sources[0] == ('initial_heading', pytest.approx(0.004))
 
 
-def test_nothing_is_foreseen_of_a_vehicle_at_rest(drive, config):
+def test_nothing_is_foreseen_at_rest_or_before_a_count_is_known_in_metres(drive, config):
     with pytest.raises(OdocalError):
         foreseen(drive, config, -5.0)
-
-
-def test_no_sigma_is_foreseen_before_a_count_is_known_in_metres(drive, config):
     with pytest.raises(OdocalError, match='not known yet'):
         foreseen(drive, config, 6.0)
     known = with_settings(config, {'odometer.nominal_scale': drive.truth.scale})
@@ -476,8 +470,8 @@ def test_the_hint_says_what_is_enough_and_what_more_it_takes(forecast, still_s, 
 
 def test_the_least_leg_comes_first():
     assert said(Forecast(GOOD, YAW), distance_m=60.0, max_speed=1.0) == (
-        'drive 40 m more, faster than 2.78 m/s (10 km/h); then stand still 10 s and call '
-        '~/stop_leg')
+        'drive 40 m more, faster than leg.min_speed, 2.78 m/s (10 km/h); then stand still 10 s '
+        'and call ~/stop_leg')
 
 
 def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():

@@ -1,22 +1,26 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The forecast of indoor runs: closed forms, and the sigmas of simulated runs."""
+"""Indoor runs: the forecast against closed forms and simulated runs; the running estimate."""
 
 import math
 
+from cells import thinned
 import numpy as np
 import pytest
 
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadData, BadUsage
+from odocal_ros.forecast.forecast import Abandoned
 from odocal_ros.forecast.indoor_motion import pattern, PATTERNS
 from odocal_ros.forecast.planned_indoor import predict_robot, ratio_sigma, Robot
+from odocal_ros.forecast.smoother_forecast import planar_forecast
 from odocal_ros.library.plan_indoor import motion_of_drive, plan_indoor, robot_of
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SLIP = 1e-3      # m/sqrt(s)
+CONFIG = with_settings(Config(), {'odometer.left': 'topic', 'odometer.right': 'topic'})
 
 
 @pytest.mark.parametrize('drive', ['differential', 'mecanum'])
@@ -78,3 +82,45 @@ def test_marks_determine_the_width_by_squares_and_not_by_an_eight():
 def test_wrong_figures_are_refused(asked, said):
     with pytest.raises(BadUsage, match=said):
         plan_indoor(**asked)
+
+
+@pytest.fixture(scope='module')
+def leg():
+    return simulate(SimOptions(scenario='indoor', duration=110.0, imu=False, reference='mocap',
+                               fix_rate=10.0, slip_walk=5e-4, seed=3)).leg()
+
+
+def forecast(leg, seconds, wanted=lambda: True):
+    return planar_forecast(thinned(leg, seconds).leg(leg.start_ns), CONFIG, wanted)
+
+
+def test_the_last_update_is_near_the_result(leg):
+    """Its samples are cells of 0.1 s, within which the speed changes: measured, 0.75 sigma."""
+    found, result = forecast(leg, 1e9), calibrate(leg, CONFIG)
+    for name in ('scale_factor', 'scale_factor_left', 'track_width'):
+        now, then = found.estimates[name], result.methods['planar'].estimates[name]
+        assert abs(now.value - then.value) < then.sigma
+        assert now.sigma == pytest.approx(then.sigma, rel=0.15)
+    assert found.scale.metres == 0.0
+    assert found.complete
+    assert not found.faults
+    assert 'yaw: not estimated on this robot' in found.words()
+
+
+def test_the_distance_to_go_is_by_the_root_of_the_path(leg):
+    """Nine times the variance that is required: eight times the path more."""
+    result = calibrate(leg, CONFIG)
+    scale = result.methods['planar'].estimates['scale_factor']
+    strict = with_settings(CONFIG, {'verdict.max_scale_sigma': scale.sigma / scale.value / 3})
+    found = planar_forecast(leg, strict, lambda: True)
+    assert found.scale.metres == pytest.approx(8 * result.distance, rel=1e-6)
+
+
+def test_before_the_first_motion_there_is_none(leg):
+    with pytest.raises(BadData, match='positions while the wheels have data'):
+        forecast(leg, 0.0)
+
+
+def test_an_update_that_nobody_wants_ends(leg):
+    with pytest.raises(Abandoned):
+        forecast(leg, 1e9, lambda: False)

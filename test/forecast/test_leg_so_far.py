@@ -68,7 +68,7 @@ def test_the_faults_so_far_are_those_of_the_result(made, wrong):
     # a slip is what a method makes of the hole
     lowering = {r.code for r in result.reasons
                 if r.code.gravity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
-    assert {r.code for r in faults(leg, screened(leg, config), config)} == lowering
+    assert {r.code for r in faults(screened(leg, config), config)} == lowering
     assert {r.code for r in faults_in_cells(thinned(leg).leg(leg.start_ns), config)} == lowering
     assert (lowering == set()) == (wrong is sound)
 

@@ -64,14 +64,11 @@ def test_a_result_within_its_limits_is_good_and_each_limit_counts_by_itself():
             assert found == ['yes'] * 4
 
 
-def test_limits_are_those_of_the_settings_and_relative_where_the_value_is_not_one():
+def test_limits_are_those_of_the_settings_and_reasons_count_against_a_value():
     values = WHOLE | {'scale_factor': Estimate(0.02, 1.9e-5, 'm/pulse')}    # 950 ppm
     assert ok(calibration=result(values)).startswith('yes')
     tight = with_settings(CONFIG, {'verdict.max_scale_sigma': 9e-4})
     assert ok(calibration=result(values), config=tight).startswith('no')
-
-
-def test_a_reason_against_a_value_and_a_rejection_make_it_not_good():
     assert ok(calibration=result(None, Code.YAW_FAR_FROM_NOMINAL)) == 'yes no yes yes yes'
     assert ok(calibration=result(None, Code.COVARIANCE_UNKNOWN)) == 'yes yes yes yes yes'
     assert ok(calibration=result(None, Code.LEG_TOO_SHORT)) == 'no no no no no'

@@ -1,13 +1,15 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A small budget of fuzzing; any number: ``python benchmarks/fuzz.py --cases N --seed S``."""
+"""A small budget of fuzzing; any number: benchmarks/fuzz.py and benchmarks/live_faults.py."""
 
 import cases
+from live_legs import DRIVES, leg, SIGMAS
 import pytest
 
 pytestmark = pytest.mark.slow
 CASES = 80       # the same on any machine: what one of two busy cores did in 15 s
+LEGS = 8
 
 
 @pytest.fixture(scope='module')
@@ -36,3 +38,16 @@ def test_a_budget_of_cases(clean, tmp_path):
     assert not wrong, '\n'.join(wrong)
     assert len(ran) == CASES
     assert {o.code for o in ran} >= {0, 2}
+
+
+def test_a_clean_leg_is_accepted():
+    """Else the faulty ones show nothing."""
+    one = leg(1, 0)
+    assert (one.faults, one.verdict, one.raised) == ((), 'accepted', '')
+    assert one.sigmas < SIGMAS
+
+
+def test_faulty_legs():
+    found = [leg(20261126, number) for number in range(DRIVES, DRIVES + LEGS)]
+    assert not [one for one in found if one.raised]
+    assert not [one for one in found if one.verdict == 'accepted' and not one.sigmas < SIGMAS]

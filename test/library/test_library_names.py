@@ -46,19 +46,12 @@ def test_names_and_arguments_stay():
     assert set(dir(odocal_ros)) >= set(odocal_ros.__all__)
 
 
-def test_each_name_has_an_example_of_its_arguments_in_its_docstring():
+def test_each_name_has_an_example_no_room_of_its_name_and_others_are_errors():
     for name in SIGNATURES:
         assert 'Raises' in getattr(odocal_ros, name).__doc__, name
-
-
-def test_no_room_takes_the_place_of_a_name():
-    """A room of a name's own name would be set in its place when it is imported."""
     from test_border import PACKAGE
     rooms = {p.name for p in PACKAGE.iterdir()} | {p.stem for p in PACKAGE.glob('*.py')}
     assert not rooms & set(odocal_ros.__all__)
-
-
-def test_a_name_that_is_none_is_an_attribute_error():
     with pytest.raises(AttributeError, match='calibrate_bags'):
         _ = odocal_ros.calibrate_bags
 

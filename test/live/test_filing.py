@@ -1,18 +1,15 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The answer of ~/save, and what it takes to put a worse result in the place of a good one."""
+"""The worker, the answer of ~/save, and what it takes to replace a good result by a worse one."""
 
 import os
 import threading
 import time
 from types import SimpleNamespace
 
-import pytest
-
-pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
-
 from bench import wait_for
+import pytest
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.live.filing import Filing
@@ -21,6 +18,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
+pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
 NOW_NS = 10**18
 GOOD = Calibration((), {}, {}, ())
 BAD = Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
@@ -129,3 +127,22 @@ def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(tmp_path, mon
     wait_for((tmp_path / 'latest' / 'report.html').exists, 'the report')
     assert done == ['a leg']
     worker.close()
+
+
+def test_jobs_given_before_the_end_are_done():
+    done, gate, w = [], threading.Event(), Worker()
+    w.submit(lambda: gate.wait(5.0), lambda *_: None)
+    w.submit(lambda: done.append('saved'), lambda *_: None)
+    threading.Timer(0.05, gate.set).start()
+    assert w.close()
+    assert done == ['saved']
+
+
+def test_a_long_job_does_not_hold_the_end():
+    gate, w = threading.Event(), Worker()
+    w.submit(gate.wait, lambda *_: None)
+    began = time.monotonic()
+    assert not w.close(0.05)       # returns though the job has not ended
+    assert not gate.is_set()
+    assert time.monotonic() - began < 60.0
+    gate.set()

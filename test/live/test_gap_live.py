@@ -45,15 +45,12 @@ def seen(tmp_path_factory):
         yield SimpleNamespace(**vars(found), **vars(seen))
 
 
-def test_it_is_said_while_the_leg_is_driven(seen):
+def test_it_is_said_at_once_and_what_was_good_enough_stays_so(seen):
     assert seen.told['level'] == b'\1'
     assert 'no IMU data for 3.02 s at t = ' in seen.told['hint']
     assert 'the leg is cut there' in seen.told['hint']
     assert 'cancel_leg' not in seen.told['hint']
     warned, = [line for line in seen.node.lines if 'WARN' in line and 'LEG_CUT' in line]
-
-
-def test_it_is_said_at_once_and_what_was_good_enough_stays_so(seen):
     assert '3.02 s' not in seen.silent['hint']     # it is silent still; 0.95 s on an idle machine
     for told in (seen.silent, seen.told):
         assert told['scale_ok'] == 'yes'
@@ -61,7 +58,7 @@ def test_it_is_said_at_once_and_what_was_good_enough_stays_so(seen):
         assert abs(off) < 4 * float(told['estimate_scale_factor_sigma'])
 
 
-def test_its_parts_make_the_result(seen):
+def test_its_parts_make_the_result_also_of_a_replay(seen):
     assert seen.stop.success
     assert seen.stop.message.startswith('leg 1 in 2 parts, ')
     assert seen.status['legs'] == '1'
@@ -71,9 +68,6 @@ def test_its_parts_make_the_result(seen):
     assert abs(scale['value'] - seen.truth.scale) < 4 * scale['sigma']
     assert 'LEG_CUT' in {r['code'] for r in seen.live['reasons']}
     assert seen.undone.message == 'leg 1 is undone; no leg is left'
-
-
-def test_a_replay_of_the_journal_gives_the_same(seen):
     ends_ns = (int(seen.status[f'leg_{end}_ns']) for end in ('start', 'stop'))
     marks = [f'{ns // 10**9}.{ns % 10**9:09}' for ns in ends_ns]
     # undone since: it must be asked for by its marks

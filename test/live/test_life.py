@@ -141,15 +141,24 @@ def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
     assert client.get('leg.min_distance') == [250.0]
 
 
-def test_a_parameter_that_does_not_exist_is_named(start, connect):
-    node = start('-p', 'leg.min_distanse:=3.0', '-p', 'somebody.elses:=1', '-p', 'imu.colour:=red',
+def test_the_shipped_file_is_taken_as_it_is_and_other_parameters_are_named(start, connect):
+    node = start('--params-file', str(ROOT / 'config' / 'calibrator.yaml'), '-p',
+                 'leg.min_distanse:=3.0', '-p', 'somebody.elses:=1', '-p', 'imu.colour:=red',
                  '-p', 'result.gyro_bias_x:=1.0')
-    connect().until(state='waiting')
+    client = connect()
+    client.until(state='waiting')
     assert 'no parameter leg.min_distanse: did you mean leg.min_distance?' in node.text
     assert 'no parameter imu.colour. It is ignored.' in node.text
     assert 'somebody' not in node.text
     assert 'gyro_bias' not in node.text
     assert node.text.count('WARN') == 2
+    names = [name for name in SETTINGS if name != 'output.directory']
+    for name, value in zip(names, client.get(*names), strict=True):
+        default = SETTINGS[name].default
+        value = default if value is None else value
+        same = list(value) == list(default) if isinstance(default, tuple) else (
+            value == default or math.isnan(value) and math.isnan(default))
+        assert same, name
 
 
 def test_messages_that_cannot_be_read_are_said(start, connect):
@@ -166,19 +175,6 @@ def test_messages_that_cannot_be_read_are_said(start, connect):
     health = wait_for(unreadable, 'the count')
     assert health['message'].startswith('/odometer: ')
     assert 'data[3]' in client.until(state='waiting')['missing']
-
-
-def test_the_shipped_parameter_file_is_taken_as_it_is(start, connect):
-    start('--params-file', str(ROOT / 'config' / 'calibrator.yaml'))
-    client = connect()
-    client.until(state='waiting')
-    names = [name for name in SETTINGS if name != 'output.directory']
-    for name, value in zip(names, client.get(*names), strict=True):
-        default = SETTINGS[name].default
-        value = default if value is None else value
-        same = list(value) == list(default) if isinstance(default, tuple) else (
-            value == default or math.isnan(value) and math.isnan(default))
-        assert same, name
 
 
 def test_a_saved_result_comes_back_as_overrides(start, connect):

@@ -64,22 +64,16 @@ def session(drive, tmp_path_factory):
         return seen
 
 
-def test_a_mark_is_refused_without_a_leg_and_while_the_wheels_turn(session):
+def test_marks_are_refused_answered_and_asked_for(session):
     assert not session.early.success
     assert 'call ~/start_leg first, then ~/mark on each point' in session.early.message
     assert not session.turning.success
     assert 'stand on the point and call again' in session.turning.message
-
-
-def test_the_answers_name_the_points(session):
     assert all(answer.success for answer in session.answers)
     said = [answer.message for answer in session.answers]
     assert said[0] == 'mark 1 of leg 1: point 1, x 0 m, y 0 m'
     assert said[7] == 'mark 8 of leg 1: point 8, x 0 m, y -4 m'
     assert len(session.status['marks'].split(',')) == len(TIMES)
-
-
-def test_the_hint_asks_for_marks(session):
     assert 'call ~/mark at rest on each point, ' in session.first['hint']
     assert 'call ~/mark' not in session.second['hint']
 
@@ -96,16 +90,10 @@ def test_the_leg_finds_both_wheels_and_the_track_width(session, drive):
     assert ('LOCAL_FRAME' in codes) is drive.options.imu
 
 
-def test_its_journal_replays_to_the_last_bit(session):
+def test_its_journal_replays_to_the_last_bit_and_options_precede_it(session):
     check_replay(session.live, session.journal)
-
-
-def test_marks_as_options_precede_those_of_the_node(session):
     with pytest.raises(BadUsage, match='--mark 14: the odometer has no data there'):
         calibrate_bag(session.journal, config={'reference.marks': [14.0]})
-
-
-def test_the_points_of_a_replay_are_those_of_the_recording(session):
     with pytest.raises(BadUsage, match='a mark of point [2-9], reference.points has 1: use'):
         calibrate_bag(session.journal, config={'reference.points': [0.0, 0.0]})
 

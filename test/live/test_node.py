@@ -335,7 +335,7 @@ def test_cancelled_and_undone_legs_are_marked(session):
     assert after == before
 
 
-def test_save_and_reset(session):
+def test_save_and_reset_and_latest_goes_with_dropped_legs(session):
     assert session.save.success
     folders = sorted(p for p in session.folder.iterdir() if not p.is_symlink())
     assert len(folders) >= 2                 # autosave of each good leg, and ~/save
@@ -345,9 +345,6 @@ def test_save_and_reset(session):
     assert (session.after_reset['leg_event'], session.after_reset['leg_id']) == ('undone', '1')
     assert session.results_after_reset['result.valid'] is False
     assert math.isnan(session.results_after_reset['result.scale_factor'])
-
-
-def test_dropped_legs_take_the_saved_folder_and_latest_with_them(session):
     # the folder saved after the first leg stands again when the later ones are undone
     assert session.back == Path(session.saved['saved']).resolve()
     assert not (session.folder / 'latest').is_symlink()

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An overloaded machine: what a queue loses is counted and said, and live is still replay."""
+"""An overloaded machine, a flood of parameters: losses are counted, the node goes on."""
 
 import contextlib
 import os
@@ -13,8 +13,10 @@ from types import SimpleNamespace
 
 from bench import given, wait_for
 from kills import NUMBERS, replayed, same_result
-from player import messages_of, part, playing_to, stopped, straight
+from player import ended, messages_of, part, Player, playing_to, recording, stopped, straight
 import pytest
+from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
 
 from odocal_ros.bagio.read import open_bag
 
@@ -22,6 +24,7 @@ pytestmark = pytest.mark.slow
 SPEED = 15.0
 BEFORE_S, MARK_S, HELD_S, GOES_ON_S, STOP_S, END_S = 45, 60, 80, 90, 115, 117    # of the drive
 FEW = 100      # messages that the queue of the odometer holds
+REQUESTS = 20
 
 
 @contextlib.contextmanager
@@ -80,3 +83,41 @@ def test_the_result_is_that_of_a_replay(leg):
     same_result(leg.live, offline)
     assert [(one['start_ns'], one['stop_ns']) for one in leg.live['legs']] == [
         (one['start_ns'], one['stop_ns']) for one in offline['legs']]
+
+
+def flood(client):
+    """Ask to set all parameters to odd values, again and again; return the futures."""
+    asked = client.send(ListParameters, 'list_parameters', ListParameters.Request())
+    wait_for(asked.done, 'the names of the parameters')
+    names, futures = asked.result().result.names, []
+    for k in range(REQUESTS):
+        wanted = [Parameter(name, value=value).to_parameter_msg()
+                  for name in names for value in (k, 'x' * 50, float('nan'), [True] * 100)]
+        futures += [
+            client.send(SetParameters, 'set_parameters', SetParameters.Request(parameters=wanted)),
+            client.send(SetParametersAtomically, 'set_parameters_atomically',
+                        SetParametersAtomically.Request(parameters=wanted))]
+    return futures
+
+
+def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(start, connect):
+    types, sent = messages_of(straight())
+    node, client = start(), connect()
+    player = recording(client, (types, sent), 45, 60, SPEED)
+    with player.playing(part(sent, 60, 95), SPEED):
+        futures = flood(client)
+        wait_for(lambda: all(one.done() for one in futures), 'the answers')
+        wait_for(lambda: float(client.status['duration_s']) > 34.0, 'the rest of the drive')
+    for one in futures:
+        answer = one.result()
+        results = answer.results if hasattr(answer, 'results') else [answer.result]
+        assert not any(result.successful for result in results)
+        assert all(result.reason for result in results)
+    assert len(node.lines) < 20
+    for publisher in player.publishers.values():
+        client.node.destroy_publisher(publisher)
+    player = Player.connected(client, types)
+    player.play(part(sent, 95, 115), SPEED)
+    answer = ended(client, player, part(sent, 115, 117), SPEED)
+    assert 'scale factor 1.0' in answer.message
+    assert node.process.poll() is None

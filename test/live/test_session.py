@@ -97,10 +97,15 @@ def test_undo_takes_the_last_leg_and_shows_its_marks():
     assert (session.state, session.calibration) == (State.IDLE, None)
 
 
-def test_reset_drops_all_legs():
+def test_a_reset_drops_all_legs_and_what_is_carried_on():
     session = with_legs(3)
     assert [leg.leg_id for leg in session.begin_reset()] == [1, 2, 3]
     assert (session.legs, session.calibration, session.state) == ([], None, State.IDLE)
+    session = with_legs(3)
+    session.carry_on('two legs', 2)
+    assert [leg.leg_id for leg in session.legs] == [3]
+    session.begin_reset()
+    assert session.carried is None
 
 
 @pytest.mark.parametrize(('command', 'words'), [
@@ -144,14 +149,6 @@ def test_a_leg_that_nobody_asked_for_leaves_no_trace_when_it_is_no_good():
     session.stop(80)
     session.finish(result(), calibration())
     assert session.unused is None
-
-
-def test_what_is_carried_on_goes_with_a_reset():
-    session = with_legs(3)
-    session.carry_on('two legs', 2)
-    assert [leg.leg_id for leg in session.legs] == [3]
-    session.begin_reset()
-    assert session.carried is None
 
 
 def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest():

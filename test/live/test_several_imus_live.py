@@ -54,18 +54,12 @@ def seen(tmp_path_factory):
     return found
 
 
-def test_the_calibrator_says_so_while_it_is_driven(seen):
+def test_both_nodes_say_so_and_the_leg_is_rejected_with_the_setting_that_chooses(seen):
     assert WORDS in seen.recording['message']
     assert seen.recording['level'] == b'\1'
     assert seen.node.text.count(WORDS) == 1
-
-
-def test_the_leg_is_rejected_with_the_setting_that_chooses(seen):
     assert not seen.stop.success
     assert 'SEVERAL_IMUS' in seen.stop.message
     assert "imu.frame_id: 'imu_link'" in seen.stop.message
     assert 'SEVERAL_IMUS' in seen.status['reasons']
-
-
-def test_the_node_odometry_says_so_once(seen):
     assert seen.odometry.text.count(WORDS) == 1

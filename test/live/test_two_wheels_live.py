@@ -62,7 +62,8 @@ def session(drive, tmp_path_factory):
 def test_the_start_says_what_to_drive_and_what_it_can_tell(session):
     assert session.start.success
     text = session.start.message
-    assert re.search(r'drive 1?\d\d m more, faster than 2.78 m/s \(10 km/h\), ', text)
+    assert re.search(r'drive 1?\d\d m more, faster than leg.min_speed, 2.78 m/s \(10 km/h\), ',
+                     text)
     assert TURNS in text
     assert 'then stand still 10 s and call ~/stop_leg' in text
     assert text.endswith(

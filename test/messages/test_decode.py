@@ -131,24 +131,18 @@ def test_speeds(message, stamped):
     assert block.stamp_ns.tolist() == [99 if stamped else 7]
 
 
-def test_arrays_give_their_only_value_or_the_one_named():
+def test_arrays_give_their_only_value_the_one_named_or_two_for_a_mean():
     block, form = one('odometer', [make.whole_array([4], 'Int64', labels=['wheel'])])
     assert block.value.tolist() == [4]
     assert (form.modulus, form.chosen) == (2**64, '')
     block, _ = one('odometer', [make.whole_array([4, 5])], config(odometer__field='data[1]'))
     assert block.value.tolist() == [5]
-
-
-def test_two_values_of_unknown_sides_are_kept_apart_for_their_mean():
     # counters roll over each for itself: a mean of raw counts would not
     pairs, reader = read('odometer', [make.whole_array([4, 5])])
     assert [(slot, block.value.tolist()) for slot, block in pairs] == [
         ('odometer', [4]), ('odometer_right', [5])]
     assert not reader.form.sides
     assert 'the mean of 0 and 1 is used' in reader.form.chosen
-
-
-def test_a_longer_array_is_refused_with_the_settings_that_name_its_wheels():
     pairs, reader = read('odometer', [make.whole_array([4, 5, 6, 7])])
     assert pairs == []
     assert 'a list of 4 values' in reader.trouble

@@ -56,13 +56,10 @@ def test_one_frame_is_used_however_the_stream_is_chopped(little_endian):
                 assert one.tobytes() == other.tobytes()
 
 
-def test_a_single_damaged_frame_decides_nothing():
+def test_a_damaged_frame_decides_nothing_and_one_that_is_set_is_used_at_once():
     found, reader = read(['x\x07', *['front'] * 9])
     assert reader.frame == 'front'
     assert found.keys() == {'imu'}
-
-
-def test_the_frame_that_is_set_is_used_from_the_first_message_on():
     found, _ = read(['front', 'rear'] * 5, wanted='rear')
     assert found['imu'].received_ns.tolist() == [1, 3, 5, 7, 9]
     assert len(found['imu_other'].stamp_ns) == 5

@@ -49,11 +49,12 @@ def test_wheels_of_real_robots(robot):
     assert pair[0] in found.about
 
 
-def test_of_several_axles_the_list_of_all_wheels_is_named():
+def test_of_several_axles_all_wheels_are_named_and_a_long_list_is_cut():
     names, _ = REAL['husky']
     assert choose(names, 4).about.endswith(
         '; for all wheels set odometer.wheels to [front_left_wheel, front_right_wheel, '
         'rear_left_wheel, rear_right_wheel]')
+    assert 'and 88 more' in choose([f'j{k}' for k in range(100)], 100)
 
 
 @pytest.mark.parametrize(('names', 'keys'), [
@@ -80,10 +81,6 @@ def test_two_of_unknown_sides(names):
     (['shoulder', 'elbow', 'wrist'], 3), (['steering'], 1), (['a', 'a'], 2), ([], 4), ([], 0)])
 def test_what_cannot_be_told_is_not_guessed(names, count):
     assert isinstance(choose(names, count), str)
-
-
-def test_a_long_list_is_cut():
-    assert 'and 88 more' in choose([f'j{k}' for k in range(100)], 100)
 
 
 def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_said():

@@ -1,20 +1,26 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Grids of speeds: found where there is one, and what values on a grid tell."""
+"""Speeds sent in steps: rounded to a grid, or held until they have changed by a step."""
 
 import numpy as np
+from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, grid
+from odocal_ros.nav.held_speed import held_speed
 from odocal_ros.nav.odometer import travel
+from odocal_ros.sim.real import Real
+from odocal_ros.sim.wheels import coarse, held
 
 KMH = 1 / 3.6
 T = np.arange(0.0, 600.0, 0.1)
 # stops and goes of uneven lengths: 0 to 16 m/s
 SPEED = np.maximum(0.0, 8 + 6 * np.sin(T / 9) + 4 * np.sin(T / 4.3))
 RATE = OdometerForm('rate', 0, '1')
+STEP = 0.5 / 3.6
+AT = np.arange(0.0, 400.0, 0.05)
 
 
 def sent(step, how, t=T, speed=SPEED):
@@ -30,14 +36,11 @@ def test_the_step_is_found(step, how):
     assert not found.interpolated
 
 
-def test_the_step_is_found_under_noise():
+def test_the_step_is_found_under_noise_and_of_a_slow_drive():
     t, v = sent(KMH, 'floor')
     noisy = v + 0.01 * np.random.default_rng(1).standard_normal(len(v)) * (v != 0)
     # the mean of some hundred places of 0.01 m/s, over a lever of tens of cells: below 1e-3
     assert grid(noisy) == pytest.approx(KMH, rel=1e-3)
-
-
-def test_a_slow_drive_has_few_values_and_a_grid():
     slow = SPEED / 8
     assert coarse_speed(*sent(KMH, 'round', speed=slow)).step == pytest.approx(KMH, rel=1e-6)
     assert coarse_speed(T, slow) is None
@@ -78,12 +81,9 @@ def test_what_steps_tell_is_the_speed_within_the_sigma(how, offset, rate):
     assert np.abs(told.value).min() > KMH
 
 
-def test_backwards_the_offset_is_backwards():
+def test_instants_have_their_side_backwards_and_none_beside_zero():
     t, v = sent(KMH, 'floor')
     np.testing.assert_array_equal(CoarseSpeed(KMH, t, -v).instants.side, -1.0)
-
-
-def test_zero_and_the_cell_beside_it_tell_nothing():
     # a dead band of a cell: from 0 to 2 at once
     t, v = sent(KMH, 'floor', speed=SPEED / 8)
     told = CoarseSpeed(KMH, t, np.where(v < 1.5 * KMH, 0.0, v)).instants
@@ -152,3 +152,53 @@ def test_a_cruise_keeps_its_rounding_and_a_ramp_loses_it():
     assert told[60:100].sum() < 0.02 * told.sum()
     # in all, by 200 drives to 1 / sqrt(400): three of those
     assert np.var(errors) == pytest.approx(told.sum(), rel=0.15 * 2)
+
+
+def town(t):
+    """Return a speed of stops, ramps and cruises that are not alike, m/s."""
+    stops = np.clip(20 * np.sin(2 * np.pi * t / 97.0), 0.0, 9.0 + 2 * np.sin(t / 61.0))
+    return np.where(stops < 0.05, 0.0, stops)
+
+
+@pytest.mark.parametrize('scale', [1.0, 37.0])
+def test_a_held_speed_is_known_by_its_step(scale):
+    found = held_speed(AT, scale * held(town(AT), STEP))
+    # the least change of many is a step and what the speed gains in a row at its slowest
+    assert STEP <= found.step / scale < 1.05 * STEP
+    assert not found.truncation
+
+
+@pytest.mark.parametrize('value', [
+    town(AT), town(AT) + 0.01 * np.random.default_rng(1).standard_normal(len(AT)),
+    np.repeat(town(AT[::5]), 5), coarse(town(AT), Real(speed_step=1 / 3.6)), np.zeros(len(AT)),
+    np.full(len(AT), 5.0)], ids=['plain', 'noisy', 'repeated', 'whole km/h', 'standing', 'even'])
+def test_other_speeds_are_not_taken_for_held(value):
+    way = travel(AT, value, RATE)[0]
+    assert way.coarse is None or way.coarse.truncation
+
+
+def test_its_changes_are_right_and_its_middle_is_within_half_a_step():
+    true = town(AT)
+    found = held_speed(AT, held(true, STEP))
+    assert_allclose(found.instants.value, np.interp(found.instants.t, AT, true), atol=1e-9)
+    off = np.abs(found.value - true)[true > 0]
+    # a row beyond it where the vehicle turns about within a step
+    assert np.percentile(off, 90) < 0.55 * STEP
+    assert off.max() < 1.6 * STEP
+
+
+def test_the_path_has_no_more_than_the_error_of_its_cruises():
+    true = town(AT)
+    middle = travel(AT, held(true, STEP), RATE)[0].s[-1]
+    whole, sent = (((x[1:] + x[:-1]) / 2 * np.diff(AT)).sum() for x in (true, held(true, STEP)))
+    # four cruises of 20 s, each uniform within a step: 3 sigmas
+    assert abs(middle - whole) < 3 * np.sqrt(4) * 20 * STEP / np.sqrt(12)
+    assert abs(middle - whole) < abs(sent - whole)
+
+
+def test_reversed_counts_are_held_on_the_other_side():
+    value = held(town(AT), STEP)
+    way, back = travel(AT, value, RATE)[0], travel(AT, -value, RATE, reversed_counts=True)[0]
+    assert_allclose(back.s, way.s)
+    assert_allclose(back.coarse.value, way.coarse.value)
+    assert_allclose(back.coarse.instants.value, way.coarse.instants.value)

@@ -138,11 +138,14 @@ def test_mounting_angles_and_forward_axis_undo_each_other(yaw, pitch, K):
     assert_allclose(forward_b(*found), d, atol=2e-15)
 
 
-def test_signs_of_the_mounting_angles():
+def test_mounting_angles_have_their_signs_and_are_of_many_axes():
     """Yaw > 0: the IMU's x axis lies left of forward; pitch > 0: below it."""
     assert forward_b(0.1, 0.0)[1] < 0
     assert forward_b(0.0, 0.1)[2] > 0
     assert_allclose(mounting_from_forward(np.array([1.0, -0.1, 0.0])), [np.arctan(0.1), 0])
+    yaw, pitch = np.array([0.1, -2.0, 3.0]), np.array([0.0, 0.3, -0.2])
+    assert_allclose(mounting_from_forward(forward_b(yaw, pitch)), [yaw, pitch], atol=1e-14)
+    assert forward_b(yaw, 0.0).shape == (3, 3)
 
 
 @pytest.mark.parametrize('pitch', [0.0, 0.02, -0.02])
@@ -152,12 +155,6 @@ def test_an_odometer_that_counts_backwards_is_a_yaw_of_half_a_turn(pitch):
     assert found == pytest.approx(-pitch, abs=1e-12) or found == pytest.approx(pitch, abs=1e-12)
     assert_allclose(forward_b(yaw, found), -np.array([np.cos(pitch), 1e-9, np.sin(pitch)]),
                     atol=1e-15)
-
-
-def test_forward_axes_of_many():
-    yaw, pitch = np.array([0.1, -2.0, 3.0]), np.array([0.0, 0.3, -0.2])
-    assert_allclose(mounting_from_forward(forward_b(yaw, pitch)), [yaw, pitch], atol=1e-14)
-    assert forward_b(yaw, 0.0).shape == (3, 3)
 
 
 def fixes(metres, rng, sigma):

@@ -142,14 +142,11 @@ def test_an_angle_in_floats_and_its_reset():
     assert codes(reasons) == [Code.COUNTER_RESET]
 
 
-def test_increments_add_up_from_the_first_row():
+def test_increments_add_up_and_rates_are_summed_by_trapezoids():
     found, _ = travel(np.arange(4.0), np.array([100, 1, 2, -1]),
                       OdometerForm('increment', 0, 'm/pulse'))
     assert_allclose(found.s, [0, 1, 3, 2], atol=0)
     assert found.quantum == 1.0
-
-
-def test_rates_are_summed_by_trapezoids_on_uneven_stamps():
     t = np.array([0.0, 1.0, 1.5, 4.0])
     found, _ = travel(t, 2 + 3 * t, OdometerForm('rate', 0, '1'))
     assert_allclose(found.s, 2 * t + 1.5 * t**2, atol=1e-14)     # exact for a straight line

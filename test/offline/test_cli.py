@@ -1,9 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The odocal command as a person meets it: exit codes, one line, no traceback."""
+"""The odocal command as a person meets it: exit codes, one line, progress, doctor, ros2 odocal."""
 
-import importlib
+import argparse
+from importlib import import_module
+from importlib.metadata import version
+import inspect
+import os
+from pathlib import Path
+import pty
+import re
+import shutil
 import subprocess
 import sys
 
@@ -11,22 +19,30 @@ import pytest
 
 from odocal_ros import __version__
 from odocal_ros.errors import BadBag
-from odocal_ros.offline import cli
+from odocal_ros.offline import cli, doctor
 
 pytestmark = pytest.mark.core
 # what this package has itself, of others it knows the names
 OWN = [name for name, (home, _) in cli.COMMANDS.items() if home.startswith('odocal_ros.')]
+SETUP = Path(__file__).resolve().parents[2] / 'setup.py'
+CODE = """
+from odocal_ros.offline.say import Phase
+with Phase('reading town', quiet={quiet}) as phase:
+    phase(0.25)
+    phase(0.5, 'leg 2 of 2')
+    phase(None, 'smoother, 7 passes done')
+with Phase('drawing the report'):
+    pass
+print('the result')
+"""
 
 
-def test_help_of_everything_is_there(capsys):
+def test_help_of_everything_is_there_and_no_command_fails(capsys):
     for argv in (['--help'], *([c, '--help'] for c in OWN)):
         with pytest.raises(SystemExit) as end:
             cli.main(argv)
         assert end.value.code == 0
         assert 'usage: odocal' in capsys.readouterr().out
-
-
-def test_no_command_shows_help_and_fails(capsys):
     assert cli.main([]) == 2
     assert 'replay' in capsys.readouterr().out
 
@@ -54,7 +70,7 @@ def fake_command(monkeypatch, error):
     def run(args):
         raise error
     for name in OWN:
-        monkeypatch.setattr(importlib.import_module(cli.COMMANDS[name][0]), 'run', run)
+        monkeypatch.setattr(import_module(cli.COMMANDS[name][0]), 'run', run)
 
 
 @pytest.mark.parametrize(('error', 'code'), [
@@ -102,3 +118,106 @@ def test_a_command_of_a_package_that_is_not_installed_names_what_to_install(
     assert err == (f'odocal: {argv[0]} is a command of odocal_reproductions, which is not '
                    'installed; install it from a checkout of odocal_ros: '
                    'pip install ./reproductions\n')
+
+
+def shown(capsys):
+    code = cli.main(['doctor'])
+    rows = dict(line.split('  ', 1) for line in capsys.readouterr().out.splitlines()[:-1])
+    return code, {name: text.strip() for name, text in rows.items()}
+
+
+def test_what_is_installed_and_what_is_lacking_is_shown(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    monkeypatch.setenv('SOME_TOKEN', 'a secret')
+    code, rows = shown(capsys)
+    assert code == 0
+    assert rows['odocal_ros'].startswith(f'{__version__}, ')
+    assert rows['Python'].endswith(sys.executable)
+    assert rows['numpy'] == version('numpy')
+    assert rows['results of a node'].startswith(f'{tmp_path}/odocal, can be written')
+    assert float(rows['results of a node'].split()[-3]) <= shutil.disk_usage(tmp_path).total / 1e9
+    assert 'a secret' not in str(rows)
+    try:
+        from rclpy.utilities import get_rmw_implementation_identifier
+    except ImportError:
+        assert rows['rclpy'].startswith('none')
+    else:
+        assert rows['rmw'] == get_rmw_implementation_identifier()
+    monkeypatch.setattr(doctor, 'NEEDED', ('numpy', 'no-such-thing'))
+    assert cli.main(['doctor']) == 1
+    assert 'missing: no-such-thing' in capsys.readouterr().out
+
+
+def ros2(*argv):
+    """Do as main and add_subparsers_on_demand of ros2cli (Jazzy) do; return the exit code."""
+    group, = re.findall(r"'ros2cli.command': \['(.+)'\]", SETUP.read_text())
+    name, module, attribute = re.fullmatch(r'(\w+) = ([\w.]+):(\w+)', group).groups()
+    extension = getattr(import_module(module), attribute)()
+    extension.NAME = name
+    assert inspect.getdoc(extension)        # of which the first line is the help
+    parser = argparse.ArgumentParser(prog='ros2')
+    commands = parser.add_subparsers()
+    own = commands.add_parser(name, formatter_class=argparse.RawDescriptionHelpFormatter)
+    own.exit, leave = lambda status=0, message=None: None, own.exit
+    own.print_help, show = lambda: None, own.print_help
+    parser.parse_known_args(argv)
+    own.exit, own.print_help = leave, show
+    extension.add_arguments(own, f'ros2 {name}')
+    return extension.main(parser=parser, args=parser.parse_args(argv))
+
+
+def test_all_words_reach_the_command(monkeypatch):
+    asked = []
+    monkeypatch.setattr(cli, 'main', lambda argv: asked.append(argv) or 5)
+    words = ['replay', 'a bag', '--imu-topic', '/imu', '--set', 'a=b', '--help']
+    assert ros2('odocal', *words) == 5
+    assert asked == [words]
+
+
+def test_help_lists_the_commands_and_errors_are_those_of_odocal(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        ros2('odocal', '--help')
+    assert stopped.value.code == 0
+    out = capsys.readouterr().out
+    assert all(re.search(rf'^  {name} +\w', out, re.MULTILINE) for name in cli.COMMANDS)
+    assert ros2('odocal') == 2          # its help
+    assert 'usage: odocal' in capsys.readouterr().out
+    assert ros2('odocal', 'replay') == 2
+    assert capsys.readouterr().err.startswith('odocal replay: ')
+
+
+def run(quiet=False):
+    """Return what goes to the output, and to the error stream, which is a terminal."""
+    master, slave = pty.openpty()
+    child = subprocess.Popen([sys.executable, '-c', CODE.format(quiet=quiet)], text=True,
+                             stdout=subprocess.PIPE, stderr=slave)
+    os.close(slave)
+    told = b''
+    try:
+        while chunk := os.read(master, 65536):
+            told += chunk
+    except OSError:      # the other side is closed
+        pass
+    os.close(master)
+    out, _ = child.communicate(timeout=60)
+    assert child.returncode == 0, told
+    return out, told.decode()
+
+
+def test_a_terminal_shows_each_phase_and_is_left_clean():
+    out, told = run()
+    assert out == 'the result\n'
+    for part in ('reading town', '25 %', 'leg 2 of 2', '50 %', 'drawing the report'):
+        assert part in told, part
+    *_, last = (line for line in told.split('\r') if 'smoother' in line)
+    assert '%' not in last
+    assert told.split('\r')[-1].strip() == ''      # the line is wiped
+    assert '\n' not in told.replace('\r\n', '')
+
+
+def test_quiet_is_quiet_and_a_pipe_stays_clean():
+    assert run(quiet=True)[1].count('reading') == 0
+    # a file or pipe as the error stream gets nothing at all
+    done = subprocess.run([sys.executable, '-c', CODE.format(quiet=False)], text=True,
+                          capture_output=True, timeout=60)
+    assert (done.stdout, done.stderr) == ('the result\n', '')

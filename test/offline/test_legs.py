@@ -67,7 +67,7 @@ class StatusBag:
             yield 0, SimpleNamespace(status=[status])
 
 
-def test_marks_of_the_node_are_found_and_cancelled_legs_are_not():
+def test_marks_of_each_run_are_found_and_cancelled_legs_are_not():
     bag = StatusBag([
         ('', 0, 0, ''), ('1', 5 * S, 0, 'started'), ('1', 5 * S, 9 * S, 'stopped'),
         ('1', 5 * S, 9 * S, ''),
@@ -77,9 +77,6 @@ def test_marks_of_the_node_are_found_and_cancelled_legs_are_not():
     assert marked_legs(bag) == [(5 * S, 9 * S), (50 * S, 0)]
     ended, broken_off = open_ended([(5 * S, 9 * S), (50 * S, 70 * S)], marked_legs(bag))
     assert (ended, [r.code for r in broken_off]) == ((), [Code.STOP_MARK_MISSING])
-
-
-def test_legs_of_two_runs_of_the_node_are_kept_apart():
     bag = StatusBag([('1', 5 * S, 9 * S, 'stopped'), ('1', 20 * S, 0, 'started'),
                      ('1', 20 * S, 30 * S, 'stopped')])
     assert marked_legs(bag) == [(5 * S, 9 * S), (20 * S, 30 * S)]

@@ -19,10 +19,12 @@ from odocal_ros.settings.config_file import parse_set, read_config_file
 pytestmark = pytest.mark.slow
 ODD = [None, True, -1, 0, 10**400, 2**63, float('inf'), float('nan'), '', 'text', '\0', [], [[]],
        {}, {'a': 1}, [None], -1e308, '1' * 5000, {'nanoseconds': []}, b'\xff']
+DEEP = 1000      # levels: each takes several frames, of which Python allows as many
+QUICK = '--quiet', '--method', 'two_point', '--set', 'output.formats=[]'
 HEAD = '/**:\n  ros__parameters:\n    '
 TEXTS = [
-    '!!python/object/apply:os.system [true]', '&a {b: *a}', '&a [*a]', '[' * 3000, '{' * 3000,
-    '- ' * 3000 + 'x', '9' * 400, '9' * 5000, '1e400', '.inf', '!!binary x', '!!timestamp 1',
+    '!!python/object/apply:os.system [true]', '&a {b: *a}', '&a [*a]', '[' * DEEP, '{' * DEEP,
+    '- ' * DEEP + 'x', '9' * 400, '9' * 5000, '1e400', '.inf', '!!binary x', '!!timestamp 1',
     '!foo bar', '? [a]\n: b', '!!int x', '0x' + 'f' * 400, '0' + '7' * 500, '"\\uD800"',
     '!!set {1}', '*nothing', '<<: *x', '%YAML 9.9', '\t', '1:60:60', '!!null {}', 'a: b: c',
     '| \n x', '\x07']
@@ -76,11 +78,11 @@ def test_metadata_and_journals_of_any_text(tmp_path, bag, capsys):
     for text in TEXTS:
         for form in (' {}', '\n    topics.imu: {}'):
             (path / 'journal.yaml').write_text((journal + form).format(text))
-            said(capsys, 'replay', path, '--output', tmp_path / 'out', '--force', '--quiet')
+            said(capsys, 'replay', path, *QUICK, '--output', tmp_path / 'out', '--force')
 
 
 def test_settings_of_any_text(tmp_path, bag, capsys):
-    for text in [*TEXTS, '[' * 3000 + ']' * 3000]:
+    for text in [*TEXTS, '[' * DEEP + ']' * DEEP]:
         for name in ('leg.min_distance', 'imu.lever_arm', 'frames.imu', 'wheels.levels',
                      'output.formats', 'method', 'reference.start', 'no.such'):
             with suppress(OdocalError):

@@ -201,11 +201,6 @@ def test_an_existing_result_is_not_replaced_without_force(drive, bag, tmp_path, 
     assert replay(bag, *QUICK, '--output', tmp_path, '--quiet', '--force') == 0
 
 
-def test_quiet_says_nothing(bag, tmp_path, capsys):
-    replay(bag, *QUICK, '--output', tmp_path / 'out', '--quiet')
-    assert capsys.readouterr() == ('', '')
-
-
 def test_config_file_then_set_then_default(drive, bag, tmp_path, capsys):
     config = tmp_path / 'calibrator.yaml'
     config.write_text('/**/calibrator:\n  ros__parameters:\n    leg:\n      min_distance: 9000\n'
@@ -235,9 +230,11 @@ def test_wrong_requests_are_one_line_and_exit_2(argv, says, bag, tmp_path, capsy
     assert not (tmp_path / 'out').exists()
 
 
-def test_default_output_is_named_after_the_bag(bag, tmp_path, monkeypatch):
+def test_quiet_says_nothing_and_the_output_is_named_after_the_bag(
+        bag, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert replay(bag, *QUICK, '--quiet') == 0
+    assert capsys.readouterr() == ('', '')
     assert (tmp_path / 'odocal_drive' / 'calibration.json').exists()
 
 

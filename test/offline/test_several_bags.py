@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal replay with several bags: what is wrong with which, and legs of two vehicles."""
+"""odocal replay with several bags, and what it says when --force or Ctrl+C ends a result."""
 
 import json
 import shutil
@@ -10,7 +10,13 @@ import pytest
 
 from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.bagio.write import drive_topics, write_bag
+from odocal_ros.calib import result
+from odocal_ros.library.calibration import Calibration
+from odocal_ros.offline import replay
 from odocal_ros.offline.cli import main
+from odocal_ros.output.files import write_results
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
@@ -34,14 +40,14 @@ def bags(tmp_path_factory):
     return folder
 
 
-def replay(bags, names, out, *options):
+def replayed(bags, names, out, *options):
     return main(['replay', *(str(bags / name) for name in names), '--output', str(out), '--method',
                  'two_point', '--set', 'output.formats=[params]', *options])
 
 
 def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path, capsys):
     names = ['one', 'cut.mcap', 'nofix', 'wheels', 'foreign.txt', 'nosuch']
-    assert replay(bags, names, tmp_path / 'out') == 2
+    assert replayed(bags, names, tmp_path / 'out') == 2
     told = capsys.readouterr()
     assert told.out == ''
     line, = told.err.splitlines()
@@ -52,28 +58,25 @@ def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path
     assert not (tmp_path / 'out').exists()
 
 
-def test_a_leg_asked_for_in_vain_says_of_which_bag(bags, tmp_path, capsys):
-    assert replay(bags, ['one', 'other'], tmp_path / 'out', '--leg', '1000:2000') == 2
+def test_an_empty_leg_and_a_speed_beside_counts_are_errors_of_their_bag(bags, tmp_path, capsys):
+    assert replayed(bags, ['one', 'other'], tmp_path / 'out', '--leg', '1000:2000') == 2
     assert f'odocal: {bags / "one"}: the leg 1000.00:2000.00 is empty' in \
         capsys.readouterr().err
-
-
-def test_a_counter_and_a_speed_have_no_mean(bags, tmp_path, capsys):
-    assert replay(bags, ['one', 'speed'], tmp_path / 'out') == 2
+    assert replayed(bags, ['one', 'speed'], tmp_path / 'out') == 2
     line, = (x for x in capsys.readouterr().err.splitlines() if x.startswith('odocal: '))
     assert str(bags / 'speed') in line
     assert 'm per m (a speed), that of the previous bags in m/pulse (a counter)' in line
 
 
 def test_two_vehicles_are_rejected(bags, tmp_path, capsys):
-    assert replay(bags, ['one', 'other'], tmp_path / 'out') == 1
+    assert replayed(bags, ['one', 'other'], tmp_path / 'out') == 1
     said = capsys.readouterr().out
     assert 'LEGS_UNLIKE: the scale of leg 2 is 40.' in ' '.join(said.split())    # 0.03 / 0.0213
     assert '  leg 1: one; leg 2: other' in said.splitlines()
 
 
 def test_a_truncated_bag_goes_with_a_whole_one(bags, tmp_path, capsys):
-    assert replay(bags, ['other', 'cut.mcap'], tmp_path / 'out', '--json') == 0
+    assert replayed(bags, ['other', 'cut.mcap'], tmp_path / 'out', '--json') == 0
     told = json.loads(capsys.readouterr().out)
     codes = {r['code'] for r in told['reasons']}
     assert 'LEGS_OVERLAP' in codes
@@ -91,9 +94,7 @@ def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys,
                         lambda bag: bag.name == 'dropped')
     said = {}
     for names in ('one', 'one dropped', 'one other'):
-        argv = [str(tmp_path / name) for name in names.split()]
-        main(['replay', *argv, '--method', 'two_point', '--json', '--output',
-              str(tmp_path / f'to {names}')])
+        replayed(tmp_path, names.split(), tmp_path / f'to {names}', '--json')
         told = capsys.readouterr()
         said[names] = told.err
         result = json.loads(told.out)
@@ -107,10 +108,59 @@ def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys,
 def test_bags_of_one_name_are_named_by_their_paths(bags, tmp_path, capsys):
     for name in ('one', 'other'):
         shutil.copytree(bags / name, tmp_path / name / 'bag')
-    code = main(['replay', str(tmp_path / 'one' / 'bag'), str(tmp_path / 'other' / 'bag'),
-                 '--method', 'two_point', '--output', str(tmp_path / 'out'), '--json'])
-    assert code == 1
+    names = ['one/bag', 'other/bag']
+    assert replayed(tmp_path, names, tmp_path / 'out', '--json') == 1
     told = json.loads(capsys.readouterr().out)
-    paths = [str(tmp_path / name / 'bag') for name in ('one', 'other')]
+    paths = [str(tmp_path / name) for name in names]
     assert [leg['bag'] for leg in told['legs']] == paths
     assert [entry['bag'] for entry in told['inputs']] == paths
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """Write a short drive."""
+    return write_bag(tmp_path_factory.mktemp('force') / 'drive', drive_topics(simulate(SimOptions(
+        scenario='straight', duration=180.0, imu_rate=20.0, odometer_rate=10.0))))
+
+
+CREATED = '2026-01-02T03:04:05+00:00'
+
+
+class Args:
+    """Options of a command line."""
+
+    force, json, quiet, holdout = True, False, False, False
+
+
+@pytest.mark.parametrize('quiet', [False, True])
+def test_a_better_one_that_went_is_named(tmp_path, capsys, quiet):
+    write_results(result.Calibration((), {}, {}, ()), Config(), tmp_path, [], CREATED)
+    args = Args()
+    args.quiet = quiet
+    worse = result.Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
+    for said in (not quiet, False):      # the second time a rejected one goes: nothing is lost
+        assert replay._report(Calibration(worse), tmp_path, args) == 1
+        err = capsys.readouterr().err
+        assert ('--force replaced a better calibration: the new result is rejected (NO_FIX), the '
+                'old one is accepted' in err) == said
+        assert bool(err) == said
+    assert json.loads((tmp_path / 'calibration.json').read_text())['verdict'] == 'rejected'
+
+
+def interrupted(*_, **__):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(('where', 'said'), [
+    ('odocal_ros.pipeline.calibrate.combine', 'odocal: interrupted, nothing written\n'),
+    ('odocal_ros.output.folder._which', 'odocal: interrupted, nothing written\n'),
+    ('odocal_ros.output.files.report_or_why', 'the results are in {out}/, report.html is not\n'),
+    ('odocal_ros.output.summary.screen', 'the results are in {out}/, report.html is not\n'),
+    ('odocal_ros.output.summary.sentence', 'the results are in {out}/\n')])
+def test_ctrl_c_is_answered_with_what_happened(bag, tmp_path, capsys, monkeypatch, where, said):
+    monkeypatch.setattr(where, interrupted)
+    assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 130
+    assert capsys.readouterr().err.endswith(said.format(out=tmp_path / 'out'))
+    written = (tmp_path / 'out').exists()
+    assert written == ('results are' in said)
+    assert not list(tmp_path.glob('.*'))

@@ -176,15 +176,12 @@ def test_of_two_poses_the_user_selects():
     assert choose(more)['fix'] == '/slam/pose'
 
 
-def test_tf_is_the_reference_only_by_name():
+def test_tf_and_odometry_are_references_only_by_name():
     found = topics(fix=None, tf='tf2_msgs/msg/TFMessage')
     with pytest.raises(BadUsage, match='name a tf2_msgs/msg/TFMessage or nav_msgs/msg/Odometry '
                        'with --fix-topic'):
         choose(found)
     assert choose(found, {'fix': '/tf'})['fix'] == '/tf'
-
-
-def test_an_odometry_is_the_reference_only_by_name():
     found = topics(fix=None, lidar_odometry=ODOM)
     with pytest.raises(BadUsage, match=r'^no fix \(a topic of sensor_msgs/msg/NavSatFix, '
                        r'geometry_msgs/msg/PoseStamped, .*\) in the bag; name .*/Odometry '

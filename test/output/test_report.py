@@ -262,14 +262,10 @@ def test_of_many_legs_the_newest_are_side_by_side(good, monkeypatch):
     assert [f'leg {k}, two' in drawing for k in (1, 2, 3)] == [False, True, True]
 
 
-def test_a_page_is_the_same_each_time(good):
-    assert page_of(drawn(good))[0] == page_of(drawn(good))[0]
-
-
-def test_drawing_leaves_no_trace_in_matplotlib(good):
+def test_a_page_is_the_same_each_time_and_leaves_no_trace_in_matplotlib(good):
     import matplotlib
     before = dict(matplotlib.rcParams)
-    page_of(drawn(good))
+    assert page_of(drawn(good))[0] == page_of(drawn(good))[0]
     assert dict(matplotlib.rcParams) == before
 
 
@@ -367,7 +363,7 @@ def test_a_leg_without_tracks_has_its_numbers(good):
     assert '4 fixes see the reasons' in text
 
 
-def test_the_four_most_important_values_stand_under_the_verdict(good):
+def test_the_four_most_important_values_stand_under_the_verdict_of_a_result(good, nothing):
     page = page_of(good)[0]
     head = page.partition('class="headline"')[2].partition('</dl>')[0]
     assert re.findall(r'<dt>(.*?)</dt>', head)[:3] == [
@@ -376,9 +372,6 @@ def test_the_four_most_important_values_stand_under_the_verdict(good):
     assert '-1.0000 ± 0.0029 deg' in head
     assert 'not determined' in head
     assert page.index('class="headline"') > page.index('class="verdict')
-
-
-def test_no_values_without_a_result(nothing):
     assert 'class="headline"' not in page_of(nothing)[0]
 
 

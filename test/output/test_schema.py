@@ -1,25 +1,31 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""calibration.json keeps its schema: what is written, and what earlier releases wrote."""
+"""calibration.json: its schema, its content, and how files come to the disk."""
 
 import json
 from pathlib import Path
 import re
 
 from drives import drive, settings
+import numpy as np
 import pytest
 
+from odocal_ros import __version__
+from odocal_ros.errors import BadUsage
 from odocal_ros.offline.cli import main
-from odocal_ros.output.files import as_json
+from odocal_ros.output import files
+from odocal_ros.output.files import as_json, write_results
 from odocal_ros.output.stored import read_stored
 from odocal_ros.pipeline.calibrate import calibrate, combine
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, SETTINGS, with_settings
 
 pytestmark = pytest.mark.core
 ROOT = Path(__file__).resolve().parents[2]
 SCHEMA = json.loads((ROOT / 'config' / 'calibration-1.schema.json').read_text())
 EARLIER = sorted(Path(__file__).parent.glob('calibration_*.json'))
+CREATED = '2026-01-02T03:04:05+00:00'
+INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
 
 
 @pytest.fixture
@@ -63,3 +69,92 @@ def test_a_break_of_the_contract_is_seen(spoil, validator):
     stored = json.loads(EARLIER[0].read_text())
     spoil(stored)
     assert not validator.is_valid(stored)
+
+
+def test_json_has_the_fixed_shape(good):
+    content = as_json(good, Config(), INPUTS, CREATED)
+    assert list(content) == ['schema', 'software', 'created', 'vehicle', 'verdict', 'reasons',
+                             'result', 'methods', 'legs', 'check', 'inputs', 'config']
+    assert content['schema'] == 1
+    assert content['software'] == f'odocal_ros {__version__}'
+    assert content['verdict'] == 'accepted'
+    assert content['reasons'][1] == {
+        'code': 'PITCH_NOT_DETERMINED', 'text': 'the heights of the fixes are too inaccurate',
+        'remedy': 'Use a receiver that publishes ellipsoidal height.'}
+    assert content['result']['scale_factor'] == {
+        'value': 0.05, 'sigma': 1.2e-6, 'unit': 'm/pulse', 'method': 'two_point'}
+    assert content['result']['imu_rotation'] == {
+        'quaternion_xyzw': [0.0, 0.0, -0.0087, 0.99996], 'rpy': [0.0, 0.0, -0.0174533]}
+    assert content['inputs'] == INPUTS
+    assert list(content['config']) == list(SETTINGS)
+
+
+def test_json_of_a_method_and_a_leg(good):
+    content = as_json(good, Config(), INPUTS, CREATED)
+    method = content['methods']['two_point']
+    assert method['verdict'] == 'accepted'
+    assert method['correlation'] == {'scale_factor,yaw_mounting_angle': 0.25}
+    assert method['budget']['fixes']['scale_factor'] == 1e-6
+    assert method['estimates']['yaw_mounting_angle'] == {
+        'value': -0.0174533, 'sigma': 5e-5, 'unit': 'rad'}
+    assert 'f' not in method
+    leg, = content['legs']
+    assert leg['methods'] == content['methods']
+    assert {k: leg[k] for k in ('bag', 'start', 'stop', 'distance', 'duration', 'imu_samples',
+                                'pulses', 'fixes', 'rejected_fixes', 'verdict')} == {
+        'bag': 'drive', 'start': 1_533_200_000.5, 'stop': 1_533_200_600.5, 'distance': 11200.3,
+        'duration': 600.0, 'imu_samples': 120_000, 'pulses': 30_000, 'fixes': 3000,
+        'rejected_fixes': 4, 'verdict': 'accepted'}
+    assert leg['reasons'][0]['code'] == 'TOPIC_GAP'
+    assert content['check']['after'] == {'rms': 0.1, 'max': 0.3, 'mean': 0.09, 'end': 0.02,
+                                         'percent_of_distance': 1.8e-4}
+
+
+def test_json_holds_no_nan_and_says_null_for_what_is_not_known(good, nothing):
+    content = as_json(good, Config(), [], CREATED)
+    assert content['result']['pitch_mounting_angle']['value'] is None
+    assert content['methods']['two_point']['odd'] is None
+    assert content['config']['imu.nominal_yaw'] is None
+    json.dumps(content, allow_nan=False)
+    empty = as_json(nothing, Config(), [], CREATED)
+    assert empty['verdict'] == 'rejected'
+    assert empty['result']['scale_factor'] == {'value': None, 'sigma': None, 'unit': None,
+                                               'method': None}
+    assert empty['check'] == {'before': None, 'after': None, 'per_distance': []}
+    json.dumps(empty, allow_nan=False)
+
+
+def test_a_rejected_result_keeps_its_values(rejected):
+    content = as_json(rejected, Config(), [], CREATED)
+    assert content['verdict'] == 'rejected'
+    assert content['result']['scale_factor']['value'] == 0.05
+
+
+def test_numpy_arrays_in_inputs_and_details_become_lists():
+    assert files.plain({'a': np.arange(2), 'b': (np.float64(1.5), np.int64(2), np.inf)}) == {
+        'a': [0, 1], 'b': [1.5, 2, None]}
+
+
+def test_write_returns_what_lies_there(good, tmp_path):
+    written = write_results(good, Config(), tmp_path / 'deep' / 'out', INPUTS, CREATED)
+    assert written[0].name == 'calibration.json'
+    assert sorted(written) == sorted((tmp_path / 'deep' / 'out').iterdir())
+    assert json.loads(written[0].read_text()) == as_json(good, Config(), INPUTS, CREATED)
+
+
+def test_a_folder_never_holds_parts_of_two_calibrations(good, nothing, tmp_path):
+    (tmp_path / 'mine.txt').write_text('keep')
+    write_results(good, Config(), tmp_path, INPUTS, CREATED)
+    assert (tmp_path / 'imu_transform.urdf').exists()
+    write_results(nothing, Config(), tmp_path, INPUTS, CREATED, force=True)
+    assert {p.name for p in tmp_path.iterdir()} == {
+        'calibration.json', 'calibration.yaml', 'report.html', 'mine.txt'}
+
+
+def test_only_the_asked_formats_are_written_and_a_bad_folder_is_one_sentence(good, tmp_path):
+    config = with_settings(Config(), {'output.formats': ()})
+    written = write_results(good, config, tmp_path, INPUTS, CREATED)
+    assert [p.name for p in written] == ['calibration.json']
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(BadUsage, match='results cannot be written'):
+        write_results(good, Config(), tmp_path / 'file' / 'out', INPUTS, CREATED)

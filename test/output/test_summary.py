@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a person reads: digits, words, and no nan."""
+"""The summary: figures, screen and sentence as people read them, and the budget."""
 
 from dataclasses import replace
 import math
@@ -14,10 +14,13 @@ import pytest
 from odocal_ros.calib.result import Calibration, Estimate, Source, TrackCheck
 from odocal_ros.output.figures import beyond_one, length, shared, time_span, with_sigma
 from odocal_ros.output.summary import screen, sentence
-from odocal_ros.output.tables import overall
+from odocal_ros.output.tables import budget_lines, overall
 from odocal_ros.reasons import Code, Reason
 
 pytestmark = pytest.mark.core
+TABLE = {'fix_end': {'scale_factor': 4e-5, 'yaw_mounting_angle': 3e-3, 'shared': False},
+         'initial_heading': {'scale_factor': 0.0, 'yaw_mounting_angle': 4e-3, 'shared': True},
+         'quantisation': {'scale_factor': 1e-9, 'yaw_mounting_angle': 0.0, 'shared': False}}
 
 
 @pytest.mark.parametrize(('others', 'percent'), [(9e-6, 58), (11e-6, 48)])
@@ -43,16 +46,18 @@ def test_digits_stop_where_the_sigma_begins(value, sigma, text):
     assert with_sigma(value, sigma) == text
 
 
-def test_signs_and_units_are_the_callers(good):
+def test_figures_have_the_digits_signs_and_units_asked_for():
     assert with_sigma(0.0174533, 5e-5, math.degrees(1), signed=True) == '+1.0000 ± 0.0029'
     assert with_sigma(-0.0174533, None, math.degrees(1), signed=True) == '-1'
-
-
-def test_lengths_and_times():
     assert [length(x) for x in (11200.3, 1004.2, 12.345, 0.09, 0.0, math.nan)] == [
         '11.20 km', '1004 m', '12.35 m', '90 mm', '0 m', 'unknown']
     assert [time_span(t) for t in (59.96, 600.0, 3600.0, 7325.0)] == [
         '60.0 s', '10 min 00 s', '1 h 00 min', '2 h 02 min']
+    assert with_sigma(-32050.0, 15191.0) == '-32000 ± 15000'
+    assert with_sigma(1234.5, 560.0) == '1230 ± 560'
+    assert beyond_one(0.968, 0.0152) == '-3.2 ± 1.5 %'
+    assert beyond_one(1.065044, 78e-6) == '+65044 ± 78 ppm'
+    assert beyond_one(1.1, None) == '+100000 ppm'
 
 
 def test_the_screen_says_it_all_in_few_lines(good):
@@ -150,14 +155,6 @@ def test_the_coordinates_of_a_lever_arm_share_a_line(good):
         '  odometer at x, z    -0.0058 ± 0.0031, +0.250 ± 0.060 m']
 
 
-def test_large_sigmas_have_two_digits_and_per_cent():
-    assert with_sigma(-32050.0, 15191.0) == '-32000 ± 15000'
-    assert with_sigma(1234.5, 560.0) == '1230 ± 560'
-    assert beyond_one(0.968, 0.0152) == '-3.2 ± 1.5 %'
-    assert beyond_one(1.065044, 78e-6) == '+65044 ± 78 ppm'
-    assert beyond_one(1.1, None) == '+100000 ppm'
-
-
 def whole(good):
     """Return a calibration with all that a screen can show, and many reasons."""
     found = good.methods['two_point']
@@ -223,3 +220,34 @@ def test_the_plain_ratio_of_path_lengths_stands_beside_the_scale(good):
     line = next(x for x in screen(replace(good, legs=legs)).splitlines() if 'path ratio' in x)
     assert line.split()[2:4] == ['0.05070', 'm/pulse']
     assert line.endswith('fixes / odometer, +1.4 % from the scale factor')
+
+
+def test_the_ratio_of_a_truncated_speed_is_beside_the_factor_of_what_is_sent(good):
+    """The path over whole km/h is 0.9947: the factor as sent, 0.8 % above the exact speed's."""
+    estimates = {'scale_factor': Estimate(0.9867, 3e-4, '1'),
+                 'scale_factor_as_sent': Estimate(0.9947, 3e-4, '1')}
+    text = screen(replace(good, estimates=good.estimates | estimates,
+                          legs=(replace(good.legs[0], path_ratio=0.9947, distance=1000.0),)))
+    line = next(x for x in text.splitlines() if 'path ratio' in x)
+    assert line.endswith('0.9947   fixes / odometer, +0.0 % from the factor as sent')
+
+
+def test_each_source_has_its_size_and_share_in_the_units_people_use():
+    head, fix, heading, small = budget_lines(TABLE, 0.02, 0.01)
+    assert head.split() == ['error', 'budget', 'scale,', 'ppm', 'yaw,', 'deg', 'pitch,', 'deg']
+    # 4e-5 of 0.02 is 2000 ppm; 3e-3 rad is 0.17 deg and 9 of 25 parts of the variance
+    assert fix.split() == ['fix', 'end', '2000', '100%', '0.17', '36%', '-']
+    assert heading.split() == ['initial', 'heading', '-', '0.23', '64%', '-', 'shared', 'by',
+                               'all', 'legs']
+    assert small.split() == ['under', '1', '%:', 'quantisation']
+
+
+def test_what_is_not_determined_shows_no_figure():
+    lines = budget_lines(TABLE, 0.02, 0.01, {'yaw_mounting_angle'})
+    assert '0.17' not in ''.join(lines)
+    assert 'initial heading' in lines[-1]
+
+
+@pytest.mark.parametrize('table', [{}, None])
+def test_without_a_budget_there_are_no_lines(table):
+    assert budget_lines(table, 1.0, 0.01) == []

@@ -71,8 +71,13 @@ def test_a_drive_given_twice_is_not_used_and_its_data_do_not_count(good):
     assert '\n  leg 1: drive; leg 2: copy\n' in text
 
 
-def test_one_bag_is_not_named_on_every_leg(good):
+def test_one_bag_is_not_named_and_long_names_keep_the_width(good):
     assert 'drive' not in screen(good)
+    names = ['rosbag2_of_a_very_long_drive_2026_11_22-02_11', 'rosbag2_of_a_long_drive_2026_11_23']
+    text = screen(replace(good, legs=tuple(later(good.legs[0], k, bag=names[k % 2])
+                                           for k in range(3))))
+    assert max(map(len, text.splitlines())) <= 98
+    assert f'legs 1 and 3: {names[0]}; leg 2:' in text
 
 
 def test_what_several_legs_share_is_said_once():
@@ -82,11 +87,3 @@ def test_what_several_legs_share_is_said_once():
     assert [(r.code, r.text) for r in shared(tuple(Reason(*one) for one in said))] == [
         (slip, 'legs 1, 3 and 4: it spun'), (slip, 'leg 2: it slid'), (slip, 'it spun'),
         (dead, 'leg 2: it spun')]
-
-
-def test_long_names_of_bags_keep_the_width(good):
-    names = ['rosbag2_of_a_very_long_drive_2026_11_22-02_11', 'rosbag2_of_a_long_drive_2026_11_23']
-    text = screen(replace(good, legs=tuple(later(good.legs[0], k, bag=names[k % 2])
-                                           for k in range(3))))
-    assert max(map(len, text.splitlines())) <= 98
-    assert f'legs 1 and 3: {names[0]}; leg 2:' in text

@@ -34,13 +34,11 @@ def later(calibration, **estimates):
     return replace(calibration, legs=legs, estimates=calibration.estimates | estimates)
 
 
-def test_a_rejected_one_is_worse_than_any_good_one(why, good, rejected):
+def test_a_rejected_one_is_worse_than_a_good_one_and_anything_may_replace_it(
+        why, good, rejected, nothing):
     assert why(good, later(rejected)).startswith('the new result is rejected (')
     assert 'GYRO_SIGN' in why(good, later(rejected))
     assert why(good, rejected)        # of the same drive too
-
-
-def test_anything_may_replace_a_rejected_one(why, good, rejected, nothing):
     assert why(rejected, good) == why(rejected, nothing) == why(nothing, rejected) == ''
 
 
@@ -53,11 +51,12 @@ def test_a_sigma_twice_as_large_is_worse(why, good, name, factor, worse):
     assert not worse or f'{name.replace("_", " ")} is 2.1 times larger' in said
 
 
-def test_a_value_lost_is_worse_and_one_gained_is_not(why, good):
+def test_a_value_lost_is_worse_and_one_gained_or_of_another_unit_is_not(why, good):
     lost = later(good, yaw_mounting_angle=Estimate(None, None, 'rad'))
     assert why(good, lost) == ('the new result has no yaw mounting angle, the old one has '
                                '-1.0000 ± 0.0029 deg')
     assert why(lost, later(later(good))) == ''
+    assert why(good, later(good, scale_factor=Estimate(0.3, 1.0, 'm/rad'))) == ''
 
 
 def test_more_legs_know_better_even_with_a_larger_sigma(why, good):
@@ -66,10 +65,6 @@ def test_more_legs_know_better_even_with_a_larger_sigma(why, good):
     assert why(good, both) == ''
     assert why(good, wider) != ''
     assert why(good, replace(wider, legs=good.legs)) != ''      # the same legs, other settings
-
-
-def test_another_unit_says_nothing(why, good):
-    assert why(good, later(good, scale_factor=Estimate(0.3, 1.0, 'm/rad'))) == ''
 
 
 def test_what_cannot_be_read_is_no_loss(why, good, tmp_path):

@@ -18,7 +18,7 @@ from odocal_ros.output import ros_files
 from odocal_ros.output.files import as_json
 from odocal_ros.output.ros_files import framed
 from odocal_ros.output.tables import leg_table, LEGS
-from odocal_ros.outside import names as outside
+from odocal_ros.outside import names as outside, whole
 from odocal_ros.outside.yaml_files import parameters, value_text
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
@@ -166,3 +166,11 @@ def test_colours_of_others_are_shown_and_no_line_is_longer_than_a_screen():
         assert len(outside.brief_line(text)) <= outside.LONGEST_LINE + 4
         assert len(outside.said_by(ValueError(text))) <= outside.LONGEST_LINE + 4
     assert outside.brief_line('a\x1b]52;c;eA==\x07b') == r'a\x1b]52;c;eA==\x07b'
+
+
+def test_folders_of_one_name_are_numbered_up_to_a_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr(whole, 'MOST_SAME_NAME', 3)
+    made = [whole.new_folder(tmp_path / 'root', 'leg').name for _ in range(3)]
+    assert made == ['leg', 'leg-2', 'leg-3']
+    with pytest.raises(OSError, match='holds 3 folders named leg'):
+        whole.new_folder(tmp_path / 'root', 'leg')

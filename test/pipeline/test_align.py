@@ -277,14 +277,11 @@ def test_orientation_is_of_the_imu_frame_not_of_the_body():
     assert_allclose(case.miss(a), 0, atol=1e-6)
 
 
-def test_yaw_means_go_over_the_seam_at_pi(plain):
+def test_means_of_headings_go_over_the_seam_and_have_their_offset(plain):
     case = asked(plain, alignment__heading_source='heading_topic')
     t = np.linspace(-30, -10, 200)
     a, _ = case.align(**heading_rows(np.pi + 0.01 * (-1.0)**np.arange(200), 1e-4, t))
     assert abs(yaw_of(a)) == pytest.approx(np.pi, abs=PLACE)
-
-
-def test_heading_topic_with_its_offset(plain):
     case = asked(plain, alignment__heading_source='heading_topic', alignment__heading_offset=0.3)
     a, _ = case.align(**heading_rows(1.0, 4e-6, np.linspace(-50, 50, 1001)))
     assert yaw_of(a) == pytest.approx(1.3, abs=PLACE)
@@ -292,15 +289,12 @@ def test_heading_topic_with_its_offset(plain):
     assert a.heading_sigma == pytest.approx(2e-3)
 
 
-def test_in_motion_the_nearest_heading_that_says_something_is_taken(plain):
+def test_in_motion_the_nearest_heading_is_taken_and_none_of_long_ago(plain):
     case = asked(plain, alignment__heading_source='heading_topic')
     rows = heading_rows(np.array([9.0, 1.0, 2.0, 9.0]), np.array([np.nan, 1e-4, 1e-4, 1e-4]),
                         np.array([0.0, 0.1, 0.3, 0.6]))
     a, _ = case.align(spans=np.empty((0, 2)), **rows)
     assert yaw_of(a) == pytest.approx(1.0, abs=PLACE)
-
-
-def test_in_motion_a_heading_of_long_ago_is_none(plain):
     case = asked(plain, alignment__heading_source='heading_topic')
     a, reasons = case.align(spans=np.empty((0, 2)),
                             **heading_rows(1.0, 1e-4, np.array([-0.6, 0.6])))

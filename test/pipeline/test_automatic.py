@@ -78,14 +78,11 @@ def test_legs_end_at_standstills_else_by_time(form, only_counts):
     assert np.array(found) == pytest.approx(np.array(expected), abs=0.15)
 
 
-def test_a_long_stop_ends_a_leg_of_any_length_and_a_short_one_none():
+def test_a_long_stop_ends_a_leg_and_a_stop_too_short_to_rest_where_it_drives_off():
     parked = [(30, 0), (60, 10), (PARKED + 5, 0), (400, 10)]
     assert legs(sent(parked))[0] == pytest.approx((30 - BEFORE, 90 + REST), abs=0.15)
     light = [(30, 0), (60, 10), (PARKED - 5, 0), (400, 10)]
     assert legs(sent(light))[0] == pytest.approx((30 - BEFORE, 330 - BEFORE), abs=0.15)
-
-
-def test_a_stop_too_short_to_rest_ends_a_leg_where_it_drives_off():
     found = legs(sent([(30, 0), (200, 10), (6, 0), (200, 10)]))
     assert found == [pytest.approx((30 - BEFORE, 236 - BEFORE), abs=0.15),
                      pytest.approx((236 - BEFORE, 0), abs=0.15)]

@@ -49,22 +49,19 @@ def test_late_and_early_fixes_are_said(late):
     assert said(made, 'smoother', gnss__time_offset=offset) is None
 
 
-def test_a_late_odometer_is_said():
+def test_a_late_odometer_is_said_and_of_no_delay_nothing():
     made = drive(**ROUTE, odometer_delay=0.04, fix_noise='rtk')
     what, size, sigma, name, offset = said(made, 'smoother')
     assert (what, name) == ('odometer', 'odometer')
     assert abs(size - 0.04) < 4 * sigma + 0.04 * (sigma / 0.01)**2 + 0.001
     assert said(made, 'smoother', odometer__time_offset=offset) is None
+    assert said(drive(**ROUTE), 'smoother') is None
 
 
 def test_what_is_set_already_is_counted_in():
     made = drive(**ROUTE, fix_delay=0.12)
     *_, offset = said(made, 'smoother', gnss__time_offset=0.05)
     assert said(made, 'smoother', gnss__time_offset=offset) is None
-
-
-def test_of_no_delay_nothing_is_said():
-    assert said(drive(**ROUTE), 'smoother') is None
 
 
 @pytest.mark.parametrize(('late', 'sigma', 'fix_sigma', 'is_said'), [
@@ -76,7 +73,7 @@ def test_of_no_delay_nothing_is_said():
 def test_it_must_be_there_and_matter(late, sigma, fix_sigma, is_said):
     t = np.arange(0.0, 60.0, 0.1)
     run = SimpleNamespace(config=Config(), fix_sigma=fix_sigma, inputs=SimpleNamespace(
-        travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0))       # 10 m/s
+        travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0, aligned={}))       # 10 m/s
     assert bool(delay_notes(run, {'gnss': (late, sigma)}, scale=0.5)) == is_said
 
 

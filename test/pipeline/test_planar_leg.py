@@ -10,6 +10,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+from drives import cached
 import foreign_keys
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ TEST = ROOT / 'test'
 SIGMAS = 3.5      # one of the values below in 2000 is beyond it
 
 
+@cached
 def driven(drive='differential', **more):
     """Return a simulated robot without an IMU, and its settings."""
     options = {'scenario': 'indoor', 'reference': 'mocap', 'fix_rate': 10.0, 'odometer': 'angle',
@@ -44,7 +46,6 @@ def driven(drive='differential', **more):
 @pytest.mark.parametrize(('drive', 'wheels'), [
     ('differential', 2), ('skid', 2), ('skid', 4), ('mecanum', 4), ('omni', 3), ('omni', 4)])
 def test_values_are_within_their_sigmas(drive, wheels):
-    """Each kind of robot, without an IMU: all values, none far off, none a caution."""
     made, config = driven(drive, wheels=wheels)
     found = calibrate(made.leg(), config)
     assert found.verdict is Verdict.ACCEPTED, found.reasons
@@ -75,7 +76,6 @@ def test_skid_steering_with_an_imu_has_a_gyro_scale():
 
 
 def test_swapped_wheels_are_rejected():
-    """Left and right are swapped: the path is that of a mirror."""
     made, config = driven()
     leg = made.leg()
     leg = replace(leg, odometer=leg.odometer_right, odometer_right=leg.odometer)
@@ -98,7 +98,6 @@ def test_a_run_without_turns_has_a_scale_and_no_width():
 
 
 def test_one_wheel_without_an_imu_is_refused_as_before():
-    """A single counter has no heading."""
     made, config = driven()
     leg = made.leg()
     found = calibrate(replace(leg, odometer_right=type(leg.odometer)(
@@ -109,7 +108,6 @@ def test_one_wheel_without_an_imu_is_refused_as_before():
 
 
 def test_mecanum_with_two_wheels_says_what_is_required():
-    """Two wheels cannot move sideways."""
     made, config = driven()
     found = calibrate(made.leg(), with_settings(config, {'odometer.drive': 'mecanum'}))
     assert found.verdict is Verdict.REJECTED
@@ -117,7 +115,6 @@ def test_mecanum_with_two_wheels_says_what_is_required():
 
 
 def test_wheels_of_another_run_are_rejected():
-    """Positions of one run, wheels of another: no fit, no exception."""
     made, config = driven()
     other, _ = driven(seed=5)
     leg = replace(made.leg(), odometer=other.leg().odometer,
@@ -131,7 +128,7 @@ def test_wheels_of_another_run_are_rejected():
 def test_controllers_of_each_drive():
     """Skid steering: width of diff_drive_controller; mecanum: radius and lever of its own."""
     made, config = driven('mecanum')
-    text = _controllers(made, config)
+    text = _controllers(_calibrated(made, config), config)
     assert 'mecanum_drive_controller:' in text
     own = yaml.safe_load(text)['mecanum_drive_controller']['ros__parameters']['kinematics']
     assert set(own) == foreign_keys.MECANUM_KINEMATICS
@@ -139,27 +136,31 @@ def test_controllers_of_each_drive():
     assert own['sum_of_robot_center_projection_on_X_Y_axis'] == pytest.approx(0.3, rel=1e-2)
     assert 'diff_drive' not in text
     made, config = driven('omni')
-    own = yaml.safe_load(_controllers(made, with_settings(config, {'odometer.wheel_offset': 0.0})))
+    config = with_settings(config, {'odometer.wheel_offset': 0.0})
+    own = yaml.safe_load(_controllers(_calibrated(made, config), config))
     own = own['omni_wheel_drive_controller']['ros__parameters']
     assert set(own) == foreign_keys.OMNI_WHEEL_DRIVE
     assert own['wheel_radius'] == pytest.approx(made.truth.scale, rel=2e-3)
     assert own['robot_radius'] == pytest.approx(0.15, rel=1e-2)
     made, config = driven('skid')
-    assert 'wheel_separation_multiplier: 1.7' in _controllers(made, config)
-    text = _controllers(made, with_settings(config, {'odometer.track_width': 0.0}))
+    calibration = _calibrated(made, config)
+    assert 'wheel_separation_multiplier: 1.7' in _controllers(calibration, config)
+    text = _controllers(calibration, with_settings(config, {'odometer.track_width': 0.0}))
     assert 'wheel_separation: 0.51' in text
     assert 'ackermann' not in text
 
 
-def _controllers(made, config):
-    calibration = combine([calibrate(made.leg(), config)], config)
+def _calibrated(made, config):
+    return combine([calibrate(made.leg(), config)], config)
+
+
+def _controllers(calibration, config):
     files = controllers(calibration, config, {'software': 'odocal', 'created': 'now',
                                               'inputs': [], 'verdict': 'accepted'})
     return files['ros2_controllers.yaml']
 
 
 def test_two_legs_are_combined():
-    """Two runs of a robot: the combination has a smaller sigma than each."""
     legs = [driven(seed=seed, start_ns=1_750_000_000_000_000_000 + seed * 10**12)
             for seed in (6, 7)]
     config = legs[0][1]

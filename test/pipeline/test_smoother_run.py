@@ -33,12 +33,16 @@ def held(made):
     return calibrate(made.leg(), settings(made, **ASKED), holdout=True)
 
 
-def test_scale_yaw_and_pitch_come_without_a_heading(made, held):
+def test_the_result_is_its_own_without_a_heading_and_a_standstill(made, held):
     found = held.methods['smoother'].estimates
     for name, true in (('scale_factor', made.truth.scale), ('yaw_mounting_angle', made.truth.yaw),
                        ('pitch_mounting_angle', made.truth.pitch)):
         assert abs(found[name].value - true) < SIGMAS * found[name].sigma, name
     assert held.methods['two_point'].estimates['yaw_mounting_angle'].value is None
+    whole = combine([held], settings(made, **ASKED))
+    assert whole.estimates['yaw_mounting_angle'].method == 'smoother'
+    assert whole.verdict is Verdict.ACCEPTED
+    assert 'NO_STANDSTILL' not in {r.code.name for r in whole.reasons}
 
 
 def test_fixes_without_altitude_give_all_three(made):
@@ -81,13 +85,6 @@ def test_the_fifth_held_back_is_met_by_dead_reckoning_with_the_values_found(made
     whole = calibrate(made.leg(), settings(made, **ASKED))
     assert whole.methods['smoother'].estimates['scale_factor'].value \
         != held.methods['smoother'].estimates['scale_factor'].value
-
-
-def test_the_result_is_its_own_and_a_missing_standstill_is_no_matter(made, held):
-    whole = combine([held], settings(made, **ASKED))
-    assert whole.estimates['yaw_mounting_angle'].method == 'smoother'
-    assert whole.verdict is Verdict.ACCEPTED
-    assert 'NO_STANDSTILL' not in {r.code.name for r in whole.reasons}
 
 
 def test_auto_takes_it_and_computes_two_point_beside_it(made):

@@ -52,10 +52,13 @@ def test_the_mean_of_both_wheels_is_the_scale_factor(result):
     assert of_scale <= min(of_wheels) <= max(of_wheels) < 1.1 * of_scale
 
 
-def test_the_result_is_that_of_the_smoother_and_names_it(made, result):
+def test_the_result_is_that_of_the_smoother_and_brings_the_track_to_the_fixes(made, result):
     whole = combine([result], settings(made))
     assert {whole.estimates[name].method for name in WHEELS} == {'smoother'}
     assert set(whole.methods) == {'two_point', 'smoother'}
+    assert result.before.rms > 20.0
+    assert result.after.rms < 2 * np.sqrt(2) * made.options.fix_sigma
+    assert result.after.mean < result.after.rms < result.after.max
 
 
 def test_wheels_is_another_word_for_the_smoother(made, result):
@@ -86,13 +89,6 @@ def test_a_leg_that_is_refused_lists_both_wheels_as_unknown(made):
     few = replace(leg, fix=take(leg.fix, inside[::200]))        # one in 40 s: 7 of 10 wanted
     found = calibrate(few, settings(made)).methods['smoother'].estimates
     assert all(found[name].value is None for name in (*WHEELS, 'track_width'))
-
-
-def test_corrected_factors_bring_the_track_to_the_fixes(made, result):
-    """Before: 6 % of scale and a degree off; after: what white fixes of 1.5 m leave."""
-    assert result.before.rms > 20.0
-    assert result.after.rms < 2 * np.sqrt(2) * made.options.fix_sigma
-    assert result.after.mean < result.after.rms < result.after.max
 
 
 def test_a_gyro_that_turns_too_far_bends_no_corrected_track():

@@ -119,6 +119,12 @@ def test_arrival_jitter_is_measured(made, lost):
     assert late_rows.arrival_jitter(t[:10]) is None
 
 
+def test_rows_of_one_stamp_have_an_arrival_jitter():
+    """Of most windows of rows the mean interval is zero."""
+    t = np.append(np.zeros(3000), np.arange(1, 301) / 10)
+    assert 0.0 < late_rows.arrival_jitter(t) < 30.0
+
+
 def test_arrival_jitter_is_no_slip(made, straight):
     """A jitter of 20 ms at 12 m/s is 0.24 m; the rest is as without it, a slip of 0.5 m too."""
     method, said = of_smoother(made, arrivals(made.odometer, 0.02))

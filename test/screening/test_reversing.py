@@ -115,15 +115,12 @@ def starts(speeds, nose=None, noise=0.0):
         np.stack([f, zero, 9.81 * np.cos(theta)], -1)
 
 
-def test_a_nose_that_dips_off_a_kerb_is_no_reversing():
+def test_a_nose_that_dips_and_starts_too_gentle_are_no_reversing():
     # gravity by the dip takes away twice what the speed adds to the specific force
     made_ = starts([8.0, 1.0, 8.0], [0.0, -2.0, 0.0])
     assert not len(reversed_starts(*made_, (0.0, 50.0)))
     travel, t, w_b, f_b = made_
     assert len(reversed_starts(travel, t, 0 * w_b, f_b, (0.0, 50.0)))    # but for the gyro
-
-
-def test_starts_too_gentle_for_a_rough_road_are_not_judged():
     # 0.06 m/s^2 in 2 m/s^2 of white noise at 50 Hz: half of 60 would go the wrong way by chance
     made_ = starts([12.0] + [0.2] * 60, noise=2.0)
     assert not len(reversed_starts(*made_, (0.0, 1000.0)))

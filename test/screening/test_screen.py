@@ -114,17 +114,20 @@ def test_stamps_in_disorder_are_no_clock_that_was_set(leg, rows):
     assert Code.CLOCK_SET not in said(replace(leg, imu=mixed))[1]
 
 
-def test_rows_without_a_stamp_are_no_clock_that_was_set(leg):
+def test_rows_without_a_stamp_or_out_of_order_are_no_clock_that_was_set(leg):
     imu = changed(leg.imu, stamp_ns=lambda a: a.__setitem__(slice(3000, 3200), 0))
     assert Code.CLOCK_SET not in said(replace(leg, imu=imu))[1]
-
-
-def test_rows_out_of_order_are_no_clock_that_was_set(leg):
     order = np.arange(len(leg.imu.stamp_ns))
     order[3000:3200] = np.random.default_rng(1).permutation(order[3000:3200])
     inputs, codes, _ = said(replace(leg, imu=take(leg.imu, order)))
     assert set(codes) == {Code.STAMPS_NOT_RISING}
     assert (np.diff(inputs.t_imu) > 0).all()
+
+
+def test_the_clock_of_the_recorder_is_not_that_of_the_sender(leg):
+    lost = take(leg.imu, np.arange(len(leg.imu.stamp_ns)) != 4000)
+    set_by = changed(lost, received_ns=lambda a: a.__setitem__(slice(4000), a[:4000] - 10**18))
+    assert Code.CLOCK_SET not in said(replace(leg, imu=set_by))[1]
 
 
 @pytest.mark.parametrize('late_s', [0.05, 0.3])

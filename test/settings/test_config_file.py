@@ -42,28 +42,24 @@ def test_blocks_of_other_nodes_are_named_not_taken(write, key):
         read_config_file(path)
 
 
-def test_later_blocks_win_and_a_key_that_comes_again_keeps_its_place(write):
+def test_later_blocks_win_and_namespaces_may_be_nested(write):
     part = '  ros__parameters:\n    leg.min_distance: '
     one = write(f'calibrator:\n{part}1.0\n/**:\n{part}2.0\n')
     assert read_config_file(one) == {'leg.min_distance': 2.0}
     again = write(f'/**:\n{part}2.0\ncalibrator:\n{part}1.0\n/**:\n{part}5.0\n')
     assert read_config_file(again) == {'leg.min_distance': 1.0}
+    path = write('/**:\n  calibrator:\n    ros__parameters:\n      leg.min_distance: 5.0\n')
+    assert read_config_file(path) == {'leg.min_distance': 5.0}
 
 
-def test_nested_and_dotted_names_mix(write):
+def test_nested_names_whole_numbers_and_what_a_node_dumps_are_read(write):
     values = read_config_file(write(
         BLOCK + '    leg: {min_distance: 50.0}\n    leg.min_speed: 1.0\n    method: all\n'
         '    gnss:\n      lever_arm: [1, 0, 0.5]\n'))
     assert values == {'leg.min_distance': 50.0, 'leg.min_speed': 1.0, 'method': 'all',
                       'gnss.lever_arm': (1.0, 0.0, 0.5)}
-
-
-def test_whole_numbers_become_doubles_where_the_setting_is_one(write):
     values = read_config_file(write(BLOCK + '    leg.min_distance: 50\n'))
     assert type(values['leg.min_distance']) is float
-
-
-def test_what_the_node_itself_leaves_in_a_dump_is_passed_over(write):
     values = read_config_file(write(
         BLOCK + '    use_sim_time: true\n    result: {scale_factor: .nan, valid: false}\n'
         '    qos_overrides:\n      /imu/data:\n        subscription: {depth: 10}\n'
@@ -197,11 +193,6 @@ def test_blocks_count_as_they_do_for_a_node(write, keys):
     by_ros = read_by_ros(path)
     assert {k: repr(v) for k, v in read_config_file(path).items()} == {
         k: by_ros[k] for k in ('leg.min_distance', 'leg.max_gap')}
-
-
-def test_namespaces_may_be_nested(write):
-    path = write('/**:\n  calibrator:\n    ros__parameters:\n      leg.min_distance: 5.0\n')
-    assert read_config_file(path) == {'leg.min_distance': 5.0}
 
 
 def test_plain_values_are_typed_as_ros_types_them(write):

@@ -4,6 +4,7 @@
 """Drawn vehicles: each effect alone is the one in the whole, and every draw can be driven."""
 
 from dataclasses import asdict
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -51,8 +52,7 @@ def test_a_rare_effect_is_drawn_where_it_is_named_only(name):
     assert name not in drawn(7, 'town', 'industrial')[1]
 
 
-@pytest.mark.parametrize('kind', KINDS)
-@pytest.mark.parametrize('grade', GRADES)
+@pytest.mark.parametrize(('kind', 'grade'), zip(KINDS, cycle(GRADES)))
 def test_a_drawn_vehicle_can_be_driven(kind, grade):
     duration = 320.0 if kind == 'out_and_back' else 260.0
     options, there = drawn(11, kind, grade, duration=duration, imu_rate=20.0)

@@ -25,14 +25,11 @@ from odocal_ros.sim.profile import chain, hold, ramp, smooth, turn
 pytestmark = pytest.mark.core
 
 
-def test_a_ramp_gains_its_speed_and_covers_half_the_way():
+def test_ramps_and_turns_have_their_speed_path_and_angle():
     speed = chain(hold(3) + ramp(10, 12, 1.0) + hold(5)).integral()
     # symmetric about its middle: mean speed 6 m/s over 10 s, then 12 m/s for 5 s
     assert speed([0, 3, 8, 13, 18, 99]) == pytest.approx([0, 0, 6, 12, 12, 12], abs=1e-13)
     assert speed.integral()(18.0) == pytest.approx(6 * 10 + 12 * 5, abs=1e-12)
-
-
-def test_a_turn_turns_by_its_angle_whatever_its_flanks():
     for blend in (0.5, 2.0, 4.0):
         assert chain(turn(8, 1.3, blend)).integral()(8.0) == pytest.approx(1.3, abs=1e-14)
 

@@ -46,7 +46,6 @@ def test_skid_wheels_turn_by_the_effective_width_on_the_spot():
 
 
 def test_mecanum_wheels_obey_their_kinematics():
-    """The sums of the four wheels are forward motion, sideways motion and turn."""
     made = robot(drive='mecanum')
     state, rolled = paths(made)
     fl, fr, rl, rr = (rolled[f'{a}_{b}'] for a in ('front', 'rear') for b in ('left', 'right'))
@@ -72,7 +71,6 @@ def test_omni_wheels_obey_their_kinematics(count):
 
 
 def test_positions_of_a_mecanum_robot_move_sideways():
-    """The path of the reference has the sideways moves."""
     made = robot(drive='mecanum', reference='mocap')
     path = np.linalg.norm(np.diff(made.positions()[:, :2][::10], axis=0), axis=1).sum()
     assert path > 1.2 * made.truth.distance

@@ -16,9 +16,9 @@ class Rows:
     """
     Residual rows of one noise level: r = value + here dx_k + ahead dx_(k+1) + constant dc.
 
-    node : (n,) node k of each group of rows.   value : (n, q).   here, ahead : (n, q, s) by the
-    states of nodes k and k + 1.   constant : (n, q, m).   weight : (n, q), one over the variance
-    at level 1.
+    node : (n,) node k of each group of rows.   value : (n, q).   here, ahead : (n, q, s)
+    derivatives by the states of nodes k and k + 1.   constant : (n, q, m) by the constants.
+    weight : (n, q), one over the variance at level 1.
     """
 
     node: Ints
@@ -39,7 +39,7 @@ class Rows:
 
 
 class Equations:
-    """The information that rows of one level give, at level 1: blocks, border and gradient."""
+    """Normal equations of the rows of one noise level, at level 1: blocks, border, gradient."""
 
     def __init__(self, rows: Rows, nodes: int) -> None:
         A, B, C, w, k = rows.here, rows.ahead, rows.constant, rows.weight, rows.node
@@ -49,7 +49,7 @@ class Equations:
             out: Floats = np.swapaxes(X * w[:, :, None], 1, 2) @ Y
             return out
         v = rows.value[:, :, None]
-        # a row of the last node has zeros ahead, for a node that is cut off; no node comes twice
+        # rows of the last node have zeros ahead, for an extra node, removed below; nodes differ
         self.diagonal, self.off = np.zeros((2, nodes + 1, s, s))
         self.border, self.gradient = np.zeros((nodes + 1, s, m)), np.zeros((nodes + 1, s))
         for at, X in ((k, A), (k + 1, B)):
@@ -84,13 +84,13 @@ class Solved:
 
     @property
     def covariance(self) -> Floats:
-        """Return that of the constants: (m, m)."""
+        """Return the covariance of the constants: (m, m)."""
         out: Floats = cho_solve(self._root, np.eye(len(self.constants)))
         return (out + out.T) / 2
 
     def log_determinant(self) -> float:
-        """Return that of all equations."""
-        # a copy: the last bits of logarithms of a row with gaps depend on its place in memory
+        """Return the log determinant of all equations."""
+        # a copy: the last bits of logarithms of a strided array depend on its place in memory
         own = np.log(self._band[-1].copy()).sum()
         return float(2 * (own + np.log(np.diag(self._root[0])).sum()))
 

@@ -10,14 +10,14 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.settings.config import MECANUM, OMNI, SKID
 
-# definition: rows of wheels, metres rolled for a metre forward, a metre to the left, and a turn in
-# which a wheel at the lever (half the track width; of mecanum half the wheelbase more) moves by a
+# definition: rows of wheels, metres rolled per metre forward, per metre left, and per turn that
+# moves a wheel at the lever (half the track width; for mecanum plus half the wheelbase) by a
 # metre
 SIDE_ROWS = np.array([[1.0, 0.0, -1.0], [1.0, 0.0, 1.0]])
 # definition: front left, front right, rear left, rear right
 MECANUM_ROWS = np.array([[1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
-# relative, 1 sigma, of the wheels of a robot that moves sideways. Judgement: without it the scale
-# of a run of 7 m with few turns was 1.9 % off (sigma 1.9 %), now 0.04 % (0.08 %)
+# relative, 1 sigma, of wheel differences if a robot moves sideways. Judgement: without it scale of
+# a run of 7 m with few turns was 1.9 % off (sigma 1.9 %), now 0.04 % (0.08 %)
 UNEQUAL = 0.03
 
 
@@ -26,8 +26,8 @@ def rows_of(kind: str, count: int, offset: float = 0.0) -> Floats:
     Return the rows of the wheels of a drive: (w, 3).
 
     kind : as odometer.drive.   count : of omni wheels, counter-clockwise.   offset : rad from the
-    x axis to the first, as omni_wheel_drive_controller has it: a wheel rolls clockwise, seen from
-    above, about the middle.
+    x axis to the first, as in omni_wheel_drive_controller: positive wheel motion is clockwise
+    about the middle, seen from above.
     """
     if kind == MECANUM:
         return MECANUM_ROWS
@@ -42,8 +42,8 @@ class Wheels:
     """
     Increments of w wheels in n intervals.
 
-    count : (n, w), scale units; of differential and skid the means of the left and of the right
-    wheels.   rows : (w, 3) of ``rows_of``, whose columns are orthogonal.   kind : as
+    count : (n, w), scale units; for differential and skid drives the means of the left and of
+    the right wheels.   rows : (w, 3) of ``rows_of``, whose columns are orthogonal.   kind : as
     odometer.drive.
     """
 
@@ -53,7 +53,7 @@ class Wheels:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the constants in the order of ``increments``."""
+        """Return the names of the constants in the order of ``increments``."""
         wheels = self.count.shape[1]
         scales = ('left', 'right') if wheels == len(SIDE_ROWS) else tuple(
             f'wheel_{k}' for k in range(1, wheels + 1))
@@ -61,20 +61,20 @@ class Wheels:
 
     @property
     def table(self) -> Floats:
-        """Return forward, left, and width times turn by a metre of each wheel: (3, w)."""
+        """Return forward, left, and width times turn per metre of each wheel: (3, w)."""
         shares: Floats = self.rows / np.maximum((self.rows**2).sum(0), 1e-12)
         out: Floats = (shares * np.array([1.0, 1.0, 2.0])).T
         return out
 
     def body(self, metres: Floats) -> Floats:
-        """Return forward, left, and width times turn of metres of the wheels, (n, w): (n, 3)."""
+        """Return forward, left, and width times turn by metres of the wheels, (n, w): (n, 3)."""
         # not by BLAS: its last bits depend on the number of rows
         out: Floats = np.einsum('kw,iw->ki', metres, self.table)
         return out
 
     @property
     def path(self) -> Floats:
-        """Return the path of a wheel, mean of both sides, and to the side: (n,)."""
+        """Return the path of a wheel, mean of both sides, plus sideways motion: (n,)."""
         forward, side, apart = self.body(self.count).T
         path: Floats = np.maximum(np.abs(forward), np.abs(apart) / 2) + np.abs(side)
         return path
@@ -97,9 +97,9 @@ class Wheels:
         """
         Return forward, left and turn of each interval, (n, 3) m, m, rad, and derivatives by c.
 
-        c : (m,) scale of each wheel, one over the track width (twice the lever); of skid steering
-        the increase of the latter from the spot to a straight line; of mecanum wheels the motion
-        over the rolling sideways.
+        c : (m,) scale of each wheel, one over the track width (twice the lever); for skid steering
+        the increase of the latter from turns on the spot to a straight line; for mecanum wheels
+        the ratio of motion to rolling sideways.
         """
         w, table = self.count.shape[1], self.table
         scale, by, side = self._split(c)
@@ -116,14 +116,14 @@ class Wheels:
         return np.stack([forward, rolled * side, apart * by], -1), J
 
     def _split(self, c: Floats) -> tuple[Floats, Floats, float]:
-        """Return scales (w,), curvatures (n,), and motion over rolling sideways."""
+        """Return scales (w,), curvatures (n,), and the ratio of motion to rolling sideways."""
         w, n = self.count.shape[1], len(self.count)
         by = np.full(n, c[w]) + (c[w + 1] * self.straightness if self.kind == SKID else 0.0)
         return c[:w], by, float(c[w + 1]) if self.kind == MECANUM else 1.0
 
     def gains(self, c: Floats) -> tuple[Floats, Floats]:
         """
-        Return forward, left and turn of each interval by its wheels, (n, 3), and derivatives by c.
+        Return the gains from wheels to forward, left and turn, (n, 3), and derivatives by c.
 
         Slip is an error of the wheels: residuals of a body increment are divided by its gain, so
         that the noise of a wheel does not bias its factor (errors in variables).
@@ -142,8 +142,8 @@ class Wheels:
                         -1), J
 
     def prior(self, left: float, right: float, width: float) -> tuple[Floats, Floats]:
-        """Return first values (m,) and their covariance (m, m) by the first values of a run."""
-        wide = 0.35     # relative, judgement: no information for any run with a result
+        """Return prior values (m,) and covariance (m, m) from the first values of a run."""
+        wide = 0.35     # relative, judgement: too wide to affect any run with a result
         w, scale = self.count.shape[1], (left + right) / 2
         scales = [left, right] if w == len(SIDE_ROWS) else [scale] * w
         more = {SKID: [(0.0, 1 / width)], MECANUM: [(1.0, 1.0)]}.get(self.kind, [])

@@ -18,20 +18,20 @@ from odocal_ros.calib.planar.start import First, first_values
 from odocal_ros.data.arrays import Floats
 
 # first levels and medians of their hyperpriors, variances. Judgement: wheels slip by millimetres
-# in a metre, robots by less to the side; references: of the levels of a SLAM
+# in a metre, robots by less to the side; positions: noise and drift of a SLAM
 LEVELS = {'along': 2e-3**2, 'side': 1e-3**2, 'turn': 4e-3**2, 'spin': 4e-3**2, 'drift': 1e-2**2,
           'white': 1.0, 'gyro': 1.0}
 ESTIMATED = tuple(LEVELS)[:-1]       # the level of the gyro is its specification
-# of the logarithm of a variance, judgement
+# sigmas of the hyperpriors, of the logarithm of a variance, judgement
 WIDE, SPREAD = 3.0, dict.fromkeys(('along', 'turn', 'spin'), 1.0)
-# of Student's distribution of white errors and of the steps of correlated ones, for outliers and
-# loop closures. Judgement; 16 runs each, SLAM: without it, and a drift_length of 5 m, the rms of
-# error over sigma of the scale was 1.08, 1.39 and 1.63 (wheels, skid, mecanum), now 0.79, 0.98
-# and 1.12
+# degrees of freedom of Student's distribution of white errors and of steps of correlated ones,
+# for outliers and loop closures. Judgement; 16 runs each, SLAM: without it, and a drift_length of
+# 5 m, the rms of error over sigma of the scale was 1.08, 1.39 and 1.63 (wheels, skid, mecanum),
+# now 0.79, 0.98 and 1.12
 FREEDOM = 4.0
 # m/s, added to the speed of wheels, moving and at rest, for noise that grows with time. Judgement
 WITH_TIME, AT_REST = 0.1, 1e-3
-LEAST = 1e-4        # judgement: of a level, times its median: no sensor is without noise
+LEAST = 1e-4        # judgement: lowest level, over its median: no sensor is without noise
 MOST_PASSES = 80
 CONVERGED = 0.02    # sigmas of a constant, and of the logarithm of a level
 
@@ -40,7 +40,7 @@ def fit(run: Run, known: Known, passed: Callable[[int, float], None] = lambda *_
     """
     Return the estimate of a run.
 
-    passed : called with the passes made and the largest step of a constant, in sigmas.
+    passed : called after each pass with its number and the largest step of a constant, in sigmas.
     """
     at_first = first_values(run, known.width)
     scale = (at_first.left + at_first.right) / 2
@@ -77,8 +77,8 @@ def fit_at(run: Run, known: Known, state: Floats, c: Floats, theta: dict[str, fl
     """
     Return the fit at states (n + 1, 5) and constants (m,): covariance, without a step.
 
-    theta : level of each noise, variance.   first : scale, scale and curvature to which residuals
-    refer.   prior : (m, m) information.   student : weights, None: equal.
+    theta : level of each noise, variance.   first : (3,) gains of forward, left and turn to which
+    residuals refer.   prior : (m, m) information.   student : weights, None: equal.
     """
     # the information of Student's distribution is 3/4 of that of a normal one
     even = {'white': np.ones(len(run.node)), 'drift': np.ones(len(state))}
@@ -107,7 +107,7 @@ def priors(run: Run, known: Known, left: float, right: float, width: float,
 
 
 def _begin(run: Run, known: Known, at_first: First) -> tuple[Floats, Floats, Floats]:
-    """Return first states (n + 1, 5) and constants (m,), and the information of priors (m, m)."""
+    """Return first states (n + 1, 5) and constants (m,), and the prior information (m, m)."""
     state = np.zeros((len(run.t), 5))
     state[:, 0], state[:, 1] = (np.interp(run.t, run.t[run.node], axis)
                                 for axis in run.position.T)
@@ -116,7 +116,7 @@ def _begin(run: Run, known: Known, at_first: First) -> tuple[Floats, Floats, Flo
 
 
 def noise_path(run: Run, scale: float) -> Floats:
-    """Return the path of a wheel with which its noise grows in each interval: (n,) m."""
+    """Return the effective wheel path in each interval, by which its noise grows: (n,) m."""
     path: Floats = run.wheels.path * scale
     out: Floats = path + np.diff(run.t) * np.where(path > 0, WITH_TIME, AT_REST)
     return out
@@ -129,7 +129,7 @@ def _solved(parts: dict[str, Equations], theta: dict[str, float], prior: Floats,
 
 
 def _after(rows: Rows, solved: Solved) -> Floats:
-    """Return the residuals after a step, linear."""
+    """Return the linearised residuals after a step."""
     step = np.append(solved.step, np.zeros((1, solved.step.shape[1])), axis=0)
     out: Floats = (rows.value + (rows.here @ step[rows.node][:, :, None])[:, :, 0]
                    + (rows.ahead @ step[rows.node + 1][:, :, None])[:, :, 0]
@@ -177,7 +177,7 @@ def _rows(run: Run, known: Known, state: Floats, c: Floats, metres: Floats, firs
     for side in (here, ahead):
         side[:, 0, 2], side[:, 1, 2] = moved[:, 1] / 2, -moved[:, 0] / 2
     arc = np.stack([chord, chord, np.ones(n)], -1)
-    # residuals are metres of the wheels: over their gains, times those at the start
+    # residuals are metres of the wheels: divided by their gains, times the first gains
     gain, by_gain = run.wheels.gains(c[:m])
     unit = first / gain
     value = (np.column_stack([moved, turned]) - model * arc) * unit
@@ -186,7 +186,7 @@ def _rows(run: Run, known: Known, state: Floats, c: Floats, metres: Floats, firs
                            + by_gain * (value / gain)[:, :, None])
     here, ahead = here * unit[:, :, None], ahead * unit[:, :, None]
     weight = np.stack([1 / metres, 1 / metres, 1 / (metres * curvature**2)], -1)
-    # the heading has a level of its own where wheels roll less than they turn
+    # the turn has a level of its own in intervals with more turn than travel
     spins = run.wheels.spins
     rows = {name: Rows(k[of], value[of, i:i + 1], here[of, i:i + 1], ahead[of, i:i + 1],
                        constant[of, i:i + 1], weight[of, i:i + 1])

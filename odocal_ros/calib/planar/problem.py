@@ -17,8 +17,8 @@ class Run:
     A run on n + 1 nodes in time.
 
     t : (n + 1,) s.   wheels : increments between nodes.   node : (k,) nodes with a position.
-    position : (k, 2) m.   sigma : (k,) m, white error as stated.   gyro : (n,) rad, integral of
-    the turn rate about the up axis; empty without a gyro.
+    position : (k, 2) m.   sigma : (k,) m, stated white error.   gyro : (n,) rad, integral of the
+    turn rate about the up axis; empty without a gyro.
     """
 
     t: Floats
@@ -32,12 +32,11 @@ class Run:
 @dataclass(frozen=True, kw_only=True)
 class Known:
     """
-    What is known before the run: 1 sigma each, SI.
+    Prior knowledge of a run; sigmas are 1 sigma, in SI units.
 
-    width : track width, m, 0 unknown; of several minima the nearest is taken.   offset : (2,) m of
+    width : track width, m, 0 unknown; of several minima the nearest is used.   offset : (2,) m of
     the tracked point ahead and left of the middle of the wheels.   drift_length
-    : m of path in which a time-correlated error of positions is forgotten.   gyro_noise :
-    rad/sqrt(s).
+    : m of path, correlation length of position errors.   gyro_noise : rad/sqrt(s).
     """
 
     width: float = 0.0
@@ -55,9 +54,8 @@ class Fit:
     """
     Estimated constants: names, values (m,), covariance (m, m).
 
-    pose : (n + 1, 3) m, m, rad.   levels : sigma of each noise by name.   passes : made.
-    converged : False at the limit of passes.   swapped : left and right
-    wheels are.
+    pose : (n + 1, 3) m, m, rad.   levels : sigma of each noise by name.   passes : their number.
+    converged : False at the limit of passes.   swapped : left and right wheels are swapped.
     """
 
     names: tuple[str, ...]

@@ -18,12 +18,12 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, SIDES
 
-# relative sigmas from which a value is refused. Judgement, by measurement on 24 simulated runs:
+# largest relative sigmas of a value. Judgement, by measurement on 24 simulated runs:
 # the two without a straight after their only turn have widths that are 3 to 570 sigma off, with a
 # sigma of 6 to 70 % of the width, or of 2.5 % of the scale
 MOST_SCALE, MOST = 0.02, 0.03
 ARC = 0.75      # definition: straightness on a radius of twice the track width
-# of the change of the width from the spot to that radius, 1 sigma: the law in between is assumed.
+# 1 sigma, share of the change of the width from the spot to that radius: its law is assumed.
 # Judgement, by measurement on 12 simulated runs with another law: the rms of error over sigma is
 # 3.6 without it, now 0.69
 LAW, MOST_ARC = 0.15, 0.05
@@ -34,7 +34,7 @@ Constants = dict[str, float]
 
 
 class Quantity(NamedTuple):
-    """An estimate: the constant it needs, its value, limit and refusal."""
+    """An estimate: the constant it needs, its value, limit, and the code and text of a refusal."""
 
     needs: str
     value: Callable[[Constants], float]
@@ -64,14 +64,14 @@ QUANTITIES = {
 
 
 def _mean_scale(c: Constants) -> float:
-    """Return the factor of the mean count of the wheels."""
+    """Return the scale factor of the mean count of the wheels."""
     scales = [value for name, value in c.items() if name in SIDES or name.startswith('wheel_')]
     return len(scales) / sum(1 / value for value in scales)
 
 
 def _quantities(names: tuple[str, ...], config: Config) -> dict[str, Quantity]:
-    """Return the estimates of the constants of a fit, and one for each wheel."""
-    # wheels in a circle or of mecanum have half of the width: the lever
+    """Return the quantities that the constants of a fit give, with one for each wheel."""
+    # omni and mecanum wheels have half of the width: the lever
     without = 'track_width' if 'wheel_1' in names else 'rotation_lever'
     found = {name: one for name, one in QUANTITIES.items() if one.needs in names
              and name != without}
@@ -88,11 +88,11 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config,
     """
     Return the result of a fit.
 
-    unit, nominal : of the scale factor.   slopes : by how much they shorten the path, relative.
+    unit, nominal : of the scale factor.   slopes : relative shortening of the path by slopes.
     """
     c = dict(zip(fit.names, fit.value.tolist(), strict=True))
     estimates, effects, laws, reasons = unknown(unit), {}, {}, _doubts(fit)
-    # what a fit that moves on may still change
+    # a fit that has not converged has twice the sigma
     root = np.linalg.cholesky(fit.covariance) * (1.0 if fit.converged else 2.0)
     quantities = _quantities(fit.names, config)
     for name, quantity in quantities.items():
@@ -158,7 +158,7 @@ def _doubts(fit: Fit) -> list[Reason]:
 
 
 def _gradient(quantity: Quantity, fit: Fit) -> Floats:
-    """Return derivatives by the constants: (m,)."""
+    """Return derivatives of a quantity by the constants: (m,)."""
     out, step = np.zeros(len(fit.value)), 1e-6
     for i, value in enumerate(fit.value):
         h = step * max(abs(value), step)
@@ -183,7 +183,7 @@ def _details(fit: Fit, estimates: dict[str, Estimate], names: tuple[str, ...],
         'budget': budget_table(of_known, own, scale),
         'correlation': correlations(total_covariance(of_known), own),
         'noise': fit.levels, 'constants': constants, 'passes': fit.passes}
-    if 'gyro_scale' in constants:       # the factor on turn rates is 1 less this error
+    if 'gyro_scale' in constants:       # the factor on turn rates is 1 minus this error
         gyro = constants['gyro_scale']
         details['gyro_scale_z'] = {'value': -gyro['value'], 'sigma': gyro['sigma']}
     return details

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""First values of a planar fit: scale, track width and headings without knowing any of them."""
+"""First values of a planar fit: scale, track width and headings, without prior values."""
 
 from typing import Any, NamedTuple
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from odocal_ros.calib.planar.problem import Run
 from odocal_ros.data.arrays import Complexes, Floats, Ints
 
-# m, 7.5 % from one to the next, and right over left wheel less 1. Judgement: of robots
+# track widths, m, 7.5 % apart, and right over left wheel minus 1. Judgement: of robots
 WIDTHS = np.geomspace(0.05, 3.0, 58)
 RATIOS = np.linspace(-0.03, 0.03, 13)
-MINIMA, ALIKE = 5, 1.3     # judgement: minima compared, and costs that do not differ
-SWAPPED = 0.3              # judgement: of the cost, if mirrored
-# m of wheel path in which a dead-reckoned path is compared. Judgement: several moves and turns
+MINIMA, ALIKE = 5, 1.3     # judgement: minima compared, and ratio of equivalent costs
+SWAPPED = 0.3              # judgement: cost ratio of the mirrored positions
+# m, wheel path over which dead reckoning is compared. Judgement: several moves and turns
 WINDOW = 6.0
 # judgement: steps in a window between distant positions, such as marks; two fit any path
 WINDOW_STEPS = 4
@@ -42,10 +42,10 @@ def first_values(run: Run, width: float = 0.0) -> First:
 
     Dead-reckoned paths for each of WIDTHS and RATIOS, in windows of WINDOW or WINDOW_STEPS steps
     between positions, are rotated and scaled onto the positions. Turns on the spot by 90 deg and
-    by 450 deg look the same: of several minima that fit about equally well the one nearest to the
-    configured width is taken, without one the largest, which has the smallest turns.
+    by 450 deg look the same: of several minima that fit about equally well, the one nearest to the
+    configured width is used; without a configured width the largest, with the smallest turns.
     """
-    # a node starts without it
+    # imported here: the start of a node does not need it
     from scipy.optimize import minimize
     z = run.position[:, 0] + 1j * run.position[:, 1]
     s = np.append(0.0, np.cumsum(run.wheels.path))[run.node]
@@ -77,7 +77,7 @@ def first_values(run: Run, width: float = 0.0) -> First:
 
 
 def _rough(z: Complexes, s: Floats) -> float:
-    """Return metres per unit: the median over straight lines between positions."""
+    """Return metres per unit: 75th percentile over straight lines between positions."""
     step = max(float(s[-1] - s[0]) / 200, 1e-12)
     at = np.unique(np.searchsorted(s[:-1], np.arange(s[0], s[-1], step)))
     ratio = np.abs(np.diff(z[at])) / np.diff(s[at])
@@ -85,9 +85,9 @@ def _rough(z: Complexes, s: Floats) -> float:
 
 
 def _windows(s: Floats) -> Ints:
-    """Return first and last + 1 position of each window, by the wheel path at each: (w, 2)."""
+    """Return first and last + 1 position of each window, by wheel path s at positions: (w, 2)."""
     steps = np.sort(np.diff(s))
-    usual = steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)]    # of half of the path
+    usual = steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)]    # median by path
     length = max(WINDOW, WINDOW_STEPS * usual)
     begins = np.arange(s[0], max(s[-1] - length / 2, s[0] + 1e-9), length / 2)
     spans = np.stack([np.searchsorted(s, begins), np.searchsorted(s, begins + length)], -1)
@@ -97,7 +97,7 @@ def _windows(s: Floats) -> Ints:
 
 
 class _Alignment:
-    """Dead-reckoned paths on the positions, in windows; what does not depend on the wheels."""
+    """Fit of dead-reckoned paths to positions in windows; holds what is independent of wheels."""
 
     def __init__(self, run: Run, z: Complexes, windows: Ints, rough: float) -> None:
         forward, side, apart = run.wheels.body(run.wheels.count).T

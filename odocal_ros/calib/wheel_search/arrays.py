@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Orthogonal arrays: which parameter sets are tried first (CN104359492A, step 5).
+Orthogonal arrays: the parameter sets to try first (CN104359492A, step 5).
 
-In an orthogonal array (of strength two) each pair of columns holds each pair of levels equally
+In an orthogonal array (of strength two) each pair of columns has each pair of levels equally
 often. Bose's construction gives q^2 rows of q + 1 columns for any prime power q: the points of a
 plane over the field of q elements, a column for each direction of parallel lines.
 """
@@ -30,7 +30,7 @@ class Design:
 
 
 def prime_power(q: int) -> tuple[int, int] | None:
-    """Return (p, m) with q = p^m, p prime; None where there are none."""
+    """Return (p, m) with q = p^m, p prime; None if q is not a prime power."""
     p = next((d for d in range(2, math.isqrt(max(q, 0)) + 1) if q % d == 0), q)
     if p < 2:
         return None
@@ -66,7 +66,7 @@ def field_tables(q: int) -> tuple[Ints, Ints]:
     for i, j in product(range(m), repeat=2):
         whole[..., i + j] += np.multiply.outer(digits[:, i], digits[:, j])
     modulus = irreducible(p, m)
-    for k in range(2 * m - 2, m - 1, -1):      # x^k = -x^(k-m) * (the modulus less its head)
+    for k in range(2 * m - 2, m - 1, -1):      # x^k = -x^(k-m) * (modulus - x^m)
         whole[..., k - m:k] -= whole[..., k, None] * np.array(modulus[:m], np.int64)
     return add, (whole[..., :m] % p) @ weight
 
@@ -102,7 +102,7 @@ def bose(q: int, columns: int) -> Ints:
     Raises
     ------
     BadUsage
-        q is no prime power, or more than q + 1 columns are requested.
+        q is no prime power, or the number of columns is not 1 to q + 1.
 
     """
     add, multiply = field_tables(q)

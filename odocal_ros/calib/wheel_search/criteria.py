@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How well parameter sets do: distances at the fixes, and heading against course over ground.
+Criteria of parameter sets: distances at the fixes, and heading relative to course over ground.
 
-The patent has the maximum and the mean of the distances, and names the receiver's course as a
-standard besides. The mean square is what the refinement lowers.
+The patent uses the maximum and the mean of the distances, and names the receiver's course as an
+additional criterion. The refinement minimises the mean square.
 """
 
 from dataclasses import dataclass, fields
@@ -17,7 +17,7 @@ from odocal_ros.calib.wheel_search.planar import coefficients, PlanarLeg, square
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import arctan2, wrap
 
-# statistical: sigmas at which a fix's pull stops growing; one in seven white fixes is beyond
+# statistical: sigmas beyond which the influence of a fix is constant: one in seven white fixes
 HUBER = 2.0
 LEAST_SIGMA = 1e-4       # m, judgement: lower limit of a stated sigma
 
@@ -27,9 +27,9 @@ class Scores:
     """
     Criteria of m parameter sets, (m,) each.
 
-    max, mean, rms : m, distance of track and fix.   loss : what is lowered; m^2, the mean square,
-    or without unit where fixes are weighted.   course_mean, course_rms : rad, dead-reckoned
-    direction less course over ground, counter-clockwise; NaN where the fixes give no course.
+    max, mean, rms : m, distance of track and fix.   loss : objective; the mean square, m^2, or
+    without unit if fixes are weighted.   course_mean, course_rms : rad, dead-reckoned direction
+    minus course over ground, counter-clockwise; NaN if the fixes give no course.
     """
 
     max: NDArray[np.float64]
@@ -40,7 +40,7 @@ class Scores:
     course_rms: NDArray[np.float64]
 
     def row(self, k: int) -> dict[str, float | None]:
-        """Return one set's criteria for people and JSON: m, deg; None: no course."""
+        """Return the criteria of one set for text and JSON, m and deg; None: no course."""
         course = {f'course_{name}_deg': np.rad2deg(float(getattr(self, f'course_{name}')[k]))
                   for name in ('mean', 'rms')}
         return {'max': float(self.max[k]), 'mean': float(self.mean[k]),
@@ -52,9 +52,9 @@ def score(leg: PlanarLeg, sets: Floats, robust: bool = False, course: bool = Tru
     """
     Return the criteria of parameter sets.
 
-    leg : what was driven.   sets : (m, 3) left and right scale, m per unit, and heading, rad.
-    robust : weight fixes by their sigma and bound the pull of outliers in ``loss``.   course :
-    compare with the course over ground too.
+    leg : tracks and fixes.   sets : (m, 3) left and right scale, m per unit, and heading, rad.
+    robust : weight fixes by their sigma and limit the influence of outliers in ``loss``.
+    course : also compare with the course over ground.
     """
     sets = np.atleast_2d(np.asarray(sets, dtype=float))
     m = len(sets)
@@ -75,8 +75,8 @@ def loss(d2: Floats, sigma: Floats, robust: bool) -> Floats:
     """
     Return the objective from (m, k) squared distances, m^2: (m,).
 
-    The mean square; robust: the mean of Huber's function of the distance in sigmas, which grows
-    as the square up to HUBER and in proportion beyond.
+    The mean square; robust: the mean of Huber's function of the distance in sigmas, quadratic up
+    to HUBER and linear beyond.
     """
     if not robust:
         mean: Floats = d2.mean(axis=1)
@@ -89,7 +89,7 @@ def loss(d2: Floats, sigma: Floats, robust: bool) -> Floats:
 
 
 def weights(d2: Floats, sigma: Floats, robust: bool) -> Floats:
-    """Return by how much each fix pulls at the parameters, of (k,) squared distances: (k,)."""
+    """Return the least-squares weight of each fix, by (k,) squared distances, m^2: (k,)."""
     if not robust:
         return np.ones(len(d2))
     sigma = np.maximum(sigma, LEAST_SIGMA)
@@ -97,7 +97,7 @@ def weights(d2: Floats, sigma: Floats, robust: bool) -> Floats:
 
 
 def course_differences(leg: PlanarLeg, sets: Floats) -> Floats:
-    """Return direction of the dead-reckoned minus that of the fix path, rad: (m, c)."""
+    """Return the direction of dead-reckoned pieces minus that by the fixes, rad: (m, c)."""
     a, b = leg.pieces.T
     mix = coefficients(sets)[:, :3]
     east, north = (rows[:3, b] - rows[:3, a] for rows in leg.basis)

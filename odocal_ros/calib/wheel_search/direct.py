@@ -4,8 +4,8 @@
 """
 Direct nonlinear least squares of left scale, right scale and heading on all fixes.
 
-The check of the response surface, and what it says of the problem itself: condition number,
-correlations, and whether positions separate left and right at all.
+It checks the response surface, and gives condition number and correlations of the problem, and
+whether positions separate left and right.
 """
 
 from dataclasses import dataclass
@@ -18,23 +18,23 @@ from odocal_ros.calib.wheel_search.planar import coefficients, PlanarLeg
 from odocal_ros.calib.wheel_search.space import sets_of, Space
 from odocal_ros.data.arrays import Floats
 
-SETTLED = 1e-11      # judgement: relative, rad, the last step
+SETTLED = 1e-11      # judgement: relative, rad, largest last step
 HALVINGS = 40    # judgement: of a step, at most
-DIFFERENCE = np.array([-1.0, 1.0, 0.0])    # definition: right less left
-BENT = 1e-4          # judgement: of path length: bend of any track by gyro, slip and tyres
+DIFFERENCE = np.array([-1.0, 1.0, 0.0])    # definition: right minus left
+BENT = 1e-4          # judgement: share of path length: bend of any track by gyro, slip, tyres
 
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
     """
-    What least squares say; x as in ``space``.
+    Result of least squares; x as in ``space``.
 
-    covariance : (3, 3) of x by the scatter of the residuals, correlated ones counted as
-        fewer; where the difference was held, left and right err equally. Errors of start, gyro and
-        lever arm are not in it.
+    covariance : (3, 3) of x by the scatter of the residuals, with the effective number of
+        correlated ones; if the difference is held, left and right have the same error. Errors of
+        start, gyro and lever arm are not included.
     condition : of the Jacobian by relative left, right scale (or both) and heading in rad.
-    sigma_difference : of right less left, relative; besides the scatter it allows for a track
-        bent by BENT of path length, which the difference of the wheels would explain as well.
+    sigma_difference : of right minus left, relative; includes the scatter, and a bend of the track
+        by BENT of path length, which has the same effect as a difference of the wheels.
     """
 
     x: NDArray[np.float64]
@@ -58,16 +58,16 @@ class LeastSquares:
 
 def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False) -> LeastSquares:
     """
-    Return the parameters that lower the (robust) mean square, by Gauss-Newton from x.
+    Return the parameters that minimise the (robust) mean square, by Gauss-Newton from x.
 
-    leg : what was driven.   x : (3,) where to begin: left, right (relative), heading (rad).
-    space : which parameters there are.   robust : as in ``criteria.score``.
+    leg : tracks and fixes.   x : (3,) first values: left, right (relative), heading (rad).
+    space : free parameters.   robust : as in ``criteria.score``.
     """
     q = space.q_of(x)
     iterations, settled = 0, False
     r, J = _linear(leg, space.T @ q)
     value = _value(leg, r, robust)
-    most = 200    # rounds; reweighting converges by a digit in a few
+    most = 200    # iterations; with reweighting a few are needed for each digit
     while not settled and iterations < most:
         iterations += 1
         root = np.sqrt(np.tile(weights(_d2(r), leg.sigma, robust), 2))
@@ -90,7 +90,7 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
 
 
 def _linear(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
-    """Return residuals turned back by the heading, (2k,) m, and their Jacobian by x: (2k, 3)."""
+    """Return residuals rotated by -heading, (2k,) m, and their Jacobian by x: (2k, 3)."""
     heading = x[2]
     by_x = np.zeros((4, 5))
     by_x[0] = coefficients(sets_of(leg, x))[0]
@@ -110,7 +110,7 @@ def _value(leg: PlanarLeg, r: Floats, robust: bool) -> float:
 
 
 def _solve(A: Floats, b: Floats) -> Floats:
-    """Return the least-squares solution, columns scaled to one size first."""
+    """Return the least-squares solution, with columns scaled to equal size."""
     size = np.linalg.norm(A, axis=0)
     size = np.where(size > 0, size, 1.0)
     return np.linalg.lstsq(A / size, b, rcond=1e-14)[0] / size
@@ -124,7 +124,7 @@ def _spread(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
     condition = float(s[0] / s[-1]) if s[-1] > 1e-15 * s[0] else np.inf
     root = np.sqrt(w)
     _, s, vt = np.linalg.svd(root[:, None] * (J @ space.T), full_matrices=False)
-    s = np.maximum(s, 1e-15 * max(s[0], 1e-300))     # what is not seen at all: a huge sigma
+    s = np.maximum(s, 1e-15 * max(s[0], 1e-300))     # unobservable: a huge sigma
     freedom = max(len(r) - len(s), 1)
     to_x = space.T @ (vt.T / s)
     rows = (root * r).reshape(2, -1)
@@ -132,7 +132,7 @@ def _spread(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
 
 
 def _sigma_difference(J: Floats, covariance: Floats) -> float:
-    """Return the sigma of right less left: by scatter, and by a track bent as all are."""
+    """Return the sigma of right minus left: by scatter, and by the bend of any track."""
     reach, parts = np.linalg.norm(J[:, 2]), float(np.linalg.norm(J[:, 1] - J[:, 0])) / 2
     bent = BENT * reach / max(parts, 1e-12)
     return float(np.sqrt(DIFFERENCE @ covariance @ DIFFERENCE + bent**2))
@@ -140,9 +140,9 @@ def _sigma_difference(J: Floats, covariance: Floats) -> float:
 
 def repeats(rows: Floats) -> float:
     """
-    Return the number of correlated residuals: 1 for white ones, many for a drift.
+    Return the number of residuals per independent one: 1 if white, many for a drift.
 
-    rows : (2, k). One and twice the sum of their autocorrelations up to the first negative one.
+    rows : (2, k). One plus twice the sum of their autocorrelations before the first negative one.
     """
     k = rows.shape[1]
     spectrum = np.abs(np.fft.rfft(rows, 2 * k, axis=1))**2

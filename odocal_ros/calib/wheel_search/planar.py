@@ -4,10 +4,10 @@
 """
 Dead reckoning in the plane for many parameter sets at once (CN104359492A, steps 2 to 4).
 
-A parameter set is left scale, right scale (m per unit) and heading (rad, counter-clockwise): the
-angle by which the whole track is to be turned. Positions are linear in the two scales, so the
-wheels' tracks are summed once, at one metre per unit, and a set costs two products of matrices.
-Only horizontal components are used, of n itself: no sphere, no map.
+A parameter set is left scale, right scale (m per unit) and heading (rad, counter-clockwise), a
+rotation of the whole track. Positions are linear in the two scales, so the wheels' tracks are
+summed once, at one metre per unit, and a set costs two products of matrices. Horizontal components
+in n are used, without a map projection.
 """
 
 from collections.abc import Iterator
@@ -20,20 +20,20 @@ from numpy.typing import ArrayLike, NDArray
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.dead_reckoning import forward_b, Track
 
-CHUNK = 500_000          # judgement: distances held at once: 4 MB, which stays in the cache
+CHUNK = 500_000          # judgement: distances in memory at once: 4 MB, which stays in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarLeg:
     """
-    A leg of two wheels as the search sees it; n, metres, (k, 2) east and north.
+    A leg of two wheels as input of the search; n, metres, (k, 2) east and north.
 
     t : (k,) s, times of the fixes.   fixes_n : (k, 2).   sigma : (k,) m, of each axis of a fix.
     left_n, right_n : (k, 2) sum of direction over the wheel's travel from the start to each fix,
-        m per m/unit of scale factor, with the heading as configured.
+        m per m/unit of scale factor, with the configured heading.
     start_n : (2,) antenna at the start, where every track begins.
     scale_left, scale_right : start values, m per unit.
-    lever_n : (k, 2) what the antenna moved by the vehicle turning about the odometer's point.
+    lever_n : (k, 2) motion of the antenna by turns about the odometer's point.
     pieces : (c, 2) rows of fixes that are far enough apart for a course over ground.
     """
 
@@ -56,9 +56,9 @@ class PlanarLeg:
     @cached_property
     def basis(self) -> tuple[Floats, Floats]:
         """
-        Return the rows that a set's coefficients mix into residuals turned back by its heading.
+        Return the rows whose sum, weighted by a set's coefficients, is its rotated residuals.
 
-        residual = (L K_L + R K_R) / 2 + lever - (fix - start) turned by -heading: (5, k) east,
+        residual = (L K_L + R K_R) / 2 + lever - (fix - start) rotated by -heading: (5, k) east,
         (5, k) north for the coefficients K_L / 2, K_R / 2, 1, -cos heading, -sin heading.
         """
         east, north = (self.fixes_n - self.start_n).T
@@ -75,9 +75,9 @@ def planar_leg(track_left: Track, track_right: Track, t_fix: Floats, fixes_n: Fl
     Project a leg of two wheels on the plane.
 
     track_left, track_right : dead reckoned with the travel of each wheel alone, same attitude.
-    t_fix, fixes_n, covariance_n : (k,), (k, 2 or 3), (k, 3, 3) fixes, s, m, m^2; those that the
-    tracks do not reach are left out.   start : (t, position_n) time, s, and antenna position, m,
-    at which the tracks begin.   scales : (left, right) start values, m per unit.   pitch : pitch
+    t_fix, fixes_n, covariance_n : (k,), (k, 2 or 3), (k, 3, 3) fixes, s, m, m^2; those outside
+    the tracks are left out.   start : (t, position_n) time, s, and antenna position, m, at the
+    begin of the tracks.   scales : (left, right) start values, m per unit.   pitch : pitch
     mounting angle, rad: the forward axis is that of yaw 0.   lever_b : (3,) antenna from the
     odometer's point, m.
     """
@@ -102,7 +102,7 @@ def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
     if not len(fixes_n):
         return np.empty((0, 2), np.int64)
     course_baseline = 10.0    # m, minimum path between two fixes for a course
-    course_clear = 20.0    # fix sigmas, the same: the course is then good to 4 deg
+    course_clear = 20.0    # fix sigmas, minimum as well: the sigma of a course is then 4 deg
     need = max(course_baseline, course_clear * float(np.median(sigma)))
     x, y = fixes_n.T.tolist()
     ends = [0]
@@ -121,7 +121,7 @@ def coefficients(sets: Floats) -> Floats:
 
 
 def positions(leg: PlanarLeg, sets: Floats) -> Floats:
-    """Return the antenna's track at the fixes, m, of (m, 3) parameter sets: (m, k, 2)."""
+    """Return the antenna's track at the fixes, m, for (m, 3) parameter sets: (m, k, 2)."""
     mix = coefficients(sets)
     body = mix[:, :3] @ leg.basis[0][:3] + 1j * (mix[:, :3] @ leg.basis[1][:3])
     p = body * np.exp(1j * np.asarray(sets, dtype=float)[:, 2:])

@@ -4,9 +4,8 @@
 """
 The search of CN104359492A: an orthogonal array, then response surfaces, checked by least squares.
 
-What is called heading here is the angle by which the dead-reckoned track must be turned,
-counter-clockwise: the error of the configured heading less the yaw mounting angle. Positions see
-only the two together.
+Heading is here the counter-clockwise rotation of the dead-reckoned track: the error of the
+configured heading minus the yaw mounting angle. Positions cannot separate the two.
 """
 
 from collections.abc import Callable
@@ -34,14 +33,14 @@ MOST_ROWS = 100      # judgement: of an array kept in calibration.json
 @dataclass(frozen=True, eq=False)
 class SearchResult:
     """
-    What the search found; parameter sets are left and right scale (m per unit), heading (rad).
+    Result of the search; parameter sets are left and right scale (m per unit), heading (rad).
 
     start : scales before, m per unit.   sets, scores : of the array's rows.
-    best : the row with the least mean distance (robust: loss), ties by the largest.
+    best : the row with the least mean distance (robust: loss), of equal ones the least maximum.
     meets : its maximum and mean meet the required accuracy, None without one.
     refined : by response surfaces.   direct : by least squares.   free : least squares with left
     and right free; the same unless held.   held : the fixes do not separate left and right, and
-    their ratio was kept at the start values.   before, after : criteria of the start values and
+    their ratio is that of the start values.   before, after : criteria of the start values and
     of the refined ones, one row each.
     """
 
@@ -115,13 +114,13 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
     """
     Search left scale, right scale and heading.
 
-    leg : what was driven; its start values are the middle of the ranges.   ranges : what is
-    searched.   robust : weight fixes by their sigma and bound the pull of outliers.   accuracy :
-    (maximum, mean) distances asked for, m.
+    leg : tracks and fixes; its start values are the middle of the ranges.   ranges : search
+    ranges.   robust : weight fixes by their sigma and limit the influence of outliers.
+    accuracy : required (maximum, mean) distances, m.
 
     Returns
     -------
-    SearchResult; None where there are fewer than four fixes.
+    SearchResult; None with fewer than four fixes.
 
     """
     if len(leg.t) < 4:
@@ -147,7 +146,7 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
 
 
 def _refined(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
-    """Lower the mean square; robust: then Huber's mean, which far off is a cone, from there."""
+    """Minimise the mean square; robust: then Huber's mean, a cone far from its minimum."""
     def by(robust: bool) -> Callable[..., Any]:
         return lambda x: score(leg, sets_of(leg, x), robust, course=False).loss
 
@@ -167,7 +166,7 @@ def _separable(free: LeastSquares, ranges: Ranges) -> bool:
     """
     Return True if the fixes constrain the wheel difference better than the range.
 
-    The range is twice the stated error of each wheel, the sigma of their difference follows.
+    The range is twice the stated error of each wheel, which gives the sigma of the difference.
     """
     return free.sigma_difference <= float(np.hypot(*ranges.half[:2])) / 2
 
@@ -194,7 +193,7 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
         apart = np.abs(refined.x - direct.x)
         apart[2] = abs(wrap(apart[2]))
         share = float((apart / ranges.half).max())
-        agree = 1e-3    # of the range: surface and least squares are one
+        agree = 1e-3    # of the range: largest difference of surface and least squares
         if share > agree or not direct.settled:
             found.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
                                 f'differ by {100 * share:.2g} % of the range'))

@@ -4,10 +4,10 @@
 """
 The parameters of the search, relative change of each wheel's scale and heading, and their ranges.
 
-Outside they are the patent's: x = (left, right, heading), scale = start value (1 + x). Inside the
-search moves by mean, difference and heading, in which the criterion's long valley is no slant:
-left plus right moves the track by the distance, their difference by the track width at most.
-If the fixes cannot separate left and right, the difference is held and two coordinates are left.
+The interface has those of the patent: x = (left, right, heading), scale = start value (1 + x). The
+search uses mean, difference and heading, along which the long valley of the criterion runs: left
+plus right moves the track by the distance, their difference by the track width at most.
+If the fixes cannot separate left and right, the difference is fixed and two coordinates remain.
 """
 
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.settings.config import WheelsConfig
 
 NAMES = ('left', 'right', 'heading')
-# definition: columns mean, difference (right less left), heading; held: mean, heading
+# definition: columns mean, difference (right minus left), heading; held: mean, heading
 FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """How the search's coordinates q make x = T q; held: without the wheels' difference."""
+    """Linear map x = T q from the search coordinates q; held: without the wheel difference."""
 
     held: bool
 
@@ -38,21 +38,21 @@ class Space:
 
     @property
     def S(self) -> NDArray[np.float64]:     # noqa: N802
-        """Return the matrix of v = S q: what the range bounds is x, or the mean where held."""
+        """Return the matrix of v = S q, bounded by the range: x; held: mean and heading."""
         return np.eye(2) if self.held else FREE
 
     def q_of(self, x: Floats) -> Floats:
-        """Return the coordinates of x; its difference is dropped where held."""
+        """Return the coordinates q of x; held: without its difference."""
         left, right, heading = x
         mean = (left + right) / 2
         return np.array([mean, heading] if self.held else [mean, right - left, heading])
 
     def bounds(self, half: Floats) -> Floats:
-        """Return the half range of v for that of x: (n,)."""
+        """Return the half range of v from that of x: (n,)."""
         return np.array([min(half[:2]), half[2]]) if self.held else np.array(half)
 
     def widened(self, half: Floats, on_edge: Bools) -> Floats:
-        """Return the half range of x doubled where v is on its edge; no scale turns negative."""
+        """Return the half range of x, doubled where v is on its edge, with positive scales."""
         edge = np.array([on_edge[0], *on_edge]) if self.held else np.asarray(on_edge)
         widest = np.array([0.9, 0.9, 1.5 * np.pi])    # of a half range
         return np.where(edge, np.minimum(2 * np.asarray(half), widest), half)
@@ -67,9 +67,9 @@ def sets_of(leg: PlanarLeg, x: Floats) -> Floats:
 @dataclass(frozen=True, eq=False)
 class Ranges:
     """
-    What is searched about the start values.
+    Search ranges about the start values.
 
-    half : (3,) of left and right (relative) and heading (rad).   why : a sentence for each.
+    half : (3,) of left and right (relative) and heading (rad).   why : the source of each.
     levels : number of levels of each.
     """
 
@@ -86,29 +86,29 @@ class Ranges:
 
     @property
     def step(self) -> NDArray[np.float64]:
-        """Return the step between levels, the whole half range of a single one."""
+        """Return the step between levels; for one or two levels the half range."""
         step: Floats = 2 * self.half / max(self.levels - 1, 2)
         return step
 
 
 def ranges_of(wheels: WheelsConfig, heading_sigma: float | None = None) -> Ranges:
     """
-    Return the ranges that the settings ask for.
+    Return the ranges by the settings.
 
     wheels : ``radius_range``, ``heading_range``, ``levels``.   heading_sigma : of heading and
-    mounting angle together, rad, where both are known that well.
+    mounting angle together, rad; None: unknown.
     """
     if wheels.radius_range > 0:
         scale, why = wheels.radius_range, 'wheels.radius_range'
     else:
-        scale_range = 0.05    # where no error is stated
+        scale_range = 0.05    # if no error is stated
         scale, why = scale_range, 'no error of the wheels is stated: 5 %'
     if wheels.heading_range > 0:
         heading, reason = wheels.heading_range, 'wheels.heading_range'
     elif heading_sigma:
         heading, reason = min(2 * heading_sigma, np.pi), 'twice the sigma of the heading'
     else:
-        heading_range = np.deg2rad(10.0)    # where no error is stated
+        heading_range = np.deg2rad(10.0)    # if no error is stated
         heading, reason = heading_range, ('heading and mounting angle rotate the track in the '
                                           'same way, and the angle is unknown: 10 deg')
     # an odd number has zero among its levels

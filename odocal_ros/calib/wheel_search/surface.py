@@ -39,11 +39,11 @@ class Surface:
 @dataclass(frozen=True, eq=False)
 class Refined:
     """
-    Where the search by surfaces ended.
+    Result of the search by surfaces.
 
     x : (3,) left, right (relative), heading (rad).   value : of the criterion there.
-    half : (3,) half range at the end.   widened : it is not the one asked for.
-    on_edge : the minimum still lies on its edge.   first, last : surfaces.
+    half : (3,) last half range.   widened : it was increased.
+    on_edge : the minimum is still on its edge.   first, last : surfaces.
     """
 
     x: NDArray[np.float64]
@@ -62,7 +62,7 @@ def fit_surface(y: Floats, values: Floats) -> Surface:
     n = y.shape[1]
     i, j = np.triu_indices(n)
     design = np.hstack([np.ones((len(y), 1)), y, y[:, i] * y[:, j]])
-    middle = values.mean()      # taken out so that its rounding is not fitted
+    middle = values.mean()      # removed, so that its rounding is not fitted
     c = np.linalg.lstsq(design, values - middle, rcond=None)[0]
     residual = values - middle - design @ c
     hessian = np.zeros((n, n))
@@ -77,11 +77,11 @@ def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats)
     """
     Return the minimum of a quadratic in a box: exact for any signs of its curvature.
 
-    The minimum is stationary on one of the box's faces (the inside and the corners among them),
-    and of three parameters there are but 27.
+    The minimum is stationary on one of the box's faces, including interior and corners: 27 faces
+    for three parameters.
     """
     n = len(gradient)
-    best, least = np.zeros(n), np.inf     # a corner at least is found
+    best, least = np.zeros(n), np.inf     # at least a corner is found
     for face in product((None, low, high), repeat=n):
         free = np.array([side is None for side in face])
         y = np.array([0.0 if side is None else side[k] for k, side in enumerate(face)])
@@ -99,18 +99,18 @@ def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats)
 def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, space: Space,
            widen: bool = True) -> Refined:
     """
-    Lower a criterion by surfaces.
+    Minimise a criterion by response surfaces.
 
-    value : (m, 3) parameters x to the criterion, (m,).   x : (3,) where to begin: the best row of
-    an array.   width : (3,) half width of the first box in x: a step between levels.   half : (3,)
-    half of the range about zero that is searched.   space : which parameters there are.   widen :
-    double the range where the minimum lies on its edge.
+    value : (m, 3) parameters x to the criterion, (m,).   x : (3,) first values: the best row of an
+    array.   width : (3,) half width of the first box in x: a step between levels.   half : (3,)
+    half of the search range about zero.   space : free parameters.   widen : double the range if
+    the minimum is on its edge.
     """
     walk = _Walk(value, space, np.asarray(half, dtype=float), np.asarray(width, dtype=float), x)
     first = last = walk.surface()
     settled = False
     iterations = 1
-    most = 300    # surfaces; a range widened as far as it goes takes a hundred
+    most = 300    # surfaces; with the widest range a hundred are needed
     while True:
         settled = walk.step(last)
         if settled and walk.on_edge.any():
@@ -128,7 +128,7 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
 
 
 class _Walk:
-    """The state of one search: where the box is, how wide, and the range."""
+    """The state of one search: position and width of the box, and the range."""
 
     def __init__(self, value: Callable[..., Any], space: Space, half: Floats, width: Floats,
                  x: Floats) -> None:
@@ -148,25 +148,25 @@ class _Walk:
         return fit_surface(self.grid, self.values)
 
     def step(self, surface: Surface) -> bool:
-        """Move to the surface's minimum in the range, shrink the box; return if it settled."""
+        """Move to the surface's minimum in the range, shrink the box; return True if converged."""
         S, bound = self.space.S, self.space.bounds(self.half)
         v = S @ self.q
-        # y = (q - q0) / w, and what the range bounds is v = S q, here in half ranges
+        # y = (q - q0) / w; the range bounds v = S q, here in half ranges
         to_y = np.linalg.inv(S) / self.w[:, None] * bound
         low, high = -1.0 - v / bound, 1.0 - v / bound
         u = minimum_in_box(to_y.T @ surface.gradient, to_y.T @ surface.hessian @ to_y, low, high)
         self.on_edge = (u <= low) | (u >= high)
         move = np.linalg.solve(S, u * bound)
         there = float(self.value((self.space.T @ (self.q + move))[None])[0])
-        settled = 1e-6    # of the half range first asked for, the last step
+        settled = 1e-6    # share of the first half range, largest last step
         small = np.abs(S @ move) <= settled * self.space.bounds(self.asked)
-        # of the criterion: a box is not shrunk to where less than this is left of it
+        # share of the criterion: the box is not shrunk if its curvature contributes less
         drowned = 1e-6
         shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < drowned * self.least)
-        narrow = 1e-3    # of it, the box to which the last surface is fitted
+        narrow = 1e-3    # share of the first width, box of the last surface
         done = bool(small.all() and (~shrinks | (self.w <= narrow * self.first_width)).all())
         beyond = np.abs(move) > self.w
-        rounding = 1e-12    # of the criterion, by which equal values may differ
+        rounding = 1e-12    # share of the criterion by which equal values may differ
         if there <= self.least * (1 + rounding):
             self.q, self.least = self.q + move, there
         else:
@@ -177,7 +177,7 @@ class _Walk:
         return done
 
     def _to_best_of_grid(self, bound: Floats) -> Bools:
-        """Move to the best fitted point within the range; return where it is an end of the box."""
+        """Move to the best grid point in the range; return True where it is an end of the box."""
         points = self.q + self.grid * self.w
         allowed = (np.abs(points @ self.space.S.T) <= bound).all(axis=1)
         k = int(np.argmin(np.where(allowed, self.values, np.inf)))
@@ -188,7 +188,7 @@ class _Walk:
         return at_end
 
     def widen(self) -> bool:
-        """Double the range where the minimum lies on its edge; False: it is as wide as it goes."""
+        """Double the range where the minimum is on its edge; return False at the widest range."""
         wider = self.space.widened(self.half, self.on_edge)
         if np.array_equal(wider, self.half):
             return False

@@ -40,11 +40,11 @@ from odocal_ros.reasons import Reason
 from odocal_ros.screening.wheel_pair import Pair, pair
 
 Event = tuple[float, float, float]      # begin, end, s, and size, m
-# steps between the ends of windows: slips of up to 1, 3, 8, 20, 50 s, those between are seen too.
+# steps between the ends of windows: slips of up to 1, 3, 8, 20, 50 s; others are detected too.
 # Judgement
 SLIP_SPANS = (10, 30, 80, 200, 500)
 # 1 sigma of the difference of two wheels on real ground without a slip. Physical, judgement: m in
-# any window (stones, tyres); of the track width times the turn (scrub, camber, the gyro's scale)
+# any window (stones, tyres); share of track width times turn (scrub, camber, the gyro's scale)
 TYRE_BLUR, TURN_DOUBT = 0.005, 0.01
 
 
@@ -57,11 +57,11 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     Return the faults of two counting wheels by the gyro, and the slips of one of them.
 
     axle : (2,) sequence of Travel the left and the right wheel, scale units.   imu : (t, w_b, f_b)
-    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.   between : (2,) the marks, s.   track : dead
-    reckoned with their mean: attitude.   latitude : rad.   metres_per_unit : rough scale of the
-    mean of both.   track_width : m, 0 unknown.   doubt_t : (d,) s, where travel is uncertain for
-    other reasons (gaps, resets).   max_deviation : ratio of the counts minus one above which it is
-    reported.   count : of the wheels in the mean.
+    (n,) s, (n, 3) rad/s, (n, 3) m/s^2, with their bias.   between : (2,) the marks, s.   track :
+    dead reckoned with the mean of both, for attitudes.   latitude : rad.   metres_per_unit :
+    approximate scale of the mean.   track_width : m, 0 unknown.   doubt_t : (d,) s, times of
+    travel that is uncertain for other reasons (gaps, resets).   max_deviation : limit of the ratio
+    of the counts minus one.   count : number of wheels in the mean.
 
     Returns
     -------
@@ -82,12 +82,12 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
                        track_width)
     reasons += unlike(two, ratio, track_width or abs(x[1]) * per_right, max_deviation)
     quantum_m = per_right * (1 + ratio) / 2
-    apart = (two.right - signals @ x) * per_right         # m, what turn and ratio leave
+    apart = (two.right - signals @ x) * per_right         # m, residual of turn and ratio
     width = track_width or abs(x[1]) * per_right
     events, lasting = _events(two, apart, quantum_m, width)
     found, change = changed(_without(two, events), signals, metres_per_unit, count)
     reasons += found
-    # a slow event that is no change of the ratio is a slip; if the ratio changes, twice as steep
+    # a slow event is a slip; if the ratio changes, only one that is twice as steep
     events = sorted(events + lasting)
     if change:
         steep = 2 * abs(change) * metres_per_unit
@@ -104,9 +104,9 @@ def _level(two: Pair, apart: Floats, quantum_m: float) -> Floats:
     """
     Return the difference of the paths, m, without the slope it has on most of the drive.
 
-    Rounding at a steady speed makes slopes too, of two counts over a window at most: they stay.
+    Slopes by rounding at a steady speed, at most two counts over a window, are not removed.
     """
-    way, n = _way(two), 200     # steps over which a slope is taken, 20 s: longer than most slips
+    way, n = _way(two), 200     # steps of a slope, 20 s: longer than most slips
     run, climb = way[n:] - way[:-n], apart[n:] - apart[:-n]
     if len(run) < n:
         return apart
@@ -118,8 +118,8 @@ def _level(two: Pair, apart: Floats, quantum_m: float) -> Floats:
 
 
 def _without(two: Pair, events: list[Event]) -> Pair:
-    """Return the wheels with the cells of slips not known."""
-    known, around = two.known.copy(), 2.0       # s each side that may be part of it
+    """Return the wheels, with the cells of slips marked as unknown."""
+    known, around = two.known.copy(), 2.0       # s each side, possibly part of the slip
     for begin, end, _ in events:
         known &= (two.t[1:] < begin - around) | (two.t[:-1] > end + around)
     return replace(two, known=known)
@@ -131,7 +131,7 @@ def _events(two: Pair, apart: Floats, quantum_m: float,
     Return (begin, end, size) of the jumps of the difference: s, s, m, in order.
 
     First those that end, then those that may be a change of the ratio.   apart : m, difference of
-    the wheels less turn and ratio; the slope of most of the path is removed here.
+    the wheels minus turn and ratio; the slope of most of the path is removed here.
     """
     apart = _level(two, apart, quantum_m)
     total = np.append(0.0, np.cumsum(apart))
@@ -158,21 +158,21 @@ def _events(two: Pair, apart: Floats, quantum_m: float,
 
 
 def _ends(two: Pair, apart: Floats, event: Event) -> bool:
-    """Return True if a slip is over: short, or the wheels continue after it as before it."""
+    """Return True if a slip ends: it is short, or its slope is absent before and after it."""
     way = _way(two)
     begin, end = np.interp(event[:2], two.t, way)
-    if end - begin < way[-1] / 16:      # half a step of the places that `changed` looks at
+    if end - begin < way[-1] / 16:      # half a step between the places tested by `changed`
         return True
     at = np.searchsorted(two.t, event[:2]).clip(0, len(way) - 1)
     for a, b in ((0, at[0]), (at[1], len(way) - 1)):
         would, does = _slope(two, event) * (way[b] - way[a]), apart[b] - apart[a]
-        if abs(would) < 0.1 or abs(does) > abs(would) / 2:      # m that would have shown
+        if abs(would) < 0.1 or abs(does) > abs(would) / 2:      # m, observable
             return False
     return True
 
 
 def _slope(two: Pair, event: Event) -> float:
-    """Return the size of a slip from its course between a tenth and nine tenths of it."""
+    """Return the slope of a slip, size by path, between a tenth and nine tenths of its size."""
     begin, end = np.interp(event[:2], two.t, _way(two))
     out: float = 0.8 * event[2] / max(end - begin, 1e-9)
     return out
@@ -183,7 +183,7 @@ def _way(two: Pair) -> Floats:
 
 
 def _limit(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -> Floats:
-    """Return the limit of each jump between two means by chance, m."""
+    """Return the limit of jumps between two means that occur by chance, m."""
     n, ends = len(jump), span + MEAN_STEPS - 1
     way = _way(two)
     turned = np.append(0.0, np.cumsum(np.abs(np.diff(two.turn))))
@@ -195,7 +195,7 @@ def _limit(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -
     turn = TURN_DOUBT * width * (turned[ends:][:n] - turned[:n])
     counts = (way[MEAN_STEPS - 1:] - way[:len(way) - MEAN_STEPS + 1]) / max(two.quantum, 1e-9)
     rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, MEAN_STEPS)
-    # rounding is bounded: both ends of both wheels are off by a count at most
+    # rounding is bounded: at most one count at both ends of both wheels
     rounding = np.minimum(WHOLE_DRIVE_SIGMAS**2 * (rounding[span:] + rounding[:-span]),
                           (2 * quantum_m)**2)
     out: Floats = np.sqrt(WHOLE_DRIVE_SIGMAS**2 * (spread**2 + TYRE_BLUR**2 + turn**2) + rounding)
@@ -204,14 +204,14 @@ def _limit(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -
 
 def _measured(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Floats, Bools]], a: int,
               b: int) -> Event:
-    """Return (begin, end, size) of the jump within steps a to b: the window that shows it best."""
+    """Return (begin, end, size) of the jump within steps a to b, by its best window."""
     found = (0.0, 0.0, 0, 0)
     for span, jump, limit, far in windows:
         low, high = max(0, a - MEAN_STEPS), max(0, b - span + 1)
         at = low + np.flatnonzero(far[low:high])
         if len(at):
             k = int(at[np.argmax(np.abs(jump[at]))])
-            # a longer window must show more than its own noise, or it only adds that
+            # a longer window is better only if its jump is larger by more than its noise
             if abs(jump[k]) > abs(found[0]) + bool(found[1]) * limit[k] / WHOLE_DRIVE_SIGMAS:
                 found = (float(jump[k]), float(limit[k]), k, span)
     size, _, k, span = found
@@ -228,14 +228,14 @@ def _measured(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Floats,
 def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
            latitude: float, event: Event) -> int:
     """
-    Return the wheel that slipped: -1, +1, or 0 where acceleration does not show it.
+    Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it.
 
-    A slip of the right wheel by x moves the mean ahead of the IMU by x / 2, one of the left by -x
-    back by as much. Their odds are from the difference of mean and IMU elsewhere.
+    A slip of the right wheel by x moves the mean by x / 2 relative to the IMU, one of the left by
+    -x moves it by -x / 2. The noise of their odds is the difference of mean and IMU elsewhere.
     """
     begin, end, size = event
     grid = np.arange(max(track.t[0], two.t[0]), min(track.t[-1], two.t[-1]), SPIN_GRID)
-    beside = 1.0        # s each side of a slip, in which speeds are pinned
+    beside = 1.0        # s each side of a slip, in which speeds are set equal
     span = max(round((end - begin + 2 * beside) / SPIN_GRID), 4 * PIN_STEPS)
     if len(grid) < 3 * span:
         return 0
@@ -248,7 +248,7 @@ def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: T
         return 0
     sigma = robust_sigma(excess[straight]) + 1e-3
     log_odds = excess[at] * size / sigma**2
-    # once in 150 the other wheel; if mean and IMU differ by less than a quarter of the half, the
-    # slip begins or ends elsewhere
+    # wrong wheel once in 150; if mean and IMU differ by less than a quarter of x / 2, the slip
+    # begins or ends elsewhere
     clear = abs(log_odds) > 5.0 and abs(excess[at]) > abs(size) / 8
     return int(np.sign(log_odds)) if clear else 0

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Slips of the wheels as they are found and said."""
+"""Detected slips of the wheels, and the reason that reports them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 
-# s, judgement: between the rows in which slips, of a second at least, are looked for
+# s, judgement: between rows in the search for slips, which last a second or more
 SLIP_GRID = 0.1
 
 
@@ -25,12 +25,12 @@ def _none(kind: type = float) -> NDArray[Any]:
 @dataclass(frozen=True, eq=False)
 class WheelSlips:
     """
-    Slips of one wheel, in order of time.
+    Slips of single wheels, in order of time.
 
-    begin, end : (k,) s.   size : (k,) m, > 0 where the wheel ran farther than the ground (for a
-    wheel that is not known: right less left).   wheel : (k,) -1 left, +1 right, 0 one of them.
-    change : of the ratio right over left at some place, as much as at half the path does the same.
-    count : of the wheels in the mean.
+    begin, end : (k,) s.   size : (k,) m, > 0 if the wheel travelled farther than the vehicle (for
+    an unknown wheel: right minus left).   wheel : (k,) -1 left, +1 right, 0 unknown.
+    change : of the ratio right over left during the drive, as the equivalent at half the path.
+    count : number of wheels in the mean.
     """
 
     begin: NDArray[np.float64] = _none()
@@ -42,15 +42,15 @@ class WheelSlips:
 
     @property
     def t(self) -> Floats:
-        """Return the middle of each, s."""
+        """Return the middle of each slip, s."""
         return (self.begin + self.end) / 2
 
     def doubts(self) -> tuple[Floats, Floats]:
         """
-        Return the times at which the mean of the wheels is uncertain, and its error: (d,) s, m.
+        Return the times at which the mean of the wheels is uncertain, and its sigma: (d,) s, m.
 
-        A slip of one of two wheels is half as large in the mean, drawn out over the seconds it
-        lasts.
+        A slip of one of ``count`` wheels is 1 / ``count`` as large in the mean, distributed over
+        its seconds.
         """
         seconds = np.maximum(np.ceil(self.end - self.begin), 1.0).astype(int)
         t = [begin + (end - begin) * (np.arange(n) + 0.5) / n
@@ -63,7 +63,7 @@ NO_SLIPS = WheelSlips()
 
 
 def of_axles(axles: Sequence[WheelSlips], count: int) -> WheelSlips:
-    """Return the slips of the wheels of several axles; count: of the wheels in the mean."""
+    """Return the slips of the wheels of several axles; count: number of wheels in the mean."""
     columns = {name: np.concatenate([getattr(one, name) for one in axles]) for name in (
         'begin', 'end', 'size', 'wheel')}
     order = np.argsort(columns['begin'], kind='stable')
@@ -72,15 +72,15 @@ def of_axles(axles: Sequence[WheelSlips], count: int) -> WheelSlips:
 
 
 def slips_of(events: list[tuple[float, float, float]], wheel: list[int]) -> WheelSlips:
-    """Return slips by (begin s, end s, size m, right less left) and by wheel, -1, 0 or +1."""
+    """Return slips by (begin s, end s, size m, right minus left) and by wheel, -1, 0 or +1."""
     begin, end, size = np.array(events).T
     which = np.array(wheel, np.int64)
-    # a left wheel that spins makes right less left negative
+    # if the left wheel spins, right minus left is negative
     return WheelSlips(begin, end, np.where(which < 0, -size, size), which)
 
 
 def slip_reason(slips: WheelSlips, names: tuple[str, ...]) -> tuple[Reason]:
-    """Return the reason that names the wheel with most slip, its size and time."""
+    """Return the reason that names the wheel with the largest slip, its size and time."""
     n = len(slips.size)
     worst = int(np.argmax(np.abs(slips.size)))
     left, right = (f'the {name} wheel' for name in names)

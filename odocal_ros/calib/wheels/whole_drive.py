@@ -4,9 +4,9 @@
 """
 Regression of the right wheel's path on the left one's, turn and load, over the whole drive.
 
-The right wheel's path is that of the left one, the track width times the turn, and little more.
-This shows of the drive as a whole: swapped wheels, one counter sent twice, different counters, a
-ratio that changes during the drive.
+The right wheel's path is that of the left one, plus track width times turn, plus small terms.
+This detects over the whole drive: swapped wheels, one counter published twice, different counters,
+a ratio that changes during the drive.
 """
 
 import numpy as np
@@ -16,18 +16,18 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_pair import Pair, robust_fit
 
-# statistical: sigmas from which wheels part, of tens of thousands of windows in a leg: once in 500
-# million each by chance, whose noise is not quite normal
+# statistical: sigmas of a significant difference of wheels: by chance once in 500 million windows;
+# a leg has tens of thousands, whose noise is not quite normal
 WHOLE_DRIVE_SIGMAS = 6.0
-MEAN_STEPS = 10     # steps that speed, turn rate and the ends of a window are averaged over: 1 s
+MEAN_STEPS = 10     # steps over which speed, turn rate and the ends of a window are averaged: 1 s
 
 
 def signals_of(two: Pair, metres_per_unit: float) -> Floats:
     """
-    Return the signals that make up the right path, at the edges: (n, 6).
+    Return the regressors of the right path, at the edges of the cells: (n, 6).
 
-    The left path, turn and time (gyro bias); speed (the wheels' stamps apart), turn rate (the
-    IMU's stamps apart) and the load that sideways acceleration moves from tyre to tyre.
+    The left path, turn and time (gyro bias); speed (delay between the wheels), turn rate (delay to
+    the IMU) and the load that sideways acceleration moves from tyre to tyre.
     """
     half = MEAN_STEPS // 2
     mean = (two.left + two.right) / 2
@@ -44,7 +44,7 @@ def _smooth(x: Floats, reach: int) -> Floats:
 
 def fitted(two: Pair, signals: Floats, metres_per_unit: float,
            ) -> tuple[Floats, Floats] | tuple[None, None]:
-    """Return the coefficients of the signals by cells of a second, and their covariance."""
+    """Return the coefficients of the signals, fitted to cells of a second, and covariance."""
     at = np.arange(0, len(two.t), MEAN_STEPS)
     A, y = np.diff(signals[at], axis=0), np.diff(two.right[at])
     keep = np.logical_and.reduceat(two.known, at[:-1])[:len(y)]
@@ -80,13 +80,13 @@ def swapped(two: Pair, width: float, sigma: float, track_width: float) -> tuple[
 def changed(two: Pair, signals: Floats, metres_per_unit: float,
             count: int) -> tuple[tuple[Reason, ...], float]:
     """
-    Return a reason if the wheels' ratio is not the same before and after some place.
+    Return a reason if the wheels' ratio differs before and after a place of the path.
 
-    count : of the wheels in the mean.
+    count : number of wheels in the mean.
 
     Returns
     -------
-    Reasons; what the sigmas are to hold, as a change of the ratio at half the path, 0 for none.
+    Reasons; the change of the ratio, at half the path, that sigmas must include, 0 for none.
 
     """
     way = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
@@ -98,13 +98,13 @@ def changed(two: Pair, signals: Floats, metres_per_unit: float,
         if x is None or covariance is None or x[0] <= 0:
             continue
         change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
-        least = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)       # tyres warm up equally to that
+        least = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)       # tyres warm up equally within it
         if abs(change) > least and abs(change) / sigma > best[0]:
             best = (abs(change) / sigma, float(change), share, at)
     odds, change, share, at = best
     if not change:
         return (), 0.0
-    # before it as likely as after it: the fit lies between, (1 - share) of the change from before
+    # correct before or after: the fit is between, (1 - share) of the change from that before
     held = float(change * np.sqrt(2 * (share**2 + (1 - share)**2)))
     left, right = two.names
     return (Reason(Code.WHEEL_SLIP, f'from t = {two.t[at]:.0f} s on, after about '
@@ -118,10 +118,10 @@ def changed(two: Pair, signals: Floats, metres_per_unit: float,
 
 
 def unlike(two: Pair, ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
-    """Return a reason if one wheel counts far finer: the mean is not of the axle's middle."""
+    """Return a reason if one wheel counts far more: the mean is not at the axle's middle."""
     if max(ratio, 1 / ratio) <= 1 + limit:
         return ()
-    # the mean count weighs each wheel by its counts a metre
+    # the mean count weights each wheel by its counts per metre
     off = (ratio / (1 + ratio) - 0.5) * width
     left, right = two.names
     return (Reason(Code.WHEEL_COUNTERS_DIFFER, f'the {right} wheel counts {ratio:.3f} times as '

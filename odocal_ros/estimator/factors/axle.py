@@ -70,8 +70,8 @@ class Axle:
         """
         Return accelerations and jerks of each interval in the order of LEAN: (K, 4).
 
-        Acceleration forward, what holds the vehicle on a slope with it, and left, m/s^2, and their
-        change, m/s^3.
+        Acceleration forward (including the component of gravity on a slope) and left, m/s^2, and
+        their rates of change, m/s^3.
         """
         T = np.diff(self.state.t)[:, None]
         # by the axes at mid interval: those at its begin would take the push of a turn for braking

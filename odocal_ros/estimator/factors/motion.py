@@ -180,12 +180,11 @@ class Motion:
 
     def _inclined(self, straight: Floats) -> Floats:
         """
-        Return the factor that makes a path along the body as long as the one travelled: (K,).
+        Return the ratio of the travelled path to its projection on the body axis: (K,).
 
-        The odometer counts the path, up and down with the ground, whatever the pitch of a body
-        that sways or spans bumps; along the axis of its noise both are shorter, by the cosine of
-        their angles. Also sets what ``_by_slope`` needs. straight : (K, 3) the path along the body
-        in n, m.
+        The odometer counts the path along the ground, independent of the body pitch by sway or
+        bumps. Both projections are shorter by the cosine of their angle. Also sets the attributes
+        that ``_by_slope`` uses. straight : (K, 3) the path along the body in n, m.
         """
         axis = (self.C + self.C_end) / 2
         self.up_n, ahead = axis @ self.up, axis @ self.state.forward

@@ -4,7 +4,7 @@
 """
 The base of the sensors besides IMU, odometer and fixes: rows with a sigma for each component.
 
-A subclass in ``equations.FACTORS`` is all that the estimator knows of such a sensor.
+To the estimator such a sensor is one subclass, listed in ``equations.FACTORS``.
 """
 
 from dataclasses import dataclass

@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The fitted signals of the IMU, which its errors multiply: decision 9, noise in the regressor.
+IMU signals without their noise, as derivatives by IMU errors: decision 9, noise in the regressor.
 
-A derivative by a scale error is a signal. The signal as measured contains noise, which the fit
-would use as information, and it would prefer a smaller signal. Once steps are below a sigma, the
-estimated noise is removed: the residual of the axis, and, since gyro noise rotates the force
-within an interval, its effect on gravity.
+The derivative by a scale error is the signal itself. The measured signal contains noise, which
+biases the estimate towards smaller signals. Once steps are below a sigma, the estimated noise is
+subtracted: the residual of the axis, and the effect of gyro noise on the direction of gravity
+within an interval.
 
-Sway and heave that odometer and attitude do not predict are noise of the road. The fit has levels
-for this noise, so it is removed as well.
+Sway and heave that odometer and attitude do not predict are road noise, which has levels of its
+own in the fit. They are subtracted as well.
 """
 
 import numpy as np
@@ -36,10 +36,10 @@ FORCES = 3      # definition: signals of a gyro from there on are forces
 
 class Signals:
     """
-    Turn rates and forces of a motion's intervals, as fitted.
+    Fitted turn rates and forces of the intervals of a motion.
 
-    sway : by the noise of the road, (K, 3) what changes of the velocity of the axle beside its
-    wheels in an interval, and the integral of this, in n, m/s and m.
+    sway : road noise: (K, 3) change of the sideways and vertical axle velocity in an interval, and
+    its integral, in n, m/s and m.
     """
 
     def __init__(self, motion: Motion) -> None:
@@ -52,12 +52,13 @@ class Signals:
     def fit(self, rows: slice, constants: Floats, by_bias: Floats, gyro: Floats,
             found: Floats) -> None:
         """
-        Put the derivatives by the IMU's errors right, in constants: (k, 18, M).
+        Subtract the noise from the derivatives by IMU errors, in place.
 
-        rows : slice of the intervals.   by_bias : (k, 18, 3) derivatives by the gyro's bias.
-        gyro : (k, 18, 3 p) columns of the gyro's unit noises, along the axes of n at p points.
-        found : (k, 3 p) their best estimates. The noises of two sensors are independent, so the
-        forces that act on the gyro are left.
+        rows : slice of the intervals.   constants : (k, 18, M) derivatives, corrected in place.
+        by_bias : (k, 18, 3) derivatives by the gyro bias.   gyro : (k, 18, 3 p) columns of unit
+        gyro noises along the axes of n at p points.   found : (k, 3 p) estimates of these noises.
+        Derivatives by g-sensitivity stay as they are: accelerometer noise is independent of the
+        gyro.
         """
         part = self.motion.take(rows)
         self._by_rates(part, constants[:, :, GYRO], by_bias)
@@ -69,7 +70,7 @@ class Signals:
                             part.residual[:, axes], of_gyro[:, axes])
 
     def _by_rates(self, part: Motion, columns: Floats, by_bias: Floats) -> None:
-        """Put the derivatives right that go by turn rates: columns (k, 18, g)."""
+        """Correct the derivatives that are turn rates: columns (k, 18, g)."""
         noise = turn(transpose(part.C), part.residual[:, PHI]) / part.T
         by_bias = by_bias.copy()
         by_bias[:, BG] = 0.0        # which walks, as a scale does not
@@ -80,10 +81,10 @@ class Signals:
     def _by_forces(self, part: Motion, columns: Floats, sway: Floats, residual: Floats,
                    of_gyro: Floats) -> None:
         """
-        Put the derivatives of velocity, or of place, right that go by forces: columns (k, 3, a).
+        Correct the derivatives of velocity, or position, that are forces: columns (k, 3, a).
 
-        sway : (k, 3) what is noise of the road, in b.
-        of_gyro : (k, 3, 3) what the gyro's noise about each axis of b put into the residual.
+        sway : (k, 3) road noise in b.
+        of_gyro : (k, 3, 3) effect of the gyro noise about each axis of b on the residual.
         """
         back = transpose(part.C)
         turned = back @ of_gyro      # toward an axis of b, about one

@@ -6,7 +6,7 @@ Lower limits of sideslip and vertical motion, by the turns of the leg.
 
 Sideslip is observable in turns: a leg with turns uses its own estimate. On a straight leg a
 constant sideslip cannot be separated from the mounting yaw: the noise of an ordinary road is the
-lower limit, whatever the residuals of single seconds.
+lower limit, even if the residuals of single seconds are smaller.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ SIDEWAYS = ('side', 'side_turn', 'up')
 
 
 def turned(leg: SmootherLeg, imu: ImuSteps) -> float:
-    """Return the total angle of the turns, without sign, rad."""
+    """Return the total angle of turns faster than TURNING_RATE, without sign, rad."""
     t = imu.t[imu.key]
     T = np.diff(t)
     turn = imu.over_intervals(imu.turn) - rest_bias(leg, imu)[0] * T[:, None]
@@ -59,7 +59,8 @@ def assumed(problem: Problem, levels: Levels) -> list[Reason]:
     if least < 2e-3**2 or all(      # m^2/s, worth a word
             levels[name] > 1.01 * least for name in SIDEWAYS):
         return []
-    return [Reason(Code.PARAMETER_NOT_DETERMINED, 'total turn angle '
+    return [Reason(Code.PARAMETER_NOT_DETERMINED, 'turns faster than '
+                   f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to '
                    f'{np.rad2deg(problem.turned):.0f} deg, too little to estimate sideslip: '
                    f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed, and the uncertainties of the '
                    'mounting angles depend on it')]

@@ -46,7 +46,7 @@ LEAST_FILTER = 0.2      # s, judgement: speeds closer in time differ by vibratio
 
 
 class SpeedSteps(PointRows):
-    """Residuals of speeds, by K what the odometer says less that of its point; one component."""
+    """Residuals of speeds: K times the odometer speed minus the speed of its point."""
 
     name, source = 'steps', 'speed_steps'
     levels_of = {'steps': slice(0, 1)}
@@ -94,7 +94,7 @@ class SpeedSteps(PointRows):
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
-        """Return the times of the steps, s, then those of the speeds that a filter takes in."""
+        """Return the times of the steps, s, then the times at which the filter needs a speed."""
         t, keyframes = _within(problem).t, problem.imu.t[problem.imu.key]
         at = t - constants[ODO_DELAY] - constants[ODO_CLOCK] * t
         before = filter_time(constants) * FILTER_X

@@ -40,10 +40,10 @@ def odometer_reasons(share: float, sigma: float, log_time: float,
 
 def by_map_drift(share: float, log_time: float, duration: float) -> float:
     """
-    Return the sigma of ln K by a map whose drift is filtered together with the wheels.
+    Return the sigma of ln K by the drift of a map that is filtered together with the wheels.
 
-    This drift is not modelled. It looks like the wheels' error for as long as the filter's time
-    constant, so that error is known as from so many samples as the leg, s, has time constants.
+    This drift is not modelled. Within a time constant of the filter it cannot be distinguished
+    from the wheel error, which is therefore averaged over only duration / time constant samples.
     """
     return float(abs(share) * np.sqrt(np.exp(log_time) / duration))
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The smoother's fit as a method's result: estimates, reasons, budget, what the drive was like."""
+"""The smoother's fit as a method's result: estimates, reasons, budget, statistics of the drive."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -157,7 +157,7 @@ def floored(covariance: Floats) -> Floats:
 def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nominal: float,
                config: Config, doubt: float = 1.0) -> tuple[dict[str, Estimate], list[Reason]]:
     """
-    Return the estimates of the constants that the data determine, and why not the others.
+    Return the estimates of the constants, and the reasons for those that are not determined.
 
     value, sigma : (M,) of the constants, ln K first, whole lever arms.   ratio : (M,) posterior
     sigma by that of the prior.   scale_unit, nominal : of the scale; K0, 0 unknown.   config :

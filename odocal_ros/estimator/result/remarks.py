@@ -87,10 +87,10 @@ def _figure(value: float, unit: str) -> dict[str, Any]:
 
 def _of_housing(found: float, found_sigma: float, sigma: float, misalignment: float) -> float:
     """
-    Return the sigma of an angle against the housing's axes, where that of the IMU's own is given.
+    Return the sigma of an angle relative to the housing, from that relative to the sensor axes.
 
-    The angle between both is one of two errors of axes, of one size, whose sum is ``found``: half
-    of it, with what is left of either.
+    The angle between them is one of two axis errors of equal size whose sum is ``found``: half of
+    ``found``, plus the remaining uncertainty of each.
     """
     if not misalignment:
         return sigma
@@ -100,7 +100,7 @@ def _of_housing(found: float, found_sigma: float, sigma: float, misalignment: fl
 
 
 def level_pitch(fit: Fit, near: JointMarginals, widen: float) -> dict[str, Any]:
-    """Return the pitch against what the accelerometer calls level: method_real's third pitch."""
+    """Return the pitch relative to the accelerometer's level: third pitch of method_real."""
     k = len(near) // 2
     n = fit.solved.step.shape[1]
     at = np.array([2 * n + PITCH, BA.start])

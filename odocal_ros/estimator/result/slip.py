@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where a wheel turned more, or less, than the vehicle moved: what the odometer's noise shows."""
+"""Places where a wheel turned more, or less, than the vehicle moved, from odometer noise."""
 
 from dataclasses import dataclass
 

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A line fitted to increments that hold a random walk and the errors of readings: (W5) to (W7).
+A line fitted to increments with a random walk and reading errors: (W5) to (W7).
 
-The error of the reading at a node is in the increment that ends there and, with the other sign, in
-the one that begins there: the covariance of the increments is tridiagonal, and what the reading
-errs by does not add up.
+The reading error at a node is in the increment that ends there and, with opposite sign, in the one
+that begins there: the covariance of the increments is tridiagonal, and reading errors do not
+accumulate.
 """
 
 from dataclasses import dataclass
@@ -114,7 +114,7 @@ def _minus_log_likelihood(log_levels: Floats, seen: Increments, spread: Floats) 
 
 
 def _left_out(banded: Floats, residual: Floats) -> Floats:
-    """Return residuals as those of increments left out, in sigmas: (k,)."""
+    """Return leave-one-out residuals of the increments, in sigmas: (k,)."""
     root = cholesky_banded(banded, check_finite=False)
     weighted = cho_solve_banded((root, False), residual, check_finite=False)
     before, after = banded[1].copy(), banded[1].copy()

@@ -92,7 +92,7 @@ def _places(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
 
 
 def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
-    """Return the reason for one wheel whose factor is unlike that of all others."""
+    """Return the reason for one wheel whose factor differs from all others."""
     if len(wheels) < FEWEST_ALIKE:
         return []
     off = {}
@@ -127,7 +127,7 @@ def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, lis
 
 def joined(legs: Sequence[MethodResult]) -> dict[str, Wheel]:
     """
-    Return the wheels of several legs, means by their variances: {} where no leg knows them.
+    Return the wheels of several legs, weighted by their variances; {} if no leg has any.
 
     Where legs differ by more than their sigmas allow, the sigma is as much larger.
     """

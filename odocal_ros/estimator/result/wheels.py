@@ -2,18 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Each wheel beside the mean: its factor, and where it rolls, docs/method.md (W1) to (W4).
+Factor and position of each wheel relative to the mean, docs/method.md (W1) to (W4).
 
-The scale factor of the fit is that of the mean reading of the wheels that do not steer. What a
-wheel reads beyond the mean is the turn of the vehicle times the wheel's distance from the middle,
-and the difference of the tyres; a steered wheel also rolls farther in turns, (W9):
+The scale factor of the fit applies to the mean reading of the wheels that do not steer. The
+reading of a wheel differs from the mean by the turn times the wheel's distance from the middle,
+and by the difference of the tyres; a steered wheel also rolls farther in turns, (W9):
 
     K (s_i - s) = (a_i - 1) K s - a_i y_i psi + a_i x_i^2 q,        K_i = K / a_i
 
 s_i and s the readings of wheel i and of the mean, psi the turn, y_i the wheel's place, positive to
-the left, x_i its distance ahead. The attitudes of the fit give the turn; any number of wheels is
-one line each. The places are those of the leg's turns: an outer tyre, which is pressed more, rolls
-on a smaller radius, and that is in them.
+the left, x_i its distance ahead. The turn is from the attitudes of the fit; each wheel has one
+line. The positions include the effect of load in turns: the outer tyre carries more and has a
+smaller rolling radius.
 """
 
 from collections.abc import Iterator
@@ -59,10 +59,10 @@ WHEELBASE = 5.0         # m, 1 sigma of how far a steered wheel is ahead. Physic
 @dataclass(frozen=True, eq=False)
 class Wheel:
     """
-    A wheel beside the mean.
+    A wheel relative to the mean.
 
     ratio : K_i / K.   ratio_sigma : relative.   y : m to the left of the middle of all wheels.
-    y_sigma : m.   walk : m/sqrt(s), by which it parts from the mean: even, hard, in turns.
+    y_sigma : m.   walk : m/sqrt(s), random walk relative to the mean: even, hard, in turns.
     x, x_sigma : m, of a steered wheel ahead of the mean, None of one that does not steer.
     """
 
@@ -121,7 +121,7 @@ def _nodes(s: Floats, quantum: float) -> Ints:
 
 
 def _unknown(leg: SmootherLeg) -> Iterator[tuple[float, float]]:
-    """Yield where increments say nothing: slips that are known, what gaps of a wheel hide, s."""
+    """Yield spans without usable increments: known slips and gaps of a wheel, s."""
     for t in leg.doubt_t:
         yield t - 1.0, t + 1.0
     for wheel in leg.wheels:
@@ -131,7 +131,7 @@ def _unknown(leg: SmootherLeg) -> Iterator[tuple[float, float]]:
 
 
 class _Common:
-    """What the lines of all wheels have in common; s : (w, k) readings at the nodes, m."""
+    """Quantities shared by the lines of all wheels; s : (w, k) readings at the nodes, m."""
 
     def __init__(self, problem: Problem, fit: Fit, at: Ints, s: Floats) -> None:
         state, motion = fit.state, fit.weighted[MotionRows].motion

@@ -1,0 +1,189 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Scale and position error by distance, by window length and by speed: closed forms."""
+
+from drives import drive, settings
+import numpy as np
+import pytest
+
+from odocal_ros.calib.per_distance import check_worse, per_distance
+from odocal_ros.calib.speed_scale import speed_scale
+from odocal_ros.calib.window_scale import window_scale, WINDOWS
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code
+
+RADIUS = 400.0
+WAY = np.arange(0.0, 3000.0, 1.0)
+TRUE = RADIUS * np.stack([np.sin(WAY / RADIUS), 1 - np.cos(WAY / RADIUS), 0 * WAY], -1)
+T = np.arange(0.0, 1800.0)
+
+
+def wrong(scale=1.0, yaw=0.0):
+    """Return what a track of this scale and yaw error strays by, pinned at its beginning."""
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    return scale * TRUE @ turn.T - TRUE
+
+
+@pytest.mark.parametrize(('scale', 'yaw'), [(1.01, 0.0), (1.0, 0.02), (0.98, -0.03)])
+def test_scale_and_yaw_show_as_their_share_of_the_chord(scale, yaw):
+    """Each piece is a chord 2 r sin(L / 2 r), off by |scale e^(i yaw) - 1| of it, anywhere."""
+    off = abs(scale * np.exp(1j * yaw) - 1)
+    for found in per_distance(WAY, wrong(scale, yaw), wrong()):
+        chord = 2 * RADIUS * np.sin(found.length / 2 / RADIUS)
+        assert found.before == pytest.approx(off * chord, rel=1e-9)
+        assert found.after == 0.0
+
+
+def test_what_bends_a_track_once_is_no_error_of_most_pieces():
+    """A step of 30 m is in the pieces that hold it: of 1000 m in half of those of 2000 m."""
+    step = np.zeros_like(TRUE)
+    step[WAY > 1500.5, 0] = 30.0
+    *_, longest = per_distance(WAY, step, step)
+    assert longest.length == 1000.0
+    assert longest.before == pytest.approx(30.0 * np.sqrt(0.5), rel=0.02)     # one of 20 pieces
+
+
+def test_lengths_beyond_the_way_or_across_missing_fixes_are_left_out():
+    assert [x.length for x in per_distance(WAY[:600], TRUE[:600], TRUE[:600])] == [100.0, 500.0]
+    seen = (WAY < 700) | (WAY > 2250)       # 1.5 km of no fixes: pieces that end beyond it
+    found = per_distance(WAY[seen], wrong(1.01)[seen], wrong()[seen])
+    assert [x.length for x in found] == [100.0, 500.0]
+    assert per_distance(np.empty(0), np.empty((0, 3)), np.empty((0, 3))) == ()
+
+
+def test_a_correction_that_makes_it_worse_is_a_reason():
+    noise = np.random.default_rng(1).normal(0.0, 0.5, TRUE.shape)
+    (reason,) = check_worse(WAY, wrong() + noise, wrong(1.02) + noise, configured=True)
+    assert reason.code is Code.CHECK_WORSE
+    # 2 % of the chord of 100 m and the noise of both ends, each axis
+    assert (f'in 100 m of path the calibrated track deviates {np.hypot(2.0, 1.0):.2g} '
+            'm') in reason.text
+    assert 'as configured 1 m' in reason.text
+    assert check_worse(WAY, wrong(1.02) + noise, wrong() + noise, configured=True) == []
+    assert check_worse(WAY, wrong() + noise, wrong(1.0005) + noise, configured=True) == []
+
+
+def driven(seed=0):
+    """Return speeds, m/s, and a track of stop and go with turns, m: (k,), (k, 2)."""
+    rng = np.random.default_rng(seed)
+    speed = np.repeat(rng.uniform(0.0, 15.0, 90), 20)
+    heading = np.repeat(np.cumsum(rng.normal(0.0, 0.5, 90)), 20)
+    step = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+    return speed, np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)[:-1]])
+
+
+def test_a_wrong_scale_is_the_same_in_all_windows():
+    _, dead = driven()
+    found = window_scale(T, 1.01 * dead, dead)
+    assert found[:, 0].tolist() == list(WINDOWS)
+    # what is far from the median of all is clipped: the longest ways a little
+    assert found[:, 1] == pytest.approx(0.01, rel=0.02)
+
+
+def test_fixes_that_hold_an_odometer_differ_in_short_windows():
+    """An odometer 2 % long, that satellites correct within 20 s: s' = -s / 20 s + 0.02 v."""
+    _, dead = driven()
+    error = np.zeros_like(dead)
+    for k in range(1, len(T)):
+        error[k] = error[k - 1] * np.exp(-1 / 20) + 0.02 * (dead[k] - dead[k - 1])
+    found = window_scale(T, dead + error, dead)
+    by_length = dict(zip(found[:, 0], found[:, 1], strict=True))
+    assert by_length[2.0] > 5 * abs(by_length[200.0])
+    assert np.all(np.diff(found[:, 1]) < 0.0)
+
+
+def test_the_sigma_is_that_of_white_fixes():
+    z = []
+    for seed in range(30):
+        rng, (_, dead) = np.random.default_rng(100 + seed), driven(seed)
+        found = window_scale(T, dead + rng.normal(0.0, 1.0, dead.shape), dead)
+        z.append(found[:5, 1] / found[:5, 2])
+    # 150 of some dependence, the sigma by seven degrees of freedom: Student's, rms 1.2
+    assert 0.9 < np.sqrt(np.mean(np.square(z))) < 1.5
+
+
+def test_a_short_or_empty_leg_has_no_windows():
+    assert window_scale(T[:0], np.empty((0, 2)), np.empty((0, 2))).shape == (0, 4)
+    _, dead = driven()
+    assert window_scale(T[:20], dead[:20], dead[:20])[:, 0].max(initial=0.0) <= 2.0
+    assert not len(window_scale(T, dead, np.zeros_like(dead)))
+
+
+def test_a_last_window_may_end_a_rounding_after_the_last_fix():
+    t = 1.203 + np.arange(34.0)
+    t[-1] = 34.203      # the last window, 32.203 to 34.203 s, ends at 34.203000000000003 s
+    even = np.stack([t, t], axis=-1)
+    assert window_scale(t, 1.001 * even, even)[0, 1] == pytest.approx(0.001)
+
+
+def test_a_way_within_one_part_of_the_leg_has_no_scatter():
+    dead = np.zeros((len(T), 2))
+    dead[:, 0] = 1e-9 * T + 1e9 * np.clip(T - 1600.0, 0.0, None)      # all of it, within rounding
+    assert not len(window_scale(T, 1.001 * dead, dead))
+
+
+def straight(factor=0.98, offset=0.12, lag=0.3, noise=0.0, reverse=False):
+    """Return the arguments of a straight drive whose odometer has these errors."""
+    t = np.arange(0.0, 600.0, 0.1)
+    v = 12 + 6 * np.sin(t / 15)
+    s = np.append(0.0, np.cumsum((v[1:] + v[:-1]) / 2 * 0.1))
+    late = np.interp(t - lag, t, s)
+    sent = (late - offset * t) / factor * (-1 if reverse else 1)
+    pick = slice(50, -50, 10)
+    place = np.stack([s, 0 * s], -1)[pick]
+    fix = place + noise * np.random.default_rng(1).standard_normal(place.shape)
+    return t[pick], fix, place, s[pick], Travel(t, sent, 0.0)
+
+
+@pytest.mark.parametrize('reverse', [False, True])
+def test_factor_offset_and_lag_are_those_of_the_odometer(reverse):
+    """Without noise the model is exact but for squares of the lag: the speed used is late too."""
+    found = speed_scale(*straight(reverse=reverse))
+    assert found.factor[0] == pytest.approx(0.98, abs=3e-4)
+    assert found.offset[0] == pytest.approx(0.12, abs=4e-3)
+    assert found.lag[0] == pytest.approx(0.3, abs=5e-3)
+    speed, ratio, _, _ = found.bins.T
+    assert (np.diff(speed) > 0).all()
+    # 0.12 m/s of the slow sections are a larger share than of the fast ones
+    assert ratio == pytest.approx(0.98 * speed / (speed - 0.12), rel=3e-3)
+
+
+def test_the_sigmas_hold_with_noise():
+    found = speed_scale(*straight(noise=0.3))
+    for (value, sigma), truth in zip((found.factor, found.offset, found.lag), (0.98, 0.12, 0.3),
+                                     strict=True):
+        assert 0 < abs(value - truth) < 4 * sigma
+
+
+def test_at_one_speed_no_offset_is_stated():
+    t = np.arange(0.0, 200.0, 0.1)
+    place = np.stack([10 * t, 0 * t], -1)[::10]
+    found = speed_scale(t[::10], place, place, 10 * t[::10], Travel(t, 10 * t / 0.5, 0.0))
+    assert found.offset is None
+    assert found.bins[:, 1] == pytest.approx(0.5)
+
+
+def test_too_few_sections_are_no_result():
+    t = np.arange(0.0, 8.0, 0.1)
+    place = np.stack([10 * t, 0 * t], -1)
+    assert not len(speed_scale(t, place, place, 10 * t, Travel(t, 10 * t, 0.0)).bins)
+
+
+@pytest.mark.slow
+def test_the_delay_of_a_simulated_odometer():
+    made = drive(scenario='town', duration=600.0, seed=4, imu_grade='industrial', fix_sigma=0.3,
+                 odometer_delay=0.2)
+    leg = calibrate(made.leg(), settings(made))
+    found = leg.evidence.by_speed
+    assert abs(found.lag[0] - 0.2) < 4 * found.lag[1] < 0.2
+    assert abs(found.factor[0] - made.truth.scale) < 4 * found.factor[1]
+
+
+def test_cells_that_end_at_the_last_fix_may_be_rounded_beyond_it():
+    t = (7_369_999_872 + np.arange(496) * 10**9) * 1e-9     # 99 cells of 5 s and 6e-14 s
+    assert np.arange(t[0], t[-1], 5.0)[-1] > t[-1]
+    place = np.stack([10 * t, 0 * t], -1)
+    found = speed_scale(t, place, place, 10 * t, Travel(t, 10 * t / 0.5, 0.0))
+    assert found.bins[:, 1] == pytest.approx(0.5)

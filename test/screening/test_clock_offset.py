@@ -1,0 +1,81 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Clocks that are seconds apart: found from the motion, corrected, and the values do not move."""
+
+from dataclasses import replace
+
+from drives import drive, everything_said, settings
+import numpy as np
+import pytest
+
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code
+from odocal_ros.screening import clock_offset
+from odocal_ros.screening.clock_offset import OFFSET_CELL
+
+LABELS = {'odometer': {'odometer'}, 'fix': {'fix'}, 'imu': {'odometer', 'fix'}}
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='town', duration=240.0, imu_grade='industrial')
+
+
+@pytest.fixture(scope='module')
+def alone(made):
+    return calibrate(made.leg(), settings(made, method='smoother'))
+
+
+def late(leg, slot, by, arrivals):
+    rows, by_ns = leg.rows(slot), round(by * 1e9)
+    moved = replace(rows, stamp_ns=rows.stamp_ns + by_ns,
+                    received_ns=rows.received_ns + by_ns * arrivals)
+    return leg.with_rows(**{slot: moved})
+
+
+@pytest.mark.parametrize(('slot', 'by', 'arrivals'), [
+    ('odometer', 5.0, True), ('odometer', -3.3, False), ('fix', 20.0, True), ('fix', -1.4, False),
+    ('imu', 2.0, True)])
+def test_clocks_that_are_seconds_apart_are_aligned(made, alone, slot, by, arrivals):
+    result = calibrate(late(made.leg(), slot, by, arrivals), settings(made, method='smoother'))
+    said = [r.text for r in result.reasons if r.code is Code.DELAY_SEEN]
+    direction = 'late' if (by > 0) != (slot == 'imu') else 'early'
+    assert {text.split(' stamps')[0] for text in said} == LABELS[slot]
+    for text in said:
+        about, _, way = text.split('about ')[1].split()[:3]
+        assert way == direction
+        assert float(about) == pytest.approx(abs(by), abs=OFFSET_CELL / 2)
+    assert Code.CLOCKS_DIFFER not in everything_said(result)
+    for name in ('scale_factor', 'yaw_mounting_angle'):
+        one, other = (x.methods['smoother'].estimates[name] for x in (result, alone))
+        # the marks cut the topics at other samples, and a part of a cell is left as a delay
+        assert abs(one.value - other.value) < 0.5 * other.sigma
+        assert one.sigma == pytest.approx(other.sigma, rel=0.1)
+
+
+def test_clocks_that_agree_stay_as_they_are(made, alone):
+    assert Code.DELAY_SEEN not in everything_said(alone)
+
+
+def test_nothing_is_aligned_without_accelerations():
+    """At a constant speed no offset is better than another; 0.3 m/s of noise is no motion."""
+    rng = np.random.default_rng(1)
+    assert clock_offset._late(rng.normal(size=(1200, 1)), rng.normal(size=(1200, 3))) is None
+    steady = np.zeros((1200, 1))
+    assert clock_offset._late(steady, steady) is None
+
+
+@pytest.mark.parametrize('by', [-7.3, 0.12, 3.37, 60.0])
+def test_an_offset_is_found_to_a_fraction_of_a_cell(by):
+    """Of a signal that a straight line between cells holds; noise of its size is independent."""
+    rng = np.random.default_rng(2)
+    t = OFFSET_CELL * np.arange(1600)
+    bumps = rng.uniform(t[0], t[-1], 60)
+
+    def signal(t):
+        return np.exp(-((t[:, None] - bumps) / 1.5)**2 / 2).sum(axis=1, keepdims=True)
+
+    x = signal(t) - signal(t).mean()
+    y = signal(t - by) - signal(t - by).mean() + 0.3 * rng.normal(size=(len(t), 1))
+    assert clock_offset._late(y, x) == pytest.approx(by, abs=OFFSET_CELL / 4)

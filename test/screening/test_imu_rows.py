@@ -1,0 +1,173 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""IMU rows: their rhythm, an axis at the limit of its range, two IMUs that alternate."""
+
+from drives import changed, drive
+import numpy as np
+import pytest
+
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.reasons import Code
+from odocal_ros.screening.imu_rhythm import on_rhythm
+from odocal_ros.screening.saturation import saturated
+from odocal_ros.screening.screen import screen
+from odocal_ros.screening.several_imus import alternating
+from odocal_ros.settings.config import Config, ImuConfig
+from odocal_ros.settings.grades import G
+
+RATE, SECONDS = 100.0, 120.0
+JITTER = 1e-3
+N = 20_000
+T = np.arange(N) * 0.01
+NONE = np.zeros((N, 3))
+BIAS = np.array([3e-3, -2e-3, 1e-3])     # rad/s: 0.17 deg/s, a consumer gyro has 1 deg/s
+
+
+def signals(t, rng, vibration=1.0, noise=0.01):
+    """Return rates and forces of an IMU that shakes at 12 Hz, taken at times: (n, 3) each."""
+    phases = rng.uniform(0, 2 * np.pi, 6)
+    x = vibration * np.sin(2 * np.pi * 12.0 * t[:, None] + phases)
+    x = x + noise * rng.standard_normal(x.shape)
+    return 0.01 * x[:, :3], x[:, 3:]
+
+
+def late(t, rng, jitter=JITTER):
+    """Return stamps of rows that arrive late by 4 ms and a jitter, in order."""
+    return np.maximum.accumulate(t + 4e-3 + jitter * rng.standard_normal(len(t))
+                                 - 1e-9 * np.arange(len(t))) + 1e-9 * np.arange(len(t))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(5)
+
+
+def test_stamps_that_jitter_are_put_on_the_rhythm(rng):
+    true = np.arange(SECONDS * RATE) / RATE
+    found = on_rhythm(late(true, rng), *signals(true, rng))
+    # means over 20 s: of 2000 rows each, between them a line
+    assert np.abs(found - true - 4e-3).max() < 5 * JITTER / np.sqrt(2000)
+    assert (np.diff(found) > 0).all()
+
+
+def test_rows_stamped_in_pairs_are_put_on_the_rhythm(rng):
+    true = np.arange(SECONDS * RATE) / RATE
+    pairs = np.repeat(true[1::2], 2) + np.tile([0.0, 1e-6], len(true) // 2)
+    found = on_rhythm(pairs, *signals(true, rng))
+    # the first of two is stamped an interval later than it was taken, the second as it was
+    np.testing.assert_allclose(found - true, 0.5 / RATE, atol=2e-6)
+
+
+def test_an_imu_that_is_asked_at_uneven_times_keeps_them(rng):
+    asked = np.sort(np.arange(SECONDS * RATE) / RATE + JITTER * rng.standard_normal(12000))
+    assert on_rhythm(asked, *signals(asked, rng)) is asked
+
+
+@pytest.mark.parametrize('t', [
+    np.arange(SECONDS * RATE) / RATE, np.arange(50) / RATE, np.zeros(500), np.empty(0),
+    np.cumsum(np.random.default_rng(3).exponential(0.01, 12000))],
+    ids=['even', 'few', 'at once', 'none', 'at random'])
+def test_what_shows_no_rhythm_stays(rng, t):
+    np.testing.assert_array_equal(on_rhythm(t, *signals(t, rng)), t)
+
+
+@pytest.mark.parametrize('noise', [0.01, 0.0])
+def test_noise_alone_tells_no_rhythm(rng, noise):
+    true = np.arange(SECONDS * RATE) / RATE
+    stamps = late(true, rng)
+    w, f = signals(true, rng, vibration=0.0, noise=noise)
+    assert on_rhythm(stamps, w, f + 9.81) is stamps
+
+
+def test_lost_rows_move_no_others(rng):
+    """A row lost every 30 s: those about it keep their stamps, the rest find their rhythm."""
+    true = np.arange(4 * SECONDS * RATE) / RATE
+    kept = np.ones(len(true), bool)
+    kept[rng.integers(500, len(true) - 500, 16)] = False
+    true = true[kept]
+    stamps = late(true, rng)
+    found = on_rhythm(stamps, *signals(true, rng))
+    left = np.abs(found - true - 4e-3)
+    # a row lost in the first or last quarter of a block moves its mean by less than is seen
+    assert np.median(left) < 0.1 * JITTER
+    assert left.max() < np.abs(stamps - true - 4e-3).max() + 0.25 / RATE
+    assert (np.diff(found) > 0).all()
+    assert np.std(found - true) < 0.6 * np.std(stamps - true)
+
+
+def shaken(size, step=0.0):
+    """Return forces about gravity: (N, 3) m/s^2, in steps."""
+    f = np.random.default_rng(1).normal(0.0, size, (N, 3)) + [0.0, 0.0, G]
+    return np.round(f / step) * step if step else f
+
+
+def words(*signals, imu=None):
+    """Return the sentences of what is found."""
+    reasons = saturated(T, *signals, imu or ImuConfig())
+    assert {reason.code for reason in reasons} <= {Code.IMU_SATURATED}
+    return [reason.text for reason in reasons]
+
+
+@pytest.mark.parametrize('step', [0.0, 0.125])
+def test_force_cut_at_a_limit_is_named(step):
+    f = np.clip(shaken(5.0, step), -2 * G, 19.5)
+    count = int((f[:, 2] == 19.5).sum())
+    first = T[np.argmax(f[:, 2] == 19.5)]
+    assert words(NONE, f) == [
+        f'accelerometer z stops at +19.5 m/s^2 in {count} of {N} messages, first at t = '
+        f'{first:.1f} s']
+
+
+def test_limits_are_of_the_scaled_unit_and_both_ends_are_counted():
+    f = np.clip(shaken(5.0), -2 * G, 2 * G) / G
+    assert 'stops at +19.61 m/s^2' in words(NONE, f, imu=ImuConfig(accel_scale=G))[0]
+    assert not words(NONE, f)       # 2 m/s^2 is no range
+    w = np.zeros((N, 3))
+    w[:, 1] = np.clip(3.0 * np.sin(T), -2.18, 2.18)
+    text, = words(w, NONE)
+    assert text.startswith('gyro y stops at ')
+    assert text.endswith('; 1 more such limits')
+
+
+@pytest.mark.parametrize('signal', [
+    shaken(5.0), shaken(5.0, 0.125), shaken(5.0, 1.0),         # not cut
+    shaken(5.0)[np.arange(N) // 4],                            # each value sent four times
+    np.round(shaken(0.01) / 0.1) * 0.1,                        # at rest, in coarse steps
+], ids=['fine', 'steps', 'coarse', 'repeated', 'rest'])
+def test_no_limit_is_found_where_none_is(signal):
+    assert not words(NONE, signal)
+    assert not words(signal * [1.0, 1.0, 0.0] / 5.0, NONE)
+
+
+@pytest.fixture(scope='module')
+def leg():
+    return drive(scenario='town', duration=200.0, imu_grade='consumer', seed=8).leg()
+
+
+def second(x, by):
+    """Return rows of which every second one is changed."""
+    return np.where((np.arange(len(x)) % 2 == 1)[:, None], by(x), x)
+
+
+@pytest.mark.parametrize(('column', 'by'), [
+    ('w_i', lambda w: w + BIAS), ('f_i', lambda f: f + 100 * BIAS),
+    ('w_i', lambda w: w @ matrix_from_rpy([0.1, 0.0, 0.0]).T)], ids=['gyro', 'force', 'axes'])
+def test_rows_that_alternate_between_two_imus_reject_the_leg(leg, column, by):
+    mixed = changed(leg.imu, **{column: lambda x: second(x, by)})
+    _, reasons = screen(leg.__class__(**{**vars(leg), 'imu': mixed}), Config())
+    assert 'every second message' in {r.code: r for r in reasons}[Code.SEVERAL_IMUS].text
+
+
+@pytest.mark.parametrize('grade', ['consumer', 'perfect'])
+@pytest.mark.parametrize('rate', [10.0, 25.0, 100.0])
+@pytest.mark.parametrize('repeat', [1, 2])
+def test_one_imu_is_one_at_any_rate_and_with_rows_that_repeat(grade, rate, repeat):
+    imu = drive(scenario='yard', duration=250.0, imu_grade=grade, imu_rate=rate, seed=9).leg().imu
+    assert not alternating(*(np.repeat(x[::repeat], repeat, axis=0) for x in (imu.w_i, imu.f_i)))
+
+
+def test_a_spike_is_no_second_imu(leg):
+    w = leg.imu.w_i.copy()
+    w[len(w) // 2] += 50.0
+    assert not alternating(w, leg.imu.f_i)
