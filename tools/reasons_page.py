@@ -131,7 +131,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'moved in the vehicle by 45 deg or more.',
         Code.IMU_WORSE_THAN_GRADE: 'IMU errors are larger than its grade. The smoother uses the '
         'noise estimated from the drive instead. Sigmas that only rest on the grade, such as '
-        'those of the other methods, are too small.',
+        'those of the other methods, are too small. Or errors are far larger for some seconds: '
+        'vibration above half the rate of the IMU (aliasing) becomes slow there.',
         Code.IMU_SATURATED: 'The largest value of an axis is repeated: the sensor stops at the '
         'limit of its range, 2 g or 16 g for an accelerometer. Potholes and a hard mount cause '
         'this. Noise levels are estimated with it.',

@@ -18,8 +18,13 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals, solve, Solved
 from odocal_ros.estimator.equations import Equations, Weighted
-from odocal_ros.estimator.factors.factor import JUMP, SPREAD, WANTED
-from odocal_ros.estimator.factors.interval_noise import ROAD
+from odocal_ros.estimator.factors.factor import (
+    JUMP,
+    SPREAD,
+    VARIANCE_FACTORS,
+    WANTED,
+)
+from odocal_ros.estimator.factors.interval_noise import INTERVAL
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.point_rows import alike, PointRows, TAIL_SIGMAS
 from odocal_ros.estimator.factors.slow_error import SlowError
@@ -64,6 +69,9 @@ CONVERGENCE = Convergence()
 # share of the last step from which on a step that turns back is shortened. Judgement: smaller
 # reversals converge without it
 TURNS_BACK = -0.5
+# statistical: squares of noises, in sigmas, beyond which an interval is an outlier; chi2 of the
+# six of a sensor (two times, three axes) is as seldom above its limit
+TAILS = np.where(np.isin(VARIANCE_FACTORS, ('gyro', 'accel')), 20.06, TAIL_SIGMAS**2)
 AGAIN_PASSES = 6    # judgement: of a fit that starts from a converged one
 
 
@@ -199,17 +207,18 @@ def slips(weighted: Weighted, marginals: JointMarginals, spread: Floats, levels:
 
     levels, onward : of this pass and of the next; outliers are evaluated at the next.
     """
-    noise, found = weighted[MotionRows].road_noise(marginals)
-    jumps = np.zeros((2, len(noise), 1))
+    rows = weighted[MotionRows]
+    jumps = np.zeros((2, len(spread), 1))
     if 'slow' in weighted.parts:
         jumps = weighted[SlowError].jumps(marginals)
-    noise, found = (np.concatenate(x, axis=1) for x in zip((noise, found), jumps, strict=True))
-    grown = weighted[MotionRows].noise.grown({n: onward[n] / levels[n] for n in ROAD})
+    noise, found = (np.concatenate(x, axis=1) for x in zip(
+        rows.road_noise(marginals), rows.imu_noise(marginals), jumps, strict=True))
+    grown = rows.noise.grown({n: onward[n] / levels[n] for n in INTERVAL})
     jumped = onward['slow'] / levels['slow'] if 'slow' in weighted.parts else 1.0
     grown = np.concatenate([grown, np.full((len(grown), 1), jumped)], axis=1)
     z2 = noise**2 / np.maximum(found, 1e-12) / grown
     z2[found < 0.02] = 0.0          # not observable in this interval
-    wanted = np.clip(spread * z2 / TAIL_SIGMAS**2, 1.0, 1e6)
+    wanted = np.clip(spread * z2 / TAILS, 1.0, 1e6)
     # half the change in the logarithm: adjacent intervals share a slip and would oscillate
     wanted[:, :JUMP] = np.sqrt(spread * wanted)[:, :JUMP]
     out: Floats = wanted

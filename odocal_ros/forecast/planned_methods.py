@@ -11,6 +11,7 @@ from odocal_ros.calib.choice import choose, deciding, worth_saying
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.estimator.chain import NotPositive, solve
 from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.factor import SPREAD
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.imu_noise import sensor_noise
@@ -92,7 +93,7 @@ def fit_at(problem: Problem, made: Ideal, levels: Levels) -> Fit:
     """Return the fit at the true state, without any step."""
     state, priors = made.state, problem.priors
     weighted = Equations(problem, state, priors).at(levels)
-    return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), True, False, 0,
+    return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, SPREAD)), True, False, 0,
                np.nan, weighted, solve(weighted.normal()), np.zeros((M, 0)))     # none estimated
 
 

@@ -79,6 +79,28 @@ def test_wheels_that_hold_are_not_blamed(options):
     assert not said(fitted(**options)[1])
 
 
+def shaken(leg):
+    """Return a leg with vibration of 70 Hz + 4 Hz per m/s, sampled at 100 Hz without a filter."""
+    t, rng = leg.t_imu, np.random.default_rng(1)
+    speed = np.abs(np.gradient(leg.travel.at(t), t)) * leg.rough_scale
+    speed = np.convolve(speed, np.full(100, 0.01), 'same')
+    phase = np.cumsum((70.0 + 4.0 * speed) * np.gradient(t)) * 2 * np.pi
+    wave = np.sin(phase[:, None] + rng.uniform(0, 2 * np.pi, 3))
+    return replace(leg, f_b=leg.f_b + 0.5 * wave, w_b=leg.w_b + np.deg2rad(0.2) * wave)
+
+
+@pytest.mark.parametrize('noise', ['white', 'rtk'])
+def test_aliased_vibration_is_an_error_of_the_imu_and_no_slip(noise):
+    drive, config, leg = made(**SHORT, fix_noise=noise)
+    method = smooth(shaken(leg), config)
+    assert not said(method)
+    assert 'aliasing' in ' '.join(r.remedy for r in method.reasons
+                                  if r.code is Code.IMU_WORSE_THAN_GRADE)
+    assert off(drive, method) < 3.3
+    yaw = method.estimates['yaw_mounting_angle']
+    assert abs(yaw.value - drive.truth.yaw) < 3.3 * yaw.sigma
+
+
 def test_a_level_that_no_row_determines_is_not_reported():
     """12 m/s in 40 s: no second speeds up by more than 0.5 m/s^2, where wheels may slip."""
     drive = by_hand(lambda duration, rng: routes._route([

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools
+from odocal_ros.estimator.factors.factor import IMU_NOISE, JUMP, SPREAD
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer_filter import stamp_of
 from odocal_ros.estimator.leg import SmootherLeg
@@ -52,6 +53,7 @@ class IntervalNoise:
 
     motion: Motion
     axes: Floats                       # (K, 3, 3) rows: forward, left, up
+    imu: Floats                        # (K, 2) factors on the unit noises of gyro and accel
     road: Floats                       # (K, 5) effects of the wheels' unit noises along their axes
     extra: Floats                      # (K, 18) variances that are given, not estimated
     given: Floats                      # (K, 18, g) columns of unit noises, the same
@@ -69,11 +71,12 @@ class IntervalNoise:
         for point, (x, weight) in enumerate(zip(GAUSS_X, GAUSS_W, strict=True)):
             u = ((1 - x) * T)[:, None, None]
             root = np.sqrt(weight * T)[:, None, None]
+            of_gyro, of_accel = (root * x[:, None, None] for x in self.imu[rows].T)
             gyro, accel, gyro_walk, accel_walk = (
                 out[:, :, first:first + 3] for first in 12 * point + 3 * np.arange(4))
-            gyro[:, PHI], gyro[:, V] = -one * root, force * u * root
-            gyro[:, P], gyro[:, D] = force * (u**2 / 2) * root, way * u * root
-            accel[:, V], accel[:, P] = one * root, one * u * root
+            gyro[:, PHI], gyro[:, V] = -one * of_gyro, force * u * of_gyro
+            gyro[:, P], gyro[:, D] = force * (u**2 / 2) * of_gyro, way * u * of_gyro
+            accel[:, V], accel[:, P] = one * of_accel, one * u * of_accel
             gyro_walk[:, PHI], gyro_walk[:, V] = -C * u * root, force @ C * (u**2 / 2) * root
             gyro_walk[:, P] = force @ C * (u**3 / 6) * root
             gyro_walk[:, D], gyro_walk[:, BG] = way @ C * (u**2 / 2) * root, one * root
@@ -85,8 +88,13 @@ class IntervalNoise:
         return out
 
     def grown(self, by: dict[str, float]) -> Floats:
-        """Return the factors of the road's variances forward, left, up by new levels: (K, 3)."""
-        out = np.ones((len(self.road), 3))
+        """
+        Return the factors of the variances by new levels: (K, 5).
+
+        Of the road forward, left, up, of gyro and accelerometer.
+        """
+        out = np.ones((len(self.road), JUMP))
+        out[:, IMU_NOISE] = by['gyro'], by['accel']
         for column, (name, axis) in enumerate(ROAD.items()):
             out[:, axis] = np.where(self.road[:, column] > 0, by[name], out[:, axis])
         return out
@@ -108,7 +116,7 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
 
     rest : (K,) bool, intervals at standstill: their odometer noise is given, since it does not
         depend on the noise in motion.
-    spread : (K, 3 or more) factors on the odometer's variances, forward, sideways and up first.
+    spread : (K, SPREAD) factors on the variances of outlier intervals.
     """
     K, T = len(motion.T), motion.T[:, 0]
     axes = np.swapaxes(motion.C_end @ motion.state.C_bv, 1, 2)      # rows: forward, left, up
@@ -117,7 +125,7 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     speed = np.linalg.norm(motion.way, axis=1) / T
     share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero where a wheel hardly turns
     hard, turning = hard_and_turning(motion)
-    spread = np.ones((K, 3)) if spread is None else spread
+    spread = np.ones((K, SPREAD)) if spread is None else spread
     left = motion.state.C_bv[:, 1]
     pitching = np.sqrt(np.maximum(left @ motion.swings @ left, 0.0))
     acting = (share * ~hard, share * hard, share * ~turning, share * turning, share, pitching)
@@ -128,7 +136,8 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     extra[rest, D] += still
     slow = ~rest & (speed < 1.0)
     extra[slow, D] += still * (1 - speed[slow, None])
-    return IntervalNoise(motion, axes, road, extra, _given(motion, leg, axes, rest))
+    return IntervalNoise(motion, axes, np.sqrt(spread[:, IMU_NOISE]), road, extra,
+                         _given(motion, leg, axes, rest))
 
 
 def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Floats:

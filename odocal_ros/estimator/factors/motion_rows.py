@@ -36,6 +36,7 @@ NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyr
          'accel_walk': 'accelerometer_bias_walk', 'along': 'travel_noise',
          'along_hard': 'travel_noise', 'side': 'sideslip', 'side_turn': 'sideslip',
          'up': 'vertical_motion', 'pitching': 'vertical_motion'}
+WHITE_NOISES = ('gyro', 'accel')
 ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up', 'pitching'))
 
 
@@ -203,6 +204,18 @@ class MotionRows(Factor):
         columns = [self.of(*names) for names in ODOMETER_AXES]
         return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
                 np.stack([seen[:, c].sum(axis=1) for c in columns], -1))
+
+    def imu_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
+        """
+        Return the white noise of gyro and accelerometer in each interval: (K, 2) each.
+
+        First the norm of the estimates of all unit noises, second the expected variance of the
+        one that is observed best.
+        """
+        estimate, seen = self._noises(marginals)
+        columns = [self.of(name) for name in WHITE_NOISES]
+        return (np.stack([np.linalg.norm(estimate[:, c], axis=1) for c in columns], -1),
+                np.stack([seen[:, c].max(axis=1) for c in columns], -1))
 
     def along_size(self) -> Floats:
         """Return the displacement by a unit of the noise along the path, m: (K,)."""
