@@ -14,8 +14,10 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, from_rates, marked, PlannedDrive
 from odocal_ros.nav.angles import arctan2
+from odocal_ros.outside.limits import read_bytes
 from odocal_ros.settings.config import Config
 
+LONGEST_TRACK = 2**26        # bytes of a GPX file, judgement: a day at 1 Hz has a fifth of it
 MOST_SECONDS = 36_000.0      # of a planned drive, judgement: ten hours
 
 
@@ -92,7 +94,7 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
     """Return times since the first point, s (None: none given), and (n, 3) geodetic, rad, m."""
     import xml.etree.ElementTree as ElementTree
     try:
-        root = ElementTree.fromstring(Path(path).read_bytes())
+        root = ElementTree.fromstring(read_bytes(Path(path), LONGEST_TRACK))
     except OSError as error:
         raise BadUsage(f'{path}: cannot be read ({error.strerror}); give the path of a GPX '
                        'file') from None

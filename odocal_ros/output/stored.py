@@ -14,6 +14,7 @@ from odocal_ros.calib.result import BESIDE, Estimate, wheel_factors
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.figures import with_sigma, with_unit
 from odocal_ros.output.files import MAIN, plain, SCHEMA
+from odocal_ros.outside.limits import read_bytes
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, flat
 
@@ -66,9 +67,7 @@ def read_stored(path: Path) -> Stored:
     try:
         path = path / MAIN if path.is_dir() else path
         biggest = 2**28    # bytes; a day of legs is a thousandth of it
-        if path.stat().st_size > biggest:
-            raise BadUsage(f'{name}: too large for a calibration.json')
-        content = json.loads(path.read_text(encoding='utf-8'), parse_constant=_no_constant)
+        content = json.loads(read_bytes(path, biggest).decode(), parse_constant=_no_constant)
         return stored_from(content, name)
     except OSError as error:
         in_folder = isinstance(error, FileNotFoundError) and path != Path(name)

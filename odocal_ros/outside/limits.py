@@ -149,8 +149,12 @@ def read_text(path: Path) -> str:
     Raises LimitReached, OSError, UnicodeDecodeError.
     """
     size = 2**19    # bytes of a YAML file
-    most = int(size * factor())
+    return read_bytes(path, size).decode()
+
+
+def read_bytes(path: Path, size: int) -> bytes:
+    """Return a file of at most ``size`` bytes, or raise LimitReached: a device has no end."""
     with path.open('rb') as file:
-        data = file.read(most + 1)
+        data = file.read(int(size * factor()) + 1)
     check(len(data), size, f'{path}: the text')
-    return data.decode()
+    return data

@@ -6,11 +6,14 @@
 import copy
 import json
 import math
+from pathlib import Path
 
 import pytest
 
 from odocal_ros.library.compare import CAUSES
 from odocal_ros.offline.cli import main
+from odocal_ros.output.stored import read_stored
+from odocal_ros.outside.limits import LimitReached
 
 pytestmark = pytest.mark.core
 ENTRY = {'value': 0.02, 'sigma': 3e-6, 'unit': 'm/pulse', 'method': 'two_point'}
@@ -234,6 +237,11 @@ def test_what_is_no_calibration_is_one_line_and_exit_2(compare, bad, word):
     assert err.count('\n') == 1
     assert word in err
     assert 'b.json' in err
+
+
+def test_a_device_is_not_read_without_end():
+    with pytest.raises(LimitReached, match='/dev/zero: the text exceeds the limit'):
+        read_stored(Path('/dev/zero'))
 
 
 @pytest.mark.parametrize(('path', 'value'), [

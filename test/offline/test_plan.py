@@ -309,6 +309,10 @@ def test_a_gpx_that_cannot_be_used_is_refused(tmp_path, capsys, text, words):
     assert str(path) in message
 
 
+def test_a_gpx_without_an_end_is_refused(capsys):
+    assert 'exceeds the limit' in refused(capsys, '--gpx', '/dev/zero')
+
+
 def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
     bag = tmp_path / 'drive'
     assert main(['simulate', '--scenario', 'straight', '--out', str(bag), '--duration', '200',
