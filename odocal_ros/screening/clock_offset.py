@@ -32,8 +32,8 @@ FARTHEST_OFFSET = 90.0      # s, judgement: largest offset that is found
 SLOW_FORCE, SLOW_SPEED = 20.0, 60.0
 # s, judgement: duration of one acceleration, which counts as one sample
 EVENT = 4.0
-# statistical: log likelihood of the best offset less that of all farther than EVENT from it; the
-# margin above 10 (once in 20,000) is for signals that repeat themselves
+# statistical: log likelihood of the best offset less that of small ones and of all farther than
+# EVENT from it; the margin above 10 (once in 20,000) is for signals that repeat themselves
 LEAST_LOG_ODDS = 20.0
 
 
@@ -71,12 +71,13 @@ def _offsets(inputs: Inputs, placed: Placed) -> Iterator[tuple[str, float]]:
     force[count == 0] = inputs.usual_f_b
     way = np.diff(travel.at(edges))
     odometer = _late(_quick(np.gradient(way)[:, None], SLOW_FORCE), _quick(force, SLOW_FORCE))
-    if odometer is not None and abs(odometer) > OFFSET_REACH:
+    if odometer:
         yield 'odometer', odometer
     place = np.stack([np.interp(edges, t_fix, axis) for axis in placed.fixes_n[:, :2].T], -1)
-    fix = _late(*(_quick(_chords(x), SLOW_SPEED) for x in (place, travel.at(edges)[:, None])))
-    if fix is not None and abs(fix + (odometer or 0.0)) > OFFSET_REACH:
-        yield 'gnss', fix + (odometer or 0.0)
+    fix = _late(_quick(_chords(place), SLOW_SPEED),
+                _quick(_chords(travel.at(edges)[:, None]), SLOW_SPEED), odometer)
+    if fix:
+        yield 'gnss', fix
 
 
 def _chords(place: Floats) -> Floats:
@@ -96,8 +97,12 @@ def _quick(x: Floats, slow: float) -> Floats:
     return out
 
 
-def _late(y: Floats, x: Floats) -> float | None:
-    """Return the delay of y, (n, 1), against x, (n, k), at its best fit, s; None: not clear."""
+def _late(y: Floats, x: Floats, x_late: float = 0.0) -> float:
+    """
+    Return the delay of y relative to the IMU, s; 0 if it is not clearly above OFFSET_REACH.
+
+    y : (n, 1), compared with its best fit by x, (n, k), whose delay is x_late.
+    """
     reach = round(FARTHEST_OFFSET / OFFSET_CELL)
     size = 2 * max(len(x), reach)
     both = np.fft.irfft(np.fft.rfft(y, size, axis=0) * np.fft.rfft(x, size, axis=0).conj(),
@@ -110,11 +115,12 @@ def _late(y: Floats, x: Floats) -> float | None:
     before, here, after = share[best - 1:best + 2]      # their parabola has its maximum there:
     top = (after - before) / max(2 * (2 * here - before - after), 1e-12)
     late = OFFSET_CELL * (at[best] + np.clip(top, -0.5, 0.5))
-    others = share[np.abs(OFFSET_CELL * at - late) > EVENT].max()
+    small = np.abs(OFFSET_CELL * at + x_late) <= OFFSET_REACH
+    others = share[(np.abs(OFFSET_CELL * at - late) > EVENT) | small].max()
     events = len(y) * OFFSET_CELL / EVENT
     left = np.maximum(1.0 - np.array([others, here]), 1e-6)      # of the variance
     log_odds = events / 2 * np.log(left[0] / left[1])
-    return float(late) if log_odds > LEAST_LOG_ODDS else None
+    return float(late + x_late) if log_odds > LEAST_LOG_ODDS else 0.0
 
 
 def _moved(samples: SomeSamples, by_ns: int, imu: ImuSamples) -> SomeSamples:

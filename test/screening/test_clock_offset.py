@@ -35,7 +35,7 @@ def late(leg, slot, by, arrivals):
 
 
 @pytest.mark.parametrize(('slot', 'by', 'arrivals'), [
-    ('odometer', 5.0, True), ('odometer', -3.3, False), ('fix', 20.0, True), ('fix', -1.4, False),
+    ('odometer', 5.0, True), ('odometer', -3.3, False), ('fix', 20.0, True), ('fix', -2.6, False),
     ('imu', 2.0, True)])
 def test_clocks_that_are_seconds_apart_are_aligned(made, alone, slot, by, arrivals):
     result = calibrate(late(made.leg(), slot, by, arrivals), settings(made, method='smoother'))
@@ -61,12 +61,12 @@ def test_clocks_that_agree_stay_as_they_are(made, alone):
 def test_nothing_is_aligned_without_accelerations():
     """At a constant speed no offset is better than another; 0.3 m/s of noise is no motion."""
     rng = np.random.default_rng(1)
-    assert clock_offset._late(rng.normal(size=(1200, 1)), rng.normal(size=(1200, 3))) is None
+    assert clock_offset._late(rng.normal(size=(1200, 1)), rng.normal(size=(1200, 3))) == 0.0
     steady = np.zeros((1200, 1))
-    assert clock_offset._late(steady, steady) is None
+    assert clock_offset._late(steady, steady) == 0.0
 
 
-@pytest.mark.parametrize('by', [-7.3, 0.12, 3.37, 60.0])
+@pytest.mark.parametrize('by', [-7.3, 0.0, 3.37, 60.0])
 def test_an_offset_is_found_to_a_fraction_of_a_cell(by):
     """Of a signal that a straight line between cells holds; noise of its size is independent."""
     rng = np.random.default_rng(2)
@@ -79,3 +79,14 @@ def test_an_offset_is_found_to_a_fraction_of_a_cell(by):
     x = signal(t) - signal(t).mean()
     y = signal(t - by) - signal(t - by).mean() + 0.3 * rng.normal(size=(len(t), 1))
     assert clock_offset._late(y, x) == pytest.approx(by, abs=OFFSET_CELL / 4)
+
+
+def test_an_offset_that_is_hardly_better_than_a_small_one_is_none():
+    """Speeds of a motorway change over half a minute: errors of the fixes move the best offset."""
+    rng = np.random.default_rng(3)
+    t = OFFSET_CELL * np.arange(1200)
+    bumps = rng.uniform(t[0], t[-1], 20)
+    x, y = (np.exp(-((t[:, None] - bumps - by) / 6)**2 / 2).sum(axis=1, keepdims=True)
+            for by in (0.0, 1.4))
+    x, y = x - x.mean(), y - y.mean() + 0.4 * x.std() * rng.normal(size=x.shape)
+    assert clock_offset._late(y, x) == 0.0
