@@ -7,8 +7,8 @@ Dead reckoning with the strapdown of the calibration, corrected at stops.
 From one IMU sample to the next attitude is turned by the calibration's rotation increments
 (``apply/attitude.py``) and travel summed by the trapezoid rule along the calibrated forward axis,
 as ``nav/dead_reckoning.py`` has it: with ``levelling`` off the path of equal samples, start
-attitude and bias is that of a replay. With it, the accelerometer holds the tilt, stops the gyro
-bias; the position never jumps.
+attitude and bias is that of a replay. With it, the tilt is corrected by the accelerometer, the
+gyro bias at standstill; the position never jumps.
 """
 
 from collections.abc import Sequence

@@ -4,6 +4,7 @@
 """Slip of a wheel in the smoother: said, where and how much, and held by the sigma."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 from drives import cached, settings
 import numpy as np
@@ -13,6 +14,8 @@ from smoother_legs import leg_of, made
 
 from odocal_ros.calib.slip import without_braking
 from odocal_ros.estimator import smooth
+from odocal_ros.estimator.factors.factor import ACCEL_NOISE, SPREAD
+from odocal_ros.estimator.result import mismatch
 from odocal_ros.estimator.result.outcome import in_words
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code
@@ -99,6 +102,14 @@ def test_aliased_vibration_is_an_error_of_the_imu_and_no_slip(noise):
     assert off(drive, method) < 3.3
     yaw = method.estimates['yaw_mounting_angle']
     assert abs(yaw.value - drive.truth.yaw) < 3.3 * yaw.sigma
+
+
+@pytest.mark.parametrize(('seconds', 'reported'), [(1, False), (2, False), (3, True)])
+def test_a_shock_of_a_short_drive_is_no_vibration(seconds, reported):
+    spread = np.ones((60, SPREAD))
+    spread[:seconds, ACCEL_NOISE] = 100.0
+    fit = SimpleNamespace(spread=spread, levels={'accel': 0.005**2})
+    assert bool(mismatch._outliers(fit)) == reported
 
 
 def test_a_level_that_no_row_determines_is_not_reported():

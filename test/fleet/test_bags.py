@@ -135,8 +135,8 @@ def test_legs_from_text_combine_to_the_same_digits():
     again = legs_from(text)
     assert leg_text(again) == text
     kept = [leg.numbers() for leg in legs]      # what is drawn is left out
-    told, known = (as_json(combine(some, config), config, [], '') for some in (again, kept))
-    assert told == known
-    assert told['result']['scale_factor']['method'] == 'smoother'
+    found, known = (as_json(combine(some, config), config, [], '') for some in (again, kept))
+    assert found == known
+    assert found['result']['scale_factor']['method'] == 'smoother'
     assert again[0].methods['smoother'].border.information.tobytes() == \
         legs[0].methods['smoother'].border.information.tobytes()

@@ -192,27 +192,27 @@ def run(quiet=False):
     child = subprocess.Popen([sys.executable, '-c', CODE.format(quiet=quiet)], text=True,
                              stdout=subprocess.PIPE, stderr=slave)
     os.close(slave)
-    told = b''
+    shown = b''
     try:
         while chunk := os.read(master, 65536):
-            told += chunk
+            shown += chunk
     except OSError:      # the other side is closed
         pass
     os.close(master)
     out, _ = child.communicate(timeout=60)
-    assert child.returncode == 0, told
-    return out, told.decode()
+    assert child.returncode == 0, shown
+    return out, shown.decode()
 
 
 def test_a_terminal_shows_each_phase_and_is_left_clean():
-    out, told = run()
+    out, shown = run()
     assert out == 'the result\n'
     for part in ('reading town', '25 %', 'leg 2 of 2', '50 %', 'drawing the report'):
-        assert part in told, part
-    *_, last = (line for line in told.split('\r') if 'smoother' in line)
+        assert part in shown, part
+    *_, last = (line for line in shown.split('\r') if 'smoother' in line)
     assert '%' not in last
-    assert told.split('\r')[-1].strip() == ''      # the line is wiped
-    assert '\n' not in told.replace('\r\n', '')
+    assert shown.split('\r')[-1].strip() == ''      # the line is wiped
+    assert '\n' not in shown.replace('\r\n', '')
 
 
 def test_quiet_is_quiet_and_a_pipe_stays_clean():

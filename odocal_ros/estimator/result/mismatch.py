@@ -21,10 +21,10 @@ from odocal_ros.settings.grades import grade_of, turn_on_bias
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: judgement
-# m/s in a second, and share of the seconds, of outliers that are reported. Judgement: aliased
-# vibration makes 0.05 to 0.13 in 1.3 % or more, kerbs under a robot at most 0.01, ordinary drives
-# have outliers in 0.5 %
-OUTLIER_SIZE, OUTLIER_TIME = 0.01, 0.01
+# m/s in a second, share and number of the seconds, of outliers that are reported. Judgement:
+# aliased vibration makes 0.05 to 0.13 in 1.3 % or more, kerbs under a robot at most 0.01, ordinary
+# drives have outliers in 0.5 %; one or two shocks of a short drive are no vibration
+OUTLIER_SIZE, OUTLIER_TIME, FEWEST_OUTLIERS = 0.01, 0.01, 3
 
 
 def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
@@ -86,8 +86,9 @@ def _outliers(fit: Fit) -> list[Reason]:
     """Report an accelerometer whose errors are far beyond its noise level for many seconds."""
     factor = fit.spread[:, ACCEL_NOISE]
     size = np.sqrt(factor * fit.levels['accel'])
-    share = float(((factor > SLIP_VARIANCE) & (size > OUTLIER_SIZE)).mean())
-    if share < OUTLIER_TIME:
+    outlier = (factor > SLIP_VARIANCE) & (size > OUTLIER_SIZE)
+    share = float(outlier.mean())
+    if share < OUTLIER_TIME or outlier.sum() < FEWEST_OUTLIERS:
         return []
     return [Reason(
         Code.IMU_WORSE_THAN_GRADE, f'accelerometer errors are outliers in {100 * share:.0f} % of '
