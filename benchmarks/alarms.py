@@ -56,6 +56,13 @@ def held_up(leg, rng):
     return replace(leg, odometer=replace(leg.odometer, stamp_ns=np.sort(stamp)))
 
 
+def turned_half_way(leg, rng):
+    """Turn the IMU by 2 deg about z."""
+    from drives import turned
+    return replace(leg, imu=turned(leg.imu, leg.imu.stamp_ns[[0, -1]].mean(),
+                                   [0.0, 0.0, 2 * DEG]))
+
+
 def right(leg, wheel):
     """Return a leg with another right wheel."""
     return replace(leg, odometer_right=wheel)
@@ -118,6 +125,7 @@ FAULTS: dict = {
                                                 odometer_right=leg.odometer)),
     'GYRO_AXES': ('gyro x has the wrong sign', 'town', {'duration': 600.0}, {}, {},
                   of_imu(w_i=lambda w: w * [-1.0, 1.0, 1.0])),
+    'CHANGE_IN_LEG': ('IMU turned by 2 deg half-way', 'town', {}, {}, {}, turned_half_way),
 }
 RUNS = ('clean', *FAULTS)
 

@@ -140,6 +140,9 @@ class Code(Enum):
                             'sensor that misses pulses. The uncertainty was increased.')
     SCALE_VARIES = NOTE, ('No action needed. For a value that stays valid longer, drive with '
                           'warm tyres at typical speeds, and combine several legs.')
+    CHANGE_IN_LEG = CAUTION, ('Check that the IMU and its bracket are fixed, and tyres, load and '
+                              'odometer. Then drive again, or use the part of the leg before or '
+                              'after this time (--leg). The value is a mean of both parts.')
     FIXES_SMOOTHED = NOTE, ('If possible, switch off smoothing in the receiver (position filter, '
                             'static hold): accelerations then determine more.')
     FIXES_FOLLOW_ODOMETER = CAUTION, ('Use positions that do not contain the wheel odometry. '

@@ -10,6 +10,7 @@ import inspect
 import numpy as np
 
 from odocal_ros.data.samples import OdometerSamples
+from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -127,3 +128,11 @@ def held_up(samples, every_s=15.0, how_long_s=0.12, drain_s=1e-3):
         free[k] = max(free[k], free[k - 1] + drain_s)
     stamps = samples.stamp_ns[0] + np.round(free * 1e9).astype(np.int64)
     return OdometerSamples(stamps, stamps, samples.value), free - t > drain_s
+
+
+def turned(imu, at_ns, turn):
+    """Return samples of an IMU that is turned by rad within a second, as its gyro measures."""
+    since = np.clip((imu.stamp_ns - at_ns) * 1e-9, 0.0, 1.0)
+    angle = np.outer(since**2 * (3 - 2 * since), turn)
+    w, f = (np.einsum('kji,kj->ki', exp_so3(angle), x) for x in (imu.w_i, imu.f_i))
+    return replace(imu, w_i=w + np.outer(6 * since * (1 - since), turn), f_i=f)

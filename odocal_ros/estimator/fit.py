@@ -17,6 +17,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals, solve, Solved
+from odocal_ros.estimator.changes import changes, Step
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors.factor import (
     JUMP,
@@ -103,6 +104,7 @@ class Fit(FitSummary):
     weighted: Weighted
     solved: Solved
     by_levels: Floats        # (M, L) what unit errors of levels do to the constants, sizes last
+    steps: tuple[Step, ...] = ()     # of constants within the leg
 
     @property
     def covariance(self) -> Floats:
@@ -183,7 +185,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     by_levels = weighted.information(solved).effects(prior_information(levels))
     return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
-               likelihood, weighted, solved, by_levels)
+               likelihood, weighted, solved, by_levels, changes(weighted, solved))
 
 
 def damped(solved: Solved, taken: Floats) -> Solved:

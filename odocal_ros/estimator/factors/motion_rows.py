@@ -3,12 +3,12 @@
 
 """The motion factor: IMU and odometer between adjacent keyframes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from weakref import ref
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import blocks, room
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
@@ -162,6 +162,35 @@ class MotionRows(Factor):
             out.chain[ends, :, columns] += g[:, n:2 * n]
             out.border[:, columns] += g[:, 2 * n:].sum(axis=0)
             out.square[np.ix_(columns, columns)] += (np.swapaxes(q, 1, 2) @ q).sum(axis=0)
+
+    def step_sides(self, at: Ints, constants: Sequence[int]) -> tuple[Floats, Floats, Floats,
+                                                                      Floats]:
+        """
+        Return the right-hand sides of steps of constants from intervals on, docs/method.md (S27c).
+
+        at : (p,) intervals.   constants : c indices.
+
+        Returns
+        -------
+        g_i by the keyframes, (N, n, c p), and by the constants, (m, c p); C' R^-1 C, (c p, c p),
+        and C' R^-1 r, (c p,), of the columns C, whose places of one constant are adjacent.
+
+        """
+        n, L = self.n, len(at) * len(constants)
+        chain, border = room(len(self.r) + 1, n, L), np.zeros((self.m, L))
+        square, score = np.zeros((L, L)), np.zeros(L)
+        for rows in blocks(len(self.r)):
+            J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
+            after = np.arange(rows.start, rows.stop)[:, None] >= at
+            columns = (J[:, :, [2 * n + i for i in constants], None] * after[:, None, None]
+                       ).reshape(*J.shape[:2], L)
+            g = np.swapaxes(J, 1, 2) @ columns
+            chain[rows] += g[:, :n]
+            chain[ends] += g[:, n:2 * n]
+            border += g[:, 2 * n:].sum(axis=0)
+            square += (np.swapaxes(columns, 1, 2) @ columns).sum(axis=0)
+            score -= np.einsum('kil,ki->l', columns, self.r[rows])
+        return chain, border, square, score
 
     def _noises(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
         """

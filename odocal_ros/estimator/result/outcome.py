@@ -3,7 +3,7 @@
 
 """The smoother's fit as a method's result: estimates, reasons, budget, statistics of the drive."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from odocal_ros.calib.slip import missing_reasons, without_braking
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.equations import OUTSIDE
+from odocal_ros.estimator.factors.factor import WANTED
 from odocal_ros.estimator.factors.fixes import Fixes
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.slide import assumed
@@ -33,10 +34,10 @@ from odocal_ros.estimator.result.refusal import OPTIONAL, UNITS, unknown
 from odocal_ros.estimator.result.remarks import (
     arms_off,
     beside,
+    beyond_fit,
     level_pitch,
     MODEL_FLOOR,
     remarks,
-    wheels_in_map,
 )
 from odocal_ros.estimator.result.shares import shares
 from odocal_ros.estimator.result.slip import (
@@ -78,8 +79,9 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     count = leg.travel.quantum * fit.state.scale
     state, c = fit.state, fit.state.constants
     covariance = floored(fit.covariance * widen**2)
-    by_map = wheels_in_map(problem, c, np.sqrt(np.diag(covariance)))
-    covariance[LN_K, LN_K] += by_map**2
+    beyond = beyond_fit(problem, fit, np.sqrt(np.diag(covariance)))
+    for i, _, own in beyond:
+        covariance[i, i] += own**2
     sigma = np.sqrt(np.diag(covariance))
     filtered = filter_reasons(c[ODO_LAG2], sigma[ODO_LAG2])
     slips, slip_said = _slips(leg, fit, near, count, filtered=bool(filtered))
@@ -88,7 +90,8 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     after = np.sqrt(np.diag(fit.covariance)) / fit.first.constants
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
     found, undetermined = determined(c + configured(leg), sigma, after, leg.scale_unit,
-                                     leg.nominal_scale, config, widen)
+                                     leg.nominal_scale, config, widen, {
+                                         CONSTANTS[i] for i, _, _ in beyond if i != LN_K})
     reasons += undetermined
     if found['scale_factor'].value is not None:
         found |= as_sent(leg, state, covariance)
@@ -115,9 +118,9 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     sources = [*(_widened(s, widen) for s in shares(fit, near)),
                Source('model', np.diag(MODEL_FLOOR))]
     border = border_of(fit, configured(leg)).widened(widen)
-    if by_map:
-        sources.append(Source('wheels_in_positions', np.array([[by_map], [0.0], [0.0]])))
-        border = border.loosened({CONSTANTS[LN_K]: by_map})
+    for i, name, own in beyond:
+        sources.append(Source(name, own * np.eye(WANTED)[:, [i]]))
+        border = border.loosened({CONSTANTS[i]: own})
     grade = problem.grade if leg.has_accelerometer else None
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
@@ -155,13 +158,15 @@ def floored(covariance: Floats) -> Floats:
 
 
 def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nominal: float,
-               config: Config, doubt: float = 1.0) -> tuple[dict[str, Estimate], list[Reason]]:
+               config: Config, doubt: float = 1.0, moved: Collection[str] = ()
+               ) -> tuple[dict[str, Estimate], list[Reason]]:
     """
     Return the estimates of the constants, and the reasons for those that are not determined.
 
     value, sigma : (M,) of the constants, ln K first, whole lever arms.   ratio : (M,) posterior
     sigma by that of the prior.   scale_unit, nominal : of the scale; K0, 0 unknown.   config :
     limits.   doubt : factor on the sigmas by model errors; angles must be determined with it.
+    moved : angles that change in the leg.
     """
     K, yaw, pitch = float(np.exp(value[LN_K])), float(wrap(value[YAW])), float(value[PITCH])
     found = unknown(scale_unit)
@@ -179,7 +184,7 @@ def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nom
     for i in OPTIONAL:
         if ratio[i] < INFORMED_SHARE:
             found[CONSTANTS[i]] = Estimate(float(value[i]), float(sigma[i]), UNITS[CONSTANTS[i]])
-    return found, _undetermined(sigma, limit / doubt, config, yaw)
+    return found, _undetermined(sigma, limit / doubt, config, yaw, moved)
 
 
 def configured(leg: SmootherLeg) -> Floats:
@@ -216,7 +221,8 @@ def _widened(source: Source, widen: float) -> Source:
     return type(source)(source.name, source.effects * widen, source.shared)
 
 
-def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float) -> list[Reason]:
+def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float,
+                  moved: Collection[str]) -> list[Reason]:
     # with model errors the limit is smaller
     reasons, wanted = [], f'; the limit is {np.rad2deg(limit):.2g} deg'
     if sigma[LN_K] > SCALE_LIMIT:
@@ -225,9 +231,10 @@ def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float) -> li
     nominal = 0.0 if np.isnan(config.imu.nominal_yaw) else config.imu.nominal_yaw
     off = abs(float(wrap(yaw - nominal)))
     if sigma[YAW] > limit:
+        cause = 'see CHANGE_IN_LEG' if CONSTANTS[YAW] in moved else (
+            'too little acceleration, or too few turns')
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
-                              f'{np.rad2deg(sigma[YAW]):.1f} deg{wanted}. Likely cause: too '
-                              'little acceleration, or too few turns'))
+                              f'{np.rad2deg(sigma[YAW]):.1f} deg{wanted}. Likely cause: {cause}'))
     elif off > np.deg2rad(135.0):       # more than any mounting: reversed
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
                               'directions: positive counts mean backwards, or the IMU x axis '
@@ -238,6 +245,7 @@ def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float) -> li
     if sigma[PITCH] > limit:
         reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
                               f'{np.rad2deg(sigma[PITCH]):.1f} deg{wanted}',
+                              'See CHANGE_IN_LEG.' if CONSTANTS[PITCH] in moved else
                               'Drive longer, with stops and starts. Accurate ellipsoidal heights '
                               'also help.'))
     return reasons

@@ -118,6 +118,15 @@ def wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
     return by_map_drift(c[FIX_BY_MOTION], c[FIX_TIME], problem.leg.t_stop - problem.leg.t_begin)
 
 
+def beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[tuple[int, str, float]]:
+    """Return errors beside those of the fit: the index of a constant, a source and its sigma."""
+    by_map = wheels_in_map(problem, fit.state.constants, sigma)
+    # which of the two values a later drive has is unknown
+    moved = [(step.constant, 'change_of_mounting', abs(step.size)) for step in fit.steps
+             if step.constant != LN_K and step.certain]
+    return [(LN_K, 'wheels_in_positions', by_map)] * bool(by_map) + moved
+
+
 def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[Reason]:
     """Return reasons: filtered signals, a varying scale, deviations from configured values."""
     c = fit.state.constants
@@ -126,7 +135,7 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[R
                               wheels_in_map(problem, c, sigma)),
             *(reason for name, i in CLOCKS.items()
               for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
-            *_varies(fit, sigma)]
+            *_varies(fit, sigma), *_changes(fit)]
     usual = imperfect_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))
     off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)
@@ -170,6 +179,19 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
     less = said[0].startswith('-') and 'speed' in said[0]
     return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(said)}; the stated '
                    'value is the mean over this leg', FALLS_WITH_SPEED if less else '')]
+
+
+def _changes(fit: Fit) -> list[Reason]:
+    """Return the reason for a scale or mounting that changes in the leg."""
+    said = []
+    for step in fit.steps:
+        if step.certain:
+            what = CONSTANTS[step.constant].replace('_', ' ')
+            size = f'{100 * step.size:+.2f} %' if step.constant == LN_K else \
+                f'{np.rad2deg(step.size):+.2f} deg'
+            said.append(f'the {what} changes by about {size} near t = {step.t:.0f} s '
+                        f'({abs(step.size) / step.sigma:.0f} sigma)')
+    return [Reason(Code.CHANGE_IN_LEG, '; '.join(said))] if said else []
 
 
 def arms_off(c: Floats, sigma: Floats) -> set[int]:

@@ -1,0 +1,65 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Constants that change within a leg, by a score test of the converged fit: docs/method.md (S27c).
+
+A step of a constant at a time is one more column of the equations: that of the constant, from this
+time on. Its estimate with all other unknowns free needs no second fit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator.chain import Solved
+from odocal_ros.estimator.equations import Weighted
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.state import LN_K, PITCH, YAW
+from odocal_ros.settings.levels import FAULT_SIGMAS
+
+STEP_PLACES = 15       # judgement: times of a step, at equal distances along the path
+STEPPING = LN_K, YAW, PITCH      # definition: constants that are tested
+# relative, of the scale: less is reported as a slope (SCALE_VARIES). Judgement: tyres that warm up
+# change it by 0.4 %; of 80 zoo drives without a step 2 are beyond 5 sigma, with 0.1 and 0.3 %
+LEAST_SCALE_STEP = 5e-3
+
+
+@dataclass(frozen=True)
+class Step:
+    """A change of a constant from a time, s, on: its size and sigma, relative or rad."""
+
+    constant: int
+    t: float
+    size: float
+    sigma: float
+
+    @property
+    def certain(self) -> bool:
+        """Return True if noise does not explain the step."""
+        return abs(self.size) > FAULT_SIGMAS * self.sigma and (
+            self.constant != LN_K or abs(self.size) > LEAST_SCALE_STEP)
+
+
+def changes(weighted: Weighted, solved: Solved) -> tuple[Step, ...]:
+    """Return the most significant step of each constant that has any; before ``marginals``."""
+    rows = weighted[MotionRows]
+    path = np.cumsum(np.linalg.norm(rows.motion.way, axis=1))
+    at = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
+    chain, border, square, score = rows.step_sides(at, STEPPING)
+    taken, _ = solved.products(chain, border)
+    of_rows = np.diag(square)
+    information = (of_rows - np.diag(taken)).reshape(len(STEPPING), STEP_PLACES)
+    # standing before or after a place, or a constant that no row depends on
+    known = information > 1e-9 * of_rows.reshape(information.shape)
+    sigma = 1 / np.sqrt(np.where(known, information, np.inf))
+    return tuple(_largest(constant, weighted.state.t[at], score_of, sigma_of)
+                 for constant, score_of, sigma_of in zip(
+                     STEPPING, score.reshape(sigma.shape), sigma, strict=True) if sigma_of.any())
+
+
+def _largest(constant: int, t: Floats, score: Floats, sigma: Floats) -> Step:
+    """Return the step of one constant with the largest size in sigmas; (STEP_PLACES,) each."""
+    k = int(np.argmax(np.abs(score) * sigma))
+    return Step(constant, float(t[k]), float(score[k] * sigma[k]**2), float(sigma[k]))

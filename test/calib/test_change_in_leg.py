@@ -1,0 +1,125 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Scale and mounting that change within a leg: the score test, and what is stated."""
+
+from dataclasses import replace
+
+from drives import turned
+import numpy as np
+import pytest
+from smoother_legs import leg_of, made
+
+from odocal_ros.estimator import smooth
+from odocal_ros.estimator.chain import Normal, solve
+from odocal_ros.estimator.changes import changes
+from odocal_ros.estimator.equations import Equations
+from odocal_ros.estimator.factors.motion_rows import MotionRows
+from odocal_ros.estimator.fit import CONVERGENCE
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.smoother import best_fit
+from odocal_ros.estimator.state import LN_K, PITCH, YAW
+from odocal_ros.reasons import Code
+from odocal_ros.settings.config import with_settings
+
+DRIVE = {'imu_grade': 'industrial', 'duration': 240.0, 'fix_sigma': 0.3}
+AFTER = 1 / 3       # of the leg, which ends with a standstill
+
+
+def changed(turn=(0.0, 0.0, 0.0), scale=0.0, **limits):
+    """Return truth, estimates, reasons of a drive with a change: IMU by rad, counts relatively."""
+    drive, config, _ = made(**DRIVE)
+    leg = drive.leg()
+    begin, end = leg.imu.stamp_ns[[0, -1]]
+    at = begin + AFTER * (end - begin)
+    value = leg.odometer.value.astype(float)
+    first = int(np.searchsorted(leg.odometer.stamp_ns, at))
+    value[first:] = value[first] + (value[first:] - value[first]) * (1 + scale)
+    leg = leg.with_rows(imu=turned(leg.imu, at, turn),
+                        odometer=replace(leg.odometer, value=np.round(value).astype(int)))
+    result = smooth(leg_of(leg, config), with_settings(config, limits))
+    said = {r.code: r.text for r in result.reasons}
+    return drive.truth, result.estimates, said
+
+
+@pytest.fixture(scope='module')
+def fitted():
+    _, config, leg = made(**DRIVE)
+    problem = problem_of(leg, config)
+    return problem, best_fit(problem, config)
+
+
+def column_of(problem, fit, constant, size):
+    """Return the whitened derivatives of the motion rows by a constant, by differences: (K, r)."""
+    rows = fit.weighted[MotionRows]
+    ends = []
+    for by in (size, -size):
+        constants = fit.state.constants.copy()
+        constants[constant] += by
+        equations = Equations(problem, replace(fit.state, constants=constants), fit.priors,
+                              fit.spread, True)
+        ends.append(equations.parts['motion'].raw)
+    return np.einsum('kij,kj->ki', rows.whiten, (ends[0] - ends[1]) / (2 * size))
+
+
+@pytest.mark.parametrize('constant', [YAW, PITCH])
+def test_a_step_is_that_of_equations_with_one_more_constant(fitted, constant):
+    problem, fit = fitted
+    weighted, rows = fit.weighted, fit.weighted[MotionRows]
+    solved = solve(weighted.normal())
+    step = next(s for s in changes(weighted, solved) if s.constant == constant)
+    at = int(np.searchsorted(fit.state.t, step.t))
+    column = column_of(problem, fit, constant, 1e-5)
+    column[:at] = 0.0
+
+    plain, n, m = weighted.normal(), weighted.n, weighted.m
+    wider = Normal(len(fit.state.t), n, m + 1)
+    wider.diagonal[:], wider.beside[:] = plain.diagonal, plain.beside
+    wider.border[:, :, :m], wider.corner[:m, :m] = plain.border, plain.corner
+    wider.g[:], wider.g_border[:m] = plain.g, plain.g_border
+    by = np.einsum('kij,ki->kj', rows.J, column)
+    wider.border[:-1, :, m] += by[:, :n]
+    wider.border[1:, :, m] += by[:, n:2 * n]
+    wider.corner[:m, m] = wider.corner[m, :m] = by[:, 2 * n:].sum(axis=0)
+    wider.corner[m, m] = (column**2).sum()
+    wider.g_border[m] = -(column * rows.r).sum()
+    whole = solve(wider)
+    sigma = np.sqrt(whole.covariance[m, m])
+    assert step.sigma == pytest.approx(sigma, rel=2e-3)
+    # the other unknowns are at their minimum to the limit of convergence
+    assert step.size == pytest.approx(whole.step_border[m], abs=CONVERGENCE.moves * sigma)
+
+
+def test_nothing_is_said_of_a_drive_without_a_change(fitted):
+    _, fit = fitted
+    assert {s.constant for s in fit.steps} == {LN_K, YAW, PITCH}
+    # the largest of 15 places that overlap: beyond 4 sigma once in 1,000 drives
+    assert all(abs(s.size) < 4 * s.sigma for s in fit.steps)
+    assert Code.CHANGE_IN_LEG not in changed()[2]
+
+
+@pytest.mark.parametrize('deg', [1.0, -1.0])
+def test_the_sigma_of_an_imu_that_was_turned_a_little_covers_both_angles(deg):
+    truth, found, said = changed(turn=(0.0, 0.0, np.deg2rad(deg)),
+                                 **{'verdict.max_yaw_sigma': 0.05})
+    yaw = found['yaw_mounting_angle']
+    assert 'yaw mounting angle changes by about' in said[Code.CHANGE_IN_LEG]
+    for true in (truth.yaw, truth.yaw + np.deg2rad(deg)):
+        assert abs(yaw.value - true) < 2 * yaw.sigma
+    assert np.deg2rad(abs(deg)) / 2 < yaw.sigma < np.deg2rad(2 * abs(deg))
+
+
+@pytest.mark.parametrize(('axis', 'name'), [(2, 'yaw'), (1, 'pitch')])
+def test_an_imu_that_was_turned_by_degrees_has_no_angle_and_the_cause(axis, name):
+    _, found, said = changed(turn=np.deg2rad(3.0) * np.eye(3)[axis])
+    assert found[f'{name}_mounting_angle'].value is None
+    assert f'the {name} mounting angle changes by about' in said[Code.CHANGE_IN_LEG]
+    if name == 'yaw':
+        assert 'see CHANGE_IN_LEG' in said[Code.YAW_NOT_DETERMINED]
+
+
+def test_a_scale_that_changes_is_said_with_size_and_time():
+    _, _, said = changed(scale=0.02)
+    assert 'the scale factor changes by about -1.' in said[Code.CHANGE_IN_LEG]
+    near = float(said[Code.CHANGE_IN_LEG].split('near t = ')[1].split(' s')[0])
+    assert abs(near - (AFTER * DRIVE['duration'] - 20.0)) < DRIVE['duration'] / 8
