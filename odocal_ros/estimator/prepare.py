@@ -42,7 +42,7 @@ from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import G, Grade, grade_as_seen, turn_on_bias
+from odocal_ros.settings.grades import G, Grade, grade_of, imu_as_seen, turn_on_bias
 from odocal_ros.settings.nominal import nominal_scale
 
 # s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a
@@ -86,7 +86,8 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     t = imu.t[imu.key]
     still = standing(leg, t)
     use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
-    grade = grade_as_seen(config.imu, at_rest(imu, leg, still))
+    config = replace(config, imu=imu_as_seen(config.imu, at_rest(imu, leg, still)))
+    grade = grade_of(config.imu)
     grade = grade if leg.has_accelerometer else without_accelerometer(grade)
     root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
     made = Problem(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,

@@ -23,7 +23,7 @@ from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_mult
 from odocal_ros.pipeline.align import choose_standstill
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import AlignmentConfig, Config
-from odocal_ros.settings.grades import Grade, grade_of, with_turn_on_level
+from odocal_ros.settings.grades import Grade, with_turn_on_level
 
 OWN_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
 
@@ -36,7 +36,7 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
     drive : as planned.   config : grade, heading source and its sigma.   fix_sigma : of one fix,
     m, for a course.   spans : list of (begin, end) standstills, s.
     """
-    grade = with_turn_on_level(grade_of(config.imu), config.imu)
+    grade = with_turn_on_level(config.imu)
     span = choose_standstill(spans)
     found: tuple[Reason, ...] = ()
     if span is not None:

@@ -33,7 +33,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import G, Grade, grade_as_seen, grade_of, with_turn_on_level
+from odocal_ros.settings.grades import G, Grade, grade_of, imu_as_seen, with_turn_on_level
 
 FEWEST_AT_REST = 20     # statistical: IMU rows, a sigma by 20 has an error of 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])
@@ -50,8 +50,8 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     """
     span = choose_standstill(spans)
     noise = {} if span is None else _noise_at_rest(inputs, span)
-    grade = with_turn_on_level(grade_as_seen(config.imu, {
-        name: sigma**2 for name, sigma in noise.items() if sigma}), config.imu)
+    grade = with_turn_on_level(imu_as_seen(config.imu, {
+        name: sigma**2 for name, sigma in noise.items() if sigma}))
     if not inputs.has_accelerometer:
         grade = replace(grade, accel_bias=TILT_SIGMA * G)
     gyro_noise = max(grade.gyro_noise, noise.get('gyro', 0.0))

@@ -90,9 +90,9 @@ def turn_on_bias(imu: ImuConfig) -> tuple[float, float]:
             max(grade.accel_bias, usual[1] if math.isnan(imu.accel_bias) else 0.0))
 
 
-def with_turn_on_level(grade: Grade, imu: ImuConfig) -> Grade:
-    """Return a grade with the usual turn-on bias of its accelerometer, which tilts the level."""
-    return dataclasses.replace(grade, accel_bias=max(turn_on_bias(imu)[1], grade.accel_bias))
+def with_turn_on_level(imu: ImuConfig) -> Grade:
+    """Return the grade with the usual turn-on bias of its accelerometer, which tilts the level."""
+    return dataclasses.replace(grade_of(imu), accel_bias=turn_on_bias(imu)[1])
 
 
 SETTINGS = {'gyro_scale_error': 'gyro_scale_sigma',
@@ -101,22 +101,26 @@ SETTINGS = {'gyro_scale_error': 'gyro_scale_sigma',
             'gyro_by_force': 'gyro_by_force_sigma'}     # setting of a figure, if its name differs
 
 
-def grade_as_seen(imu: ImuConfig, variance: Mapping[str, float]) -> Grade:
+def imu_as_seen(imu: ImuConfig, variance: Mapping[str, float]) -> ImuConfig:
     """
-    Return the grade of the imu settings, or a worse one that fits its noise at rest better.
+    Return the imu settings, with a worse grade if that fits the noise at rest better.
 
     With too good a grade, the priors of bias and scale would be too narrow.
 
     variance : dict, white noise of 'gyro' and 'accel' at rest, per s; empty: not known.
     """
-    grades = [grade_of(dataclasses.replace(imu, grade=name)) for name in GRADES]
-    stated = list(GRADES).index(imu.grade)
     if not variance:
-        return grades[stated]
-    return min(reversed(grades[:stated + 1]), key=lambda grade: sum(
-        abs(math.log(max(sigma, 1e-12) / math.sqrt(variance[name])))
-        for name, sigma in (('gyro', grade.gyro_noise), ('accel', grade.accel_noise))
-        if name in variance))
+        return imu
+    worse = [dataclasses.replace(imu, grade=name) for name in GRADES][:list(GRADES).index(
+        imu.grade) + 1]
+
+    def misfit(one: ImuConfig) -> float:
+        grade = grade_of(one)
+        return sum(abs(math.log(max(sigma, 1e-12) / math.sqrt(variance[name])))
+                   for name, sigma in (('gyro', grade.gyro_noise), ('accel', grade.accel_noise))
+                   if name in variance)
+
+    return min(reversed(worse), key=misfit)
 
 
 def grade_of(imu: ImuConfig) -> Grade:

@@ -12,12 +12,13 @@ import pytest
 from smoother_legs import leg_of, made
 
 from odocal_ros.estimator import smooth
+from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.result import remarks
 from odocal_ros.estimator.state import CONSTANTS, FAST_SPEED
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.settings.grades import grade_as_seen, GRADES
+from odocal_ros.settings.grades import GRADES, imu_as_seen, TURN_ON
 from odocal_ros.sim.draw import drawn
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
@@ -146,16 +147,24 @@ def test_a_straight_drive_does_not_pull_the_yaw_to_zero():
     assert abs(found.details['accelerometer_scale_y']['value']) < 0.005     # nothing tells it
 
 
+def test_an_imu_worse_than_its_setting_has_the_turn_on_bias_of_its_own_grade():
+    _, config, leg = made(imu_grade='consumer', duration=135.0)
+    for grade in ('consumer', 'industrial'):
+        problem = problem_of(leg, with_settings(config, {'imu.grade': grade}))
+        assert problem.priors.accel_bias[0] == pytest.approx(TURN_ON['consumer'][1])
+        assert problem.priors.gyro_bias[0] == pytest.approx(TURN_ON['consumer'][0])
+
+
 def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_one():
     imu = Config().imu
     grade = GRADES['tactical']
     tactical = {'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2}
     for told, seen in (('navigation', 'tactical'), ('tactical', 'tactical'),
                        ('consumer', 'consumer')):
-        assert grade_as_seen(replace(imu, grade=told), tactical) == GRADES[seen]
+        assert imu_as_seen(replace(imu, grade=told), tactical).grade == seen
     vibrating = {name: 100.0 * value for name, value in tactical.items()}
-    assert grade_as_seen(replace(imu, grade='tactical'), vibrating) == GRADES['consumer']
-    assert grade_as_seen(replace(imu, grade='navigation'), {}) == GRADES['navigation']
+    assert imu_as_seen(replace(imu, grade='tactical'), vibrating).grade == 'consumer'
+    assert imu_as_seen(replace(imu, grade='navigation'), {}).grade == 'navigation'
 
 
 @pytest.mark.parametrize(('set_to', 'found', 'text', 'do'), [
