@@ -216,6 +216,9 @@ def report(drive, twists, begin_ns) -> None:
     error = np.array([m.twist.twist.linear.x for m in twists])[1:] - true
     sigma = np.sqrt([m.twist.covariance[0] for m in twists])[1:]
     moving = np.abs(true) > MOVING
+    if not moving.any():
+        print(f'none of {len(twists)} twists is in motion: the node did not keep up')
+        return
     ratio = np.abs(error[moving]) / sigma[moving]
     print(f'{moving.sum()} twists in motion: {np.mean(ratio <= 2):.1%} within 2 sigma, '
           f'{np.mean(ratio > 3):.1%} beyond 3, worst {ratio.max():.1f}; error '

@@ -62,6 +62,7 @@ class Solved:
     _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n), until marginals
     _scale: Floats            # (N, n)
     _scale_border: Floats     # (m,) of those that are not absent
+    taken: float = 1.0        # share of the full step
 
     def marginals(self) -> 'JointMarginals':
         """Return the joint marginals of adjacent blocks; once, since they reuse the memory."""

@@ -48,6 +48,9 @@ def changes(weighted: Weighted, solved: Solved) -> tuple[Step, ...]:
     path = np.cumsum(np.linalg.norm(rows.motion.way, axis=1))
     at = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
     chain, border, square, score = rows.step_sides(at, STEPPING)
+    left = 1 / solved.taken - 1      # of the step, if it was shortened: to the minimum
+    score -= left * (np.einsum('kil,ki->l', chain, solved.step)
+                     + border.T @ solved.step_border[:len(border)])
     taken, _ = solved.products(chain, border)
     of_rows = np.diag(square)
     information = (of_rows - np.diag(taken)).reshape(len(STEPPING), STEP_PLACES)

@@ -199,7 +199,7 @@ def damped(solved: Solved, taken: Floats) -> Solved:
     along = float(taken @ solved.reduced @ solved.step_border)
     back = along / before if before > 0 else 0.0
     by = 1 / (1 - back) if back < TURNS_BACK else 1.0
-    return replace(solved, step=by * solved.step, step_border=by * solved.step_border)
+    return replace(solved, step=by * solved.step, step_border=by * solved.step_border, taken=by)
 
 
 def slips(weighted: Weighted, marginals: JointMarginals, spread: Floats, levels: Levels,

@@ -90,6 +90,24 @@ def test_a_step_is_that_of_equations_with_one_more_constant(fitted, constant):
     assert step.size == pytest.approx(whole.step_border[m], abs=CONVERGENCE.moves * sigma)
 
 
+def test_a_shortened_last_step_does_not_change_the_steps(fitted):
+    problem, fit = fitted
+    constants = fit.state.constants.copy()
+    constants[[LN_K, YAW]] += 0.01
+    equations = Equations(problem, replace(fit.state, constants=constants), fit.priors,
+                          fit.spread, True)
+    found = []
+    for taken in (1.0, 0.4):
+        weighted = equations.at(fit.levels)
+        full = solve(weighted.normal())
+        solved = replace(full, step=taken * full.step, step_border=taken * full.step_border,
+                         taken=taken)
+        found.append([step.size for step in changes(weighted.after(solved), solved)])
+    sigma = [step.sigma for step in fit.steps]
+    # fixes beyond their tails lose weight with the full step
+    np.testing.assert_allclose(*found, atol=0.1 * max(sigma))
+
+
 def test_nothing_is_said_of_a_drive_without_a_change(fitted):
     _, fit = fitted
     assert {s.constant for s in fit.steps} == {LN_K, YAW, PITCH}
