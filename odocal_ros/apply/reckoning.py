@@ -109,7 +109,7 @@ class Reckoning:
             if received:
                 out.append(self._pose())
                 if not out[-1].is_valid():
-                    self.failed = 'the pose was not finite'
+                    self.failed = 'a value of the pose is not finite'
                     return out[:-1]
             self._correct_periodically()
             if last > ROWS_BEHIND:
@@ -197,7 +197,7 @@ class Reckoning:
         self.errors.add_turn(C_nb @ np.diag(turn**2 - self._implausible_turn**2) @ C_nb.T)
         self._implausible_turn = turn
         if np.sqrt(self.errors.cov[[3, 4], [3, 4]].max()) > TILT_LOST:
-            self.failed = 'the tilt is no longer known'
+            self.failed = f'the sigma of the tilt exceeds {TILT_LOST:g} rad'
 
     def _velocity_n(self, t: float) -> Floats:
         """Return the velocity of the IMU in n, (3,) m/s, by odometer and turn rate."""

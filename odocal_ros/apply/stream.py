@@ -62,7 +62,7 @@ class ImuStream:
                           'hold NaN or impossible values')
         kept, self._held = self._screen.sift(rows)
         self._say_dropped(len(rows) - len(kept) - len(self._held),
-                          'jump away and back, or repeat one value')
+                          'jump and return, or repeat one value')
         for row in kept:
             self.rows.append(row)
             if len(self.rows) - 2 > self.at and is_single(self.rows[-SINGLE_ROWS:]):
@@ -76,7 +76,7 @@ class ImuStream:
 
     def _say_dropped(self, rows: int, why: str) -> None:
         if rows:
-            self._notes.append(f'IMU messages {why}: {rows} dropped and interpolated')
+            self._notes.append(f'{rows} IMU messages dropped and interpolated: they {why}')
 
     def forget(self, seconds: float) -> None:
         """Drop rows more than ``seconds`` older than the newest; for use before a path exists."""

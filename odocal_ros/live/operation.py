@@ -146,7 +146,7 @@ class Operation(AutomaticLegs):
         if why := self._why_not():
             raise Refused(f'no leg can be started: {why}')
         if session.state is State.RECORDING:      # an automatic leg
-            self._drop_leg(f'leg {session.leg_id} is replaced by a started by the operator')
+            self._drop_leg(f'leg {session.leg_id} is replaced by a leg of the operator')
         return True, self._begin_leg(mark_ns)
 
     def mark(self) -> tuple[bool, str]:

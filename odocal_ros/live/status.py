@@ -193,7 +193,7 @@ def input_status(name: str, health: Health, why: str, needed: bool,
     if why:
         status, message = DiagnosticStatus.ERROR if needed else DiagnosticStatus.WARN, why
     elif health.fix_status is not None and health.fix_status < 0:
-        status, message = DiagnosticStatus.WARN, f'no position yet, status {health.fix_status}'
+        status, message = DiagnosticStatus.WARN, f'no position: NavSatStatus {health.fix_status}'
     elif health.unusable:
         status = DiagnosticStatus.WARN
         message = f'{rate:.1f} Hz, {health.unusable} messages unreadable'

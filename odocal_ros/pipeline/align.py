@@ -140,7 +140,7 @@ def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
         return ()
     unit = ', so its unit is probably deg/s' if 30 < times < 120 else ''
     return (Reason(Code.IMU_WORSE_THAN_GRADE, f'gyro noise at rest is {times:.0f} times that of '
-                   f'its grade{unit}'),)
+                   f'its grade; the limit is {noisier_at_rest:.0f} times{unit}'),)
 
 
 def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
@@ -232,7 +232,8 @@ def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, conf
     stated = float(np.median(variance[pick]))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:
-        return None, f'its covariance is ± {np.rad2deg(sigma):.3g} deg'
+        return None, (f'its sigma is {np.rad2deg(sigma):.3g} deg; the limit is '
+                      f'{np.rad2deg(HEADING_LIMIT):.3g} deg')
     return (float(wrap(yaw)), float(sigma)), ''
 
 
@@ -245,12 +246,14 @@ def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
     yaw, sigma = gyrocompass(level, latitude, grade)
     if sigma > COMPASS_LIMIT:
         return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) causes a '
-                      f'heading uncertainty of {np.rad2deg(min(sigma, np.pi)):.1f} deg')
+                      f'heading uncertainty of {np.rad2deg(min(sigma, np.pi)):.1f} deg; '
+                      f'the limit is {np.rad2deg(COMPASS_LIMIT):.1f} deg')
     off = off_the_earth(level, latitude, grade)
     no_earth_sigmas = 4.0    # sigmas: with a larger bias there is no gyrocompass
     if off > no_earth_sigmas:
-        return None, (f'the turn rate at rest differs from the Earth rate by {off:.0f} sigma: '
-                      f'the gyro bias exceeds the {config.imu.grade} grade')
+        return None, (f'the turn rate at rest differs from the Earth rate by {off:.0f} sigma '
+                      f'(limit {no_earth_sigmas:.0f}): the gyro bias exceeds that of the '
+                      f'{config.imu.grade} grade')
     return (yaw, sigma), ''
 
 

@@ -53,8 +53,9 @@ def judge_clocks(leg: Leg, config: Config) -> list[Reason]:
         ahead += offset[slot]
         if abs(ahead) > CLOCK_APART:
             found.append(Reason(
-                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps are {ahead:+.3f} s relative to '
-                f'IMU stamps of the same time{_cure(slot, ahead)}', remedy(ahead)))
+                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {ahead:+.3f} s '
+                f'from IMU stamps that arrive at the same time; the limit is {CLOCK_APART:g} s'
+                f'{_cure(slot, ahead)}', remedy(ahead)))
     return found
 
 

@@ -33,7 +33,7 @@ def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[
         false = false_counts(t, samples.value, form.modulus)
         if false.any():
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
-                                'counts freeze or jump away and back, first at t = '
+                                'counts are frozen or isolated outliers, first at t = '
                                 f'{t[np.argmax(false)]:.2f} s; dropped'))
         return take(samples, ~false), t[~false]
     if form.quantity == 'increment':
