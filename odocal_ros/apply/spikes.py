@@ -191,7 +191,7 @@ def is_single(rows: Sequence[Row]) -> bool:
     """
     Return True if the row before the last of SINGLE_ROWS is an isolated outlier.
 
-    As ``screening.glitches.single``, but by earlier rows only.
+    As ``screening.glitches.isolated``, but by earlier rows only.
     """
     if len(rows) < SINGLE_ROWS:
         return False

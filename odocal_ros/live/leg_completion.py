@@ -74,7 +74,7 @@ class LegCompletion:
         self._filing.poll()
         self.pump()
         if self._recording.time_jumped:
-            self._start_time_anew()
+            self._restart_after_jump()
         self._stop_when_too_long()
         self._close_when_complete()
         if self._at_stop is not None and self.session.state is State.COMPUTING:
@@ -114,7 +114,7 @@ class LegCompletion:
                 f'{for_shell(["odocal", "replay", folder])}') if folder else 'it has no journal'
         return f'leg {self.session.leg_id} was not stopped: {kept}'
 
-    def _start_time_anew(self) -> None:
+    def _restart_after_jump(self) -> None:
         """Drop all samples from before a jump of time; a running leg is cancelled."""
         jump = 'time jumped back (a bag restarted, or a clock was set)'
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
@@ -123,9 +123,9 @@ class LegCompletion:
             self._log.warning(self._lost_leg())
         else:
             self._log.warning(f'{jump}: all samples so far are dropped')
-        self._recording.start_anew()
+        self._recording.restart()
         self.session.marks.clear()
-        self._journal.start_anew()
+        self._journal.restart()
 
     def view(self) -> SessionView:
         """Return the current view of the node."""
