@@ -17,7 +17,7 @@ from odocal_ros.outside.names import said_by
 from odocal_ros.reasons import cautions, Reason, Verdict
 
 MOST_REASONS = 3     # judgement: in an answer
-KMH = 3.6    # definition: km/h in a m/s
+KMH = 3.6    # definition: km/h per m/s
 FORECAST_OLD_S = 15.0    # judgement: age from which the forecast is reported as old
 FEWEST_MARKS = 2         # judgement: marks after which the hint omits ~/mark
 DRIVE = 'drive '

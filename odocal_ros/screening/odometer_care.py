@@ -22,7 +22,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond, speed_glitches
 
 STEPS_BESIDE = 5    # judgement: steps next to a jump or gap that give the speed there
-# counts, rad, m: less is not reported as motion
+# counts, rad, m: smaller travel is not reported
 STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
