@@ -140,7 +140,7 @@ def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
         return ()
     unit = ', so its unit is probably deg/s' if 30 < times < 120 else ''
     return (Reason(Code.IMU_WORSE_THAN_GRADE, f'gyro noise at rest is {times:.0f} times that of '
-                   f'its grade; the limit is {noisier_at_rest:.0f} times{unit}'),)
+                   f'its grade (limit {noisier_at_rest:.0f}){unit}'),)
 
 
 def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
