@@ -8,7 +8,7 @@ import pytest
 
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.odometer import travel
-from odocal_ros.screening.odometer_care import doubted
+from odocal_ros.screening.odometer_care import with_uncertainty
 
 RATE = OdometerForm('rate', 0, '1')
 T = np.arange(0.0, 300.0, 0.05)
@@ -21,7 +21,7 @@ BAND = 0.25
 
 def of(value, **how):
     way, _ = travel(T, value, RATE, **how)
-    return doubted(way, value, RATE)
+    return with_uncertainty(way, value, RATE)
 
 
 @pytest.mark.parametrize('reversed_counts', [False, True])

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Arrivals of a stream: accepted stamps of a topic, and times on the rhythm of the sender."""
+"""Stamps of a stream: selection of usable ones, and row times without arrival jitter."""
 
 from collections import deque
 import math
@@ -12,58 +12,58 @@ from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.screening.imu_rhythm import APART
 from odocal_ros.screening.late_rows import LEAST_JITTER
 
-# judgement: ns that a stamp may be ahead of what the arrivals before allow, and behind the newest:
-# no driver is as odd; rows in turn beyond it, after which the clock was set
+# judgement: limits of a stamp: lag below the least one, and age relative to the newest stamp, ns;
+# number of consecutive rows beyond a limit after which the clock was set
 ODD_NS, ODD_ROWS = 200_000_000, 10
-LATEST_NS = (2**31 - 5) * 10**9    # format: s of a header's stamp, with an imu.time_offset
-FAST_PLAY = 1.5      # judgement: times real time, from which a bag is played, without its clock
-LAG_ROWS = 1000      # judgement: accepted rows over which the least lag is forgotten
-# judgement: rows in turn, all off by so many s or more, that show a clock that moved; rows that
-# show that it stays so; ns per row that the usual lag follows; how far from real time a bag is
-# played whose arrivals show nothing
+LATEST_NS = (2**31 - 5) * 10**9    # format: 32-bit seconds of a header, minus a time_offset
+FAST_PLAY = 1.5      # judgement: least speed of a played bag, times real time
+LAG_ROWS = 1000      # judgement: accepted rows over which the least lag increases again
+# judgement: consecutive rows, and least shift, s, of a clock step; rows of a permanent one; ns per
+# row, largest change of the median lag; lags are not used if a bag is played faster or slower by
+# this share
 MOVED_ROWS, MOVED_S, STAYS_ROWS, FOLLOW_NS, PLAYED = 3, 0.03, 50, 1e4, 0.05
-# judgement: rows before the line is used; rows that it forgets in: crystals keep their rate for
-# longer, and the jitter of the line goes by the root of 4 over them
+# judgement: rows before the line is used; rows of its memory: crystals are stable for longer, and
+# the sigma of the line is sqrt(4 / rows) of the jitter
 FIRST_ROWS, LINE_ROWS = 20, 300
-UNEVEN_ROWS = 100          # judgement: rows in motion over which unevenness is averaged
-# judgement: ratio of unevenness on the rhythm to that of the arrivals above which it is no longer
-# used, and below which it is again
+UNEVEN_ROWS = 100          # judgement: rows in motion of the mean roughness
+# judgement: ratio of the roughness on the line to that at arrival: the line is no longer used
+# above the first, and used again below the second
 AS_EVEN, EVENER = 1.0, 0.8
-LATE_SIGMA = 1.5           # judgement: sigma over mean deviation of lateness, 1.3 if exponential
-MOST_LATE = 3.0            # judgement: mean deviations that a row moves the line by at most
+LATE_SIGMA = 1.5           # judgement: sigma over mean deviation of delays, 1.3 if exponential
+MOST_LATE = 3.0            # judgement: limit of the deviation of a row, in mean deviations
 LATE_ROWS = 50             # judgement: rows of the mean deviation
-SURE_STEP = 4.0            # judgement: counts in an interval from which travel shows lost rows
-FAR = 0.5                  # judgement: intervals off the line from which rows may have been lost
-FAR_ROWS = 25              # judgement: rows all of which are off so: it is no jitter
-LONG_GAP = 1.0             # s; judgement: between rows of a slow wheel, lost rows
-MOST_LOST = 5              # judgement: rows lost at once after which another line is determined
+SURE_STEP = 4.0            # judgement: least counts per interval to detect lost rows
+FAR = 0.5                  # judgement: least deviation of lost rows, intervals
+FAR_ROWS = 25              # judgement: rows that all deviate by FAR: not jitter
+LONG_GAP = 1.0             # s; judgement: gap with lost rows at a slow wheel
+MOST_LOST = 5              # judgement: largest gap, intervals, without a new line
 
 
 class Arrivals:
     """
-    The stamps of one topic against their arrival.
+    Test of the stamps of one topic against their arrival.
 
-    Lag is arrival minus stamp. Its least value so far, slowly forgotten, shows how early a stamp
-    may be: one further ahead is false, or the clock was set. ``anew`` is True once ODD_ROWS in
-    turn are odd; ``odd_from`` is then the first of them in the last block.
+    Lag is arrival minus stamp. No usable stamp has a lag far below the least lag so far: it is
+    false, or the clock was set. ``jumped`` is True after ODD_ROWS consecutive stamps beyond a
+    limit; ``jump_row`` is then the first of them in the last block.
     """
 
     def __init__(self) -> None:
-        self.anew = False
-        self.odd_from = 0
-        self.off_s = 0.0              # of the last odd stamp: how far ahead, or behind if negative
-        self.dropped = 0              # rows of the last block, whatever their stamps are
+        self.jumped = False
+        self.jump_row = 0
+        self.off_s = 0.0              # excess of the last odd stamp; negative: behind
+        self.dropped = 0              # rows of the last block
         self._odd = 0
         self._newest_ns = 0
         self._first: tuple[int, int] | None = None      # stamp and arrival, ns
-        self.rate = 1.0               # times real time that the stamps go by, 1 if about real time
-        self.lag_ns: float | None = None      # the least, arrival less stamp
+        self.rate = 1.0               # stamps over arrival time; 1 below FAST_PLAY
+        self.lag_ns: float | None = None      # the least one
         self._real_time = True
-        self._usual_ns = 0.0                  # of the lags, their median
+        self._usual_ns = 0.0                  # running median of the lags
         self._lags: deque[int] = deque(maxlen=STAYS_ROWS)
 
     def moved_s(self, rows: int) -> float:
-        """Return by how many s the last rows are off the usual lag, 0 if one of them is not."""
+        """Return the shift of the lag of the last rows, s; 0 if any of them is within MOVED_S."""
         if len(self._lags) < rows or not self._real_time or (
                 abs(self._lags[-1] - self._usual_ns) * 1e-9 <= MOVED_S):
             return 0.0
@@ -74,7 +74,7 @@ class Arrivals:
     def usable(self, stamp_ns: Ints, received_ns: Ints) -> Bools:
         """Return a mask of rows of the next block with a usable stamp: (n,)."""
         good = [False] * len(stamp_ns)
-        self.odd_from = self.dropped = 0
+        self.jump_row = self.dropped = 0
         for k, (stamp, received) in enumerate(zip(stamp_ns.tolist(), received_ns.tolist(),
                                                   strict=True)):
             if not 0 < stamp < LATEST_NS:
@@ -84,10 +84,10 @@ class Arrivals:
             ahead = 0.0 if self.lag_ns is None else self.lag_ns - lag
             behind = self._newest_ns - stamp
             if ahead > ODD_NS * self.rate or behind > ODD_NS:
-                self.odd_from = k if not self._odd else self.odd_from
+                self.jump_row = k if not self._odd else self.jump_row
                 self._odd += 1
                 self.off_s = (-behind if behind > ODD_NS else ahead) * 1e-9
-                self.anew |= self._odd >= ODD_ROWS
+                self.jumped |= self._odd >= ODD_ROWS
             elif behind < 0:
                 good[k], self._odd, self._newest_ns = True, 0, stamp
                 if self.lag_ns is None or ahead > 0:
@@ -101,13 +101,13 @@ class Arrivals:
         return np.array(good, bool)
 
     def _follow(self, lag: int) -> None:
-        """Take a lag, ns, and let the usual one follow slowly, as two clocks drift."""
+        """Update the median lag by a lag, ns; it changes slowly, as two clocks drift."""
         self._usual_ns = self._usual_ns if self._lags else float(lag)
         self._usual_ns += min(max(lag - self._usual_ns, -FOLLOW_NS), FOLLOW_NS)
         self._lags.append(lag)
 
     def _take_rate(self, received_ns: int) -> None:
-        """Take the rate of the stamps since the first block; of a bag played fast it is not 1."""
+        """Update the rate of the stamps since the first block: the speed of a played bag."""
         if self._first is None:
             self._first = (self._newest_ns, received_ns) if self._newest_ns else None
         elif received_ns > self._first[1]:
@@ -118,23 +118,25 @@ class Arrivals:
 
 class Rhythm:
     """
-    Places the rows of a counter in time.
+    Row times of a counter without arrival jitter.
 
-    ``error_s`` is the sigma of the times, s, beside a constant delay, as unevenness shows it.
+    A counter is sampled evenly: a line through the arrivals (row number to time) gives better
+    times if the travel on it is smoother. ``error_s`` is the sigma of the times, s, by the
+    roughness of the travel, without a constant delay.
     """
 
     def __init__(self) -> None:
-        self._even = True      # travel is as even on the line, as far as it is known
+        self._even = True      # travel is not rougher on the line
         self.error_s = 0.0
-        self._t = -math.inf                     # s, the last row as placed
+        self._t = -math.inf                     # s, time of the last row
         self._rows: deque[tuple[float, float, float]] = deque(maxlen=3)  # arrival, line, travel
-        self._uneven = [0.0, 0.0]               # m^2, of travel by arrivals, on the line
-        self._rounding = self._moved = 0.0      # m^2, of a count; (m/s)^2, mean of the speed
+        self._uneven = [0.0, 0.0]               # m^2, roughness at arrival, on the line
+        self._rounding = self._moved = 0.0      # m^2, of a count; (m/s)^2, mean square speed
         self._tested = 0
         self._restart()
 
     def _restart(self) -> None:
-        """Forget the line: the next rows determine another."""
+        """Remove the line; the next rows determine another."""
         self._count = self._shifted = 0
         self._line = self._interval = self._late = 0.0
         self._off: deque[float] = deque(maxlen=FAR_ROWS)
@@ -143,13 +145,13 @@ class Rhythm:
         """
         Return the time of the next row, s.
 
-        t : s, its arrival.   travel : m, so far.   speed : m/s, before it.   quantum : m.
+        t : s, arrival.   travel : m, up to the row.   speed : m/s, before it.   quantum : m.
         """
         expected = abs(speed) * self._interval
         step = abs(travel - self._rows[-1][2]) if self._rows else 0.0
         sure = expected > SURE_STEP * quantum
         if not sure and t - self._line > LONG_GAP and not 0 < step <= 2 * SURE_STEP * quantum:
-            self._restart()      # lost rows, as far as travel shows it: late ones come in turn
+            self._restart()      # lost rows; late ones arrive one after the other
         self._follow(t, step, expected if sure else 0.0)
         self._rows.append((t, self._line if self._count else t, travel))
         if len(self._rows) == 3:
@@ -160,7 +162,7 @@ class Rhythm:
 
     @property
     def delay_s(self) -> float:
-        """Return the sigma of the constant delay of the times, s: no row is early."""
+        """Return the sigma of the constant delay of the times, s."""
         return LATE_SIGMA * self._late if self._in_use() else 0.0
 
     def _in_use(self) -> bool:
@@ -168,9 +170,10 @@ class Rhythm:
 
     def _follow(self, t: float, step: float, expected: float) -> None:
         """
-        Move the line to the next row: that of least squares through the arrivals.
+        Advance the line to the next row, by recursive least squares.
 
-        t : s, its arrival.   step, expected : m in an interval, expected 0 where it shows nothing.
+        t : s, arrival.   step : m, travel since the last row.   expected : m, travel in an
+        interval, 0 if it is too small to detect lost rows.
         """
         self._count += 1
         k = min(self._count, LINE_ROWS)
@@ -198,20 +201,20 @@ class Rhythm:
             self._shift()
 
     def _shift(self) -> None:
-        """Put a line right that all of the last rows are off by an interval or more."""
+        """Shift the line by whole intervals if all of the last rows deviate in one direction."""
         least, largest = min(self._off), max(self._off)
         far = least if least > 0 else -largest if largest < 0 else 0.0
         if len(self._off) < FAR_ROWS or far <= FAR * self._interval:
             return
         if self._count - self._shifted < 4 * FAR_ROWS and self._shifted:
-            self._restart()      # it is another rhythm
+            self._restart()      # the interval is wrong
             return
         self._shifted = self._count
         self._line += math.copysign(round(far / self._interval) or 1, least) * self._interval
         self._off.clear()
 
     def _test(self, quantum: float) -> None:
-        """Compare how even the travel is by arrivals and on the line."""
+        """Compare the roughness of the travel at arrival and on the line."""
         (t0, p0, s0), (t1, p1, s1), (t2, p2, s2) = self._rows
         if self._count <= FIRST_ROWS or abs(s2 - s0) <= 2 * SURE_STEP * quantum:
             return
@@ -225,8 +228,8 @@ class Rhythm:
         limit = AS_EVEN if self._even else EVENER
         known = self._tested > FIRST_ROWS
         self._even = not known or self._uneven[1] <= limit**2 * self._uneven[0]
-        # a row off its neighbours' middle by x has a sigma of x / sqrt(1.5)
+        # a time error sigma causes a deviation from the mean of both neighbours of sqrt(1.5) sigma
         left = max(self._uneven[self._in_use()] / 1.5 - self._rounding, 0.0)
         self.error_s = math.sqrt(left / max(self._moved, APART))
-        if not known:       # they may be right as they came
+        if not known:       # few rows: times of arrival may be correct
             self.error_s = max(self.error_s, LATE_SIGMA * self._late)

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Attitude of one sample after another, in plain numbers: arrays of one row cost ten times as much.
+Rotations and attitude increments of single samples, with tuples instead of numpy arrays.
 
-The conventions are those of ``nav/rotations.py`` and ``nav/strapdown.py``, which do the same for
-arrays. A vector is three numbers, a quaternion four, x y z w, a matrix three rows.
+Tuples take a tenth of the time of arrays of one row. The conventions are those of
+``nav/rotations.py`` and ``nav/strapdown.py``, which do the same for arrays. A vector has three
+numbers, a quaternion four (x y z w), a matrix three rows.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.strapdown import EVEN_RATIO, LEAST_INTERVAL
 
-SMALL = 1e-8      # rad; definition: a half angle whose sine is the angle to the last digit
+SMALL = 1e-8      # rad; definition: half angle that is equal to its sine in double precision
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -24,7 +25,7 @@ ZERO = (0.0, 0.0, 0.0)      # definition
 
 
 def rotation(phi: Sequence[float]) -> Quaternion:
-    """Return the quaternion of a rotation vector, rad; unit."""
+    """Return the unit quaternion of a rotation vector, rad."""
     a, b, c = phi
     half = math.sqrt(a * a + b * b + c * c) / 2
     s = math.sin(half) / half / 2 if half > SMALL else 0.5
@@ -32,7 +33,7 @@ def rotation(phi: Sequence[float]) -> Quaternion:
 
 
 def product(q: Sequence[float], r: Sequence[float]) -> Quaternion:
-    """Return the product of two quaternions, of length 1."""
+    """Return the product of two quaternions, normalised."""
     (x, y, z, w), (a, b, c, d) = q, r
     i, j, k, re = (w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a,
                    w * c + x * b - y * a + z * d, w * d - x * a - y * b - z * c)
@@ -41,7 +42,7 @@ def product(q: Sequence[float], r: Sequence[float]) -> Quaternion:
 
 
 def matrix_of(q: Sequence[float]) -> Matrix:
-    """Return the rotation matrix of a quaternion of any length but zero."""
+    """Return the rotation matrix of a quaternion, which need not be normalised."""
     x, y, z, w = q
     s = 2 / (x * x + y * y + z * z + w * w)
     return ((1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)),
@@ -77,7 +78,7 @@ def rotation_increment(t: Sequence[float], w: Sequence[Sequence[float]], k: int)
     """
     Return the rotation vector of b from sample k to the next, rad.
 
-    t : s.   w : rad/s.   To the last digit ``nav.strapdown.rotation_increments``.
+    t : s.   w : rad/s.   Bitwise equal to ``nav.strapdown.rotation_increments``.
     """
     h, first, second = t[k + 1] - t[k], w[k], w[k + 1]
     rise = [b - a for a, b in zip(first, second, strict=True)]

@@ -11,13 +11,13 @@ from odocal_ros.apply.attitude import Vector
 from odocal_ros.apply.errors import GRAVITY
 from odocal_ros.data.arrays import Floats
 
-# judgement: rows of a second, at least and at most; s over which residuals are correlated
+# judgement: least and largest number of rows, one per second; s, correlation of residuals
 LEAST_DELAY_ROWS, MOST_DELAY_ROWS, LAGS = 60, 300, 4
-# judgement: s and sigmas of a delay that is reported. 168 simulated drives without a delay showed
+# judgement: least delay that is reported, s and sigmas. 168 simulated drives without a delay had
 # up to 0.028 s and 2.5 sigmas at their ends; of 60 others none was reported at any second
 LEAST_DELAY, DELAY_SIGMAS = 0.04, 4.0
-# judgement: a central difference over two seconds is smaller than the change within one, in
-# simulated town drives by that
+# judgement: ratio of the change of acceleration within a second to the central difference over
+# two, in simulated town drives
 CHANGE_SMOOTHED = 1.2
 
 
@@ -25,12 +25,11 @@ class DelaySearch:
     """
     Regression of force minus acceleration on the change of acceleration, one row per second.
 
-    The velocity of an IMU that is tau s late is that of tau s earlier: its change in a second
-    differs by -tau times the change of acceleration. A constant (tilt, bias) is estimated too.
+    If the IMU is tau s late, its velocity is that of tau s earlier: the change in a second differs
+    by -tau times the change of acceleration. A constant (tilt, bias) is estimated too.
 
-    span_s : the odometer's speeds are means over that time, and late by half of it.   sigma_s : of
-    the delay as configured; ``sigma_s`` grows with the delay found.   notes : list that takes the
-    sentence.
+    span_s : averaging time of the odometer's speeds, which are late by half of it.   sigma_s :
+    configured sigma of the delay, increased if a delay is found.   notes : list for the text.
     """
 
     def __init__(self, span_s: float, sigma_s: float, notes: list[str]) -> None:
@@ -40,10 +39,10 @@ class DelaySearch:
 
     def take(self, forward_n: Vector, change_n: Floats | None, dv_n: Vector, T: float) -> bool:
         """
-        Take a second; return True if ``sigma_s`` has grown.
+        Add a second of data; return True if ``sigma_s`` has increased.
 
-        forward_n : forward axis.   change_n, dv_n : (3,) m/s, change of velocity by the odometer,
-        None if not usable, and integral of the specific force, over T s.
+        forward_n : forward axis.   change_n : (3,) m/s, change of velocity by the odometer, None
+        if not usable.   dv_n : m/s, integral of the specific force.   T : s.
         """
         if change_n is None:
             self._last.clear()
@@ -76,7 +75,7 @@ class DelaySearch:
             return 0.0, np.inf
         fit = np.linalg.solve(N, X.T @ y)
         scores = X * (y - X @ fit)[:, None]
-        # residuals are correlated: the sum of products over some lags (Newey-West)
+        # residuals are correlated: Newey-West covariance
         middle = scores.T @ scores
         for lag in range(1, LAGS):
             product = scores[lag:].T @ scores[:-lag] * (1 - lag / LAGS)

@@ -24,15 +24,15 @@ from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import CLOCK_APART
 from odocal_ros.settings.node_configs import ApplyConfig
 
-BEGINS_ANEW = 'odometry restarts'      # so begins each sentence that says it
+RESTARTS = 'odometry restarts'      # begin of the note on a restart
 
 
 class Odometry:
     """
-    Turns samples into poses.
+    Conversion of samples to poses.
 
-    ``feed`` blocks as they come, ``poses`` gives what they allow: up to the last time that the
-    odometer and the IMU but for its newest sample have reached.
+    ``feed`` adds blocks in order of arrival. ``poses`` returns the poses up to the newest odometer
+    row and the newest IMU row but one.
     """
 
     def __init__(self, vehicle: Vehicle, config: ApplyConfig) -> None:
@@ -41,35 +41,35 @@ class Odometry:
         self.restarts = 0
         self._first_ahead: float | None = None
         self._notes: list[str] = []
-        self._anew()
+        self._reset()
 
     def take_notes(self) -> list[str]:
-        """Return the findings since the last call, in sentences."""
+        """Return the notes since the last call, each once."""
         notes = list(dict.fromkeys(self._notes))
         self._notes.clear()
         return notes
 
     def apart(self) -> float:
-        """Return by how many s an odometer's clock is ahead of the IMU's, 0 if it may be delay."""
-        # arrivals of a bag that is played fast are of a coarser time
+        """Return the lead of the odometer's clock over the IMU's, s, 0 if it may be a delay."""
+        # a bag that is played fast has a coarser time of arrival
         fast = max((one.rate for one in self._arrivals.values()), default=1.0)
         ahead = self._ahead()
         return ahead if abs(ahead) > CLOCK_APART * fast else 0.0
 
     def _ahead(self) -> float:
-        """Return by how many s an odometer's stamps are ahead of the IMU's, 0 unknown."""
+        """Return the lead of the odometer's stamps over the IMU's, s, 0 if unknown."""
         lags = {slot: one.lag_ns for slot, one in self._arrivals.items() if one.lag_ns is not None}
         imu_ns = lags.pop('imu', None)
         ahead = [imu_ns - lag for lag in lags.values()] if imu_ns is not None else []
         return max(ahead, key=abs, default=0.0) * 1e-9
 
-    def begin_anew(self, why: str) -> None:
+    def restart(self, why: str) -> None:
         """Restart at the origin, with a note of the cause."""
         self.restarts += 1
-        self._notes.append(f'{BEGINS_ANEW}, from the origin: {why}')
-        self._anew()
+        self._notes.append(f'{RESTARTS} from the origin: {why}')
+        self._reset()
 
-    def _anew(self) -> None:
+    def _reset(self) -> None:
         self.wheels = Wheels(self.vehicle, self.config, self._notes)
         self.imu = ImuStream(self.config, self._notes)
         self._arrivals: dict[str, Arrivals] = {}
@@ -77,14 +77,14 @@ class Odometry:
 
     def feed(self, slot: str, block: ImuSamples | OdometerSamples,
              form: OdometerForm | None = None) -> None:
-        """Take a block of 'imu', 'odometer' or 'odometer_right', the latter with their form."""
+        """Add a block of 'imu', 'odometer' or 'odometer_right'; the latter two have a form."""
         if slot not in self._arrivals:
             self._arrivals[slot] = Arrivals()
         arrivals = self._arrivals[slot]
         usable = arrivals.usable(block.stamp_ns, block.received_ns)
-        if arrivals.anew:
-            self.begin_anew(f'the stamps of the {slot} jump by {arrivals.off_s:+.3g} s')
-            block = take(block, slice(arrivals.odd_from, None))
+        if arrivals.jumped:
+            self.restart(f'the {slot} stamps jump by {arrivals.off_s:+.3g} s')
+            block = take(block, slice(arrivals.jump_row, None))
             arrivals = self._arrivals[slot] = Arrivals()
             usable = arrivals.usable(block.stamp_ns, block.received_ns)
         if arrivals.dropped:
@@ -99,18 +99,18 @@ class Odometry:
         self.wheels.zero_ns = self.imu.zero_ns
 
     def lacking_s(self) -> float:
-        """Return by how many s the odometer has not reached the next pose, inf without a path."""
-        return math.inf if self._path is None else self._path.lacking_s()
+        """Return the time from the newest odometer row to the next pose, s; inf without a path."""
+        return math.inf if self._path is None else self._path.due() - self.wheels.newest()
 
     def wait_s(self) -> float:
-        """Return in how many s the samples of the next pose exist, if they come without delay."""
+        """Return the time until the samples of the next pose arrive, s, if without delay."""
         return self.lacking_s() + self.imu.usual
 
     def poses(self) -> list[Pose]:
-        """Return the poses that what was fed since the last call allows."""
+        """Return the poses whose samples have arrived since the last call."""
         apart = self.apart()
         if apart and self._path is not None:
-            self.begin_anew(f'odometer stamps differ from IMU stamps by {apart:+.3g} s')
+            self.restart(f'odometer stamps differ from IMU stamps by {apart:+.3g} s')
         if self._path is None and not apart:
             self._path = self._begin()
         if self._path is None:
@@ -120,18 +120,18 @@ class Odometry:
                  for rows in (MOVED_ROWS, STAYS_ROWS))
         out = self._path.poses(*moved)
         if self._path.failed:
-            self.begin_anew(self._path.failed)
+            self.restart(self._path.failed)
         return out
 
     def _begin(self) -> Reckoning | None:
-        """Return the path from the first samples on, None while too few have come."""
+        """Return a path from the first samples, None while there are too few."""
         start = begin(self.imu, self.wheels, self.vehicle, self.config, self.grade)
         if start is None:
             return None
         ahead = self._ahead()
         if self._first_ahead is None:
             self._first_ahead = ahead
-        # a clock that was set alone is now apart from the other by what nobody has calibrated
+        # after one clock was set, the stamps have an additional offset that is not calibrated
         delay = float(np.hypot(self.config.odometer.time_sigma, ahead - self._first_ahead))
         return Reckoning(start, self.imu, self.wheels, self.vehicle, self.config, self._notes,
                          delay)

@@ -15,7 +15,7 @@ from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import SWAY
 
-# definition: in the numbers of a pose: how many, diagonals of both covariances
+# definition: number of floats of a pose; indices of the variances of both covariances
 NUMBERS, VARIANCES = 85, np.r_[7:43:7, 49:85:7]
 NONE = (0.0,) * 6      # definition
 
@@ -25,8 +25,8 @@ class Pose:
     """
     Pose of the vehicle, and mean motion since the previous pose.
 
-    stamp_ns : of the IMU.   numbers : (85,) all floats of a nav_msgs/Odometry in its order; its
-    twist's are the last 42.
+    stamp_ns : of the IMU.   numbers : (85,) floats of a nav_msgs/Odometry in order; the last 42
+    are those of the twist.
     """
 
     stamp_ns: int
@@ -62,7 +62,7 @@ class Pose:
         """Return the covariance of velocity and rate: (6, 6)."""
         return self.numbers[49:].reshape(6, 6)
 
-    def sound(self) -> bool:
+    def is_valid(self) -> bool:
         """Return True if all values are finite and no variance is negative."""
         return math.isfinite(self.numbers.dot(self.numbers)) and (
             min(self.numbers[VARIANCES].tolist()) >= 0)
@@ -82,8 +82,9 @@ def covariances(by_errors: Floats, late: Sequence[float], along_n: Sequence[floa
     """
     Return the covariances of pose and twist: (2, 36).
 
-    by_errors : (2, 6, 6).   late, swing : 6 each, sigmas of a common cause of a pose, of a twist.
-    along_n : (3,) m, of another, of the position.   variances : 3, of the velocity, (m/s)^2.
+    by_errors : (2, 6, 6), by the error state.   late : (6,) effect of one sigma of the delay on
+    the pose.   along_n : (3,) m, one sigma of the travel.   swing : (6,) effect of one sigma of
+    the gyro scale on the twist.   variances : (3,) of the velocity, (m/s)^2.
     """
     x, y, z = map(math.sqrt, variances)
     off = np.array([[late, (*along_n, *NONE[3:]), NONE, NONE],
@@ -94,11 +95,11 @@ def covariances(by_errors: Floats, late: Sequence[float], along_n: Sequence[floa
 
 def velocity_variances(vehicle: Vehicle, speed: float, T: float, travel: float) -> Vector:
     """
-    Return the variances of a mean velocity over T s, of base_link, (m/s)^2.
+    Return the variances of the mean velocity of base_link over T s, (m/s)^2.
 
-    speed : m/s, of the odometer's point.   travel : m^2, its variance in T beside that of scale
-    and road.
+    speed : m/s, of the odometer's point.   travel : m^2, variance of the travel in T s, without
+    those of scale and slip.
     """
-    along, left, up = (variance / T for variance in Errors.road(speed))
+    along, left, up = (variance / T for variance in Errors.slip_variances(speed))
     along += (speed * vehicle.scale_sigma)**2 + travel / T**2 + 1e-6
     return along, left + SWAY**2, up + SWAY**2

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Implausible rows of the IMU, detected in a stream, in plain numbers: a block has two or three.
+Detection of implausible IMU rows in a stream.
 
-A leg is screened as a whole (``screening/glitches.py``); a stream has its past, and what follows
-within the time that a spike may take. The limits are those of the leg.
+A leg is screened as a whole (``screening/glitches.py``). A stream has the rows before, and those
+after within the longest duration of a spike. The limits are those of a leg. A block has two or
+three rows, so numbers are faster than numpy arrays.
 """
 
 from bisect import bisect_right
@@ -32,22 +33,22 @@ from odocal_ros.screening.glitches import (
 
 # physical: twice the range of common gyros, 2000 deg/s; range of accelerometers for crashes, 200 g
 MOST_TURN, MOST_FORCE = 70.0, 2000.0      # rad/s, m/s^2
-USUAL_ROWS = 50           # judgement: rows over which the usual step is taken
-STUCK_TIME = 0.1          # s; judgement: of rows equal in every bit, after which the sensor hangs
-TURN_CHANGE = 10.0        # rad/s^2; physical: no vehicle starts to turn faster, but over a stone
-STRANGE_TURN_TIME = 1.0        # s; judgement: after which a turn that began so is one
-ALONE_CHANGE = 2.5        # rad/s^2; judgement: of a step that stands alone: turns begin slower
+USUAL_ROWS = 50           # judgement: rows of the mean step
+STUCK_TIME = 0.1          # s; judgement: rows that are equal for longer are frozen
+TURN_CHANGE = 10.0        # rad/s^2; physical: of a vehicle, except over a stone
+STRANGE_TURN_TIME = 1.0        # s; judgement: a longer turn after a step is real
+ALONE_CHANGE = 2.5        # rad/s^2; judgement: least isolated step; turns start more slowly
 SINGLES = (SINGLE_TURN,) * 3 + (SINGLE_FORCE,) * 3
-SINGLE_ROWS = ROWS_BESIDE + 4      # definition: rows that ``is_single`` looks at
-MISSING = (math.nan, math.nan, math.nan)      # definition: m/s^2, where no force is sent
+SINGLE_ROWS = ROWS_BESIDE + 4      # definition: rows that ``is_single`` uses
+MISSING = (math.nan, math.nan, math.nan)      # definition: m/s^2, no force published
 
 
 class Row(NamedTuple):
     """
     A row of the IMU.
 
-    t : s since the first.   w_b, f_b : rad/s, m/s^2, MISSING: no force is sent.
-    strange : rad/s, size of an implausible turn rate.
+    t : s since the first.   w_b, f_b : rad/s, m/s^2; MISSING: no force published.
+    strange : rad/s, implausible part of the turn rate.
     """
 
     t: float
@@ -57,37 +58,37 @@ class Row(NamedTuple):
     strange: Vector = ZERO
 
 
-time_of = itemgetter(0)      # definition: of a row, to search by
+time_of = itemgetter(0)      # definition: sort key of a row
 Pair = tuple[float, float]
 
 
 def is_possible(w_b: Vector, f_b: Vector) -> bool:
-    """Return True if a sensor can show a turn rate, rad/s, and a force, m/s^2 or MISSING."""
+    """Return True if turn rate, rad/s, and force, m/s^2 or MISSING, are in a sensor's range."""
     return _within(w_b, MOST_TURN) and (f_b is MISSING or _within(f_b, MOST_FORCE))
 
 
 def _within(a: Vector, most: float) -> bool:
-    """Return True if no element of a vector is larger; False of NaN."""
+    """Return True if all elements of a vector are within ``most``; False for NaN."""
     x, y, z = a
     return abs(x) <= most and abs(y) <= most and abs(z) <= most
 
 
 class SpikeScreen:
     """
-    Selects rows by the rows before and after them.
+    Selection of plausible rows.
 
-    A row that leaves the last one by more than a vehicle does is held until it is known whether
-    the values come back (a spike: dropped) or stay (motion, or a fault that stays: released).
+    A row after a large step is held until later rows decide: if the values return, it is a spike
+    and is dropped; otherwise it is motion or a permanent fault, and is kept.
     """
 
     def __init__(self) -> None:
-        self._usual = 0.0, 0.0              # of steps from row to row, as ``_step`` has them
-        self._since = 0.0                   # s, since when the rows are equal
+        self._usual = 0.0, 0.0              # mean steps from row to row, in units of ``_step``
+        self._since = 0.0                   # s, begin of equal rows
         self._kept: deque[Row] = deque(maxlen=ROWS_BESIDE + 1)
-        self._dropped = False               # a row since the last one kept
-        self._strange = ZERO                # rad/s, step of the gyro that no vehicle makes
-        self._before = ZERO                 # rad/s, rate before it
-        self._until = 0.0                   # s
+        self._dropped = False               # a row was dropped since the last kept one
+        self._strange = ZERO                # rad/s, implausible step of the gyro
+        self._before = ZERO                 # rad/s, rate before the step
+        self._until = 0.0                   # s, end of the implausible part
 
     def sift(self, rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
         """Return the rows to keep, with their implausible rates, and the rows to hold."""
@@ -101,13 +102,13 @@ class SpikeScreen:
                 if back is None and within == len(rows):
                     break
             if any(alone) and k + 1 == len(rows) and back is None:
-                break                  # the next row shows whether it is alone
+                break                  # wait for the next row
             self._learn(step)
             if any(step) or not any(row.w_b) or not self._kept:      # a gyro may have a dead band
                 self._since = row.t
             self._dropped = back is not None or row.t - self._since > STUCK_TIME
             if not self._dropped:
-                strange = self._strange_of(last, row, alone)
+                strange = self._implausible_part(last, row, alone)
                 kept.append(row if strange is ZERO else row._replace(strange=strange))
                 self._kept.append(row)
             k += 1 + (back or 0)
@@ -115,7 +116,7 @@ class SpikeScreen:
 
     def _alone(self, rows: Sequence[Row]) -> tuple[bool, ...]:
         """
-        Return a mask of the rates of the first of two rows that follow a step which stands alone.
+        Return a mask of the gyro axes with an isolated step before the first of two rows.
 
         A vehicle starts to turn over several rows; a sensor fault may start with one step.
         """
@@ -136,8 +137,8 @@ class SpikeScreen:
             abs(w - before) <= BACK_SHARE * size for w, before, size in zip(
                 row.w_b, self._before, self._strange, strict=True) if size))
 
-    def _strange_of(self, last: Row, row: Row, alone: Sequence[bool]) -> Vector:
-        """Return the implausible part of a rate, rad/s, from the step where it started."""
+    def _implausible_part(self, last: Row, row: Row, alone: Sequence[bool]) -> Vector:
+        """Return the implausible part of a rate, rad/s: the size of the step at its start."""
         if self._is_over(row):
             self._strange = ZERO
         elif self._strange is ZERO:
@@ -151,13 +152,13 @@ class SpikeScreen:
         return self._strange
 
     def _leaves(self, step: Pair) -> tuple[bool, bool]:
-        """Return a mask of gyro and force: the step is larger than a vehicle's."""
+        """Return True for gyro and force if the step is implausible for a vehicle."""
         (turn, force), (usual_turn, usual_force) = step, self._usual
         return (turn > max(1.0, USUAL_STEPS * usual_turn),
                 force > max(1.0, USUAL_STEPS * usual_force))
 
     def _learn(self, step: Pair) -> None:
-        """Let the usual step follow; one spike hardly changes it."""
+        """Update the mean step; a single spike has little effect."""
         (turn, force), (usual_turn, usual_force) = step, self._usual
         self._usual = (
             usual_turn + (min(turn, 4 * usual_turn + 1 / USUAL_STEPS) - usual_turn) / USUAL_ROWS,
@@ -165,7 +166,7 @@ class SpikeScreen:
             / USUAL_ROWS)
 
     def _back(self, last: Row, rows: Sequence[Row], step: Pair) -> int | None:
-        """Return at which of the rows after a step the values are back, None if at none."""
+        """Return the number of the row where the values are back after a step, None without."""
         leaves = self._leaves(step)
         for k, row in enumerate(rows):
             if all(left <= BACK_SHARE * size for left, size, bound in zip(
@@ -175,13 +176,13 @@ class SpikeScreen:
 
 
 def _largest(a: Vector, b: Vector) -> float:
-    """Return the largest difference of two vectors, NaN of MISSING."""
+    """Return the largest difference between elements of two vectors; NaN for MISSING."""
     (x, y, z), (u, v, w) = a, b
     return max(abs(u - x), abs(v - y), abs(w - z))
 
 
 def _step(last: Row, row: Row) -> Pair:
-    """Return the steps of gyro and force, 1 where a vehicle hardly makes it; 0 of MISSING."""
+    """Return the steps of gyro and force over TURN_STEP and FORCE_STEP; 0 for MISSING."""
     force = _largest(last.f_b, row.f_b) / FORCE_STEP
     return _largest(last.w_b, row.w_b) / TURN_STEP, force if force == force else 0.0
 
@@ -190,7 +191,7 @@ def is_single(rows: Sequence[Row]) -> bool:
     """
     Return True if the row before the last of SINGLE_ROWS is an isolated outlier.
 
-    As ``screening.glitches.single`` has it, but by the rows before: those after are still to come.
+    As ``screening.glitches.isolated``, but by earlier rows only.
     """
     if len(rows) < SINGLE_ROWS:
         return False

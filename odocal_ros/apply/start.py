@@ -19,12 +19,12 @@ from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
 from odocal_ros.settings.grades import Grade
 from odocal_ros.settings.node_configs import ApplyConfig
 
-MOST_TILTING = 0.5         # rad/s; physical: no vehicle rolls or pitches so for START_SPAN
-START_SPAN = 2.0           # s; judgement: of samples that a start is taken from
-GIVEN_TILT_SIGMA = 0.01    # rad; judgement: of an attitude from outside
-ROAD_TILT_SIGMA = 0.1      # rad; physical: a road of 10 %
-START_HOLE = 0.5           # s; judgement: without IMU data, in the samples of a start
-BRAKING_SIGMA = 2.0        # m/s^2; physical: that a mean over START_SPAN may hold of braking
+MOST_TILTING = 0.5         # rad/s; physical: largest mean rate of roll and pitch over START_SPAN
+START_SPAN = 2.0           # s; judgement: duration of the samples of a start
+GIVEN_TILT_SIGMA = 0.01    # rad; judgement: tilt of an attitude given by the settings
+ROAD_TILT_SIGMA = 0.1      # rad; physical: a road slope of 10 %
+START_HOLE = 0.5           # s; judgement: largest IMU gap in the samples of a start
+BRAKING_SIGMA = 2.0        # m/s^2; physical: mean acceleration over START_SPAN
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Start:
     """
     Attitude and gyro bias at a row of the IMU.
 
-    earth_n : (3,) rad/s that is taken out of the turn rates, zero where it is in the bias.
+    earth_n : (3,) rad/s, Earth rate removed from the turn rates; zero if the bias contains it.
     """
 
     row: int
@@ -44,7 +44,7 @@ class Start:
 
 def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
           grade: Grade) -> Start | None:
-    """Return the start, None while too little has come."""
+    """Return the start, None while there are too few samples."""
     if not wheels.ready() or not imu.rows:
         return None
     row = imu.from_time(wheels.oldest())
@@ -68,7 +68,7 @@ def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
 
 
 def _tilting(w: Floats, f: Floats) -> Floats:
-    """Return the part of a mean turn rate, (3,) rad/s, not about the vertical; 0 without force."""
+    """Return the horizontal part of a mean turn rate, (3,) rad/s; zero without force."""
     up = f / np.linalg.norm(f)
     return w - up * (w @ up) if np.isfinite(up).all() else np.zeros(3)
 
@@ -84,7 +84,7 @@ def _given(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Sta
 
 def _levelled(row: int, length: float, w: Floats, f: Floats, resting: bool, vehicle: Vehicle,
               grade: Grade) -> Start:
-    """Return the start by gravity, x along the vehicle; the bias by a rest, else as calibrated."""
+    """Return the start by gravity, x forward; gyro bias as measured at rest, or calibrated."""
     mean = f.mean(axis=0)
     level = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_FORCE_OFF)      # not NaN either
     C_Lb = level_frame(mean) if level else vehicle.C_vb
@@ -98,6 +98,6 @@ def _levelled(row: int, length: float, w: Floats, f: Floats, resting: bool, vehi
         known = vehicle.gyro_bias is not None
         bias, sigma = (vehicle.gyro_bias if known else np.zeros(3)), grade.gyro_bias
     errors = Errors(grade, vehicle, ROAD_TILT_SIGMA, sigma)
-    if level:        # so that the tilt hangs on the accelerometer's bias
-        errors.by_gravity(C_nb, np.zeros(3), length, 0.0 if resting else BRAKING_SIGMA)
+    if level:        # correlates the tilt with the accelerometer bias
+        errors.correct_by_gravity(C_nb, np.zeros(3), length, 0.0 if resting else BRAKING_SIGMA)
     return Start(row, quat_from_matrix(C_nb), bias, np.zeros(3), errors)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The IMU samples that the odometry still needs."""
+"""The IMU rows of a stream that dead reckoning still needs."""
 
 from bisect import bisect_left
 from itertools import pairwise
@@ -20,16 +20,16 @@ from odocal_ros.data.samples import ImuSamples
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.settings.node_configs import ApplyConfig
 
-INTERVAL_ROWS = 64      # judgement: rows that determine the usual interval
-HOLE_INTERVALS = 2.5      # judgement: usual intervals of the IMU, a longer one hides a turn
+INTERVAL_ROWS = 64      # judgement: rows of the median interval
+HOLE_INTERVALS = 2.5      # judgement: median intervals; in a longer gap a turn is not measured
 
 
 class ImuStream:
     """
-    Rows of the IMU, usable and rising.
+    Usable rows of the IMU in order of time.
 
-    at : the row that is reached.     zero_ns : stamp of t = 0.     usual : s between rows.
-    ``notes`` receives sentences on dropped rows.
+    at : current row of the path.   zero_ns : stamp of t = 0.   usual : s, median interval.
+    notes : list for texts on dropped rows.
     """
 
     def __init__(self, config: ApplyConfig, notes: list[str]) -> None:
@@ -47,7 +47,7 @@ class ImuStream:
         self._unmeasured = 0        # rows since ``usual`` was measured
 
     def feed(self, block: ImuSamples) -> None:
-        """Take rows whose stamps rise, as far as it is known that they are no spikes."""
+        """Add rows with rising stamps; possible spikes are held until the next call."""
         rows, before = self._held, len(self._held)
         for stamp, w_i, f_i in zip(block.stamp_ns.tolist(), block.w_i.tolist(),
                                    block.f_i.tolist(), strict=True):
@@ -62,7 +62,7 @@ class ImuStream:
                           'hold NaN or impossible values')
         kept, self._held = self._screen.sift(rows)
         self._say_dropped(len(rows) - len(kept) - len(self._held),
-                          'jump away and back, or repeat one value')
+                          'jump and return, or repeat one value')
         for row in kept:
             self.rows.append(row)
             if len(self.rows) - 2 > self.at and is_single(self.rows[-SINGLE_ROWS:]):
@@ -76,18 +76,18 @@ class ImuStream:
 
     def _say_dropped(self, rows: int, why: str) -> None:
         if rows:
-            self._notes.append(f'IMU messages {why}: {rows} dropped and interpolated')
+            self._notes.append(f'{rows} IMU messages dropped and interpolated: they {why}')
 
     def forget(self, seconds: float) -> None:
-        """Forget rows older than so much before the newest, while nothing is reached."""
+        """Drop rows more than ``seconds`` older than the newest; for use before a path exists."""
         if self.rows and self.rows[-1].t - self.rows[0].t > 2 * seconds:
             self.drop(self.from_time(self.rows[-1].t - seconds))
 
     def from_time(self, t: float, low: int = 0) -> int:
-        """Return the first row, from one on, at a time, s, or later."""
+        """Return the number of the first row at or after t, s, not before row ``low``."""
         return bisect_left(self.rows, t, low, key=time_of)
 
     def drop(self, row: int) -> None:
-        """Forget the rows before one; what is reached must not be among them."""
+        """Drop the rows before a row; the current row must not be one of them."""
         del self.rows[:row]
         self.at = max(self.at - row, 0)

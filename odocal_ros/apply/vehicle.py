@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a calibration says of a vehicle, as dead reckoning takes it."""
+"""Calibrated values of a vehicle for dead reckoning."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix
 from odocal_ros.settings.node_configs import ApplyConfig
 
-# rad, 1 sigma of what no calibration determined; judgement: 5 and 3 deg of a mounting by eye
+# rad, 1 sigma of angles without a calibration; judgement: 5 and 3 deg of mounting by eye
 UNKNOWN_YAW, UNKNOWN_PITCH = 0.087, 0.05
 SIDES = ('scale_factor_left', 'scale_factor_right')
 
@@ -29,12 +29,12 @@ class Vehicle:
     """
     A calibrated vehicle.
 
-    scale : m per unit of the odometer, of two wheels of their mean.   scale_sigma : relative.
-    wheel_scales : m per unit, left and right, None where only their mean is calibrated.
+    scale : m per unit of the odometer; of two wheels: of their mean.   scale_sigma : relative.
+    wheel_scales : m per unit, left and right; None if only the mean is calibrated.
     yaw, pitch : rad, mounting angles, with sigmas.
-    lever_arm : (3,) m, the odometer's point in base_link.
-    gyro_bias : (3,) rad/s in b as last calibrated, None unknown.
-    guessed : what no calibration determined, for people.
+    lever_arm : (3,) m, position of the odometer in base_link.
+    gyro_bias : (3,) rad/s in b as last calibrated, None if unknown.
+    guessed : texts on assumed values.
     """
 
     scale: float
@@ -55,7 +55,7 @@ class Vehicle:
 
     @cached_property
     def C_vb(self) -> Floats:
-        """Return the rotation that takes b to the vehicle's axes."""
+        """Return the rotation from b to the vehicle's axes."""
         return matrix_from_rpy([0.0, self.pitch, self.yaw])
 
     @cached_property
@@ -69,7 +69,7 @@ class Vehicle:
         return np.concatenate([skewed(self.lever_arm.tolist()), np.eye(3)]) @ self.C_vb
 
     def swing(self, rate_b: Vector) -> tuple[float, ...]:
-        """Return the twist of base_link by a turn rate in b, rad/s, as ``twist_b`` gives it."""
+        """Return ``twist_b`` times a turn rate in b, rad/s, as numbers."""
         C_vb, lever_v = self._plain
         rate_v = rotated(C_vb, rate_b)
         return *cross(lever_v, rate_v), *rate_v
@@ -95,7 +95,7 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     if len(config.odometer.wheels) > len(SIDES):
         raise BadConfig(f'odometer.wheels has {len(config.odometer.wheels)} wheels; the limit of '
                         'this node is 2: name the wheels of an axle that does not steer')
-    # speeds that are multiplied as they are sent have a factor of their own
+    # speeds without corrections have their own factor
     scale, sigma = estimate_of('scale_factor_as_sent', *estimate_of('scale_factor', math.nan))
     left, right = (estimate_of(name, math.nan)[0] for name in SIDES)
     if math.isnan(scale):

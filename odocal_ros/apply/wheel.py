@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Travel of one wheel: rollovers corrected, resets interpolated, lost travel with its variance.
+Travel of one wheel in a stream, with the variance of lost travel.
 
-A leg is judged as a whole (``nav/odometer.py``, ``screening/odometer_care.py``); a stream has
-only its past, and a scale that is known: what no vehicle does in the time is no travel.
+Rollovers are corrected, and resets are interpolated. A leg is screened as a whole
+(``nav/odometer.py``, ``screening/odometer_care.py``). A stream has only earlier rows, but its
+scale is known: rows that no vehicle can cause are refused.
 """
 
 from bisect import bisect_left
@@ -17,60 +18,59 @@ from odocal_ros.apply.arrivals import Rhythm
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.settings.levels import FASTEST
 
-# s, counts; judgement: over which the speed beside a row is taken, at least and at most
+# judgement: averaging time of the speed, s, least and largest; counts that it contains
 LEAST_TIME, SPEED_TIME, SPEED_COUNTS = 0.1, 0.5, 10.0
-# m/s^2; physical: half of g is hard braking; what a wheel that locks or spins shows at most
+# m/s^2; physical: half of g, hard braking; largest acceleration of a wheel that locks or spins
 SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
-# judgement: s that a burst of stamps may hide; usual jitters of stamps that a row may be off by;
-# rows that determine them
+# judgement: s, longest burst of stamps; limit of the deviation of a row in mean jitters of the
+# stamps; rows that determine the mean
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
-# judgement: usual jitters, and s, that one row counts as at most: one that lost its counts is not
-# late
+# judgement: limits of one row in the mean jitter, in mean jitters and s: lost counts are no jitter
 LATEST_ROW, LATE_FLOOR = 2.0, 1e-3
-HUNG_JITTERS = 2.0    # judgement: of a counter that stops at once; one that is held shows 3
-# judgement: rows before any is tested; rows in turn, and s, that are refused at least before one
-# is accepted
+HUNG_JITTERS = 2.0    # judgement: limit of a counter that stops abruptly; a held one has 3
+# judgement: rows before the first test; least number of consecutive refused rows, and their
+# duration, s, before one is accepted
 SURE_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
-STRANGE_TIME = 1.0    # s; judgement: after it motion may explain a jump of speed
-KEPT_TIME = 60.0    # s; judgement: of rows without a message of the IMU
-HIDDEN = 1e-3    # m; judgement: of travel between two speeds, less is below any road's slip
-MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, usual intervals; judgement: messages are missing
+UNSURE_TIME = 1.0    # s; judgement: after it, acceleration may explain a step of the speed
+KEPT_TIME = 60.0    # s; judgement: age of rows that are dropped, also without IMU messages
+LEAST_BEND = 1e-3    # m; judgement: smaller errors of travel between two speeds are below slip
+MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, median intervals; judgement: least gap
 
 
 class Wheel:
     """
     Travel of a wheel, m, at the times of its rows.
 
-    scale : m per unit.   ``notes`` collects sentences on the findings.
+    scale : m per unit.   ``notes`` collects texts on faults.
     """
 
     def __init__(self, form: OdometerForm, scale: float, reversed_counts: bool = False) -> None:
         self.form = form
         self.scale = -scale if reversed_counts else scale      # m per unit, signed
-        self.quantum = 0.0             # m, size of a count, 0 for values that are no counts
-        self.speed = 0.0               # m/s, over the last rows
+        self.quantum = 0.0             # m, size of a count, 0 if values are not counts
+        self.speed = 0.0               # m/s, of the last rows
         self.usual = 0.0               # s between rows
-        self.hung = False              # it stopped at once, and has not moved since
+        self.hung = False              # it stopped abruptly, and has not moved since
         self.notes: list[str] = []
         self.t: deque[float] = deque()
         self.s: deque[float] = deque()
-        self.doubts: deque[tuple[float, float]] = deque()   # (t, m^2) of uncertain travel
+        self.uncertain: deque[tuple[float, float]] = deque()   # (t, m^2) of uncertain travel
         self._rhythm = Rhythm()
         self._arrival = -math.inf      # s, of the last row
         self._value: int | float | None = None
         self._rows = self._refused = 0
         self._refused_since = 0.0
         self._change = 0.0             # m/s, between the last two speeds
-        # m by which rows in turn that were refused differ from the speed, and all before them
-        self._owed = self._refused_travel = 0.0
-        # s, of the stamps, as the rows show it; it does not change a speed
+        # m, difference of refused travel to the speed: of consecutive rows, and of all before
+        self._refused_error = self._refused_travel = 0.0
+        # s, jitter of the stamps, which does not change a speed
         self._jitter = STAMP_BURST / JITTERS if form.quantity != 'rate' else 0.0
-        # after rows that were refused: m/s that nothing explains yet, m it may have misled by, for
-        # s, m/s before it
-        self._strange = self._strange_travel = self._strange_time = self._sure_speed = 0.0
+        # after refused rows: unexplained change of speed, m/s, its travel, m, its duration, s, and
+        # the speed before, m/s
+        self._unsure = self._unsure_travel = self._unsure_time = self._sure_speed = 0.0
 
     def feed(self, t: Sequence[float], value: Sequence[float]) -> None:
-        """Take rows: times, s, and values as sent; what has no time or value is passed over."""
+        """Add rows: times, s, and raw values. Repeated times and NaN are skipped."""
         for row in zip(t, value, strict=True):
             if math.isfinite(row[1]) and row[0] > self._arrival:
                 self._arrival = row[0]
@@ -79,7 +79,7 @@ class Wheel:
             self.forget(self.t[-1] - KEPT_TIME)
 
     def rescale(self, scale: float) -> None:
-        """Take another factor, m per unit, for what was rolled too."""
+        """Set the scale, m per unit, also for earlier travel."""
         factor = scale / abs(self.scale)
         self.scale *= factor
         self.quantum *= factor
@@ -94,12 +94,12 @@ class Wheel:
         t0, t1, s0, s1 = self.t[after - 1], self.t[after], self.s[after - 1], self.s[after]
         return s0 + (s1 - s0) * (t - t0) / (t1 - t0)
 
-    def doubt(self, t_from: float, t_to: float) -> float:
-        """Return the variance of the travel between two times, m^2, each uncertainty once."""
-        return sum((variance for t, variance in self.doubts if t_from < t <= t_to), 0.0)
+    def variance_between(self, t_from: float, t_to: float) -> float:
+        """Return the variance of uncertain travel (faults, gaps) between two times, m^2."""
+        return sum((variance for t, variance in self.uncertain if t_from < t <= t_to), 0.0)
 
-    def jitter(self, t: float, T: float) -> float:
-        """Return the variance, m^2, of the travel in the T s up to a time by arrival jitter."""
+    def jitter_variance(self, t: float, T: float) -> float:
+        """Return the variance by arrival jitter of the travel in the T s before t, m^2."""
         if self.form.quantity == 'rate':
             return 0.0
         off = self._rhythm.error_s * (self.at(t) - self.at(t - T)) / T
@@ -107,11 +107,11 @@ class Wheel:
 
     @property
     def delay_s(self) -> float:
-        """Return the sigma of the delay of the rows by their arrival, s."""
+        """Return the sigma of the constant delay of the rows, s."""
         return self._rhythm.delay_s
 
-    def between(self, t: float) -> float:
-        """Return the variance, m^2, of the travel at a time because rows lie only beside it."""
+    def interpolation_variance(self, t: float) -> float:
+        """Return the variance by interpolation of the travel at a time, m^2."""
         after = bisect_left(self.t, t)
         if not 0 < after < len(self.t):
             return 0.0
@@ -119,12 +119,12 @@ class Wheel:
         return sag**2
 
     def forget(self, t: float) -> None:
-        """Drop rows that nobody asks for again."""
+        """Drop rows before a time that are no longer needed."""
         while len(self.t) > 2 and self.t[1] < t:
             self.t.popleft()
             self.s.popleft()
-        while self.doubts and self.doubts[0][0] < t:
-            self.doubts.popleft()
+        while self.uncertain and self.uncertain[0][0] < t:
+            self.uncertain.popleft()
 
     def _take(self, t: float, value: float) -> None:
         if self._value is None:
@@ -134,7 +134,7 @@ class Wheel:
             self._add(t, 0.0)
             return
         before = self._value
-        if self.form.quantity == 'rate':      # its value does not show which rows are missing
+        if self.form.quantity == 'rate':      # speeds do not show lost rows
             self._rhythm.place(t, min(max(value * self.scale, -FASTEST), FASTEST), 0.0, 0.0)
         else:
             most = FASTEST * STAMP_BURST + self.quantum
@@ -151,29 +151,30 @@ class Wheel:
         if self._is_false(t, dt, step, shown, off):
             self.notes.append(f'the counter jumps by {step:+.1f} m in {dt:.2f} s: a reset or an '
                              f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
-            if abs(shown * dt) <= self._most(dt):      # else it is no travel at all
-                self._owed += shown * dt - self.speed * dt
+            if abs(shown * dt) <= self._most(dt):      # else it is certainly not travel
+                self._refused_error += shown * dt - self.speed * dt
             step = self.speed * dt
             lost = (abs(self.speed) + SPEED_CHANGE * dt) * dt
-            self._doubt((lost**2 + self.quantum**2) / 3)
+            self._add_variance((lost**2 + self.quantum**2) / 3)
             value = before if self.form.quantity == 'rate' else value
         else:
             self._follow(dt, step, shown, off)
-            if self._owed:
-                self._doubt_refused()
+            if self._refused_error:
+                self._add_refused_variance()
         if self.form.quantity == 'rate':
-            self._doubt_between((value - before) * self.scale, dt)
-        if self._strange:      # refused rows are interpolated at a speed that may be false
-            self._doubt_speed(dt)
+            self._add_bend_variance((value - before) * self.scale, dt)
+        if self._unsure:      # the speed used for refused rows may be false
+            self._add_speed_variance(dt)
         self._value = value
         self.usual += (dt - self.usual) * (0.1 if self.usual and not gap else not gap)
         self._add(t, self.s[-1] + step)
 
     def _is_false(self, t: float, dt: float, step: float, shown: float, off: float) -> bool:
         """
-        Return True if a row is not motion: a step, m, with this deviation, m, from the speed.
+        Return True if a row is not motion.
 
-        shown : m/s, of the row.   What stays for a while and is possible at all is accepted.
+        step : m.   shown : m/s, speed of the row.   off : m, deviation of the step from the speed.
+        Possible values that remain for REFUSED_TIME are accepted.
         """
         possible = abs(step) <= self._most(dt) and (
             self.form.quantity != 'rate' or abs(shown) <= FASTEST)
@@ -186,84 +187,85 @@ class Wheel:
             t - self._refused_since < REFUSED_TIME)
 
     def _most(self, dt: float) -> float:
-        """Return the most that a vehicle travels between rows, m."""
+        """Return the largest possible travel between two rows, m."""
         return FASTEST * max(dt, STAMP_BURST) + self.quantum
 
     def _hangs(self, dt: float, step: float) -> bool:
-        """Return True if a counter stops at once: it hangs, or the wheel locks."""
-        return not step and not self._strange and self.form.quantity != 'rate' and (
+        """Return True if a counter stops abruptly: it hangs, or the wheel locks."""
+        return not step and not self._unsure and self.form.quantity != 'rate' and (
             abs(self.speed) * dt > self._limit(dt, SPEED_CHANGE, HUNG_JITTERS))
 
     def _limit(self, dt: float, change: float = WHEEL_CHANGE, jitters: float = JITTERS) -> float:
         """Return the limit for the deviation of a row from the previous speed, m."""
-        T = max(dt, self.usual)      # a row of a burst holds the motion of an interval
-        return (change * (T + self._lag()) * T + 3 * self.quantum
+        T = max(dt, self.usual)      # a row of a burst contains the travel of an interval
+        return (change * (T + self._speed_time()) * T + 3 * self.quantum
                 + (jitters * self._jitter + T - dt) * abs(self.speed))
 
-    def _lag(self) -> float:
-        """Return the time, s, that the speed is taken over: coarse counts want more."""
+    def _speed_time(self) -> float:
+        """Return the averaging time of the speed, s, longer for coarse counts."""
         counts = SPEED_COUNTS * self.quantum
         coarse = counts / max(abs(self.speed), counts) if counts else 0.0
         return min(SPEED_TIME, LEAST_TIME + coarse)
 
     def _follow(self, dt: float, step: float, shown: float, off: float) -> None:
-        """Use the speed of an accepted row; add variance after a jump of speed."""
+        """Update the speed by an accepted row; add variance after a step of the speed."""
         hangs = self._hangs(dt, step)
         self.hung = not step and (self.hung or hangs or (
             self._refused > 0 and off > self._limit(dt)))
         if self._refused:
-            if not self._strange:      # else the speed itself is not explained
-                self._sure_speed, self._strange_travel = self.speed, 0.0
-            back = abs(shown - self._sure_speed) * dt <= self._limit(dt) and self._strange > 0
-            self._strange = 0.0 if back else abs(shown - self._sure_speed)
-            self._strange_time = 0.0
+            if not self._unsure:      # else the speed is still unexplained
+                self._sure_speed, self._unsure_travel = self.speed, 0.0
+            back = abs(shown - self._sure_speed) * dt <= self._limit(dt) and self._unsure > 0
+            self._unsure = 0.0 if back else abs(shown - self._sure_speed)
+            self._unsure_time = 0.0
             self.speed = shown if off > self._limit(dt) else self.speed
         elif hangs:
-            self.notes.append(f'the counter stops at once from {self.speed:.1f} m/s: it hangs, or '
-                              'the wheel locks; sigma increased')
-            self._strange, self._sure_speed = abs(self.speed), self.speed
-            self._strange_travel = self._strange_time = 0.0
+            self.notes.append(f'the counter stops abruptly from {self.speed:.1f} m/s: it hangs, '
+                              'or the wheel locks; sigma increased')
+            self._unsure, self._sure_speed = abs(self.speed), self.speed
+            self._unsure_travel = self._unsure_time = 0.0
         elif off > self._limit(dt, SPEED_CHANGE):
-            self._doubt(off**2)
+            self._add_variance(off**2)
         self._refused = 0
         if self.form.quantity != 'rate':
             late = min(off / max(abs(self.speed), 1.0), LATEST_ROW * self._jitter + LATE_FLOOR)
             self._jitter += (late - self._jitter) / JITTER_ROWS
-        change, most = (step / dt - self.speed) * min(1.0, dt / self._lag()), WHEEL_CHANGE * dt
-        self.speed += min(max(change, -most), most)
+        change = (step / dt - self.speed) * min(1.0, dt / self._speed_time())
+        self.speed += min(max(change, -WHEEL_CHANGE * dt), WHEEL_CHANGE * dt)
 
-    def _doubt_speed(self, dt: float) -> None:
-        """Add variance of the travel in dt s at a speed that nothing explains."""
-        path_length = self._strange_travel + self._strange * dt
-        self._doubt((path_length**2 - self._strange_travel**2) / 3)
-        self._strange_travel = path_length
-        self._strange_time += dt
-        if self._strange_time > STRANGE_TIME:      # motion itself may explain it
-            self._strange = max(self._strange - SPEED_CHANGE * dt, 0.0)
+    def _add_speed_variance(self, dt: float) -> None:
+        """Add the variance of the travel in dt s by the unexplained speed."""
+        path_length = self._unsure_travel + self._unsure * dt
+        self._add_variance((path_length**2 - self._unsure_travel**2) / 3)
+        self._unsure_travel = path_length
+        self._unsure_time += dt
+        if self._unsure_time > UNSURE_TIME:      # real acceleration explains more of it
+            self._unsure = max(self._unsure - SPEED_CHANGE * dt, 0.0)
 
-    def _doubt_between(self, change: float, dt: float) -> None:
-        """Add variance of the travel between two speeds that differ by m/s, dt s apart."""
-        # a corner of the speed in the middle of the rows
+    def _add_bend_variance(self, change: float, dt: float) -> None:
+        """Add the variance of travel by a new acceleration; change : m/s, in the last dt s."""
+        # the speed bends in the middle of the rows
         hidden, self._change = abs(change - self._change) * dt / 4, change
-        if hidden > HIDDEN:
-            self._doubt(hidden**2)
+        if hidden > LEAST_BEND:
+            self._add_variance(hidden**2)
 
-    def _doubt_refused(self) -> None:
-        """Add variance of the travel of refused rows, which may be true: all of one cause."""
-        before, self._refused_travel = self._refused_travel, self._refused_travel + self._owed
-        self._owed = 0.0
-        self._doubt(max(self._refused_travel**2 - before**2, 0.0))
+    def _add_refused_variance(self) -> None:
+        """Add the variance of refused travel, which may be real: one common error."""
+        before = self._refused_travel
+        self._refused_travel += self._refused_error
+        self._refused_error = 0.0
+        self._add_variance(max(self._refused_travel**2 - before**2, 0.0))
 
-    def _doubt(self, variance: float) -> None:
-        """Add variance of the travel, m^2, from the last row on."""
-        self.doubts.append((self.t[-1] + 1e-6, variance))
+    def _add_variance(self, variance: float) -> None:
+        """Add a variance, m^2, to the travel after the last row."""
+        self.uncertain.append((self.t[-1] + 1e-6, variance))
 
     def _add(self, t: float, s: float) -> None:
         self.t.append(t)
         self.s.append(s)
 
     def _step(self, value: float, before: float, dt: float) -> float:
-        """Return the units rolled between two rows."""
+        """Return the travel between two rows, scale units."""
         if self.form.quantity == 'rate':
             return (before + value) / 2 * dt
         if self.form.quantity == 'increment':
@@ -274,7 +276,7 @@ class Wheel:
         return step
 
     def _bridged(self, dt: float, step: float) -> float:
-        """Return the travel to add for a gap, m; increase the sigma of speeds or increments."""
+        """Return the travel to add for a gap, m; add variance for speeds and increments."""
         if self.form.quantity == 'cumulative':
             self.notes.append(f'no odometer message for {dt:.2f} s: the counts of this gap are '
                              'distributed evenly')
@@ -282,7 +284,7 @@ class Wheel:
         missing = dt - self.usual
         lost = self.speed * missing if self.form.quantity == 'increment' else 0.0
         size = max(abs(self.speed), abs(step) / dt)
-        self._doubt((min(missing / 50, 0.3) * size * missing) ** 2 / 3)
+        self._add_variance((min(missing / 50, 0.3) * size * missing) ** 2 / 3)
         self.notes.append(f'no odometer message for {dt:.2f} s: the travel is interpolated from '
                          'the adjacent speeds')
         return lost

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The travel of a vehicle by one counter or by those of its two wheels."""
+"""Travel of a vehicle by the counter of one wheel or of two."""
 
 import math
 
@@ -11,16 +11,16 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.standstill import REST_TRAVEL
 from odocal_ros.settings.node_configs import ApplyConfig
 
-STILL_COUNTS = 1.5    # physical: counts that a wheel at rest may still show
+STILL_COUNTS = 1.5    # physical: largest number of counts of a wheel at rest
 SIDES = ('odometer', 'odometer_right')
 Rows = tuple[str, OdometerSamples, OdometerForm]
 
 
 class Wheels:
     """
-    Travel, m, of the vehicle's odometer: one wheel's, or the mean of two.
+    Travel of the vehicle, m: of its only wheel, or the mean of two.
 
-    Of two wheels each has its own factor where the calibration gives both.
+    Each of two wheels has its own scale if the calibration has both.
     """
 
     def __init__(self, vehicle: Vehicle, config: ApplyConfig, notes: list[str]) -> None:
@@ -34,7 +34,7 @@ class Wheels:
         self.quantum = 0.0                   # m, size of a count of the travel
 
     def feed(self, slot: str, block: OdometerSamples, form: OdometerForm) -> None:
-        """Take rows of a slot."""
+        """Add rows of a slot."""
         self._waiting.append((slot, block, form))
         if not self.zero_ns:
             self._waiting = self._waiting[-100:]
@@ -56,47 +56,49 @@ class Wheels:
         self.quantum = math.hypot(*(w.quantum for w in self._wheels.values())) / len(self._wheels)
 
     def _scale(self, form: OdometerForm) -> None:
-        """Give each of two wheels its own factor."""
+        """Set the scale of each of two wheels."""
         scales = self._vehicle.wheel_scales
         if len(self._wheels) == 2 and scales is not None and form.sides:
             for slot, scale in zip(SIDES, scales, strict=True):
                 self._wheels[slot].rescale(scale)
 
     def ready(self) -> bool:
-        """Return True if every wheel has sent rows."""
+        """Return True if every wheel has rows."""
         return bool(self._wheels) and all(w.t for w in self._wheels.values()) and (
             not self._two or len(self._wheels) == 2)
 
     def newest(self) -> float:
-        """Return the last time that every wheel's rows have reached, s."""
+        """Return the newest time for which every wheel has travel, s."""
         return min(w.t[-1] for w in self._wheels.values())
 
     def oldest(self) -> float:
-        """Return the first time that every wheel has, s."""
+        """Return the oldest time for which every wheel has travel, s."""
         return max(w.t[0] for w in self._wheels.values())
 
     def at(self, t: float) -> float:
         """Return the travel at a time, m."""
         return sum(wheel.at(t) for wheel in self._wheels.values()) / len(self._wheels)
 
-    def doubt(self, t_from: float, t_to: float) -> float:
-        """Return the variance of the travel between two times, m^2, beside that of the scale."""
-        return sum(w.doubt(t_from, t_to) for w in self._wheels.values()) / len(self._wheels)**2
+    def variance_between(self, t_from: float, t_to: float) -> float:
+        """Return the variance of uncertain travel (faults, gaps) between two times, m^2."""
+        wheels = self._wheels.values()
+        return sum(w.variance_between(t_from, t_to) for w in wheels) / len(wheels)**2
 
     def variances(self, t: float, T: float) -> tuple[float, float]:
-        """Return the variances of the travel at a time, and of that in the T s up to it, m^2."""
+        """Return the variances of the travel at t, and of the travel in the T s before, m^2."""
         wheels, n = self._wheels.values(), len(self._wheels)**2
         rounding = self.quantum**2 / 6
-        jitter = sum(w.jitter(t, T) for w in wheels) / n      # of arrivals
-        return rounding + sum(w.between(t) for w in wheels) / n + jitter / 2, rounding + jitter
+        jitter = sum(w.jitter_variance(t, T) for w in wheels) / n
+        interpolation = sum(w.interpolation_variance(t) for w in wheels) / n
+        return rounding + interpolation + jitter / 2, rounding + jitter
 
     @property
     def delay_s(self) -> float:
-        """Return the sigma of the delay of the travel by its arrival, s."""
+        """Return the sigma of the constant delay of the travel, s."""
         return max(w.delay_s for w in self._wheels.values())
 
     def still(self, t_from: float, t_to: float) -> bool:
-        """Return True if no wheel turned between two times, and none hangs."""
+        """Return True if no wheel turned between two times and no counter hangs."""
         return all(not w.hung and abs(w.at(t_to) - w.at(t_from))
                    <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum for w in self._wheels.values())
 

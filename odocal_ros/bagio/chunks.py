@@ -93,7 +93,7 @@ def _zstd() -> Any:
 def _packed(records: bytes) -> tuple[str, bytes]:
     """Return the compression's name and the compressed bytes."""
     zstd = _zstd()
-    level = 1    # a third of the size at a hundredth of a core
+    level = 1    # a third of the size for 1 % of a core
     return ('zstd', zstd.compress(records, level)) if zstd else ('', records)
 
 

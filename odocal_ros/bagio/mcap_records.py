@@ -30,8 +30,8 @@ class Place(NamedTuple):
     """
     Index entry of a chunk: times, position of its record, channels.
 
-    ``index_size`` is that of the message index after it, limited by ``apart`` to the space before
-    the next chunk; ``unpacked`` is its stated unpacked size, bytes.
+    index_size : bytes of the message index after the chunk, limited by ``apart`` to the space
+    before the next chunk.   unpacked : bytes, unpacked size as stated.
     """
 
     start_ns: int
@@ -70,9 +70,9 @@ def place_of(body: bytes) -> Place:
 
 def apart(places: Sequence[Place], end: int) -> list[Place]:
     """
-    Return the chunks of an index by time; they do not overlap in the file or exceed ``end``.
+    Return the chunks of an index in order of time.
 
-    Raises Damaged if one does: the file would unpack to more than its content.
+    Raises Damaged if they overlap in the file or exceed ``end``: they could unpack to any size.
     """
     places, found, at = sorted(places, key=attrgetter('at')), [], len(MAGIC)
     for place, after in zip(places, [*(p.at for p in places[1:]), end], strict=True):
@@ -90,7 +90,7 @@ def statistics_of(body: bytes) -> tuple[int, int, int, dict[int, int]]:
 
 
 def text_at(body: Bytes, at: int) -> tuple[str, int]:
-    """Return a text of a record and the offset of its end."""
+    """Return the text at an offset of a record, and the offset after it."""
     (size,) = struct.unpack_from('<I', body, at)
     return bytes(body[at + 4:at + 4 + size]).decode(), at + 4 + size
 

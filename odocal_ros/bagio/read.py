@@ -94,7 +94,7 @@ class Bag:
             seconds = (part.end_ns - part.start_ns) * 1e-9
             missing = (f'{max(end_ns - part.end_ns, 0) * 1e-9:.1f} s at the end are missing'
                        if end_ns is not None else
-                       'how much is missing cannot be known without metadata.yaml')
+                       'without metadata.yaml the lost time is unknown')
             found.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
                                 f'{seconds:.1f} s were read; {missing}'))
         lost = (known.whole.end_ns - self.end_ns) * 1e-9 if known.whole else 0.0

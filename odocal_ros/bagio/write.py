@@ -94,7 +94,7 @@ def check_target(path: Path, storage: str, compression: str, force: bool) -> Non
     if path.exists() and not force:
         raise BadUsage(f'{path} already exists; give --force to replace it, or another --out')
     if path.exists() and not _is_bag(path):
-        raise BadUsage(f'{path} is there and is not a bag; choose another --out')
+        raise BadUsage(f'{path} already exists and is not a bag; choose another --out')
 
 
 def _is_bag(path: Path) -> bool:

@@ -5,7 +5,7 @@
 
 from typing import NamedTuple
 
-# slots of the wheels, in the order of odometer.wheels. Judgement: an 8x8 truck has most
+# slots of the wheels, in the order of odometer.wheels. Judgement: 8, as of an 8x8 truck
 WHEELS = ('odometer', 'odometer_right', *(f'odometer_{k}' for k in range(3, 9)))
 
 
@@ -13,11 +13,10 @@ class Input(NamedTuple):
     """
     One input; its slot is its name in code, bags, journals and options.
 
-    label : in texts.   kind : name of the class of its samples (``data/samples.py``).   needed :
-    columns that a usable row must have.   clock : group of settings with its ``time_offset``, or
-    empty.   topic : of the node's subscription; empty for further wheels of one message.
-    queue : messages that the subscription keeps.   possible : limits of the value of a sensor of
-    one number, None: no limits.
+    label : name in texts.   kind : class of its samples (``data/samples.py``).   needed : columns
+    that a usable row must have.   clock : group of settings with its ``time_offset``, or empty.
+    topic : default topic of the node; empty for further wheels of one message.   queue : depth of
+    the subscription, messages.   possible : limits of the value of a scalar sensor, None: none.
     """
 
     label: str
@@ -29,8 +28,7 @@ class Input(NamedTuple):
     possible: tuple[float, float] | None = None
 
 
-# queues, physical: five seconds of the highest expected rate, 4 kHz, 1 kHz and 100 Hz; messages
-# beyond are lost
+# queues, physical: messages of five seconds at the highest expected rates, 4 kHz, 1 kHz and 100 Hz
 INPUTS = {
     'imu': Input('IMU', 'ImuSamples', ('w_i', 'f_i'), 'imu', 'imu/data', 20_000),
     'odometer': Input('odometer', 'OdometerSamples', ('value',), 'odometer', 'odometer', 5000),

@@ -17,11 +17,11 @@ from odocal_ros.outside.names import said_by
 from odocal_ros.reasons import cautions, Reason, Verdict
 
 MOST_REASONS = 3     # judgement: in an answer
-KMH = 3.6    # definition: km/h in a m/s
+KMH = 3.6    # definition: km/h per m/s
 FORECAST_OLD_S = 15.0    # judgement: age from which the forecast is reported as old
 FEWEST_MARKS = 2         # judgement: marks after which the hint omits ~/mark
 DRIVE = 'drive '
-STRAIGHT = 'drive straight at speed until left and right wheel are separable'
+STRAIGHT = 'drive straight at normal speed until left and right scale are separable'
 TURNS = 'for the track width: turn by 90 deg in total or more'
 SPOT_TURNS = ('for the track width: turn on the spot in both directions, and drive straight for a '
               'metre after each turn')

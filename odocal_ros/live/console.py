@@ -10,7 +10,7 @@ from odocal_ros.live.session import SessionView, State
 from odocal_ros.outside.names import brief_line
 from odocal_ros.reasons import Code
 
-# judgement: delay of the first log of missing inputs, longest time until its repetition
+# judgement: delay of the first log of missing inputs, and longest interval of its repetitions
 SILENCE_FIRST_NS, SILENCE_SELDOM_NS = 5 * 10**9, 3600 * 10**9
 # judgement: growth of a count of lost messages after which it is reported again
 LOSS_FACTOR = 10
@@ -85,7 +85,7 @@ class Console:
         self._silence = False        # has been logged
         self._due_ns = 0             # time of the next log of missing inputs
         self._pause_ns = SILENCE_FIRST_NS
-        self._missing_text = ''      # missing inputs of the last view, without numbers
+        self._missing_text = ''      # missing inputs of the last view, numbers removed
         self._leg_id = 0             # the leg whose faults are logged
         self._reported: set[Code] = set()      # logged faults of this leg
         self._withdrawn: set[Code] = set()     # logged as no longer valid

@@ -107,7 +107,7 @@ class DrivePattern(SettledNode):
                                 driven_s, self.config.timeout)
 
     def _start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        why = 'the robot is driven already' if self._route else self._why_stop()
+        why = 'a pattern is already running' if self._route else self._why_stop()
         others = self.count_publishers(self._publisher.topic_name) - 1
         if not why and others:
             why = (f'{self._publisher.topic_name} has {others} other publisher'
@@ -128,7 +128,7 @@ class DrivePattern(SettledNode):
 
     def _stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = True
-        response.message = 'stopped' if self._route else 'the robot was not driven; stopped'
+        response.message = 'stopped' if self._route else 'no pattern was running; stopped'
         self._halt('~/stop')
         return response
 
@@ -141,7 +141,7 @@ class DrivePattern(SettledNode):
             self._send(0.0, 0.0)
 
     def _tick(self) -> None:
-        """Send a command while the robot is driven; then zeros, then nothing."""
+        """Send a command while a pattern is running; then zeros, then nothing."""
         if not self._route:
             if self._zeros:
                 self._zeros -= 1

@@ -262,7 +262,7 @@ class Filing:
         def then(folder: Path | None, error: Exception | None) -> None:
             self.saved = '' if folder is None else str(folder)
             if error is not None:
-                self._log.warning('latest still contains a dropped leg: '
+                self._log.warning('latest still points to a result with a dropped leg: '
                                   f'{answers.one_line(error)}')
             self._show()
 

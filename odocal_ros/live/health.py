@@ -13,7 +13,7 @@ from odocal_ros.data.arrays import Bools
 from odocal_ros.data.samples import FixSamples, Samples
 from odocal_ros.settings.levels import TIME_ANEW_NS, TIME_ANEW_ROWS
 
-# judgement: time span and blocks for a rate; silence after which a topic is lost
+# judgement: time span and number of blocks of a rate; silence of a lost topic
 RATE_SPAN_NS, RATE_BLOCKS = 3 * 10**9, 64
 SILENCE_NS = 2 * 10**9
 # judgement: a stamp further ahead is accepted if TIME_ANEW_ROWS of them follow
@@ -52,7 +52,7 @@ class Health:
         self.received_ns = now_ns
         numbers = [s for s in [self._last_sequence, *sequences] if s is not None]
         steps = [after - before for before, after in pairwise(numbers)]
-        # several publishers, or one that restarted: the numbers are useless
+        # numbers of several publishers, or of a restarted one, cannot be used
         if steps and min(steps) > 0:
             self.lost += sum(steps) - len(steps)
         if numbers:

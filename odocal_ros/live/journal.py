@@ -101,7 +101,7 @@ class Journal:
     def _limit_from(self, config: Config) -> int:
         """Update limit and reach from the settings; return the limit, 0 for no journal."""
         if self._limit and not config.journal.max_bytes:
-            self.start_anew()
+            self.restart()
         self._limit = config.journal.max_bytes
         # the recorder's margin, and a batch of about a second
         self._reach_ns = round((config.leg.preroll + PREROLL_MARGIN_S + 1.0) * 1e9)
@@ -155,10 +155,10 @@ class Journal:
             self._ended = True
             self._writer.submit(self._writer.end)
 
-    def start_anew(self) -> None:
+    def restart(self) -> None:
         """Discard the samples so far, after a jump of time."""
         self._batch = {}
-        self._writer.submit(self._writer.start_anew)
+        self._writer.submit(self._writer.restart)
 
     def close(self) -> bool:
         """Write the rest; files of a long leg may stay separate; return True if all is done."""

@@ -181,8 +181,8 @@ class LegJournal:
             taken = make_room(self.plan.root, self.plan.limit, size)
             self._others = taken - self._bag.size
             if taken + size > self.plan.limit:
-                self._give_up(f'{self.plan.root}: the limit journal.max_bytes is reached; raise '
-                              'it')
+                self._give_up(f'{self.plan.root}: the journals reach {self.plan.limit} bytes, the '
+                              'limit; raise journal.max_bytes')
                 return
         self._bag.append(self._waiting)
         self._waiting = []

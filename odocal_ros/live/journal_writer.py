@@ -125,7 +125,7 @@ class JournalWriter:
         if self._leg is not None:
             self._leg.put(chunks * self._listening + ([self._packed(marks)] if marks else []))
 
-    def start_anew(self) -> None:
+    def restart(self) -> None:
         """Forget the pre-roll, as after a jump of time."""
         self._preroll.clear()
 

@@ -74,7 +74,7 @@ class LegCompletion:
         self._filing.poll()
         self.pump()
         if self._recording.time_jumped:
-            self._start_time_anew()
+            self._restart_after_jump()
         self._stop_when_too_long()
         self._close_when_complete()
         if self._at_stop is not None and self.session.state is State.COMPUTING:
@@ -114,17 +114,18 @@ class LegCompletion:
                 f'{for_shell(["odocal", "replay", folder])}') if folder else 'it has no journal'
         return f'leg {self.session.leg_id} was not stopped: {kept}'
 
-    def _start_time_anew(self) -> None:
+    def _restart_after_jump(self) -> None:
         """Drop all samples from before a jump of time; a running leg is cancelled."""
+        jump = 'time jumped back (a bag restarted, or a clock was set)'
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
-            self._log.warning(f'time jumped: leg {self.session.leg_id} is cancelled')
+            self._log.warning(f'{jump}: leg {self.session.leg_id} is cancelled')
             self._drop_leg(lost='time jumped back')
             self._log.warning(self._lost_leg())
         else:
-            self._log.warning('time jumped: all samples so far are dropped')
-        self._recording.start_anew()
+            self._log.warning(f'{jump}: all samples so far are dropped')
+        self._recording.restart()
         self.session.marks.clear()
-        self._journal.start_anew()
+        self._journal.restart()
 
     def view(self) -> SessionView:
         """Return the current view of the node."""
@@ -171,10 +172,10 @@ class LegCompletion:
         session = self.session
         if session.state is not State.RECORDING:
             return
-        gone_s = (self._recording.newest_ns - session.start_ns) * 1e-9
-        if gone_s > session.config.leg.max_duration:
+        limit = session.config.leg.max_duration
+        if (self._recording.newest_ns - session.start_ns) * 1e-9 > limit:
             self._log.warning(
-                f'leg {session.leg_id} is longer than leg.max_duration and is stopped')
+                f'leg {session.leg_id} is stopped: it reached leg.max_duration, {limit:g} s')
             self.end_leg_now()
 
     def _why_not(self) -> str:

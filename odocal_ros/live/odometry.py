@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
-from odocal_ros.apply.odometry import BEGINS_ANEW, Odometry
+from odocal_ros.apply.odometry import Odometry, RESTARTS
 from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.arrays import Floats
@@ -146,8 +146,8 @@ class OdometryNode(SettledNode):
             poses = self._reckon(now_ns)
         except Exception as error:      # no message may stop the node
             poses = []
-            self._odometry.begin_anew(f'internal error, please report it: {type(error).__name__}: '
-                                      f'{said_by(error)}')
+            self._odometry.restart(f'internal error, please report it: {type(error).__name__}: '
+                                   f'{said_by(error)}')
         for pose in poses:
             self._publish(pose)
         if poses:
@@ -173,7 +173,7 @@ class OdometryNode(SettledNode):
     def _say(self, text: str, now_ns: int) -> None:
         """Log the findings: every restart, other kinds of text at a limited rate."""
         kind = re.sub(r'[-+.\de]*\d', '#', text)
-        if text.startswith(BEGINS_ANEW) or now_ns - self._said_ns.get(kind, 0) > SAID_AGAIN_NS:
+        if text.startswith(RESTARTS) or now_ns - self._said_ns.get(kind, 0) > SAID_AGAIN_NS:
             self._said_ns[kind] = now_ns
             self.get_logger().warning(text)
 

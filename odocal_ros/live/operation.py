@@ -63,9 +63,9 @@ class AutomaticLegs(LegCompletion):
         before, self._searched = self._searched, wanted
         self._search = LegSearch(self._config()) if wanted else None
         if wanted and before is None:
-            self._go_on()
+            self._load_carried()
 
-    def _go_on(self) -> None:
+    def _load_carried(self) -> None:
         """Continue with the carried result of earlier runs of the node."""
         found = latest_of(self._config(), self._node_name)
         if not found or not found.carried:
@@ -105,13 +105,13 @@ class AutomaticLegs(LegCompletion):
         super()._drop_leg(text, lost)
         self._look_after(self._recording.newest_ns, at_rest=True)
 
-    def _start_time_anew(self) -> None:
-        super()._start_time_anew()
+    def _restart_after_jump(self) -> None:
+        super()._restart_after_jump()
         self._search = LegSearch(self._config()) if self._searched else None
 
     def _look_after(self, stamp_ns: int, at_rest: bool) -> None:
         if self._search is not None:
-            self._search.begin_anew(stamp_ns, at_rest)
+            self._search.restart(stamp_ns, at_rest)
 
     def _take_leg(self, done: worker.Computed | worker.LeftOut) -> None:
         super()._take_leg(done)
@@ -146,7 +146,7 @@ class Operation(AutomaticLegs):
         if why := self._why_not():
             raise Refused(f'no leg can be started: {why}')
         if session.state is State.RECORDING:      # an automatic leg
-            self._drop_leg(f'leg {session.leg_id} is replaced by a started by the operator')
+            self._drop_leg(f'leg {session.leg_id} is replaced by a leg of the operator')
         return True, self._begin_leg(mark_ns)
 
     def mark(self) -> tuple[bool, str]:

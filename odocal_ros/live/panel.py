@@ -33,7 +33,7 @@ def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:
 def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     """Return the progress towards each limit: label -> (0 to 1, text)."""
     if status.get('state') == 'computing':
-        return {}      # the hint has the passes: their total is unknown
+        return {}      # passes are in the hint, since their total is unknown
     driven, lacks = number(status, 'distance_m'), number(status, 'metres_to_least')
     stand = number(status, 'seconds_to_stand')
     found = {}

@@ -42,7 +42,7 @@ class Publishing:
         self._diagnostics = publish(DiagnosticArray, '/diagnostics', 1)
         self._hint = publish(String, '~/hint', LATCHED)
         self._plotted = {name: publish(Float64, f'~/{name}', LATCHED) for name in PLOTTED}
-        self._shown: dict[Publisher, str] = {}        # their last messages
+        self._shown: dict[Publisher, str] = {}        # last message of each
         self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
         self.setting_results = False      # true while the node itself sets ``result.*``
@@ -53,11 +53,11 @@ class Publishing:
         return {name: self._node.get_parameter(name).value for name in params.RESULTS}
 
     def scale_factor(self) -> float:
-        """Return the scale factor in force, NaN where none is."""
+        """Return the scale factor in force, NaN without one."""
         return float(self._node.get_parameter('result.scale_factor').value)
 
     def set_results(self, calibration: Calibration | None) -> None:
-        """Set all ``result.*`` in one event; None: to the restored result, or to none."""
+        """Set all ``result.*`` at once; None: to the restored result, if there is one."""
         stamp = no_date(iso(self._node.get_clock().now().nanoseconds))
         results = self._before
         if calibration:
@@ -87,7 +87,7 @@ class Publishing:
     def show_status(self, now: SessionView) -> DiagnosticArray:
         """Publish ``~/status`` and return it."""
         array = self._array([calibration_status(now)])
-        # first: a receiver of the status then has its hint
+        # the hint first: receivers of the status then have it
         self._show(self._hint, String(data=action_first(now)))
         self._status.publish(array)
         for name, publisher in self._plotted.items():

@@ -130,7 +130,7 @@ class Recording:
         """Return True if the clock or the stamps of the leading topic went back."""
         return self._clock_jumped or self.inputs.leading.health.jumped_back
 
-    def start_anew(self) -> None:
+    def restart(self) -> None:
         """Drop all samples, after a jump of time."""
         self._clock_jumped = False
         self.recorder.clear()

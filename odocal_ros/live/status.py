@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Content of ``~/status`` and ``/diagnostics``: keys for machines, a sentence for people."""
+"""Content of ``~/status`` and ``/diagnostics``: keys and values, and a sentence."""
 
 import math
 from typing import Any
@@ -18,7 +18,7 @@ from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Verdict
 
-SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a short move in a yard is no fault
+SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # short moves are not a fault
 NAME = 'calibrator: calibration'  # replay finds marks by this name
 # judgement: significant decimals
 PLACES = dict.fromkeys((
@@ -193,7 +193,7 @@ def input_status(name: str, health: Health, why: str, needed: bool,
     if why:
         status, message = DiagnosticStatus.ERROR if needed else DiagnosticStatus.WARN, why
     elif health.fix_status is not None and health.fix_status < 0:
-        status, message = DiagnosticStatus.WARN, f'no position yet, status {health.fix_status}'
+        status, message = DiagnosticStatus.WARN, f'no position: NavSatStatus {health.fix_status}'
     elif health.unusable:
         status = DiagnosticStatus.WARN
         message = f'{rate:.1f} Hz, {health.unusable} messages unreadable'

@@ -212,7 +212,7 @@ class Input:
         return self.health.flowing(time.monotonic_ns())
 
     def why(self) -> str:
-        """Return the explanation why no usable message arrives, for people; empty if one does."""
+        """Return the reason why no usable message arrives, as text; empty if one does."""
         silent = self.health.silent_s(time.monotonic_ns())
         if self.flowing():
             return ''
@@ -234,5 +234,5 @@ class Input:
                                    for p in self.publishers}))
         many = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'
         if not self.health.received_ns:
-            return f'{self.topic}: {many} found ({offers}) but no message yet'
+            return f'{self.topic}: {many} found ({offers}) but no message yet; check the driver'
         return f'no {INPUTS[self.slot].label} on {self.topic} for {silent:.0f} s: {many} found'

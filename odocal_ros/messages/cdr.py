@@ -79,7 +79,7 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
 
 
 class Run(NamedTuple):
-    """Adjacent values of one kind: their bytes, kind, kind of all as one item, number."""
+    """Adjacent values of one type: their bytes, type, type of all as one item, number."""
 
     place: slice
     dtype: np.dtype[Any]
@@ -134,7 +134,6 @@ class Layout:
         runs = self._places(tuple(paths))
         if runs is None:
             return None
-        # a run at a time, not a value at a time
         values = [table[:, run.place].view(run.together).copy().view(run.dtype).reshape(
             -1, run.width) for run in runs]
         return values[0] if len(values) == 1 else np.concatenate(values, axis=1)
@@ -158,7 +157,7 @@ class Layout:
             raw[a:b] == values for (a, b), values in zip(self.fixed, self.values, strict=True))
 
 
-_before: dict[str, Layout] = {}      # by type, the last one found: most topics have only one
+_before: dict[str, Layout] = {}      # newest layout of each type: most topics have only one
 
 
 def _side_by_side(places: Sequence[tuple[int, str] | None]) -> list[Run] | None:
@@ -246,7 +245,7 @@ class _Walk:
                 raise ValueError(path)
 
     def align(self, size: int) -> None:
-        self.layout.size += (4 - self.layout.size) % size   # counted from after the four bytes
+        self.layout.size += (4 - self.layout.size) % size      # relative to byte 4
 
     def length(self) -> int:
         self.align(4)
@@ -259,7 +258,7 @@ class _Walk:
         return length
 
     def text(self, keep: bool) -> str:
-        """Return a string and skip it; ``keep``: it is common to all messages of this layout."""
+        """Skip a string; return it if ``keep``: the layout includes its content."""
         length = self.length()
         at = self.layout.size
         self.layout.size += length

@@ -25,7 +25,7 @@ from odocal_ros.messages.raws import FEW_ROWS, FrameFilter, Raws, Table, tables
 from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan, TRANSFORMS
 from odocal_ros.settings.config import Config
 
-# judgement: unreadable messages after which unusual ones are no longer deserialised
+# judgement: unreadable messages after which messages without a layout are skipped
 HOPELESS = 20_000
 Deserialize = Callable[[bytes], object]
 Feed = Callable[[str, Samples], None]

@@ -151,7 +151,7 @@ class FrameFilter:
         while not self._settled and first < len(raws):
             self._count(self._frame(raws[first], deserialize))
             first += 1
-        keep[first:] = self._alike(raws[first:])
+        keep[first:] = self._with_frame(raws[first:])
         if keep.all():
             return keep, None
         other, stamps = [], []
@@ -177,7 +177,7 @@ class FrameFilter:
         if self._seen[frame] >= SETTLED:
             self.frame, self._settled = frame, True
 
-    def _alike(self, raws: Sequence[bytes]) -> Bools:
+    def _with_frame(self, raws: Sequence[bytes]) -> Bools:
         """Return a mask of messages with the frame at its place in CDR, little endian."""
         text = self.frame.encode() + b'\0'
         pattern = b'\0\1' + struct.pack('<I', len(text)) + text

@@ -142,4 +142,4 @@ def save_figure(figure: Any, path: Path) -> None:
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise BadUsage(f'--plot {path}: cannot write it ({error.strerror})') from None
+        raise BadUsage(f'--plot {path}: cannot be written ({error.strerror})') from None

@@ -56,8 +56,9 @@ def by_speed(found: SpeedScale, name: str) -> drawing.Drawing:
     draw_by_speed(ax, found)
     drawing.key(figure, ax)
     fit = fit_text(found) or 'No fit: the speed varies too little'
-    says = ('Path length by the fixes over the odometer as sent, each point a group of sections '
-            f'of a few seconds. A constant factor is a level line. {fit}.')
+    says = ('Path length from the fixes divided by that of the raw odometer. Each point is a '
+            'group of sections of a few seconds. A constant factor gives a level line. '
+            f'{fit}.')
     return 'Scale against speed', says, drawing.svg(figure, f'{name}-by-speed', says)
 
 
@@ -71,10 +72,10 @@ def by_window(found: Floats, name: str) -> drawing.Drawing:
     ax.set(xscale='log', xlabel='length of the window, s', ylabel='fixes / track - 1, %')
     ax.set_xticks(length, [f'{x:g}' for x in length], minor=False)
     ax.set_xticks([], minor=True)
-    says = ('Displacement by the fixes over that of the calibrated track, in windows of seconds '
-            'to minutes, ± their scatter over eight parts of the leg. A level line at 0: errors '
-            'of the fixes do not depend on the motion. Short windows that differ: the fixes '
-            'contain an odometer, the receiver filters, or the fixes are late.')
+    says = ('Displacement from the fixes divided by that of the calibrated track, in windows of '
+            'seconds to minutes, ± their scatter over eight parts of the leg. A level line at 0 '
+            'shows that fix errors do not depend on the motion. If short windows differ, the '
+            'fixes contain an odometer, the receiver filters, or the fixes are late.')
     picture = drawing.svg(figure, f'{name}-by-window', says)
     return 'Scale against the length of the window', says, picture
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""report.html: one page that needs no network, for people."""
+"""The page report.html, which loads nothing from the network."""
 
 from collections import Counter
 from datetime import datetime, UTC
@@ -41,7 +41,7 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
         (folder / 'report.html').read_text(encoding='utf-8'))
     style = (folder / 'report.css').read_text(encoding='utf-8')
     legs, compared, missing = _drawn(calibration)
-    # the first track is next to the verdict only
+    # the first track is shown next to the verdict instead
     first = legs[0]['figures'][:1] if legs else []
     if first:
         legs[0]['figures'] = legs[0]['figures'][1:]
@@ -52,9 +52,9 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
 def report_or_why(calibration: Calibration, config: Config,
                   content: dict[str, Any]) -> tuple[str, str]:
     """
-    Return the page and why it could not be drawn, empty if it could.
+    Return the page, and the reason if it cannot be drawn, else empty.
 
-    A drawing error must not affect a result: the page states the error instead.
+    A drawing error must not affect a result: the page then states the error.
     """
     try:
         return report_html(calibration, config, content), ''
@@ -74,11 +74,10 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
     bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
     return {
         'title': content['vehicle'] or ', '.join(bags) or 'live drive',
-        'created': _made(content['created']),
+        'created': _readable_date(content['created']),
         'verdict': calibration.verdict.value, 'meaning': MEANING[calibration.verdict],
         'sentence': sentence(calibration).partition(': ')[2],
-        'way': f'{counted(len(legs), "leg")}, {length(distance)} in '
-               f'{time_span(duration)}',
+        'driven': f'{counted(len(legs), "leg")}, {length(distance)} in {time_span(duration)}',
         'headline': tables.headline(calibration),
         'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),
         'why': _why(calibration.reasons), 'rotation': _degrees(calibration),
@@ -91,11 +90,11 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
 
 
 def _why(reasons: tuple[Reason, ...]) -> Reason | None:
-    """Return the first of the gravest reasons against acceptance, those of a value first."""
+    """Return the gravest reason against acceptance, None without one; those on a value first."""
     groups = grouped(reasons)
     if not groups or groups[0][0] == Verdict.ACCEPTED.value:
         return None
-    return min(groups[0][2], key=lambda r: r.code not in ABOUT)      # of a value, before others
+    return min(groups[0][2], key=lambda r: r.code not in ABOUT)
 
 
 def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
@@ -107,19 +106,19 @@ def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
 
 def _leading(methods: dict[str, MethodResult],
              estimates: dict[str, Estimate]) -> dict[str, MethodResult]:
-    """Return methods, those with most values of the result first."""
+    """Return methods in order of the number of values that the result has from them."""
     given = Counter(e.method for e in estimates.values() if e.value is not None)
     return dict(sorted(methods.items(), key=lambda item: -given[item[0]]))
 
 
 def _degrees(calibration: Calibration) -> str:
-    # + 0.0: no minus before a zero
+    # + 0.0 turns -0.0 into 0.0
     return ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
                      for angle in calibration.imu_rotation_rpy or ())
 
 
-def _made(created: str) -> str:
-    """Return a date for people, unchanged if it cannot be parsed."""
+def _readable_date(created: str) -> str:
+    """Return an ISO date in readable form, unchanged if it cannot be parsed."""
     try:
         return f'{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC'
     except ValueError:
@@ -133,9 +132,9 @@ def _budgets(methods: dict[str, MethodResult]) -> list[tuple[str, dict[str, Any]
 
 def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing], list[int]]:
     """
-    Return the content of each leg, the figure of all, and the legs without figures.
+    Return the content of each leg, the figure of all legs, and the legs without figures.
 
-    If a page has no room for all legs, the newest have figures.
+    If figures exceed MOST_BYTES, only those of the newest legs are shown.
     """
     from odocal_ros.output.drawing import look
     from odocal_ros.output.plots import leg_figures
@@ -155,7 +154,7 @@ def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing
                 figures[number] = drawn
     legs = [_leg(number, leg, figures.get(number, []), several=len(numbered) > 1)
             for number, leg in numbered]
-    # legs whose tracks were dropped had figures, too
+    # also legs whose tracks were removed to save memory
     had = [number for number, leg in numbered if leg.evidence is not None
            or leg.before is not None]
     return legs, together, [number for number in had if number not in figures]

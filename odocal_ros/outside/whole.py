@@ -4,7 +4,7 @@
 """
 Atomic writing of files and folders; the only module that does it.
 
-Every step that a disk can refuse goes through ``disk``, so that tests can refuse each in turn.
+Every operation that the disk can fail is called through ``disk``, so that tests can fail each.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,14 +18,14 @@ import threading
 from typing import Any, BinaryIO
 
 MOST_SAME_NAME = 1000             # judgement: folders of one name
-PART = '.part'                # of files being written: not an ending of results or bags
+PART = '.part'                # suffix of files being written; no result or bag has it
 
 
 class Disk:
-    """The operations that a disk can refuse, one call each."""
+    """Caller of operations that the disk can fail."""
 
     def __call__(self, step: Callable[..., Any], *values: Any) -> Any:
-        """Do a step of the operating system."""
+        """Return the result of an operation of the operating system."""
         return step(*values)
 
 
@@ -33,7 +33,7 @@ disk = Disk()
 
 
 class WholeFile:
-    """A file being written, each write a step."""
+    """A file being written; each write can fail."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -45,7 +45,7 @@ class WholeFile:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[WholeFile]:
-    """Open a file that after the block is complete and synced to the disk, or does not exist."""
+    """Open a file to write; after an error in the block, the earlier file is unchanged."""
     part = path.with_name(f'.{path.name}{PART}')
     try:
         with disk(open, part, 'wb') as file:
@@ -61,7 +61,7 @@ def whole_file(path: Path) -> Iterator[WholeFile]:
 
 
 def new_folder(root: Path, name: str) -> Path:
-    """Create a new folder: of that name, or with a number after it."""
+    """Create a new folder; its name has a number if the folder exists."""
     root.mkdir(parents=True, exist_ok=True)
     for count in range(1, MOST_SAME_NAME + 1):
         folder = root / (name if count == 1 else f'{name}-{count}')
@@ -74,7 +74,7 @@ def new_folder(root: Path, name: str) -> Path:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all, safe on the disk when this returns."""
+    """Write a text file completely or not at all; it is synced to the disk at return."""
     with whole_file(path) as file:
         file.write(text.encode())
 
@@ -93,8 +93,8 @@ def locked(folder: Path, wait: bool = True) -> Iterator[bool]:
     """
     Lock a folder against other callers; yields True if it is locked.
 
-    No file remains, and the lock ends with the process. Without support for locks, as on some
-    network disks, it counts as locked.
+    No lock file is created, and the lock ends with the process. Yields True also without support
+    for locks, as on some network disks.
     """
     try:
         handle = os.open(folder, os.O_RDONLY)
@@ -120,11 +120,11 @@ def uninterrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield       # only the main thread receives it
         return
-    came: list[tuple[Any, ...]] = []
-    before = signal.signal(signal.SIGINT, lambda *values: came.append(values))
+    received: list[tuple[Any, ...]] = []
+    before = signal.signal(signal.SIGINT, lambda *values: received.append(values))
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-        if came and callable(before):
-            before(*came[0])
+        if received and callable(before):
+            before(*received[0])

@@ -35,9 +35,9 @@ from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of, imu_as_seen, with_turn_on_level
 
-FEWEST_AT_REST = 20     # statistical: IMU rows, a sigma by 20 has an error of 16 %
+FEWEST_AT_REST = 20     # statistical: IMU rows; a sigma of 20 values has an error of 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])
-Found = tuple[tuple[float, float] | None, str]      # yaw, sigma, rad, ''; or None and the reason
+Found = tuple[tuple[float, float] | None, str]      # (yaw, sigma) rad, or None and the reason
 
 
 def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats, origin: Origin,
@@ -66,7 +66,7 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     return complete(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
 
 
-def with_seen_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
+def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
                    epochs: tuple[Floats, Floats], earth_rate_n: Floats) -> Alignment:
     """
     Return an alignment whose gyro bias walk is at least that observed at later standstills.
@@ -133,18 +133,18 @@ def _level(inputs: Inputs, span: Floats | None, metres_per_unit: float, latitude
 
 
 def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
-    """Return a caution if the gyro noise at rest is far above its grade; so is its bias walk."""
+    """Return a caution if the gyro noise at rest far exceeds that of its grade."""
     times = noise / max(grade.gyro_noise, 1e-12)
     noisier_at_rest = 10.0    # times the noise of the grade at rest: another gyro, or another unit
     if times <= noisier_at_rest:
         return ()
     unit = ', so its unit is probably deg/s' if 30 < times < 120 else ''
     return (Reason(Code.IMU_WORSE_THAN_GRADE, f'gyro noise at rest is {times:.0f} times that of '
-                   f'its grade{unit}'),)
+                   f'its grade (limit {noisier_at_rest:.0f}){unit}'),)
 
 
 def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
-    """Return the white noise of gyro and accelerometer, per root of Hz, of the largest axis."""
+    """Return the white noise of gyro and accelerometer, per sqrt(Hz), of the noisiest axis."""
     pick = (inputs.t_imu >= span[0]) & (inputs.t_imu <= span[1])
     t, signals = inputs.t_imu[pick], {'gyro': inputs.w_b[pick], 'accel': inputs.f_b[pick]}
     if len(t) < FEWEST_AT_REST:
@@ -156,7 +156,7 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
 
 def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
              config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
-    """Return yaw of L's x axis, sigma, source, shared, reasons; a course's yaw is set later."""
+    """Return yaw of the x axis of L, sigma, source, shared, reasons; 0, pi for a course."""
     asked = config.alignment.heading_source
     order = [asked] if asked != 'auto' else ['heading_topic', 'imu_orientation', 'gyrocompass']
     if asked == 'auto' and not np.isnan(config.alignment.heading):
@@ -217,7 +217,7 @@ def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, conf
                       to_b: Callable[[Floats], Floats], offset: float) -> Found:
     """Return (yaw, sigma) at the level's epoch from published orientations, or None, reason."""
     heading_reach = 0.5    # s, largest distance of a heading sample from a start in motion
-    # only the rows that are used, of possibly hours
+    # a leg may have hours of rows: select the used ones first
     begin, end = level.standstill or (level.t - heading_reach, level.t + heading_reach)
     near = slice(np.searchsorted(t, begin), np.searchsorted(t, end, side='right'))
     t, q, variance = t[near], q[near], variance[near]
@@ -232,7 +232,8 @@ def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, conf
     stated = float(np.median(variance[pick]))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:
-        return None, f'its covariance is ± {np.rad2deg(sigma):.3g} deg'
+        return None, (f'its sigma is {np.rad2deg(sigma):.3g} deg; the limit is '
+                      f'{np.rad2deg(HEADING_LIMIT):.3g} deg')
     return (float(wrap(yaw)), float(sigma)), ''
 
 
@@ -245,12 +246,14 @@ def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
     yaw, sigma = gyrocompass(level, latitude, grade)
     if sigma > COMPASS_LIMIT:
         return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) causes a '
-                      f'heading uncertainty of {np.rad2deg(min(sigma, np.pi)):.1f} deg')
+                      f'heading uncertainty of {np.rad2deg(min(sigma, np.pi)):.1f} deg; '
+                      f'the limit is {np.rad2deg(COMPASS_LIMIT):.1f} deg')
     off = off_the_earth(level, latitude, grade)
     no_earth_sigmas = 4.0    # sigmas: with a larger bias there is no gyrocompass
     if off > no_earth_sigmas:
-        return None, (f'the turn rate at rest differs from the Earth rate by {off:.0f} sigma: '
-                      f'the gyro bias exceeds the {config.imu.grade} grade')
+        return None, (f'the turn rate at rest differs from the Earth rate by {off:.0f} sigma '
+                      f'(limit {no_earth_sigmas:.0f}): the gyro bias exceeds that of the '
+                      f'{config.imu.grade} grade')
     return (yaw, sigma), ''
 
 

@@ -89,7 +89,7 @@ class LegSearch:
                 self._travel = float(travel[-1])
         self._decide()
 
-    def begin_anew(self, after_ns: int, at_rest: bool) -> None:
+    def restart(self, after_ns: int, at_rest: bool) -> None:
         """
         Remove the legs; the next one begins after a stamp.
 

@@ -127,7 +127,7 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \
         else f'{coarse.step:.3g} m/s ({3.6 * coarse.step:.3g} km/h)'
     if not coarse.truncation:
-        return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed repeats until it has changed by '
+        return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed is held until it has changed by '
                        f'{sent}; half a step is added in the direction of the last change')]
     between = ', with interpolated values between' if coarse.interpolated else ''
     return [Reason(Code.SPEED_COARSE, f'odometer resolution is {sent}{between}; if truncated, '

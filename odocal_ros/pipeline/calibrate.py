@@ -34,7 +34,7 @@ from odocal_ros.screening.facing import imu_sanity, UNUSABLE
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.moved_imu import turned_over
-from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
+from odocal_ros.screening.reversing import BY_FIT, doubled, reversing_reasons
 from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
 
@@ -80,8 +80,8 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     back, scale = _reversed(result, inputs)
     if not len(back):
         return result
-    return result_of(inputs.mirrored(back), (
-        *seen.reasons, *said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)))
+    found = reversing_reasons(back, inputs.travel, scale, BY_FIT, config.odometer.signed)
+    return result_of(inputs.mirrored(back), (*seen.reasons, *found))
 
 
 def faults(seen: Screened, config: Config) -> tuple[Reason, ...]:

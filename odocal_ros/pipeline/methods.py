@@ -21,7 +21,7 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.beyond_model import delay_notes, held, held_steps, upright
-from odocal_ros.pipeline.prepare import judged_by
+from odocal_ros.pipeline.prepare import checked_with_scale
 from odocal_ros.pipeline.prepared import MethodRun, Passed, PreparedLeg, Stage
 from odocal_ros.pipeline.tracks import check_of, tracks
 from odocal_ros.pipeline.two_point_run import two_point
@@ -141,7 +141,7 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     leg, inputs, asked = prepared.leg, prepared.inputs, prepared.config.method
     names = _methods_of(prepared)
-    runs = run_methods(names, prepared, _teller(names, progress))
+    runs = run_methods(names, prepared, _progress_reporter(names, progress))
     progress(Stage('tracks', 1.0 - TRACKS / _effort(names)))
     methods = {name: run.result for name, run in runs.items()}
     found = [*found_by(runs, prepared), *disagreements(methods)]
@@ -156,7 +156,7 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     distance_sigma = 0.05    # largest relative sigma of a scale for the distance
     # more accurate than the approximate scale; the travel is that of the uncorrected speed
     if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
-        prepared = judged_by(prepared, estimates.get(AS_SENT, scale).value or scale.value)
+        prepared = checked_with_scale(prepared, estimates.get(AS_SENT, scale).value or scale.value)
     shown, said = tracks(prepared, paths)
     found += said
     for name, run in runs.items():
@@ -185,7 +185,7 @@ def _effort(names: Iterable[str]) -> int:
     return sum(METHOD_EFFORT[name] for name in names) + TRACKS
 
 
-def _teller(names: Iterable[str],
+def _progress_reporter(names: Iterable[str],
             progress: Callable[[Stage], None]) -> Callable[[str], Passed]:
     """Return a callback that reports the start of a method and returns one for its passes."""
     done = 0.0

@@ -18,7 +18,7 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
-from odocal_ros.pipeline.align import align, with_seen_walk
+from odocal_ros.pipeline.align import align, with_observed_walk
 from odocal_ros.pipeline.beyond_model import coarse_reasons
 from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
@@ -81,7 +81,8 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
     gap = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
     epochs = attitude_of(inputs, placed.origin, alignment.t, alignment.q_nb, alignment.gyro_bias)
     if own:
-        alignment = with_seen_walk(alignment, inputs, spans, epochs, placed.origin.earth_rate_n)
+        alignment = with_observed_walk(alignment, inputs, spans, epochs,
+                                       placed.origin.earth_rate_n)
     track = dead_reckon(*epochs, inputs.travel)
     apart, slips = _wheels_beside(inputs, config, placed, track, reasons)
     distance, judged = judge_drive(track, inputs.t_stop, placed.rough, config.leg)
@@ -97,7 +98,7 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
                  *(r for r in judged if r not in of_ends)), of_ends=of_ends)
 
 
-def judged_by(prepared: PreparedLeg, scale: float) -> PreparedLeg:
+def checked_with_scale(prepared: PreparedLeg, scale: float) -> PreparedLeg:
     """Return a leg with distance and speed checked by a more accurate scale."""
     distance, judged = judge_way(prepared.track, prepared.inputs.t_stop, scale,
                                  prepared.config.leg)

@@ -33,7 +33,7 @@ def axles_of(wheels: Sequence[T]) -> list[tuple[T, ...]]:
     return [tuple(wheels[k:k + 2]) for k in range(0, len(wheels), 2)]
 
 
-def judged_axles(wheels: Wheels, imu: Imu,
+def usable_axles(wheels: Wheels, imu: Imu,
                  between: tuple[float, float]) -> tuple[Wheels, list[Reason]]:
     """
     Return the usable wheels, with the distance of steered ones ahead, and reasons.

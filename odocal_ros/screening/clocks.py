@@ -32,7 +32,7 @@ def offsets(config: Config) -> dict[str, float]:
     return {slot: of(one.clock) - of('imu') for slot, one in INPUTS.items()}
 
 
-def judge_clocks(leg: Leg, config: Config) -> list[Reason]:
+def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
     """
     Return reasons for clocks that differ from the IMU's at equal times of arrival.
 
@@ -53,8 +53,9 @@ def judge_clocks(leg: Leg, config: Config) -> list[Reason]:
         ahead += offset[slot]
         if abs(ahead) > CLOCK_APART:
             found.append(Reason(
-                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps are {ahead:+.3f} s relative to '
-                f'IMU stamps of the same time{_cure(slot, ahead)}', remedy(ahead)))
+                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {ahead:+.3f} s '
+                f'from IMU stamps that arrive at the same time; the limit is {CLOCK_APART:g} s'
+                f'{_offset_hint(slot, ahead)}', remedy(ahead)))
     return found
 
 
@@ -96,7 +97,7 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
     return found
 
 
-def _cure(slot: str, ahead: float) -> str:
+def _offset_hint(slot: str, ahead: float) -> str:
     """Return the offset that aligns a topic's stamps with the IMU, if a setting allows it."""
     group = INPUTS[slot].clock
     if not group or abs(ahead) > OFFSET_REACH:

@@ -19,21 +19,21 @@ from odocal_ros.settings.config import ImuConfig
 
 # judgement: far beyond any sensor in any unit in use (deg/s, mm/s^2): wrong units are kept
 BEYOND_SENSOR = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
-# judgement: rows beyond any sensor, each within CLUMP_REACH rows of the one before, are a clump
+# judgement: least number of impossible rows in a group, each within CLUMP_REACH of the one before
 CLUMP_ROWS = 5
 CLUMP_REACH = 50          # rows: about a page or a packed block of a recording
-DAMAGED_SHARE = 0.01      # share of rows beyond any sensor in a damaged recording, or
-SEVERAL_ROWS = 4          # their number at any places: adjacent rows may be false undetected
-ROWS_BESIDE = 5          # rows to either side of a single false row that show no motion
+# judgement: least share, or least number, of impossible rows in a damaged recording: others
+# near them may be false too
+DAMAGED_SHARE, SEVERAL_ROWS = 0.01, 4
+ROWS_BESIDE = 5          # rows without motion on each side of an isolated outlier
 # judgement: of a spike: least step from row to row, rad/s and m/s^2 (potholes are kept), and in
-# usual steps; s, its longest duration (motion may last longer); largest share of the step that
-# remains after it
+# median steps; s, its longest duration; largest share of the step that remains after it
 TURN_STEP, FORCE_STEP, USUAL_STEPS, GLITCH_TIME, BACK_SHARE = 0.8, 50.0, 20.0, 0.4, 0.5
-# judgement: of a single row: least deviation, rad/s (0.003 rad in 0.1 s) and m/s^2; ratio to the
-# deviations of adjacent rows; share of it by which the rows before and after may differ
+# judgement: of an isolated outlier: least deviation, rad/s (0.003 rad in 0.1 s) and m/s^2, and in
+# deviations of adjacent rows; largest difference of the rows before and after, in deviations
 SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES, EQUAL_NEIGHBOURS = 0.03, 2.0, 10.0, 0.3
-GLITCH_SHARE = 0.002      # of the rows: more of them are not glitches
-ROLLS = 0.1               # of the top speed: with a lower mean, a vehicle may be at rest
+GLITCH_SHARE = 0.002      # largest share of glitches; with more, they are normal for the sensor
+ROLLS = 0.1               # of the top speed: least mean speed of a moving vehicle
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
@@ -73,13 +73,12 @@ def oriented(samples: Oriented) -> Oriented:
 
 def about_clumps(wild: Bools) -> Bools:
     """
-    Return a mask of rows in or near a group of impossible rows.
+    Return a mask of rows in or near a group of impossible rows: (n,) bool.
 
-    In a damaged recording only a part of the false rows is detected: the errors of others are
-    within a sensor's range.
+    In a damaged recording only some false rows are impossible values. The mask contains each
+    group, and on each side twice as many rows as the largest distance of its impossible rows.
 
-    wild : (n,) bool.   Returns (n,) bool, the clumps and to either side twice as many rows as the
-    longest interval in them without impossible rows.
+    wild : (n,) bool, impossible rows.
     """
     suspect = np.zeros(len(wild), bool)
     at = np.flatnonzero(wild)
@@ -90,12 +89,12 @@ def about_clumps(wild: Bools) -> Bools:
     return suspect
 
 
-def alone(t: Floats, x: Floats, least: float) -> Bools:
+def spikes(t: Floats, x: Floats, least: float) -> Bools:
     """
     Return a mask of rows that jump away from their neighbours and back: (n,) bool.
 
-    t : (n,) times, s, rising.   x : (n, k) values.   least : smallest jump, from one row to the
-    next, of a glitch. All false if so many rows jump that it is normal for the sensor.
+    t : (n,) s, rising.   x : (n, k) values.   least : smallest step of a spike from row to row.
+    All False if so many rows jump that it is normal for the sensor.
     """
     found = np.zeros(len(x), bool)
     bound = by_step(lambda x: across(np.maximum, np.abs(np.diff(x, axis=0))), x)
@@ -117,11 +116,11 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
     return found if found.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
 
 
-def single(x: Floats, least: float) -> Bools:
+def isolated(x: Floats, least: float) -> Bools:
     """
     Return a mask of isolated outliers with no motion before and after.
 
-    x : (n, k).   least : smallest deviation of an outlier.   Returns (n,) bool, all false if
+    x : (n, k).   least : smallest deviation of an outlier.   Returns (n,) bool, all False if
     there are so many that it is normal for the sensor.
     """
     edge = ROWS_BESIDE + 1
@@ -148,19 +147,19 @@ def single(x: Floats, least: float) -> Bools:
 
 
 def imu_glitches(t: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> Bools:
-    """Return a mask of IMU rows with an impossible spike, by the factors of the imu settings."""
+    """Return a mask of IMU rows that are spikes or isolated outliers; imu : its scale factors."""
     gyro, accel = max(imu.gyro_scale, 1e-12), max(imu.accel_scale, 1e-12)
-    return (alone(t, w_i, TURN_STEP / gyro) | single(w_i, SINGLE_TURN / gyro)
-            | alone(t, f_i, FORCE_STEP / accel) | single(f_i, SINGLE_FORCE / accel))
+    return (spikes(t, w_i, TURN_STEP / gyro) | isolated(w_i, SINGLE_TURN / gyro)
+            | spikes(t, f_i, FORCE_STEP / accel) | isolated(f_i, SINGLE_FORCE / accel))
 
 
 def speed_glitches(t: Floats, speed: Floats) -> Bools:
-    """Return a mask of rows of a rate odometer with an impossible spike."""
+    """Return a mask of odometer speeds that are spikes: (n,) bool."""
     if len(speed) < 20:
         return np.zeros(len(speed), bool)
     top = np.percentile(np.abs(speed), 95)
     speed_step = 0.3    # of the top speed, least jump from row to row of a glitch
-    return alone(t, speed[:, None], max(speed_step * top, 1e-12))
+    return spikes(t, speed[:, None], max(speed_step * top, 1e-12))
 
 
 def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, ...]:
@@ -168,8 +167,8 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
     Return IMU_GAP if the gyro repeats exactly one value while the wheels roll.
 
     t, w : (n,), (n, 3) IMU rows.   travel : Travel.   limit : s, longest allowed gap.
-    A gyro that measures zero is accepted: some drivers have a dead band. So is one that often
-    repeats its value: it has coarse steps.
+    Accepted are a gyro that measures zero (some drivers have a dead band) and one that often
+    repeats its value (coarse steps).
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()

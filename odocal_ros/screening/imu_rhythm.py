@@ -20,7 +20,7 @@ from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks, PIECE_ROWS, runs
 
 BLOCK_TIME = 1.0          # s, judgement: of rows whose mean shows a lost row
-WINDOW_BLOCKS = 20        # judgement: of a mean: jitter over sqrt(2000) remains at 100 Hz
+WINDOW_BLOCKS = 20        # judgement: duration of a mean; at 100 Hz jitter / sqrt(2000) remains
 JITTER_SHARE = 2e-3       # judgement: of an interval, smallest jitter that is corrected
 TESTED_ROWS = 20_000      # judgement: largest number of tested rows
 TESTED_GROUPS = 40        # judgement: groups of them, whose sums give the significance

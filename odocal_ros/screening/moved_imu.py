@@ -13,17 +13,17 @@ from odocal_ros.screening.facing import Accelerations, facing_of
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.unit_changes import tenths
 
-# judgement, deg: larger than by slopes, bends and noise; largest scatter of tenths on one side
+# judgement, deg: least turn, larger than by slopes, bends and noise; largest scatter on one side
 LEAST_TURN, SIDE = 45.0, 20.0
-SAME_SIZE = 1.15    # judgement: ratio of gravity on both sides; a bend that leans it 45 deg: 1.4
-# judgement, deg: driving backwards with an unsigned counter turns forward by 180 deg
+SAME_SIZE = 1.15    # judgement: ratio of gravity on both sides; 1.4 in a bend at 45 deg
+# judgement, deg: a larger turn is by reversing with an unsigned counter (180 deg)
 MOST_YAW = 135.0
 YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond LEAST_TURN
 DO = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
 
 
 def turned_over(inputs: Inputs) -> tuple[Reason, ...]:
-    """Return IMU_AXES if gravity has one direction before, and another after, a tenth."""
+    """Return IMU_AXES if the direction of gravity changes between two tenths of the leg."""
     edges = tenths(inputs)
     if not len(edges):
         return ()
@@ -44,7 +44,7 @@ def turned_over(inputs: Inputs) -> tuple[Reason, ...]:
 
 
 def turned_about(found: Accelerations | None) -> tuple[Reason, ...]:
-    """Return IMU_AXES if forward has one direction before, and another after, a tenth."""
+    """Return IMU_AXES if the forward direction changes between two tenths of the leg."""
     if found is None:
         return ()
     edges = np.linspace(0, len(found.t), 11).astype(int)

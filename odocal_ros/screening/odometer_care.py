@@ -22,18 +22,19 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond, speed_glitches
 
 STEPS_BESIDE = 5    # judgement: steps next to a jump or gap that give the speed there
-# counts, rad, m: less is not reported as motion
+# counts, rad, m: smaller travel is not reported
 STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
-def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
-           name: str = 'odometer') -> tuple[OdometerSamples, Floats]:
+def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
+                       found: list[Reason],
+                       name: str = 'odometer') -> tuple[OdometerSamples, Floats]:
     """Return rows without false counts, or with false increments interpolated."""
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)
         if false.any():
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
-                                'counts freeze or jump away and back, first at t = '
+                                'counts are frozen or isolated outliers, first at t = '
                                 f'{t[np.argmax(false)]:.2f} s; dropped'))
         return take(samples, ~false), t[~false]
     if form.quantity == 'increment':
@@ -81,30 +82,31 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
         ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= excursion_time]
         for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in ends]:
             net = counter_steps(value[[a, b + 1]], modulus)[0]     # exact, unlike a sum of steps
-            if _goes_on(t, net, rate, a, b) or a == j and _comes_back(t, net, step, a, b, top):
+            if _continues(t, net, rate, a, b) or a == j and _is_reverted(t, net, step, a, b, top):
                 false[a + 1:b + 1] = True
                 done = b
                 break
     return false
 
 
-def _goes_on(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
+def _continues(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
     """Return True if the counter continues from step a to after step b at adjacent speeds."""
     length = t[b + 1] - t[a]
     travels = [_usual(r) * length for r in (rate[max(0, a - STEPS_BESIDE):a],
                                          rate[b + 1:b + 1 + STEPS_BESIDE])]
-    goes_on_share = 0.5    # of the expected travel: limit for a counter that continues
-    slack = goes_on_share * max(abs(w) for w in travels) + 3
+    continuation_share = 0.5    # of the expected travel: limit for a counter that continues
+    slack = continuation_share * max(abs(w) for w in travels) + 3
     return bool(min(travels) - slack <= net <= max(travels) + slack)
 
 
-def _comes_back(t: Floats, net: float, step: Floats, a: int, b: int, top: float) -> bool:
+def _is_reverted(t: Floats, net: float, step: Floats, a: int, b: int, top: float) -> bool:
     """Return True if step b reverts a far jump at step a, except for possible motion."""
     reach = 1.2 * top * (t[b + 1] - t[a]) + 3
     return bool(abs(net) <= reach and min(abs(step[a]), abs(step[b])) > 2 * reach)
 
 
-def doubted(travel: Travel, value: Values, form: OdometerForm) -> tuple[Travel, Floats, Floats]:
+def with_uncertainty(travel: Travel, value: Values,
+                     form: OdometerForm) -> tuple[Travel, Floats, Floats]:
     """Return travel with interpolated gaps, and times (s) and sigmas of uncertain travel."""
     none = np.empty(0)
     if len(travel.t) < FEWEST_STEPS:

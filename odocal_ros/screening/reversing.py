@@ -88,7 +88,7 @@ def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: fl
     return spans[(driven > least_backwards) & (twice > low) & (twice < high)]
 
 
-def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
+def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
             signed: bool = True) -> tuple[Reason, ...]:
     """
     Return REVERSING_UNSIGNED with the reversed sections, () if there are none.

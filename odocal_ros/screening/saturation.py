@@ -10,7 +10,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
 from odocal_ros.settings.grades import G
 
-# physical: ranges are larger, and gravity at rest, also in coarse steps, is smaller
+# physical: smaller than any range, larger than gravity at rest
 LEAST_GYRO, LEAST_ACCELEROMETER = 1.0, 1.5 * G      # rad/s, m/s^2
 # statistical: coarse steps also repeat the largest value, but less often than the next smaller one
 FEWEST_AT_LIMIT, TIMES_NEXT = 5, 3.0

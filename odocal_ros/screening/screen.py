@@ -20,14 +20,14 @@ from odocal_ros.data.samples import FixSamples, ImuSamples, VelocitySamples
 from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.axles import judged_axles
-from odocal_ros.screening.clocks import judge_clocks, offsets, without_sets
+from odocal_ros.screening.axles import usable_axles
+from odocal_ros.screening.clocks import clock_reasons, offsets, without_sets
 from odocal_ros.screening.fix_screen import contradicted, reckoned, usable_fixes
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.inputs import Inputs, place, UsableRows
 from odocal_ros.screening.leg_kind import with_force, without_north
-from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
+from odocal_ros.screening.reversing import BY_IMU, reversed_starts, reversing_reasons
 from odocal_ros.screening.row_screen import topic_gap, usable_rows
 from odocal_ros.screening.saturation import saturated
 from odocal_ros.screening.several_imus import alternating, other_imus
@@ -48,7 +48,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     found += _missing(leg, found)
     if judged:
         leg, sets = without_sets(leg)
-        found += [*sets, *judge_clocks(leg, config)]
+        found += [*sets, *clock_reasons(leg, config)]
     rows = _usable(leg, config, judged, found)
     inputs = _in_base(leg, config, rows, _fixes(leg, config, rows, found))
     inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
@@ -151,7 +151,7 @@ def _wheel_gaps(leg: Leg, wheels: Wheels) -> list[Reason]:
 def _axles(inputs: Inputs, wheels: Wheels) -> tuple[Wheels, list[Reason]]:
     """Return the usable wheels, and reasons; one axle is only tested with an accelerometer."""
     if len(wheels.each) > (1 if inputs.has_accelerometer else len(SIDES)):
-        return judged_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop))
+        return usable_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop))
     return wheels, []
 
 
@@ -160,7 +160,7 @@ def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> I
     back = reversed_starts(inputs.travel, inputs.t_imu, inputs.w_b, inputs.f_b,
                            (0.0, inputs.t_stop))
     metres = place(inputs, config).rough or None if len(back) else None
-    found += said_of(back, inputs.travel, metres, BY_IMU, config.odometer.signed)
+    found += reversing_reasons(back, inputs.travel, metres, BY_IMU, config.odometer.signed)
     return inputs.mirrored(back)
 
 

@@ -23,7 +23,7 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.odometer import FEWEST_STEPS, mean_travel, Travel, travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.late_rows import on_time
-from odocal_ros.screening.odometer_care import counter_steps, doubted, mended
+from odocal_ros.screening.odometer_care import counter_steps, with_uncertainty, without_false_rows
 from odocal_ros.settings.config import Config
 
 SPANS = {'whole': 2.0 ** np.arange(6, 54), 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
@@ -227,11 +227,11 @@ def _one(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config
         step = counter_steps(samples.value, form.modulus)
         samples, why, doubt_t, doubt = unrolled(t, samples, step, name, of_one=not side)
         found.extend(why)
-    samples, t = mended(samples, t, form, found, f'{side} odometer'.strip())
+    samples, t = without_false_rows(samples, t, form, found, f'{side} odometer'.strip())
     t = on_time(samples, t, form, found, f'{side} odometer'.strip())
     counts, reasons = travel(t, samples.value, form, config.odometer.reversed, name)
     found.extend(reasons)
-    counts, more_t, more = doubted(counts, samples.value, form)
+    counts, more_t, more = with_uncertainty(counts, samples.value, form)
     return replace(counts, name=side), np.append(doubt_t, more_t), np.append(doubt, more)
 
 

@@ -74,8 +74,8 @@ class OdometerConfig:
                          '(cars too), skid (wheels or tracks that slide in turns), mecanum '
                          '(four odometer.wheels: front left, front right, rear left, rear right) '
                          'or omni (three or more, counter-clockwise in a circle).')
-    wheel_offset: float = setting(0.0, 'rad', -6.3, 6.3, ro=True, about='Of omni wheels: angle '
-                                  'from the x axis to the first, seen from the middle.')
+    wheel_offset: float = setting(0.0, 'rad', -6.3, 6.3, ro=True, about='Omni wheels: angle from '
+                                  'the x axis to the first wheel, seen from the centre.')
     track_width: float = setting(0.0, 'm', 0.0, 20.0, about='Distance between the left and the '
                                  'right wheel; 0: unknown.')
 
@@ -141,7 +141,8 @@ class ImuConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class GnssConfig:
-    lever_arm: tuple[float, ...] = _place('Antenna in base_link (10 cm is enough).')
+    lever_arm: tuple[float, ...] = _place('Antenna position in base_link; 10 cm accuracy is '
+                                         'sufficient.')
     lever_arm_sigma: float = setting(0.1, 'm', 0.0, 10.0, about='Uncertainty of the antenna '
                                      'position, each axis.')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to fix stamps.')
@@ -175,15 +176,16 @@ class LegConfig:
                              'the leg is cut.')
     standstill: float = setting(2.0, 's', 0.2, 600.0, about='Minimum duration of a standstill.')
     preroll: float = setting(600.0, 's', 0.0, 7200.0, about='Data kept before the start mark.')
-    compute_limit: int = setting(40, 'passes', 5, 1000, about='Limit of passes of the fit of a '
-                                 'leg; a pass processes one keyframe per second of the leg. At '
-                                 'the limit the best estimate is stated, with a sigma of four '
-                                 'times the remaining change.')
+    compute_limit: int = setting(40, 'passes', 5, 1000, about='Largest number of passes of a fit; '
+                                 'a pass processes one keyframe per second of the leg. At the '
+                                 'limit the best estimate is used, with a sigma of four times '
+                                 'the remaining change.')
     automatic: bool = setting(False, about='Legs start and end automatically at standstills, '
                               'otherwise every leg.automatic_minutes; a scale change beyond 3 '
                               'sigma is reported.')
-    automatic_minutes: float = setting(10.0, 'min', 1.0, 120.0, about='Longest leg of '
-                                       'leg.automatic; half of it is enough at a standstill.')
+    automatic_minutes: float = setting(10.0, 'min', 1.0, 120.0, about='Largest '
+                                       'duration of an automatic leg; after half of it, a '
+                                       'standstill ends the leg.')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +195,7 @@ class AlignmentConfig:
     heading: float = setting(NAN, 'rad', about="Heading of the IMU's x axis at the start mark, "
                              'clockwise from north (a compass quantity).')
     heading_sigma: float = setting(0.0175, 'rad', 0.0, 3.2, about='Uncertainty of a fixed heading '
-                                   'and of sources that do not state theirs, 1 sigma.')
+                                   'and of sources without a stated sigma, 1 sigma.')
     heading_offset: float = setting(0.0, 'rad', -6.3, 6.3, about='Added to the ENU yaw of the '
                                     'heading topic.')
 

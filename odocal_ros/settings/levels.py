@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Limits of several packages: sigmas for a remark, and motions of land vehicles.
+Limits that several packages use: sigmas of reasons, and motions of land vehicles.
 
 The comment on a level is the two-sided probability of exceeding it by chance.
 
@@ -13,7 +13,7 @@ specification; or definition: a unit, a layout, a quadrature, a convention of a 
 
 import math
 
-REMARK_SIGMAS = 3.0     # statistical: for a remark: once in 370
+REMARK_SIGMAS = 3.0     # statistical: for a reason: once in 370
 FAULT_SIGMAS = 5.0      # statistical: for a fault of a sensor or a setting: once in 1.7 million
 # statistical: robust sigmas of an outlier among many values: the same
 OUTLIER_SIGMAS = 5.0

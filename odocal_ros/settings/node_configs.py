@@ -44,8 +44,8 @@ class ApplyConfig:
 
     vehicle: str = setting('', ro=True, about='Name of the vehicle; a calibration of another '
                            'vehicle is refused.')
-    levelling: bool = setting(True, ro=True, about='Use the accelerometer for tilt and stops for '
-                              'the gyro bias; false: gyros only, as in replay.')
+    levelling: bool = setting(True, ro=True, about='Correct the tilt by the accelerometer, and '
+                              'the gyro bias at standstill; false: gyros only, as in replay.')
     publish_tf: bool = setting(False, ro=True, about='Publish the pose as TF too: frames.odom -> '
                                'frames.base. Only one node may send this transform.')
     odometer: OdometerConfig = OdometerConfig()
@@ -73,8 +73,10 @@ class PatternConfig:
     turn_rate: float = setting(0.5, 'rad/s', 0.05, 3.0, ro=True, about='Largest turn rate.')
     acceleration: float = setting(0.3, 'm/s^2', 0.01, 5.0, ro=True, about='Largest acceleration, '
                                   'and deceleration to a rest.')
-    rest: float = setting(3.0, 's', 0.0, 60.0, ro=True, about='Rest at the end of each straight.')
-    timeout: float = setting(600.0, 's', 1.0, 7200.0, ro=True, about='The robot stops after it.')
+    rest: float = setting(3.0, 's', 0.0, 60.0, ro=True, about='Duration of the rest '
+                          'at the end of each straight.')
+    timeout: float = setting(600.0, 's', 1.0, 7200.0, ro=True, about='Largest '
+                             'duration of the pattern; the robot then stops.')
     pose_type: str = setting(POSES[0], ro=True, choices=POSES, about='Message type of the topic '
                              'pose: the pose of base_link.')
     stamped: bool = setting(False, ro=True, about='Publish cmd_vel as geometry_msgs/TwistStamped '

@@ -79,7 +79,7 @@ class Setting:
         if isinstance(value, (int, float)) and kind is not bool:
             unset = kind is float and math.isnan(value)
             if unset and not (isinstance(self.default, float) and math.isnan(self.default)):
-                raise BadConfig(f'{self.name}: NaN is not a value')
+                raise BadConfig(f'{self.name}: NaN is not allowed')
             if not unset and not math.isfinite(value):
                 raise BadConfig(f'{self.name}: {value} is not finite')
             # larger than any value in SI units; sums with it stay finite

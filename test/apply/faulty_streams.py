@@ -192,7 +192,7 @@ def worst_of(drive, poses, topics, path=0):
     inside = (t > 0) & (t < drive.motion.duration)
     if not inside.all():
         return np.inf, 'a stamp outside of the drive'
-    if not all(p.sound() for p in poses):
+    if not all(p.is_valid() for p in poses):
         return np.inf, 'not finite'
     state = drive.motion.at(t)
     origin = Origin(state.latitude[0], state.longitude[0], state.height[0])

@@ -75,4 +75,4 @@ def test_it_does_not_start_across_a_gap_of_the_imu(from_s):
     since = (poses[0].stamp_ns - made.imu.stamp_ns[0]) / SECOND
     # two seconds of rows without a gap
     assert since == pytest.approx(3.1 if from_s < 3.0 else 12.1, abs=0.15)
-    assert all(pose.sound() for pose in poses)
+    assert all(pose.is_valid() for pose in poses)

@@ -236,7 +236,7 @@ def test_stamps_of_fast_bags_are_usable_and_those_of_set_clocks_are_not():
     stamp = 10**18 + np.arange(0, 60 * SECOND, SECOND // 25)
     arrivals = Arrivals()
     assert arrivals.usable(stamp, 10**18 + (stamp - stamp[0]) // 20).all()
-    assert not arrivals.anew
+    assert not arrivals.jumped
     for by in (3 * SECOND, -3 * SECOND):
         odd = stamp.copy()
         odd[500:] += by
@@ -244,13 +244,13 @@ def test_stamps_of_fast_bags_are_usable_and_those_of_set_clocks_are_not():
         usable = arrivals.usable(odd[:510], stamp[:510])
         assert usable[:500].all()
         assert not usable[500:509].any()
-        assert arrivals.anew
+        assert arrivals.jumped
         assert abs(arrivals.off_s) == pytest.approx(3.0, abs=0.4)
     few = stamp.copy()
     few[500:503] += 29 * SECOND
     arrivals = Arrivals()
     assert (~arrivals.usable(few, stamp)).nonzero()[0].tolist() == [500, 501, 502]
-    assert not arrivals.anew
+    assert not arrivals.jumped
 
 
 @pytest.mark.core
@@ -261,5 +261,5 @@ def test_a_false_speed_at_rest_is_doubted_from_the_speed_before_all_of_it():
     wheel = Wheel(OdometerForm('rate', 0, '1'), 1.02)
     for row in range(len(t)):
         wheel.feed([float(t[row])], [float(value[row])])
-        assert abs(wheel.s[-1]) <= 3 * np.sqrt(wheel.doubt(0.0, t[row])) + 0.02
+        assert abs(wheel.s[-1]) <= 3 * np.sqrt(wheel.variance_between(0.0, t[row])) + 0.02
     assert wheel.s[-1] < -30.0         # false travel, of a vehicle at rest

@@ -156,8 +156,8 @@ def test_two_wheels_ask_for_turns_and_for_a_straight_stretch():
     neither = replace(apart, wheels=WheelsForecast(2e-3, None))
     assert hint(recording(**far, forecast=neither, still_s=10.0)) == (
         'OK: scale 100 ppm (limit 1000); OK: yaw 0.286 deg (limit 0.498); drive straight at '
-        'speed until left and right wheel are separable; for the track width: turn by 90 deg in '
-        'total or more; call ~/stop_leg')
+        'normal speed until left and right scale are separable; for the track width: turn by '
+        '90 deg in total or more; call ~/stop_leg')
     both = replace(apart, wheels=WheelsForecast(2e-4, 0.01))
     assert manoeuvres(recording(**far, forecast=both)) == []
 

@@ -162,7 +162,7 @@ def test_the_service_and_a_timeout_stop():
     with driven(kind=TwistStamped, stamped='true', timeout=5.0) as (node, client, robot):
         assert client.call('stop').message == 'stopped'
         stopped(node, robot, '~/stop', 5)
-        assert 'was not driven' in client.call('stop').message
+        assert 'no pattern was running' in client.call('stop').message
         assert client.call('start').success
         stopped(node, robot, 'timeout of 5 s', 10)
 

@@ -118,7 +118,7 @@ def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeyp
     one = leg(tmp_path, 500_000)
     for k in range(20):
         one.put([chunk(k)])
-    assert 'the limit journal.max_bytes is reached' in one.trouble
+    assert 'raise journal.max_bytes' in one.trouble
     one.finish()
     folder, = journals(tmp_path)
     assert size_of(folder) <= 500_000

@@ -245,6 +245,6 @@ def test_it_goes_on_after_an_error_of_its_own(sent, simulated):
         code = node.end()
         client.close()
     assert code == 0
-    assert 'restarts, from the origin: internal error, please report it: ZeroDivisionError' in (
+    assert 'restarts from the origin: internal error, please report it: ZeroDivisionError' in (
         node.text)
     assert len(seen) > 500

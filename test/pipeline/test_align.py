@@ -22,7 +22,7 @@ from odocal_ros.nav.rotations import (
     transpose,
 )
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.pipeline.align import align, choose_standstill, with_seen_walk
+from odocal_ros.pipeline.align import align, choose_standstill, with_observed_walk
 from odocal_ros.pipeline.prepared import attitude_of
 from odocal_ros.reasons import Code
 from odocal_ros.screening.inputs import UsableRows
@@ -167,13 +167,13 @@ def test_a_gyro_that_warms_up_walks_as_its_standstills_show(slope):
     epochs = attitude_of(inputs, case.origin, alignment.t, alignment.q_nb, alignment.gyro_bias)
     later = case.spans[case.spans[:, 0] > alignment.t]
     assert len(later) > 1
-    seen = with_seen_walk(alignment, inputs, case.spans, epochs, case.origin.earth_rate_n)
+    seen = with_observed_walk(alignment, inputs, case.spans, epochs, case.origin.earth_rate_n)
     # the heading of a course has an error, and with it the Earth rate
     walk = slope * np.sqrt(np.median(later.mean(axis=1) - alignment.t))
     assert seen.gyro_bias_walk == pytest.approx(max(walk, alignment.gyro_bias_walk), rel=0.1)
     if slope:
         assert walk > 10 * alignment.gyro_bias_walk
-    unknown = with_seen_walk(replace(alignment, standstill=None), inputs, case.spans, epochs,
+    unknown = with_observed_walk(replace(alignment, standstill=None), inputs, case.spans, epochs,
                              case.origin.earth_rate_n)
     assert unknown.gyro_bias_walk == alignment.gyro_bias_walk
 
@@ -303,7 +303,8 @@ def test_in_motion_the_nearest_heading_is_taken_and_none_of_long_ago(plain):
 
 
 @pytest.mark.parametrize('source', ['imu_orientation', 'heading_topic'])
-@pytest.mark.parametrize(('variance', 'says'), [(np.nan, 'covariance[0] = -1'), (10.0, '± 181')])
+@pytest.mark.parametrize(('variance', 'says'), [
+    (np.nan, 'covariance[0] = -1'), (10.0, 'sigma is 181 deg; the limit is')])
 def test_an_orientation_not_sent_or_worthless_is_refused(plain, source, variance, says):
     case = asked(plain, alignment__heading_source=source)
     rows = orientations(plain, 1.0, variance) if source == 'imu_orientation' else \

@@ -133,5 +133,5 @@ def test_after_a_leg_of_the_operators_it_goes_on():
         for some in (block.stamp_ns < cut, block.stamp_ns >= cut):
             search.feed('odometer', rows(block.stamp_ns[some], block.value[some]), COUNTER)
             if len(search.spans) == 1:
-                search.begin_anew(cut, at_rest)
+                search.restart(cut, at_rest)
         assert in_seconds(search)[0][0] == pytest.approx(expected, abs=0.15)

@@ -124,7 +124,7 @@ def test_set_takes_yaml_and_gives_the_settings_type(text, name, value):
 
 def test_set_takes_nan_where_a_setting_may_be_unset():
     assert math.isnan(parse_set('imu.nominal_yaw=nan')[1])
-    with pytest.raises(BadConfig, match='NaN is not a value'):
+    with pytest.raises(BadConfig, match='NaN is not allowed'):
         parse_set('leg.min_distance=.nan')
 
 
