@@ -59,13 +59,13 @@ class Solved:
     log_determinant: float    # of H
     reduced: Floats           # (m, m) Schur complement of the border
     g_reduced: Floats         # (m,)
-    _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n), until marginals
+    _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n); None after marginals
     _scale: Floats            # (N, n)
     _scale_border: Floats     # (m,) of those that are not absent
 
     def marginals(self) -> 'JointMarginals':
-        """Return the joint marginals of adjacent blocks; once, since they reuse the memory."""
-        assert self._chain is not None, 'the chain was used up'
+        """Return the joint marginals of adjacent blocks; callable once: it reuses the memory."""
+        assert self._chain is not None, 'marginals() was already called'
         (wide, own), self._chain = self._chain, None
         N, n = self.step.shape
         m = len(self._scale_border)
@@ -103,10 +103,10 @@ class Solved:
         """
         Return g' H^-1 g of right-hand sides g, (r, r), and H^-1 g of the border, (m, r).
 
-        chain : (N, n, r), border : (m, r).   By the forward elimination alone; before
+        chain : (N, n, r), border : (m, r).   Uses the forward elimination only; call it before
         ``marginals``.
         """
-        assert self._chain is not None, 'the chain was used up'
+        assert self._chain is not None, 'call products() before marginals()'
         wide, own = self._chain
         N, n = self.step.shape
         m = len(self._scale_border)
@@ -129,7 +129,7 @@ class JointMarginals:
     """
     Joint marginals: the covariance of block k, block k + 1 and the border, for N - 1 intervals.
 
-    In full (N - 1, 2n + m, 2n + m); computed for some intervals at a time.
+    The full array would be (N - 1, 2n + m, 2n + m); a few intervals are computed at a time.
     """
 
     _own: Floats              # (N, n, n) covariance of each block
@@ -187,9 +187,10 @@ class JointMarginals:
 
     def spread_of(self, rows: slice, J: Floats) -> Floats:
         """
-        Return the covariance of rows of some intervals, as a form: (k, r, r).
+        Return a matrix with the quadratic form of the covariance of rows: (k, r, r).
 
-        J : (k, r, 2n + m).   The form is not symmetric: its quadratic form is the variance.
+        J : (k, r, 2n + m).   The matrix A is not symmetric: a' A a is the variance of a' times the
+        rows.
         """
         n, ends = self._own.shape[1], slice(rows.start + 1, rows.stop + 1)
         across, after = self._across[rows], self._across[ends][:, :, n:]
@@ -201,7 +202,7 @@ class JointMarginals:
         return out
 
     def blocks(self) -> Iterator[Floats]:
-        """Yield the covariances of some intervals after others: (k, 2n + m, 2n + m)."""
+        """Yield the covariances of all intervals in chunks: (k, 2n + m, 2n + m)."""
         for rows in blocks(len(self)):
             yield self.of(np.arange(rows.start, rows.stop))
 
@@ -220,7 +221,7 @@ def solve(normal: Normal) -> Solved:
     diagonal, wide = normal.diagonal, normal.wide
     N, n = normal.g.shape
     m = len(normal.g_border)
-    s = np.ones((N + 1, n))     # and of a missing block after the last
+    s = np.ones((N + 1, n))     # of N blocks and of one after the last, which is not used
     for rows in blocks(N):
         s[rows] = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', diagonal[rows]), 1e-300))
     s_c = 1 / np.sqrt(np.maximum(np.diag(normal.corner), 1e-300))

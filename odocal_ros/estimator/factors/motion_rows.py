@@ -173,7 +173,7 @@ class MotionRows(Factor):
         Returns
         -------
         g_i by the keyframes, (N, n, c p), and by the constants, (m, c p); C' R^-1 C, (c p, c p),
-        and C' R^-1 r, (c p,), of the columns C, whose places of one constant are adjacent.
+        and C' R^-1 r, (c p,), of the columns C; those of one constant are adjacent.
 
         """
         n, L = self.n, len(at) * len(constants)

@@ -20,7 +20,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import grade_of, turn_on_bias
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: judgement
+WORSE_THAN_GRADE = 3.0      # judgement: times the noise of its grade
 # m/s in a second, share and number of the seconds, of outliers that are reported. Judgement:
 # aliased vibration makes 0.05 to 0.13 in 1.3 % or more, kerbs under a robot at most 0.01, ordinary
 # drives have outliers in 0.5 %; one or two shocks of a short drive are no vibration
@@ -33,7 +33,7 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     gyro_sold, accel_sold = turn_on_bias(config.imu)
     level = fit.levels.roots()
-    # of an accelerometer that is not there nothing is said
+    # no reasons about an accelerometer that does not exist
     sensors = {'gyro': 'gyro'} | (
         {'accel': 'accelerometer'} if problem.leg.has_accelerometer else {})
     remedy = noise_remedy(problem, level, [
@@ -58,9 +58,9 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
         odd.append(f'after {fit.iterations} passes ' + (
             f'the estimates still changed by {move:.2g} sigma'
             if move > CONVERGENCE.nearly else 'the noise levels still changed'))
-    odd_share = 0.15        # of fixes far off, of intervals with a slip: judgement
+    odd_share = 0.15        # share of outliers among the fixes, of intervals with slip: judgement
     noisy = []
-    if over_grade > WORSE_THAN_GRADE:      # vibration is not white, and of no known spectrum
+    if over_grade > WORSE_THAN_GRADE:      # vibration is not white, and its spectrum is unknown
         noisy = [f'IMU noise is {over_grade:.1f} times that of its grade and may not be white; '
                  'uncertainties were increased']
     odd += noisy
