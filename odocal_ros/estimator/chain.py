@@ -239,7 +239,7 @@ def solve(normal: Normal) -> Solved:
     for k in stepping(range(N)):
         root, info = dpotrf(D, lower=1)
         if info:
-            raise NotPositive(f'keyframe {k} of {N} is not constrained')
+            raise NotPositive(f'the data do not constrain keyframe {k} of {N}')
         W = wide[k]
         X, _ = dpotrs(root, W, lower=1)
         roots[k] = root.diagonal()
@@ -255,7 +255,7 @@ def solve(normal: Normal) -> Solved:
         diagonal[rows, below[1], below[0]] = diagonal[rows, below[0], below[1]]
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
-        raise NotPositive('the constants are not determined')
+        raise NotPositive('the data do not determine the constants of the vehicle')
     logdet = 2 * sum(np.log(x).sum() for x in (roots / s, root.diagonal() / s_c)) \
         + np.log(normal.absent).sum()
     reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)

@@ -147,14 +147,14 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
         if name not in PARAMETERS and abs(z[k]) < max(FAULT_SIGMAS, worst):
             continue
         # two legs have the same deviation from each other
-        who = f', {_name(numbers[k])} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
+        who = f'; {_name(numbers[k])} differs most ({z[k]:+.1f} sigma from the others)' * (J > 2)
         said.append(Reason(
-            Code.LEGS_DISAGREE, f'{name}: the {J} legs differ {np.sqrt((z**2).mean()):.1f} times '
-            f'more than their uncertainties{who}', DELAY_DIFFERS if 'delay' in name else ''))
+            Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
+            f'times their uncertainties{who}', DELAY_DIFFERS if 'delay' in name else ''))
     if found.factor > 1:
         said.append(Reason(
-            Code.LEGS_DISAGREE, f'the {J} legs differ {found.factor:.1f} times more than their '
-            'uncertainties, in other parameters than the ones listed'))
+            Code.LEGS_DISAGREE, f'the scatter of {J} legs in parameters that are not listed is '
+            f'{found.factor:.1f} times their uncertainties'))
     return tuple(said)
 
 

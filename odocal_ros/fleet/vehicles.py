@@ -32,6 +32,7 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.levels import DAY_NS
 
 FEWEST_REJECTED = 2             # judgement: last legs, all rejected; one alone may be a bad drive
+LOOK_AT_BAGS = 'See the column failures of vehicles.parquet for the reason of each bag.'
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,13 +180,13 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
     return row | none | {
         'legs': 0, 'legs_good': 0, 'distance_km': 0.0, 'driven_h': 0.0, 'first': None,
         'last': None, 'unit': '', 'since': None, 'verdict': Verdict.REJECTED.value,
-        'decision': decision, 'why': 'no bag could be calibrated', 'remedy':
-        'See the reasons of the bags.', 'reasons': '', 'changes': '[]', 'odd_legs': '',
+        'decision': decision, 'why': f'none of {row["bags"]} bags could be calibrated',
+        'remedy': LOOK_AT_BAGS, 'reasons': '', 'changes': '[]', 'odd_legs': '',
         'rejected_for': '', 'rejected_since': None,
         'drift_per_year': None, 'drift_per_year_sigma': None, 'drift_per_1000_km': None,
         'drift_per_1000_km_sigma': None, 'now': [], 'report': None, 'line': json.dumps(
             {'vehicle': row['vehicle'], 'decision': decision,
-             'why': row['failures'], 'remedy': 'See the reasons of the bags.', 'values': {},
+             'why': row['failures'], 'remedy': LOOK_AT_BAGS, 'values': {},
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
 
 

@@ -55,7 +55,7 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     odd, move = [], 0.0
     if fit.creeping or not fit.settled:
         move = moving(fit)
-        odd.append(f'after {fit.iterations} passes ' + (
+        odd.append(f'after {fit.iterations} iterations ' + (
             f'the estimates still changed by {move:.2g} sigma'
             if move > CONVERGENCE.nearly else 'the noise levels still changed'))
     odd_share = 0.15        # share of outliers among the fixes, of intervals with slip: judgement
@@ -64,15 +64,14 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
         noisy = [f'IMU noise is {over_grade:.1f} times that of its grade and may not be white; '
                  'uncertainties were increased']
     odd += noisy
-    share = float((fit.weighted[Fixes].weight[:, 0] < 0.5).mean())
-    if share > odd_share:
-        odd.append(f'{100 * share:.0f} % of the fixes are outliers')
-    share = float((fit.spread[:, 0] > SLIP_VARIANCE).mean())
-    if share > odd_share:
-        odd.append(f'the wheel slips {100 * share:.0f} % of the time')
-    if max(level['side'], level['side_turn']) > 0.2:       # m/sqrt(s): no vehicle on wheels
-        odd.append(f'sideslip at the odometer is {max(level["side"], level["side_turn"]):.2f} '
-                   'm/√s')
+    for what, mask in (('of the fixes are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5),
+                       ('of the time the wheel slips', fit.spread[:, 0] > SLIP_VARIANCE)):
+        share = float(mask.mean())
+        if share > odd_share:
+            odd.append(f'{100 * share:.0f} % {what} (limit {100 * odd_share:.0f} %)')
+    sideslip, most = max(level['side'], level['side_turn']), 0.2    # m/sqrt(s), of wheels
+    if sideslip > most:
+        odd.append(f'sideslip at the odometer is {sideslip:.2f} m/√s (limit {most:g})')
     reasons += _heading(problem.outside.get('heading'), float(fit.state.constants[HEADING]))
     if odd:
         known = 'See IMU_WORSE_THAN_GRADE.' if worse else remedy
