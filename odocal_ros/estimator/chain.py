@@ -185,7 +185,7 @@ class JointMarginals:
         out: Floats = (own * by_own).sum(axis=1) + (border * by_border).sum(axis=1)
         return out if ahead is None else out + (ahead * by_ahead).sum(axis=1)
 
-    def spread_of(self, rows: slice, J: Floats) -> Floats:
+    def covariance_form(self, rows: slice, J: Floats) -> Floats:
         """
         Return a matrix with the quadratic form of the covariance of rows: (k, r, r).
 

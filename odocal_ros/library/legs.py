@@ -154,7 +154,7 @@ def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | st
     if marks:
         return _marked(marks, last, bag)
     if config.leg.automatic:
-        return by_themselves(recorder, last, config) or [(first, last)]
+        return automatic_legs(recorder, last, config) or [(first, last)]
     return [_by_standstill(first, last, stops_known())]
 
 
@@ -222,7 +222,7 @@ def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
     return first + np.round(spans * 1e9).astype(np.int64), (metres, float(path_length[-1]))
 
 
-def by_themselves(recorder: LegRecorder, last: int, config: Config) -> Spans:
+def automatic_legs(recorder: LegRecorder, last: int, config: Config) -> Spans:
     """Return the legs that the node would start and end automatically."""
     search = LegSearch(config)
     for slot in ('fix', 'imu', 'odometer'):

@@ -105,7 +105,7 @@ class Motion:
         straight = turn(half @ self.C, turn(intervals.S, along))
         self.rolled = straight * self.varied * self._inclined(straight)[:, None]
         self.faster = self._by_odometer_filter()
-        self.way = self.rolled + self.heaved
+        self.way = self.rolled + self.vertical_shift
         self.unsaid = self._by_speed_offset(leg.travel.coarse)
         if self.unsaid is not None:
             self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
@@ -149,7 +149,7 @@ class Motion:
         return out
 
     @property
-    def heaved(self) -> Floats:
+    def vertical_shift(self) -> Floats:
         """Return the vertical displacement of the odometer by pitching: (K, 3) m."""
         out: Floats = self.pitched @ self.state.constants[PITCH_CENTRE]
         return out
@@ -272,7 +272,7 @@ class Motion:
         if self.fitted:     # without sway and vertical motion, which are road noise
             along = self.rolled / np.maximum(np.linalg.norm(self.rolled, axis=1), 1e-6)[:, None]
             way = along * np.einsum('ki,ki->k', along, self.travelled)[:, None]
-        c[:, D, LN_K] = self.heaved - way
+        c[:, D, LN_K] = self.vertical_shift - way
         by_scale = c[:, D, LN_K] / self.varied
         c[:, D, TYRES] = by_scale[:, :, None] * self.from_mean[:, None]
         c[:, D, BY_PITCHING] = by_scale * self.swung[:, None]

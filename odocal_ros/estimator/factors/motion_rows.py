@@ -203,7 +203,7 @@ class MotionRows(Factor):
             for rows in blocks(len(self.r)):
                 A = self.units(rows)
                 estimates[rows] = np.einsum('kic,ki->kc', A, self.r[rows])
-                fitted = marginals.spread_of(rows, self.J[rows])
+                fitted = marginals.covariance_form(rows, self.J[rows])
                 variances[rows] = (A * (A - fitted @ A)).sum(axis=1)
             self._found = ref(marginals), estimates, variances
         return self._found[1:]
