@@ -208,33 +208,62 @@ class JointMarginals:
 
 
 def solve(normal: Normal) -> Solved:
-    """
-    Solve the normal equations in place.
-
-    Raises
-    ------
-    NotPositive
-        An unknown is not constrained, within rounding.
-
-    """
-    from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
-    diagonal, wide = normal.diagonal, normal.wide
+    """Solve normal equations in place; raises NotPositive: an unknown is not constrained."""
+    from scipy.linalg.lapack import dpotrf, dpotrs
+    wide = normal.wide
     N, n = normal.g.shape
     m = len(normal.g_border)
+    s, s_c = _scale(normal)
+    corner = np.zeros((m + 1, m + 1))
+    corner[:m, :m] = normal.corner * np.multiply.outer(s_c, s_c)
+    corner[:m, m] = corner[m, :m] = normal.g_border * s_c
+    roots = _eliminate(normal, corner)
+    root, info = dpotrf(corner[:m, :m], lower=1)
+    if info:
+        raise NotPositive('the data do not determine the constants of the vehicle')
+    logdet = 2 * sum(np.log(x).sum() for x in (roots / s, root.diagonal() / s_c)) \
+        + np.log(normal.absent).sum()
+    reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
+    c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
+    covariance = dpotrs(root, np.eye(m), lower=1)[0]
+    x = np.concatenate([wide[rows, :, n + m] - wide[rows, :, n:n + m] @ c
+                        for rows in blocks(N)])
+    for k in stepping(range(N - 2, -1, -1)):
+        x[k] -= wide[k][:, :n] @ x[k + 1]
+    absent = normal.absent
+    return Solved(
+        x * s, _with_absent(c * s_c, 0 * absent),
+        _with_absent(covariance * np.multiply.outer(s_c, s_c), 1 / absent), float(logdet),
+        _with_absent(reduced, absent), _with_absent(corner[:m, m] / s_c, 0 * absent),
+        (wide, normal.diagonal), s, s_c)
+
+
+def _scale(normal: Normal) -> tuple[Floats, Floats]:
+    """Scale the blocks to a unit diagonal, in place; return the factors: (N, n), (m,)."""
+    diagonal, wide = normal.diagonal, normal.wide
+    N, n = normal.g.shape
     s = np.ones((N + 1, n))     # of N blocks and of one after the last, which is not used
     for rows in blocks(N):
         s[rows] = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', diagonal[rows]), 1e-300))
-    s_c = 1 / np.sqrt(np.maximum(np.diag(normal.corner), 1e-300))
+    s_c: Floats = 1 / np.sqrt(np.maximum(np.diag(normal.corner), 1e-300))
     for rows in blocks(N):
         diagonal[rows] *= s[rows, :, None]
         diagonal[rows] *= s[rows, None, :]
         wide[rows] *= s[rows, :, None]
         wide[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
         normal.border[rows] *= s_c
-    s = s[:N]
-    corner = np.zeros((m + 1, m + 1))
-    corner[:m, :m] = normal.corner * np.multiply.outer(s_c, s_c)
-    corner[:m, m] = corner[m, :m] = normal.g_border * s_c
+    return s[:N], s_c
+
+
+def _eliminate(normal: Normal, corner: Floats) -> Floats:
+    """
+    Eliminate the blocks in place, in order; return the diagonals of their roots: (N, n).
+
+    corner : (m + 1, m + 1) border and right-hand side, reduced in place.
+    """
+    from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+    diagonal, wide = normal.diagonal, normal.wide
+    N, n = normal.g.shape
     D, roots = diagonal[0], np.empty((N, n))
     for k in stepping(range(N)):
         root, info = dpotrf(D, lower=1)
@@ -253,24 +282,7 @@ def solve(normal: Normal) -> Solved:
     below = np.tril_indices(n, -1)      # dpotri fills one triangle
     for rows in blocks(N):
         diagonal[rows, below[1], below[0]] = diagonal[rows, below[0], below[1]]
-    root, info = dpotrf(corner[:m, :m], lower=1)
-    if info:
-        raise NotPositive('the data do not determine the constants of the vehicle')
-    logdet = 2 * sum(np.log(x).sum() for x in (roots / s, root.diagonal() / s_c)) \
-        + np.log(normal.absent).sum()
-    reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
-    c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
-    covariance = dpotrs(root, np.eye(m), lower=1)[0]
-    x = np.concatenate([wide[rows, :, n + m] - wide[rows, :, n:n + m] @ c
-                        for rows in blocks(N)])
-    for k in stepping(range(N - 2, -1, -1)):
-        x[k] -= wide[k][:, :n] @ x[k + 1]
-    absent = normal.absent
-    return Solved(
-        x * s, _with_absent(c * s_c, 0 * absent),
-        _with_absent(covariance * np.multiply.outer(s_c, s_c), 1 / absent), float(logdet),
-        _with_absent(reduced, absent), _with_absent(corner[:m, m] / s_c, 0 * absent),
-        (wide, diagonal), s, s_c)
+    return roots
 
 
 def _with_absent(x: Floats, absent: Floats) -> Floats:
