@@ -112,7 +112,7 @@ def rejected_from(driven: Sequence[Driven]) -> int:
                     if one.leg.verdict is not Verdict.REJECTED), default=-1)
 
 
-def gone(lost: Sequence[Driven]) -> Reason:
+def all_rejected(lost: Sequence[Driven]) -> Reason:
     """Return the reason why the current state of a vehicle is unknown."""
     last = rejecting(lost[-1].leg)[0]
     since = f'{utc(lost[0].leg.start_ns):%Y-%m-%d}'
@@ -162,7 +162,7 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     calibration = combine([one.leg for one in now], config, imu=known_imu(config))
     lost = driven[rejected_from(driven):]
     if len(lost) >= FEWEST_REJECTED and calibration.verdict is not Verdict.REJECTED:
-        calibration = replace(calibration, reasons=(gone(lost), *calibration.reasons))
+        calibration = replace(calibration, reasons=(all_rejected(lost), *calibration.reasons))
     row |= _current(calibration, config, driven, starts) | _changes(histories, driven) \
         | {'rejected_for': ' '.join(dict.fromkeys(
             r.code.name for one in driven for r in rejecting(one.leg))),

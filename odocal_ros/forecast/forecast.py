@@ -127,7 +127,7 @@ class Forecast:
     def age_s(self, stamp_ns: int) -> float:
         """Return the time from the estimate to a stamp, s; NaN if the stamp is not after it."""
         age = (stamp_ns - self.until_ns) * 1e-9
-        return age if age >= 0 else math.nan       # wild stamps, or the IMU has stopped
+        return age if age >= 0 else math.nan       # implausible stamps, or the IMU has stopped
 
 
 def better(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None:

@@ -177,7 +177,7 @@ def _ends(recorder: LegRecorder) -> dict[str, tuple[int, int]]:
     """Return the first and the last stamp of each required slot that has stamps."""
     rows = {slot: recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')}
     stamps = {slot: s[s > 0] for slot, s in rows.items()}
-    # percentiles of order, not extremes: one wild stamp must not move the leg
+    # percentiles, not extremes: one implausible stamp must not move the leg
     return {slot: (int(np.median(s[:5])), int(np.median(s[-5:]))) if len(s) > 20
             else (int(s.min()), int(s.max())) for slot, s in stamps.items() if len(s)}
 
