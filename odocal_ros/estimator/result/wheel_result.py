@@ -111,10 +111,13 @@ def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, lis
         return none, []         # the configured width is more accurate
     if sigma < TRACK_WIDTH.least and width < TRACK_WIDTH.least:
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
-                             f'match the gyro turns: the track width would be {width:.2g} m')]
-    if sigma >= TRACK_WIDTH.determined_share * max(width, TRACK_WIDTH.least):
+                             f'match the gyro turns: the track width would be {width:.2g} m; '
+                             f'the lower limit is {TRACK_WIDTH.least:g} m')]
+    limit = TRACK_WIDTH.determined_share * max(width, TRACK_WIDTH.least)
+    if sigma >= limit:
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
-                             f'{sigma:.2g} m. Likely cause: too few turns')]
+                             f'{sigma:.2g} m; the limit is {limit:.2g} m. Likely cause: too few '
+                             'turns')]
     if given and abs(width - given) > REMARK_SIGMAS * np.hypot(
             TRACK_WIDTH.taped_share * given, sigma):
         return Estimate(width, sigma, 'm'), [Reason(
