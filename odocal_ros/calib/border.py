@@ -61,7 +61,7 @@ class Border:
                                  np.array(list(sigmas.values())))
         return replace(self, information=D, pull=pull)
 
-    def doubted(self, effects: Floats) -> 'Border':
+    def with_errors(self, effects: Floats) -> 'Border':
         """
         Return the border that gives, with the priors used, the same x and a larger covariance.
 

@@ -31,7 +31,7 @@ class Carried:
     last_ns: int
     legs: int
 
-    def goes_on_from(self, other: 'Carried') -> bool:
+    def includes(self, other: 'Carried') -> bool:
         """Return True if it contains all the information of another."""
         return self.first_ns == other.first_ns and self.legs > other.legs
 

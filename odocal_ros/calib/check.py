@@ -23,7 +23,7 @@ ONE_MOTION_RATIO = 0.6, 1.6
 NOISIER_WORTH = 1.25
 
 
-def stray(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
+def track_residuals(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.
 
@@ -64,7 +64,7 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     return np.where(factors > NOISIER_WORTH, factors, 1.0)
 
 
-def _believable(sigma: float, distance: float) -> float:
+def _distance_limit(sigma: float, distance: float) -> float:
     """
     Return the limit of the distance between track and fixes, m.
 
@@ -77,7 +77,7 @@ def _believable(sigma: float, distance: float) -> float:
 def mismatch(check: TrackCheck, fix_sigma: float, drift: float,
              distance: float) -> tuple[Reason, ...]:
     """Return TRACK_MISMATCH where the corrected track differs from the fixes beyond its sigmas."""
-    allowed = _believable(np.hypot(np.sqrt(2) * fix_sigma, drift), distance)
+    allowed = _distance_limit(np.hypot(np.sqrt(2) * fix_sigma, drift), distance)
     if check.rms <= allowed:
         return ()
     return (Reason(Code.TRACK_MISMATCH, f'the corrected track is {check.rms:.1f} m rms from the '
@@ -102,7 +102,7 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
     if len(count) < 3:      # two windows show no bend
         return ()
     sigma = np.sqrt((along**2).mean() + fix_sigma**2 / np.median(count) + drift**2)
-    allowed, most = _believable(sigma, distance), np.abs(across).max()
+    allowed, most = _distance_limit(sigma, distance), np.abs(across).max()
     if most <= allowed:
         return ()
     return (Reason(Code.MODEL_MISMATCH, f'the track deviates up to {most:.1f} m from the fixes; '

@@ -92,8 +92,8 @@ def leg_estimates(leg: LegResult) -> dict[str, Estimate]:
     return choose(leg.methods, leg.deciding or ORDER)[0]
 
 
-def worth_saying(reasons: Iterable[Reason], method: str,
-                 estimates: Mapping[str, Estimate]) -> tuple[Reason, ...]:
+def relevant_reasons(reasons: Iterable[Reason], method: str,
+                     estimates: Mapping[str, Estimate]) -> tuple[Reason, ...]:
     """Return a method's reasons, without those about values that another method gives."""
     return tuple(r for r in reasons if r.code not in ABOUT or (
         given := estimates.get(ABOUT[r.code])) is None or given.method == method)

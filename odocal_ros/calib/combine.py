@@ -124,8 +124,8 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
     if freedom and deviate(chi2, freedom) > Z95:
         factor = np.sqrt(chi2 / freedom)
         variance *= factor**2
-        reasons = (Reason(Code.LEGS_DISAGREE, f'{parameter}: the {len(y)} legs differ '
-                          f'{factor:.1f} times more than their uncertainties'),)
+        reasons = (Reason(Code.LEGS_DISAGREE, f'{parameter}: the scatter of {len(y)} legs is '
+                          f'{factor:.1f} times their uncertainties'),)
     mean = np.exp(mean) if relative else wrap(mean) if angle else mean
     return float(mean), float(variance), shared, reasons
 

@@ -34,7 +34,7 @@ def counter_change(parts: Sections, t_fix: Floats, fix_distance: Floats) -> tupl
         return ()
     _, k, factor = min(found)
     begin, end = np.interp([parts.begin[known[k]], parts.end[known[k]]], fix_distance, t_fix)
-    return (Reason(Code.TRACK_MISMATCH, 'the odometer changes its scale: it counts '
+    return (Reason(Code.TRACK_MISMATCH, 'the odometer scale changes: it counts '
                    f'{factor:.2f} times as much per metre after t = {begin:.0f} to {end:.0f} s as '
                    'before', 'Check the driver for a change of decoding (x1, x2, x4), unit or '
                    'gear. Mark a leg on one side of the change with --leg.'),)

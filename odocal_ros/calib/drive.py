@@ -21,7 +21,7 @@ FURTHEST_SLIDE = 100.0   # m, physical: wheel slides and errors of fixes are sma
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """Return the path length between the marks, m, and the reasons against the drive."""
-    distance, found = judge_way(track, t_stop, metres_per_unit, leg)
+    distance, found = check_path(track, t_stop, metres_per_unit, leg)
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
     if len(t) < 2:
@@ -35,8 +35,8 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
     return distance, found
 
 
-def judge_way(track: Track, t_stop: float, metres_per_unit: float,
-              leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
+def check_path(track: Track, t_stop: float, metres_per_unit: float,
+               leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """
     Return the path length between the marks, and reasons if it or the speed is too low.
 
@@ -120,7 +120,7 @@ def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Re
     """Return a reason if the fixes, (k, 2) at (k,) s, move ``least`` m without counts."""
     far, since, until = max(_without_counts(travel, t, fixes, least), default=(0.0, 0.0, 0.0))
     # smaller shares of the path are within the tolerance of tyres, and are found elsewhere
-    if far < least or far < TYRE_SPREAD * way_and_chord(t, fixes)[0]:
+    if far < least or far < TYRE_SPREAD * path_and_chord(t, fixes)[0]:
         return ()
     return (Reason(Code.ODOMETER_STILL, f'the fixes move by {far:.0f} m from t = {since:.0f} s '
                    f'to {until:.0f} s, but the odometer does not count'),)
@@ -132,7 +132,7 @@ def _without_counts(travel: Travel, t: Floats, fixes: Floats,
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
-    return [(_gone(fixes[(t >= begin[k]) & (t <= end[k])], least), begin[k], end[k])
+    return [(_motion_between(fixes[(t >= begin[k]) & (t <= end[k])], least), begin[k], end[k])
             for k in np.flatnonzero(end - begin > least / FASTEST)]
 
 
@@ -156,7 +156,7 @@ def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) ->
     return np.reshape(np.array(spans, float), (-1, 2))
 
 
-def _gone(fixes: Floats, least: float) -> float:
+def _motion_between(fixes: Floats, least: float) -> float:
     """
     Return the significant motion of (k, 2) fixes from begin to end, m, 0 below ``least``.
 
@@ -174,8 +174,8 @@ def _gone(fixes: Floats, least: float) -> float:
     return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(middle[-1] - middle[0]))))
 
 
-def way_and_chord(t_fix: Floats, fixes_n: Floats,
-                  least: float = GNSS_MOVES) -> tuple[float, float]:
+def path_and_chord(t_fix: Floats, fixes_n: Floats,
+                   least: float = GNSS_MOVES) -> tuple[float, float]:
     """
     Return path length and distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 

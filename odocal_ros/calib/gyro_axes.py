@@ -73,7 +73,7 @@ def gyro_axes(inputs: 'Inputs', placed: Placed, faces: Facing | None) -> tuple[R
     found = by_course(inputs, placed, w_i, axes, names)
     if not found and inputs.has_accelerometer:
         inverted = faces and faces.inward < min(INVERTED, -FAR_SIGMAS * faces.inward_sigma)
-        if inverted:            # the yaw rate with the sign by the accelerometer
+        if inverted:            # the yaw rate, with the sign determined by the accelerometer
             w_i = w_i - 2 * np.outer(w_i @ axes[2], axes[2])
         found = by_gravity(inputs, placed, w_i, f_i, axes, names)
         if faces and inverted:

@@ -18,8 +18,8 @@ MISTAKEN = {
           0.3048: 'speeds in ft/s', 0.01: 'speeds in cm/s', 1e-3: 'speeds in mm/s'},
     'm/rad': {np.pi / 180: 'angles in degrees', 2 * np.pi: 'whole turns',
               np.pi / 30: 'rates in rpm'},
-    'm/pulse': {0.25: 'a counter of the four edges of a pulse',
-                0.5: 'a counter of both edges of a pulse'}}
+    'm/pulse': {0.25: 'counting four edges per pulse (x4)',
+                0.5: 'counting two edges per pulse (x2)'}}
 PER_CENT_FROM = 0.01    # definition: relative values from this size are shown in per cent
 
 
@@ -29,7 +29,8 @@ def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
         if abs(ratio / known - 1) < 0.04:      # tolerance for tyres: the ratios are farther apart
             return f', typical for {what}', (
                 f'If so, set odometer.nominal_scale to {known * nominal:.6g}, or correct the '
-                'sender. Otherwise check the odometer. The limit is odometer.max_scale_deviation.')
+                'odometer driver. Otherwise check the odometer. The limit is '
+                'odometer.max_scale_deviation.')
     return '', ''
 
 

@@ -67,7 +67,7 @@ class MethodResult:
     name: str
     reasons: tuple[Reason, ...]
     estimates: dict[str, Estimate] = field(default_factory=dict)
-    parameters: tuple[str, ...] = ()    # names in the order of the sources' rows
+    parameters: tuple[str, ...] = ()    # names, in the order of the rows of the sources
     sources: tuple[Source, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
     border: Border | None = None        # of the leg, or of all; None: the method has none
@@ -96,7 +96,7 @@ class PerDistance:
     length: float       # m driven
     before: float
     after: float
-    pieces: float       # of this length in the path, end to end
+    pieces: float       # path length over ``length``
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +124,8 @@ class LegResult:
     C_bi: NDArray[np.float64] | None = None   # (3, 3) nominal rotation used, imu frame to b
     deciding: tuple[str, ...] = ()            # methods whose verdict counts, all if empty
     evidence: Evidence | None = None          # plot data, None if no track was usable
-    path_ratio: float | None = None     # median of distance between fixes over travel
-    cut_from_ns: int | None = None            # start mark of the leg that it is a part of
+    path_ratio: float | None = None     # median ratio of distance between fixes to travel
+    cut_from_ns: int | None = None            # start mark of the leg of which this is a section
 
     @property
     def driven_ns(self) -> int:

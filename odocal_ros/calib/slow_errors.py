@@ -54,10 +54,10 @@ def slow_variance(t: Floats, along: Floats, way: Floats, variance: Floats,
         return 0.0, np.inf
     next_to = (means[1:] * means[:-1])[np.diff(number) == 1]
     alike = (next_to.mean() - drift**2) / (seen - white) if len(next_to) else 1.0
-    return float(seen - white), _lasting(alike)
+    return float(seen - white), _time_constant(alike)
 
 
-def _lasting(alike: float) -> float:
+def _time_constant(alike: float) -> float:
     """Return the time constant, s, by the correlation of adjacent means of SLOW_WINDOW."""
     times = np.geomspace(2.0, 2000.0, 100)      # s, that such a window can determine
     x = SLOW_WINDOW / times
@@ -72,8 +72,8 @@ def slow_share(seconds: float, tau: float) -> float:
     return float(share[0] / share[1])
 
 
-def no_better(mark: MarkFix, slow: float, tau: float, span: tuple[float, float] | None,
-              stated: float, up_ratio: float) -> MarkFix:
+def with_slow_errors(mark: MarkFix, slow: float, tau: float, span: tuple[float, float] | None,
+                     stated: float, up_ratio: float) -> MarkFix:
     """
     Return a mark with at least the variance of the slow fix errors.
 
@@ -94,9 +94,9 @@ def no_better(mark: MarkFix, slow: float, tau: float, span: tuple[float, float] 
     return mark
 
 
-def marks_no_better(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats, way_n: Floats,
-                    chord_n: Floats, residual: Floats, covariance_n: Floats,
-                    drift_n: Floats) -> tuple[MarkFix, MarkFix]:
+def marks_with_slow_errors(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats, way_n: Floats,
+                           chord_n: Floats, residual: Floats, covariance_n: Floats,
+                           drift_n: Floats) -> tuple[MarkFix, MarkFix]:
     """
     Return both marks of a leg with at least the variance of its slow fix errors.
 
@@ -110,6 +110,6 @@ def marks_no_better(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats, wa
     slow, tau = slow_variance(t, residual[:, :2] @ along, way_n[:, :2] @ along, stated,
                               float(np.linalg.norm(along @ drift_n[:2])))
     up_ratio = np.median(covariance_n[:, 2, 2] / stated)
-    start, end = (no_better(mark, slow, tau, standing_at(mark.t, spans), np.median(stated),
-                            up_ratio) for mark in marks)
+    start, end = (with_slow_errors(mark, slow, tau, standing_at(mark.t, spans), np.median(stated),
+                                   up_ratio) for mark in marks)
     return start, end

@@ -54,12 +54,12 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     T, path = np.diff(t), np.diff(distance[knots])
     chord, dead = (np.hypot(*np.diff(p[knots, :2], axis=0).T) for p in (fix_n, dead_n))
     rolled = np.diff(travel.at(t))
-    slope = 0.5       # s to either side of a knot, for the speed there
-    speed = (travel.at(t + slope) - travel.at(t - slope)) / (2 * slope)
+    half = 0.5        # s before and after a knot, for the mean speed there
+    speed = (travel.at(t + half) - travel.at(t - half)) / (2 * half)
     straight = dead > 0.8 * path      # judgement: in tighter turns a chord is too short
-    high = 90     # percentile of the speeds, which may have outliers
     good = (2 * cell > T) & straight & (rolled != 0) & _moves(travel, t)
-    good &= path / T > SLOWEST_CELL * float(np.percentile(path / T, high))
+    top = float(np.percentile(path / T, 90))      # robust to outliers
+    good &= path / T > SLOWEST_CELL * top
     if good.sum() < FEWEST_CELLS:
         return SpeedScale(NO_BINS)
     length = chord[good] * path[good] / dead[good]
@@ -83,7 +83,7 @@ def _fit(length: Floats, rolled: Floats, T: Floats, change: Floats
     mean_speed = length / T
     scale = float(length.sum() / rolled.sum())
     X = np.stack([rolled, T, scale * change], -1)
-    for _ in range(3):      # passes, until outliers are found
+    for _ in range(3):      # iterations of outlier rejection
         x, *_ = np.linalg.lstsq(X[used], length[used], rcond=None)
         off = np.abs(length - X @ x)
         sigma = robust_sigma(off[used])
@@ -97,7 +97,7 @@ def _fit(length: Floats, rolled: Floats, T: Floats, change: Floats
 
 
 def _bins(length: Floats, rolled: Floats, T: Floats) -> Floats:
-    """Return speed, ratio, its sigma and number of cells, of groups of equally many cells."""
+    """Return speed, ratio, its sigma and number of cells, for groups of equal numbers of cells."""
     # sorted by odometer speed: by the fixes they would be sorted by fix errors
     order, scale = np.argsort(rolled / T, kind='stable'), float(length.sum() / rolled.sum())
     rows = []

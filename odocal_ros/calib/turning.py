@@ -69,15 +69,15 @@ def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
     if ratio is None or ONE_MOTION_RATIO[0] < ratio < ONE_MOTION_RATIO[1]:
         return ()
     if ratio < -ONE_MOTION_RATIO[0]:
-        return (Reason(Code.GYRO_SIGN, 'the gyro turns opposite to the course of the fixes '
+        return (Reason(Code.GYRO_SIGN, 'turns by the gyro are opposite to those by the fixes '
                        f'(ratio {ratio:.2f} instead of 1)'),)
     degrees = 40.0 < ratio < 80.0       # 180 / pi, with a margin for scale errors and skid
     if abs(ratio) < 0.01:       # no error of the unit: revolutions give 0.16
-        return (Reason(Code.IMU_UNITS, f'the gyro shows only {ratio:#.2g} times the turns of the '
-                       'fixes', 'Set imu.mounting_rpy if another IMU '
+        return (Reason(Code.IMU_UNITS, f'turns by the gyro are only {ratio:#.2g} times those by '
+                       'the fixes', 'Set imu.mounting_rpy if another IMU '
                        'axis is vertical; otherwise correct the IMU driver.'),)
     wanted = gyro_scale * (np.pi / 180 if degrees else 1 / ratio)
-    return (Reason(Code.IMU_UNITS, f'the gyro shows {ratio:#.3g} times the turns of the '
-                   'fixes' + ', as deg/s would' * degrees,
+    return (Reason(Code.IMU_UNITS, f'turns by the gyro are {ratio:#.3g} times those by the '
+                   'fixes' + ', typical for deg/s' * degrees,
                    f'Set imu.gyro_scale to {wanted:.10g}, or correct the unit in the IMU '
                    'driver.'),)

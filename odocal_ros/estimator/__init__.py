@@ -4,8 +4,9 @@
 """
 The GNSS / IMU / odometer smoother: a batch maximum likelihood over all samples of a leg.
 
-``smooth`` takes a leg that is over, ``GrowingFit`` one that grows; ``smoother_leg`` makes either
-of screened samples, where ``too_little_of`` says no. ``bound`` is the covariance without a fit.
+``smooth`` fits a finished leg, ``GrowingFit`` a leg that grows. ``smoother_leg`` makes their input
+from screened samples, ``too_little_of`` returns the samples that are missing, and ``bound`` the
+covariance without a fit.
 """
 
 from odocal_ros.estimator.growing import GrowingFit, Running

@@ -59,14 +59,14 @@ class Solved:
     log_determinant: float    # of H
     reduced: Floats           # (m, m) Schur complement of the border
     g_reduced: Floats         # (m,)
-    _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n), until marginals
+    _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n); None after marginals
     _scale: Floats            # (N, n)
     _scale_border: Floats     # (m,) of those that are not absent
     taken: float = 1.0        # share of the full step
 
     def marginals(self) -> 'JointMarginals':
-        """Return the joint marginals of adjacent blocks; once, since they reuse the memory."""
-        assert self._chain is not None, 'the chain was used up'
+        """Return the joint marginals of adjacent blocks; callable once: it reuses the memory."""
+        assert self._chain is not None, 'marginals() was already called'
         (wide, own), self._chain = self._chain, None
         N, n = self.step.shape
         m = len(self._scale_border)
@@ -104,10 +104,10 @@ class Solved:
         """
         Return g' H^-1 g of right-hand sides g, (r, r), and H^-1 g of the border, (m, r).
 
-        chain : (N, n, r), border : (m, r).   By the forward elimination alone; before
+        chain : (N, n, r), border : (m, r).   Uses the forward elimination only; call it before
         ``marginals``.
         """
-        assert self._chain is not None, 'the chain was used up'
+        assert self._chain is not None, 'call products() before marginals()'
         wide, own = self._chain
         N, n = self.step.shape
         m = len(self._scale_border)
@@ -130,7 +130,7 @@ class JointMarginals:
     """
     Joint marginals: the covariance of block k, block k + 1 and the border, for N - 1 intervals.
 
-    In full (N - 1, 2n + m, 2n + m); computed for some intervals at a time.
+    The full array would be (N - 1, 2n + m, 2n + m); a few intervals are computed at a time.
     """
 
     _own: Floats              # (N, n, n) covariance of each block
@@ -186,11 +186,12 @@ class JointMarginals:
         out: Floats = (own * by_own).sum(axis=1) + (border * by_border).sum(axis=1)
         return out if ahead is None else out + (ahead * by_ahead).sum(axis=1)
 
-    def spread_of(self, rows: slice, J: Floats) -> Floats:
+    def covariance_form(self, rows: slice, J: Floats) -> Floats:
         """
-        Return the covariance of rows of some intervals, as a form: (k, r, r).
+        Return a matrix with the quadratic form of the covariance of rows: (k, r, r).
 
-        J : (k, r, 2n + m).   The form is not symmetric: its quadratic form is the variance.
+        J : (k, r, 2n + m).   The matrix A is not symmetric: a' A a is the variance of a' times the
+        rows.
         """
         n, ends = self._own.shape[1], slice(rows.start + 1, rows.stop + 1)
         across, after = self._across[rows], self._across[ends][:, :, n:]
@@ -202,60 +203,25 @@ class JointMarginals:
         return out
 
     def blocks(self) -> Iterator[Floats]:
-        """Yield the covariances of some intervals after others: (k, 2n + m, 2n + m)."""
+        """Yield the covariances of all intervals in chunks: (k, 2n + m, 2n + m)."""
         for rows in blocks(len(self)):
             yield self.of(np.arange(rows.start, rows.stop))
 
 
 def solve(normal: Normal) -> Solved:
-    """
-    Solve the normal equations in place.
-
-    Raises
-    ------
-    NotPositive
-        An unknown is not constrained, within rounding.
-
-    """
-    from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
-    diagonal, wide = normal.diagonal, normal.wide
+    """Solve normal equations in place; raises NotPositive: an unknown is not constrained."""
+    from scipy.linalg.lapack import dpotrf, dpotrs
+    wide = normal.wide
     N, n = normal.g.shape
     m = len(normal.g_border)
-    s = np.ones((N + 1, n))     # and of a missing block after the last
-    for rows in blocks(N):
-        s[rows] = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', diagonal[rows]), 1e-300))
-    s_c = 1 / np.sqrt(np.maximum(np.diag(normal.corner), 1e-300))
-    for rows in blocks(N):
-        diagonal[rows] *= s[rows, :, None]
-        diagonal[rows] *= s[rows, None, :]
-        wide[rows] *= s[rows, :, None]
-        wide[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
-        normal.border[rows] *= s_c
-    s = s[:N]
+    s, s_c = _scale(normal)
     corner = np.zeros((m + 1, m + 1))
     corner[:m, :m] = normal.corner * np.multiply.outer(s_c, s_c)
     corner[:m, m] = corner[m, :m] = normal.g_border * s_c
-    D, roots = diagonal[0], np.empty((N, n))
-    for k in stepping(range(N)):
-        root, info = dpotrf(D, lower=1)
-        if info:
-            raise NotPositive(f'keyframe {k} of {N} is not constrained')
-        W = wide[k]
-        X, _ = dpotrs(root, W, lower=1)
-        roots[k] = root.diagonal()
-        corner -= W[:, n:].T @ X[:, n:]
-        if k + 1 < N:
-            onward = W[:, :n].T @ X
-            D = diagonal[k + 1] - onward[:, :n]
-            wide[k + 1, :, n:] -= onward[:, n:]
-        diagonal[k] = dpotri(root, lower=1)[0]
-        W[:] = X
-    below = np.tril_indices(n, -1)      # dpotri fills one triangle
-    for rows in blocks(N):
-        diagonal[rows, below[1], below[0]] = diagonal[rows, below[0], below[1]]
+    roots = _eliminate(normal, corner)
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
-        raise NotPositive('the constants are not determined')
+        raise NotPositive('the data do not determine the constants of the vehicle')
     logdet = 2 * sum(np.log(x).sum() for x in (roots / s, root.diagonal() / s_c)) \
         + np.log(normal.absent).sum()
     reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
@@ -270,7 +236,54 @@ def solve(normal: Normal) -> Solved:
         x * s, _with_absent(c * s_c, 0 * absent),
         _with_absent(covariance * np.multiply.outer(s_c, s_c), 1 / absent), float(logdet),
         _with_absent(reduced, absent), _with_absent(corner[:m, m] / s_c, 0 * absent),
-        (wide, diagonal), s, s_c)
+        (wide, normal.diagonal), s, s_c)
+
+
+def _scale(normal: Normal) -> tuple[Floats, Floats]:
+    """Scale the blocks to a unit diagonal, in place; return the factors: (N, n), (m,)."""
+    diagonal, wide = normal.diagonal, normal.wide
+    N, n = normal.g.shape
+    s = np.ones((N + 1, n))     # of N blocks and of one after the last, which is not used
+    for rows in blocks(N):
+        s[rows] = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', diagonal[rows]), 1e-300))
+    s_c: Floats = 1 / np.sqrt(np.maximum(np.diag(normal.corner), 1e-300))
+    for rows in blocks(N):
+        diagonal[rows] *= s[rows, :, None]
+        diagonal[rows] *= s[rows, None, :]
+        wide[rows] *= s[rows, :, None]
+        wide[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
+        normal.border[rows] *= s_c
+    return s[:N], s_c
+
+
+def _eliminate(normal: Normal, corner: Floats) -> Floats:
+    """
+    Eliminate the blocks in place, in order; return the diagonals of their roots: (N, n).
+
+    corner : (m + 1, m + 1) border and right-hand side, reduced in place.
+    """
+    from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+    diagonal, wide = normal.diagonal, normal.wide
+    N, n = normal.g.shape
+    D, roots = diagonal[0], np.empty((N, n))
+    for k in stepping(range(N)):
+        root, info = dpotrf(D, lower=1)
+        if info:
+            raise NotPositive(f'the data do not constrain keyframe {k} of {N}')
+        W = wide[k]
+        X, _ = dpotrs(root, W, lower=1)
+        roots[k] = root.diagonal()
+        corner -= W[:, n:].T @ X[:, n:]
+        if k + 1 < N:
+            onward = W[:, :n].T @ X
+            D = diagonal[k + 1] - onward[:, :n]
+            wide[k + 1, :, n:] -= onward[:, n:]
+        diagonal[k] = dpotri(root, lower=1)[0]
+        W[:] = X
+    below = np.tril_indices(n, -1)      # dpotri fills one triangle
+    for rows in blocks(N):
+        diagonal[rows, below[1], below[0]] = diagonal[rows, below[0], below[1]]
+    return roots
 
 
 def _with_absent(x: Floats, absent: Floats) -> Floats:

@@ -40,7 +40,7 @@ from odocal_ros.settings.config import Config
 LONG_WINDOW, NEXT_WINDOW = 600.0, 120.0
 LOOK_PASSES = 2         # judgement: from the last fit; AGAIN_PASSES where that is too few
 ANEW_GROWTH = 1.5       # judgement: growth of the window after which a fit is a cold start
-DRIVING_SPEED = 0.5     # m/s; judgement: slower steps between keyframes do not count
+DRIVING_SPEED = 0.5     # m/s; judgement: slower motion does not count as driving
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +64,8 @@ class GrowingFit:
     """
     The fit of one leg while it grows.
 
-    cpu_s : returns the CPU time used so far, s.   ``once_s``: CPU time of the last fit if it was a
-    cold start, which becomes rarer as a window grows.
+    cpu_s : returns the CPU time used so far, s.   ``once_s`` : CPU time of the last fit if it was
+    a cold start; these become rarer as a window grows.
     """
 
     def __init__(self, cpu_s: Callable[[], float]) -> None:
@@ -139,7 +139,7 @@ class GrowingFit:
             best = best_fit(problem, config, trace)
             self.once_s = self._cpu_s() - begin if last is not None else 0.0
             return best
-        # the levels are kept until the state is on the new section too
+        # the levels are kept until the state of the new section is estimated as well
         near = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun,
                    trace=trace).summary()
         best = fit(problem, near.state, near.levels, LOOK_PASSES, about=near, trace=trace)

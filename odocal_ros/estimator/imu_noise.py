@@ -46,9 +46,9 @@ def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     squares = [[(np.diff((x / T)[run], n=2, axis=0)**2).sum(axis=1) * T[run][1:-1, 0] / 6
                 for x in (turn, force)] for run in runs if len(run) > 2]
     both = np.concatenate([np.zeros((2, 0)), *squares], axis=1)
-    if both.shape[1] < 15:      # of three axes each: a variance by fewer is good to 30 % at best
+    if both.shape[1] < 15:      # of three axes each: with fewer, a variance has a sigma above 30 %
         return {}
-    # people get in and out, or load for most of a stop: then by the quarter that moves least
+    # people may get in and out, or load, during most of a stop: use the quarter with least motion
     found = {name: max(min(np.median(x) / CHI2_3_MEDIAN, np.quantile(x, 0.25) / CHI2_3_QUARTILE),
                        LEAST.imu[name]**2)
              for name, x in zip(('gyro', 'accel'), both, strict=True)}

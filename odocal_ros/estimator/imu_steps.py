@@ -6,8 +6,8 @@ IMU samples of a leg, summed once to steps of a tenth of a second.
 
 A step holds the rotation vector and the single and double integral of the specific force in the
 axes at its begin, coning and sculling at the sample rate included (two-speed strapdown, Savage
-1998). The passes of the fit integrate steps: the errors that they estimate are constant for
-longer than one.
+1998). The iterations of the fit integrate steps: the errors they estimate are constant within a
+step.
 """
 
 from dataclasses import dataclass, fields
@@ -70,7 +70,7 @@ class ImuSteps(Steps):
 
     @classmethod
     def of(cls, leg: SmootherLeg, spacing: float) -> 'ImuSteps':
-        """Return the steps of a leg, from begin to stop, with keyframes so far apart, s."""
+        """Return the steps of a leg, from begin to stop, with keyframes ``spacing`` s apart."""
         return cls.between(leg, keyframes(leg.t_imu, leg.t_begin, leg.t_stop, spacing))
 
     @classmethod
@@ -109,7 +109,7 @@ def _edges(t: Floats, key: Ints) -> Ints:
     begin, T = t[key[:-1]], np.diff(t[key])
     count = np.maximum(1, np.round(T / STEP))
     own = np.repeat(np.arange(len(T)), np.diff(key))
-    rounding = 1e-6     # of a step: a sample at the end of one does not slip into it
+    rounding = 1e-6     # of a step: a sample at the end of a step is not moved into it by rounding
     cell = np.floor((t[key[0]:key[-1]] - begin[own]) / T[own] * count[own] + rounding)
     new = np.r_[True, (np.diff(own) > 0) | (np.diff(cell) > 0)]
     out: Ints = np.append(np.flatnonzero(new), key[-1] - key[0]) + key[0]

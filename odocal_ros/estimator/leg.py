@@ -52,7 +52,7 @@ class SmootherLeg:
     doubt_sigma: Floats = _none()        # scale units
     outside: Mapping[str, Outside] = field(default_factory=dict)     # by the name of its factor
     wheels: tuple[Travel, ...] = ()     # in the order of odometer.wheels
-    has_accelerometer: bool = True      # False: f_b is gravity, made up
+    has_accelerometer: bool = True      # False: f_b is constant gravity
 
     @property
     def by_steps(self) -> bool:
@@ -79,6 +79,6 @@ def drift_time(leg: SmootherLeg, t: Floats) -> Floats:
     if not leg.origin.local or (far > fastest * T).any():
         return T
     path = np.max([np.abs(np.diff(one.at(t))) for one in leg.wheels or (leg.travel,)], axis=0)
-    at_rest = 0.01      # of the time, judgement: a pose may change without motion
+    at_rest = 0.01      # share of the time, judgement: a pose may change without motion
     out: Floats = np.maximum(T.sum() * path / max(path.sum(), 1e-12), at_rest * T)
     return out

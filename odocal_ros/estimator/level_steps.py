@@ -23,8 +23,9 @@ class OverRelaxation:
 
     first: float = 1.6          # from 2 on a single level oscillates
     faster: float = 1.25        # factor after a step in the same direction
-    # factor after a step that reverses; taken back at once if the next one does not, since a small
-    # exponent converges slowly (an exponent that recovers by ``faster``: 1.04 times the passes)
+    # factor after a step in the opposite direction; it is undone if the next step is in the same
+    # direction again, because a small exponent converges slowly (recovery by ``faster``: 1.04
+    # times the iterations)
     slower: float = 0.5
     most: float = 3.0
 
@@ -56,7 +57,8 @@ def update(weighted: Weighted, marginals: JointMarginals, levels: Levels, proble
             found[name] = by * found[name][0], found[name][1]
     for name, (quadratic, expected) in found.items():
         level = levels[name]
-        # the others have one, at their current value: more would stop at too large a noise
+        # the others have one pseudo-observation, at their current value: with more, iterations
+        # would end at too large a noise
         pseudo = PRIOR_ROWS.get(name, 1.0)
         pull = pseudo * (problem.first_levels[name] / level if name in PRIOR_ROWS else 1.0)
         step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
@@ -64,7 +66,7 @@ def update(weighted: Weighted, marginals: JointMarginals, levels: Levels, proble
         first = RELAXATION.first if name in SLIPPING or name in PRIOR_ROWS else 1.0
         move = np.clip(_paced(pace, name, step, first) * step, np.log(0.03), np.log(30.0))
         new[name] = max(level * float(np.exp(move)), problem.least[name])
-    # constants by residuals that contain the start are not judged
+    # the first steps are not compared: their residuals depend on the initial state
     for name, size in weighted[PriorRows].sizes(marginals).items() if fitted else ():
         step = float(np.log(size / levels[name]))
         new[name] = levels[name] * float(np.exp(min(_paced(pace, name, step, 1.0), 1.0) * step))

@@ -4,11 +4,11 @@
 """
 Preintegration: dR, dv, dp and S of each interval, docs/method.md (S4).
 
-All in the body frame at the interval's begin, so that nothing depends on where the vehicle is:
-with R the attitude since then, dv, dp the single and double integral of R f, S the sum of R over
-travel (Forster et al. 2017 have the first two). Errors of the IMU are constant within a step:
-they turn R by -A d within it, A the integral of R, and shift the force by as much. No loop over
-steps: rotations by a prefix product, the rest by cumulative sums, some intervals at a time.
+All values are in the body frame at the start of the interval, independent of the position of the
+vehicle. R is the attitude since then, dv and dp the single and double integral of R f, S the sum
+of R over travel (dR, dv, dp: Forster et al. 2017). IMU errors d are constant within a step: they
+rotate R by -A d, with A the integral of R, and change the force accordingly. There is no loop over
+steps: rotations are prefix products, the other values cumulative sums, in chunks of intervals.
 """
 
 from collections.abc import Callable
@@ -44,8 +44,7 @@ from odocal_ros.nav.strapdown import prefix_product
 Floats = NDArray[np.float64]
 # judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
 STEPS_AT_A_TIME = 2048
-# definition: of the signals (1, w, f) of a step, those that errors of the gyro and of the
-# accelerometer multiply
+# definition: signals (1, w, f) of a step that the errors of gyro and accelerometer multiply
 OF_GYRO, OF_ACCEL = slice(6), np.array([0, 4, 5, 6])
 
 
@@ -140,7 +139,7 @@ class _Chunk:
         back = quat_conjugate(q[self.key[:-1]])[self.own]
         self.R = matrix_from_quat(quat_multiply(back, q[:-1]))
         self.R_end = matrix_from_quat(quat_multiply(back[self.key[1:] - 1], q[self.key[1:]]))
-        # a turn that grows over the step acts on the force's moment about its begin
+        # a rotation that grows over the step multiplies the force times the time since its start
         self.grows = np.eye(3) + skew(self.turn) / 3
         dv, dp, turned = imu.dv[rows], imu.dp[rows], turn(self.grows, gyro)
         dv, dp = (dv - np.cross(turned, dv - dp / dt) - turn(self.G, accel),
@@ -150,7 +149,7 @@ class _Chunk:
         self.p, self.dp = self._running(self.v * dt + self.step_p)
         # integrals of R over a step, single and double
         self.mean, self.twice = self.R @ self.G, self.R @ self.GG * dt[:, None]
-        # what biases, and constants of gyro and accelerometer, multiply
+        # signals that biases and constants of gyro and accelerometer multiply
         self.signals = np.concatenate([dt, imu.signals[rows]], axis=1)
         self.since = self.t[:-1] - self.t[self.key[:-1]][self.own]      # s, begin of the interval
 
@@ -252,7 +251,7 @@ class _Chunk:
         tau = t - self.t[self.key[interval]]
         A, AA, F, FF, turned, dv_by, dp_by = self._effects(
             self.key[interval], j, dv, dp, tau[:, None, None])
-        # those in the step itself
+        # errors within the step itself
         share, by = (h / dt)[:, None], self.signals[j]
         own, moved = _gyro(_by(self.mean[j] * share, by[:, OF_GYRO])), self.step_v[j] * (h / dt)
         by = by[:, OF_ACCEL]

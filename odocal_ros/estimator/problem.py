@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The estimation problem of a leg as a record: what does not change from pass to pass."""
+"""The estimation problem of a leg: data that is the same in all iterations."""
 
 from dataclasses import dataclass, field
 
@@ -24,13 +24,13 @@ class Problem:
     grade: Grade
     priors: Priors
     within: np.ndarray       # (k,) bool, fixes within the keyframes
-    use: np.ndarray          # (k,) bool, of these the ones that are used
+    use: np.ndarray          # (k,) bool, fixes that are used
     root: np.ndarray         # (m, 3, 3) inverse roots of the stated covariances
     still: np.ndarray        # (N,) bool
-    outside: dict[str, Outside]    # within the keyframes, where there are any
-    own: dict[str, slice]    # of their constants, by source: those that no other leg shares
+    outside: dict[str, Outside]    # within the keyframes
+    own: dict[str, slice]    # slices of their constants, by source, that no other leg shares
     turned: float            # rad, in turns
-    fix_time: float          # s, as gnss.correlation_time: 0 white, NaN to be judged
+    fix_time: float          # s, as gnss.correlation_time: 0 white, NaN estimated
     rate_b: np.ndarray       # (N, 3) rad/s, measured at the keyframes
     swings: np.ndarray       # (K, 3, 3) rad^2, of the angles within the intervals
     drift_time: np.ndarray   # (K,) s, in which the correlated fix error changes

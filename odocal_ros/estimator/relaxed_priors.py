@@ -26,7 +26,7 @@ def relaxed(first: Priors, now: Priors, state: State, solved: Solved,
     P0 = np.diagonal(marginals[0])[:n]
     variance = np.diag(solved.covariance)
     constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
-    constants[IMPERFECT] = now.constants[IMPERFECT]       # whose sizes are levels
+    constants[IMPERFECT] = now.constants[IMPERFECT]       # their sizes are levels
     # the grid holds that offset; times are of receivers as they are made
     held = [SPEED_OFFSET, FIX_TIME]
     constants[held] = now.constants[held]
@@ -41,7 +41,7 @@ def _wider(first: Floats, now: Floats, off: Floats, variance: Floats) -> Floats:
     """
     Return sigmas for which ``off`` is at most RELAXED_BEYOND sigmas, none below the first.
 
-    At most 30 times the first: a prior farther off is a wrong setting, which is reported.
+    At most 30 times the first: a larger difference is a wrong setting, which is reported.
     """
     held = np.isfinite(first)
     first_, now_ = np.where(held, first, 1.0), np.where(held, now, 1.0)

@@ -44,7 +44,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     Combine the smoother results of several legs of one vehicle.
 
     results : those with a border, at least one.   times_ns : when each leg was driven.   config :
-    limits, ``verdict.scale_drift_per_day``.   numbers : of the legs in messages, 1, 2, ... by
+    limits, ``verdict.scale_drift_per_day``.   numbers : of the legs in reasons, 1, 2, ... by
     default; 0: legs of an earlier result.
 
     Returns
@@ -140,21 +140,21 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
     """Return the reasons for constants in which legs differ, with the leg that differs most."""
     J, said = len(found.deviation), list[Reason]()
     apart = {name: found.deviation[:, found.names.index(name)] for name in found.disputed}
-    # what is determined with a parameter differs with it
+    # parameters correlated with a disputed one differ as well
     worst = max((np.abs(z).max() for n, z in apart.items() if n in PARAMETERS), default=0.0)
     for name, z in apart.items():
         k = int(np.argmax(np.abs(z)))
         if name not in PARAMETERS and abs(z[k]) < max(FAULT_SIGMAS, worst):
             continue
-        # two legs differ from each other by the same
-        who = f', {_name(numbers[k])} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
+        # two legs have the same deviation from each other
+        who = f'; {_name(numbers[k])} differs most ({z[k]:+.1f} sigma from the others)' * (J > 2)
         said.append(Reason(
-            Code.LEGS_DISAGREE, f'{name}: the {J} legs differ {np.sqrt((z**2).mean()):.1f} times '
-            f'more than their uncertainties{who}', DELAY_DIFFERS if 'delay' in name else ''))
+            Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
+            f'times their uncertainties{who}', DELAY_DIFFERS if 'delay' in name else ''))
     if found.factor > 1:
         said.append(Reason(
-            Code.LEGS_DISAGREE, f'the {J} legs differ {found.factor:.1f} times more than their '
-            'uncertainties, in other parameters than the ones listed'))
+            Code.LEGS_DISAGREE, f'the scatter of {J} legs in parameters that are not listed is '
+            f'{found.factor:.1f} times their uncertainties'))
     return tuple(said)
 
 

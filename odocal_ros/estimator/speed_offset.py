@@ -19,7 +19,7 @@ from odocal_ros.estimator.state import Priors, SPEED_OFFSET
 
 def judge_offset(problem: Problem, now: Fit, trace: Trace | None = None) -> Fit:
     """
-    Return a fit with the offset of a coarse speed taken as that of truncation or of rounding.
+    Return a fit with the offset of a coarse speed fixed to that of truncation or of rounding.
 
     Unchanged if the likelihood ratio is below 1000 to 1, or if the nearer one is 3.5 sigmas off
     (one correct drive in 2000).
@@ -37,7 +37,7 @@ def judge_offset(problem: Problem, now: Fit, trace: Trace | None = None) -> Fit:
     constants[SPEED_OFFSET] = known
     summary = now.summary()
     del now             # the equations of one fit at a time
-    sure = 1e-3 * coarse.step       # as good as exact
+    sure = 1e-3 * coarse.step       # practically fixed
     about = replace(summary, priors=_held(summary.priors, known, sure),
                     first=_held(summary.first, known, sure))
     last = fit(problem, replace(about.state, constants=constants), about.levels, AGAIN_PASSES,

@@ -29,17 +29,17 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.rotations import skew
 
-# s each side, over which a speed is taken: some rows of an odometer. Judgement
+# s each side, for the mean of a speed: some rows of an odometer. Judgement
 SPEED_WINDOW = 0.4
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A first state, and how well it is known."""
+    """A first state and its uncertainty."""
 
     state: State
     yaw_sigma: float        # rad, of the heading by acceleration
-    fix_spread: float       # m, of the fixes about the track
+    fix_spread: float       # m, scatter of the fixes about the track
 
 
 def standing(leg: SmootherLeg, t: Floats) -> Bools:
@@ -65,10 +65,10 @@ def rest_bias(leg: SmootherLeg, imu: ImuSteps) -> tuple[Floats, float]:
 def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
                 yaw: float | None = None) -> Start:
     """
-    Return a state to start from.
+    Return the first state of a cold start.
 
-    leg : the leg.   imu : its IMU steps with the keyframes.   priors : turn-on bias.   yaw : yaw
-    mounting to start from, rad, in place of that found from accelerations.
+    leg : the leg.   imu : its IMU steps with the keyframes.   priors : turn-on bias.   yaw :
+    initial yaw mounting, rad, instead of the one estimated from accelerations.
     """
     bias, rest = rest_bias(leg, imu)
     sigma = np.full(3, 2e-4) if rest else np.maximum(priors.gyro_bias, 1e-3)
@@ -113,7 +113,7 @@ def _level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     """Return up in the frame of the first keyframe and the change of the gyro bias: (3,) each."""
     C, T = C_0k[:-1], sums.T
     force = np.einsum('kij,kj->ki', C, sums.dv) / T[:, None]
-    turned = np.cumsum(C @ sums.A, axis=0)                  # by one rad/s of bias: end of interval
+    turned = np.cumsum(C @ sums.A, axis=0)       # of one rad/s of bias, at interval ends
     turned = turned - C @ sums.A / 2
     g = gravity(leg.origin.latitude, leg.origin.height)
     up = np.median(force, axis=0)
@@ -139,7 +139,7 @@ class _Track:
 
     X : (N,) travel units, complex.   K : m per unit.   chi : rad, rotation to the fixes at the
     first keyframe.   slope : rad/s, its change, None without fixes.   place : (N,) m, east + i
-    north.   height : (N,) m.   spread : m, of the fixes about the track.
+    north.   height : (N,) m.   spread : m, scatter of the fixes about the track.
     """
 
     def __init__(self, leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals) -> None:
@@ -191,7 +191,7 @@ def _rotation(moved: Complexes, gone: Complexes, sigma: float) -> float:
     Return the mean angle from steps of the track to those of the fixes, rad.
 
     moved, gone : (n,) steps, any unit and m.   sigma : m, of a fix. The weight of a step is its
-    length by the odometer, so that a jump of the fixes has no larger weight.
+    length by the odometer, so that a jump of the fixes does not get a larger weight.
     """
     return float(np.angle((moved.conj() * gone / np.maximum(np.abs(gone), sigma)).sum()))
 
@@ -209,7 +209,7 @@ def _line(t: Floats, y: Floats) -> tuple[float, float]:
 
 
 def _smooth(t: Floats, t_fix: Floats, y: Floats, window: float = 20.0) -> Floats:
-    """Return medians over windows, interpolated to t: outliers do not count."""
+    """Return medians over windows, interpolated to t, without the effect of outliers."""
     if not len(y):
         return np.zeros(len(t))
     cells = np.floor((t_fix - t_fix[0]) / window).astype(int)

@@ -21,7 +21,7 @@ from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.rotations import exp_so3
 
 Floats = NDArray[np.float64]
-# the unknowns of a block, one after the other, and how many each has
+# unknowns of a block in order, and their sizes
 BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
          'accelerometer bias': 3, 'travel error': 1, 'slow fix error, ENU, where there is one': 3}
 P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
@@ -29,11 +29,11 @@ P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
 E = TRAVEL.start
 BARE, WITH_SLOW = SLOW.start, SLOW.stop     # unknowns of a block
 
-# Errors of the IMU's axes: (axis that is wrong, signal that it wrongly contains). Signals of the
+# Errors of the IMU's axes: (axis with the error, signal that it contains). Signals of the
 # gyro are (w_x, w_y, w_z, f_x, f_y), of the accelerometer (f_x, f_y, f_z); f_z in x and y is a
 # bias of a level IMU, not of one mounted at an angle. Three of the 18 are zero by the definition
-# of the axes: z is the axis of turns on level ground, x the direction of a push that the y
-# accelerometer does not show.
+# of the axes: z is the axis of turns on level ground, x the direction of a force that the y
+# accelerometer does not measure.
 GYRO_ERRORS = {
     'gyro_scale_z': (2, 2), 'gyro_scale_x': (0, 0), 'gyro_scale_y': (1, 1),
     'gyro_axis_xy': (0, 1), 'gyro_axis_yx': (1, 0), 'gyro_axis_zx': (2, 0), 'gyro_axis_zy': (2, 1),
@@ -81,18 +81,18 @@ ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_yz')
 # s^2, of a receiver's filter: square of the time constant of the mean of the past, or, below zero,
 # of a filter of position and velocity (nav/receiver_filter.py)
 FIX_LAG2 = CONSTANTS.index('fix_lag_square')
-# m/s: change of the height error, over more time than a leg has
+# m/s: rate of a height error that changes over more time than a leg
 HEIGHT_DRIFT = CONSTANTS.index('fix_height_drift')
-# error of the fixes in stated sigmas, east, north, up: a receiver converges as they fall (S15a)
+# fix errors per stated sigma, east, north, up: they decrease as a receiver converges (S15a)
 BY_SIGMA = constants_from('fix_error_east', 'fix_error_up')
-# of the errors of the fixes, in this leg alone
+# of fix errors, for this leg only
 FIX_ERRORS = constants_from('fix_height_drift', 'fix_error_up')
-# relative: by how much the clock of its stamps is faster than that of the IMU
+# relative: rate of the clock of its stamps minus that of the IMU
 GNSS_CLOCK, ODO_CLOCK = map(CONSTANTS.index, ('gnss_clock_rate', 'odometer_clock_rate'))
 # s^2, of a low-pass filter on the odometer's speed: square of its time constant
 ODO_LAG2 = CONSTANTS.index('odometer_lag_square')
-# of an odometer in the receiver: its relative error, and the time constant, logarithm of s, with
-# which satellites take its places back
+# of an odometer in the receiver: its relative error, and the logarithm of the time constant, s,
+# with which satellites correct its positions
 FIX_BY_MOTION, FIX_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_motion_time'))
 # relative change of the scale from its mean by distance: with the square of the speed (its slope
 # at FAST_SPEED, s/m), with time as tyres warm (its rate at the begin of the leg, 1/s), and with
@@ -100,17 +100,17 @@ FIX_BY_MOTION, FIX_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_moti
 TYRES = constants_from('scale_by_speed', 'scale_by_braking')
 BY_SPEED, BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
 FAST_SPEED = 20.0           # m/s, definition: at which the slope is stated, a country road
-# of the path, by half the mean square of the angle by which the body pitches in an interval: 1 if
-# the axle keeps its direction, 0 if it follows the body, less if bumps are shorter than both
+# of the path, per half the mean square of the body pitch in an interval: 1 if the axle keeps its
+# direction, 0 if it follows the body, negative if bumps are shorter than the wheelbase
 BY_PITCHING = CONSTANTS.index('scale_by_pitching')
 # of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
-# change, rad per m/s^3: a body reacts late, tyres at once
+# change, rad per m/s^3: the body reacts with a delay, tyres immediately
 LEAN = constants_from('squat', 'sideslip_by_jerk')
 # m, ahead of the odometer: points about which the body pitches on hills, and in addition on bumps
 PITCH_CENTRE = constants_from('pitch_centre', 'pitch_centre_of_bumps')
 # deviations from an ideal vehicle
 IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre_of_bumps')
-# kinds of these with one size each, and their numbers of constants
+# kinds of deviations with one common size each, and their numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
               'clock_rate': 2, 'odometer_lag_square': 1,
@@ -120,15 +120,15 @@ KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'acceleromete
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECT
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')
-# of a GNSS velocity: delay of its stamps, s, square of the time constant by which the receiver
-# smooths it, s^2, and by how much it is too large, relative
+# of a GNSS velocity: delay of its stamps, s, square of the time constant of the receiver's filter,
+# s^2, and relative scale error
 VELOCITY = constants_from('velocity_delay', 'velocity_scale')
 VELOCITY_DELAY, VELOCITY_LAG2, VELOCITY_SCALE = range(VELOCITY.start, VELOCITY.stop)
-# of heights by air pressure: m, m/s of weather, m per (m/s)^2 by the wind of driving, relative
-# by the temperature of the air
+# of heights by air pressure: m, m/s by weather, m per (m/s)^2 by dynamic pressure, relative by air
+# temperature
 PRESSURE = constants_from('pressure_offset', 'pressure_scale')
 M = len(CONSTANTS)
-NO_ERROR = 1e-12    # definition: prior sigma of what there is none of, in any unit
+NO_ERROR = 1e-12    # definition: prior sigma of constants that do not apply, in any unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,9 +197,9 @@ class State:
 
 def upright(constants: Floats) -> Floats:
     """
-    Return constants whose pitch is within a quarter turn: the same forward axis, the top up.
+    Return equivalent constants with a pitch within a quarter turn: same forward axis, up positive.
 
-    Far from the answer a step may turn the pitch over, and the lever arms with it.
+    Far from the solution, a step may move the pitch beyond 90 deg and invert the lever arms.
     """
     if abs(constants[PITCH]) <= np.pi / 2:
         return constants
@@ -220,7 +220,7 @@ def C_bv(forward: Floats, up: Floats) -> Floats:
 
 
 def _turned_axes(C: Floats, up: Floats, by_forward: Floats) -> Floats:
-    """Return the derivative of C_bv by what turns the forward axis by ``by_forward``: (3, 3)."""
+    """Return the derivative of C_bv, from that of the forward axis: (3, 3)."""
     forward, left = C[:, 0], C[:, 1]
     size = np.linalg.norm(np.cross(up, forward))
     by_left = np.cross(up, by_forward) / size

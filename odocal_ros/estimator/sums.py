@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What preintegration returns, docs/method.md (S4): sums over intervals, and to times in them."""
+"""Preintegrated sums over intervals, and up to times within them: docs/method.md (S4)."""
 
 from dataclasses import dataclass, fields
 
@@ -26,13 +26,13 @@ class Intervals:
     #                  millimetres off, which would determine a scale that is not observable
     FF: Floats       # (K, 3, a) its integral: d dp = -FF d constants
     # by the gyro bias (3) and by the constants of GYRO (g)
-    turned: Floats   # (K, 3, 3 + g) the end turns by -turned d; the first three are A
+    turned: Floats   # (K, 3, 3 + g) rotation of the end: -turned d; the first three are A
     dv_by: Floats    # (K, 3, 3 + g) derivative of dv
     dp_by: Floats    # (K, 3, 3 + g)
     S: Floats        # (K, 3, 3) sum of R over travel, scale units
     S_by: Floats     # (K, 3, 3 + g) derivative of S @ forward
-    mean_rate: Floats   # (K, 3) mean turn rate as measured, bias and all, rad/s
-    mean_force: Floats  # (K, 3) mean specific force as measured, m/s^2
+    mean_rate: Floats   # (K, 3) mean measured turn rate, with bias, rad/s
+    mean_force: Floats  # (K, 3) mean measured specific force, m/s^2
     longest_step: Floats   # (K,) longest gap between IMU rows, s
 
     def take(self, rows: slice) -> 'Intervals':
@@ -58,9 +58,9 @@ class Points:
     dp_by: Floats    # (m, 3, 3 + g)
     force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
     rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
-    spin: Floats     # (m, 3) rad/s^2, by which that rises
-    measured: Floats    # (m, 6) turn rate and specific force as measured, means of the step
+    spin: Floats     # (m, 3) rad/s^2, its rate of change
+    measured: Floats    # (m, 6) measured turn rate and specific force, means of the step
 
     def take(self, index: Ints) -> 'Points':
-        """Return the points that an index picks."""
+        """Return the points selected by an index."""
         return Points(**{f.name: getattr(self, f.name)[index] for f in fields(self)})

@@ -25,7 +25,7 @@ from odocal_ros.estimator.state import State
 
 def steps_of(view: SmootherLeg, spacing: float) -> ImuSteps:
     """
-    Return the steps of a leg with keyframes that stay where they are as it grows.
+    Return the steps of a leg whose keyframes keep their times as it grows.
 
     They lie at multiples of ``spacing``; first and last row are keyframes too.
     """
@@ -44,14 +44,14 @@ def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
     """
     Return the start from the last fit, extended to new keyframes.
 
-    None if keyframes differ, or constants that the fit needs: a sensor has begun to send.
+    None if keyframes differ, or the constants in use: a sensor started to publish.
     """
     t, old = problem.imu.t[problem.imu.key], last.state.t
     rounding = 1e-6     # s
     at = np.clip(np.searchsorted(old, t - rounding), 0, len(old) - 1)
     same = np.abs(old[at] - t) < rounding
     n = len(t) if same.all() else int(np.argmin(same))
-    # s at the end, where rows may have come late
+    # s at the end, in which rows may have arrived late
     if n < 2 or t[n - 1] < old[-1] - 3.0 or last.priors.in_use != problem.priors.in_use:
         return None
     at = at[:n]
@@ -65,7 +65,7 @@ def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
 
 
 def _reckoned(state: State, problem: Problem) -> State:
-    """Return a state reckoned on by gyro and odometer over the keyframes that it lacks."""
+    """Return a state extended by dead reckoning with gyro and odometer to the new keyframes."""
     imu, leg, n = problem.imu, problem.leg, len(state.t)
     key = imu.key[n - 1:]
     rows = replace(imu, key=key)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""calibrate_bags: a fleet's bags from Python, for notebooks."""
+"""calibrate_bags: calibrate the bags of a fleet from Python, for notebooks."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,7 +25,7 @@ def calibrate_bags(bags: Any, config: Any = None, client: Any = None,
     client : distributed.Client, optional
         Client of the workers; None: temporary local processes.
     output : path, optional
-        Folder for the rows, which are used again; None: a temporary one.
+        Folder for the rows, which later calls reuse; None: a temporary folder.
     **options
         Options of ``replay`` by name: imu_topic, leg, method and the like; vehicle_from.
 

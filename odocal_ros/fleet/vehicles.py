@@ -32,6 +32,7 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.levels import DAY_NS
 
 FEWEST_REJECTED = 2             # judgement: last legs, all rejected; one alone may be a bad drive
+LOOK_AT_BAGS = 'See the column failures of vehicles.parquet for the reason of each bag.'
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,7 @@ def rejected_from(driven: Sequence[Driven]) -> int:
                     if one.leg.verdict is not Verdict.REJECTED), default=-1)
 
 
-def gone(lost: Sequence[Driven]) -> Reason:
+def all_rejected(lost: Sequence[Driven]) -> Reason:
     """Return the reason why the current state of a vehicle is unknown."""
     last = rejecting(lost[-1].leg)[0]
     since = f'{utc(lost[0].leg.start_ns):%Y-%m-%d}'
@@ -161,7 +162,7 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     calibration = combine([one.leg for one in now], config, imu=known_imu(config))
     lost = driven[rejected_from(driven):]
     if len(lost) >= FEWEST_REJECTED and calibration.verdict is not Verdict.REJECTED:
-        calibration = replace(calibration, reasons=(gone(lost), *calibration.reasons))
+        calibration = replace(calibration, reasons=(all_rejected(lost), *calibration.reasons))
     row |= _current(calibration, config, driven, starts) | _changes(histories, driven) \
         | {'rejected_for': ' '.join(dict.fromkeys(
             r.code.name for one in driven for r in rejecting(one.leg))),
@@ -179,13 +180,13 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
     return row | none | {
         'legs': 0, 'legs_good': 0, 'distance_km': 0.0, 'driven_h': 0.0, 'first': None,
         'last': None, 'unit': '', 'since': None, 'verdict': Verdict.REJECTED.value,
-        'decision': decision, 'why': 'no bag could be calibrated', 'remedy':
-        'See the reasons of the bags.', 'reasons': '', 'changes': '[]', 'odd_legs': '',
+        'decision': decision, 'why': f'none of {row["bags"]} bags could be calibrated',
+        'remedy': LOOK_AT_BAGS, 'reasons': '', 'changes': '[]', 'odd_legs': '',
         'rejected_for': '', 'rejected_since': None,
         'drift_per_year': None, 'drift_per_year_sigma': None, 'drift_per_1000_km': None,
         'drift_per_1000_km_sigma': None, 'now': [], 'report': None, 'line': json.dumps(
             {'vehicle': row['vehicle'], 'decision': decision,
-             'why': row['failures'], 'remedy': 'See the reasons of the bags.', 'values': {},
+             'why': row['failures'], 'remedy': LOOK_AT_BAGS, 'values': {},
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
 
 

@@ -17,8 +17,8 @@ from odocal_ros.pipeline.methods import METHODS
 from odocal_ros.screening.glitches import Oriented, oriented
 from odocal_ros.settings.config import Config, DIFFERENTIAL, MECANUM, OMNI, SKID, with_settings
 
-EXACT_HEADING = 1e-6      # rad; judgement: of a heading with a configured sigma of 0
-COURSE_FIX_SIGMA = 1.5    # m; physical: fixes of a single receiver, for a course
+EXACT_HEADING = 1e-6      # rad; judgement: sigma of a heading whose configured sigma is 0
+COURSE_FIX_SIGMA = 1.5    # m; physical: sigma of a fix of a single receiver
 SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topic',
            'imu_orientation': 'the IMU orientation', 'gyrocompass': 'the gyrocompass'}
 # values of the planar estimator
@@ -40,7 +40,7 @@ class Received:
 
     variances : of the yaw by ``heading_topic`` and ``imu_orientation``, rad^2; inf if none is
     sent.   rested_s : length of the current or last standstill.   latitude : rad.   height : the
-    fixes have one.   has_accelerometer : the IMU has an accelerometer.   imu : there is one.
+    fixes have a height.   has_accelerometer : of the IMU.   imu : an IMU is present.
     """
 
     variances: dict[str, float]
@@ -54,7 +54,7 @@ class Received:
 
 @dataclass(frozen=True)
 class Ability:
-    """Observable quantities, unobservable ones with the cause, and a weakness of all."""
+    """Observable quantities, unobservable ones with the cause, and a limitation of all values."""
 
     can: tuple[str, ...]
     cannot: tuple[str, ...]

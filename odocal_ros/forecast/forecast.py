@@ -13,6 +13,8 @@ from odocal_ros.reasons import Reason
 
 PERCENT_FROM = 0.01       # judgement: relative sigma from which it is printed in per cent
 FARTHEST_M = 2e4          # judgement: limit of a useful forecast of the remaining distance
+# definition: shown if more driving does not help
+UNREACHABLE = f'the limit is not reached within another {FARTHEST_M / 1000:.0f} km'
 # judgement: standstill at a predicted end; it gives the level and the gyro bias
 REST_FORESEEN_S = 10.0
 SOURCE_SHARE = 0.01    # judgement: of the variance; smaller sources are not listed
@@ -32,7 +34,7 @@ class Prospect:
     sigma, asked : predicted, required sigma, relative or rad; None: not determined so far.
     metres : remaining distance to the limit, m; 0: reached, None: unreachable.
     sources : (name, sigma) of the largest errors, in order.
-    why : cause why more driving does not reach the limit.
+    why : reason why more driving does not reach the limit.
     now : the value so far, as text, if it is determined before the end.
     lack : required manoeuvres, besides distance.
     """
@@ -61,7 +63,7 @@ class Prospect:
             return f'{known}: {self.why}'
         if self.metres == 0.0:
             return f'OK: {known} (limit {asked})'
-        more = f'drive {_rounded_up(self.metres)} m more for the limit of {asked} {unit}'
+        more = f'drive {_rounded_up(self.metres)} m more to reach the limit of {asked} {unit}'
         if sigma is None:
             return f'{name} is not determined yet; {more}'
         return f'{known} so far; {more}' if self.now else (
@@ -125,7 +127,7 @@ class Forecast:
     def age_s(self, stamp_ns: int) -> float:
         """Return the time from the estimate to a stamp, s; NaN if the stamp is not after it."""
         age = (stamp_ns - self.until_ns) * 1e-9
-        return age if age >= 0 else math.nan       # wild stamps, or the IMU has stopped
+        return age if age >= 0 else math.nan       # implausible stamps, or the IMU has stopped
 
 
 def better(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None:

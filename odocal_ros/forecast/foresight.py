@@ -27,6 +27,7 @@ from odocal_ros.forecast.forecast import (
     Prospect,
     REST_FORESEEN_S,
     sources_of,
+    UNREACHABLE,
 )
 from odocal_ros.forecast.planned_drive import inserted, PlannedDrive, REST_SPEED
 from odocal_ros.forecast.predict import metres_to_go, predict, Prediction, Sigmas
@@ -105,7 +106,7 @@ def _by_ends(leg: Leg, fix_rate: float, config: Config,
         metres = 0.0 if sigma is not None and sigma <= asked else None
         if metres is None and not why:
             metres = metres_to_go(drive, sigmas, parameter, asked, FARTHEST_M)
-            why = f'even {FARTHEST_M / 1000:.0f} km more do not reach the limit'
+            why = UNREACHABLE
         return Prospect(sigma, asked, metres, sources_of(now.method, parameter), why)
 
     limits = config.verdict

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.choice import choose, deciding, worth_saying
+from odocal_ros.calib.choice import choose, deciding, relevant_reasons
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.estimator.chain import NotPositive, solve
 from odocal_ros.estimator.equations import Equations
@@ -154,7 +154,7 @@ class Plan:
         """
         said = list(self.two_point.of_drive)
         for name in self.methods:
-            own = worth_saying(self.reasons_of(name), name, self.estimates)
+            own = relevant_reasons(self.reasons_of(name), name, self.estimates)
             if name == 'smoother':
                 own = tuple(r for r in self.reasons_of(name) if r in own
                             or r.code.name.endswith('_NOT_DETERMINED'))

@@ -21,6 +21,7 @@ from odocal_ros.forecast.forecast import (
     Forecast,
     Prospect,
     sources_of,
+    UNREACHABLE,
     WheelsForecast,
 )
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
@@ -122,7 +123,7 @@ def _scale(running: Running, asked: float) -> Prospect:
     if now and e.unit != '1':
         now += f' {e.unit}'
     return Prospect(sigma, asked, metres, sources_of(running.method, SCALE),
-                    f'even {FARTHEST_M / 1000:.0f} km more do not reach the limit', now)
+                    UNREACHABLE, now)
 
 
 def _slow_share(running: Running) -> float:
@@ -192,5 +193,4 @@ def _planar_scale(result: LegResult, asked: float) -> Prospect:
     metres = result.distance * max((sigma / asked)**2 - 1, 0.0) if asked else math.inf
     return Prospect(
         sigma, asked, metres if metres <= FARTHEST_M else None,
-        why=f'even {FARTHEST_M / 1000:.0f} km more do not reach the limit',
-        now=digits(scale.value, scale.sigma))
+        why=UNREACHABLE, now=digits(scale.value, scale.sigma))

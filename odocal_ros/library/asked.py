@@ -23,6 +23,8 @@ Settings = Config | Mapping[str, object] | str | Path | None
 Leg = str | tuple[float | None, float | None]
 EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
 EACH_STOP = 'each-stop'
+LEG_FORMS = ("required: 'A:B' or (A, B) in seconds, 'A/B' for ISO 8601 dates, or "
+             f"'{EACH_STOP}'")
 
 
 class Listener:
@@ -89,8 +91,8 @@ def topics_of(asked: Any) -> dict[str, str]:
                        f"'/imu/data'}}, not {type(asked).__name__}")
     unknown = [one for one in asked or () if one not in TOPICS]
     if unknown:
-        raise BadUsage(f'topics: {brief_line(repr(unknown[0])[:100])} is no slot; required: '
-                       f'{", ".join(TOPICS)}')
+        raise BadUsage(f'topics: {brief_line(repr(unknown[0])[:100])} is not a slot; required: '
+                       f'one of {", ".join(TOPICS)}')
     return dict(asked or {})
 
 
@@ -127,7 +129,7 @@ def legs_of(asked: Iterable[Leg] | Leg | None) -> list[LegSpan | str]:
     if asked is None:
         return []
     if not isinstance(asked, Iterable):
-        raise BadUsage(f"legs: {asked!r} is neither 'A:B', 'A/B', 'each-stop' nor (A, B)")
+        raise BadUsage(f'legs: {asked!r}: {LEG_FORMS}')
     one_alone = isinstance(asked, str) or isinstance(asked, tuple) and _is_pair(asked)
     wanted: Iterable[Any] = [asked] if one_alone else asked
     return [one if one == EACH_STOP else parse_leg(_text(one)) for one in wanted]
@@ -141,7 +143,7 @@ def _text(leg: Any) -> str:
     if isinstance(leg, str):
         return leg
     if not (isinstance(leg, tuple) and _is_pair(leg)):
-        raise BadUsage(f"legs: {leg!r} is neither 'A:B', 'A/B', 'each-stop' nor (A, B)")
+        raise BadUsage(f'legs: {leg!r}: {LEG_FORMS}')
     return ':'.join('' if edge is None else f'{float(edge):.9f}' for edge in leg)
 
 
@@ -169,8 +171,8 @@ def _edge(text: str, whole: str) -> tuple[int | None, bool]:
         seconds = Decimal(text)
         if seconds.is_finite():
             if seconds.copy_abs() >= LATEST_NS // 10**9:
-                raise BadUsage(f'--leg {whole}: {text[:40]} is not a valid time: beyond the year '
-                               '2116')
+                raise BadUsage(f'--leg {whole}: {text[:40]} is out of range; the limit is the '
+                               'year 2116')
             return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH
     except InvalidOperation:
         pass
@@ -183,5 +185,5 @@ def _edge(text: str, whole: str) -> tuple[int | None, bool]:
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
     whole_ns = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
     if abs(whole_ns) >= LATEST_NS:
-        raise BadUsage(f'--leg {whole}: {text} is not a valid time')
+        raise BadUsage(f'--leg {whole}: {text} is out of range; the limit is the year 2116')
     return whole_ns, False

@@ -17,7 +17,12 @@ from odocal_ros.bagio.write import write_bag
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.export_pictures import draw_map, draw_scale_by_speed, scale_by_speed
+from odocal_ros.library.export_pictures import (
+    draw_map,
+    draw_scale_by_speed,
+    LOCAL,
+    scale_by_speed,
+)
 from odocal_ros.library.series import Left, left_in, residuals, Series, stacked, states, trajectory
 from odocal_ros.output.drawing import PICTURES
 from odocal_ros.outside.whole import whole_file
@@ -84,8 +89,7 @@ def kml(columns: Series) -> str:
     """Return the track of each leg as a line on the ground, for Google Earth."""
     ElementTree.register_namespace('', KML)
     if np.isnan(columns['latitude_deg']).all():
-        raise BadUsage('export: track.kml: the positions are in a local frame, which has no place '
-                       'on a map; use trajectory.csv or trajectory.tum')
+        raise BadUsage(f'export: track.kml: {LOCAL}')
     root = ElementTree.Element(f'{{{KML}}}kml')
     document = ElementTree.SubElement(root, f'{{{KML}}}Document')
     for leg in np.unique(columns['leg']).tolist():

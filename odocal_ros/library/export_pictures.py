@@ -17,6 +17,8 @@ from odocal_ros.library.series import Series
 from odocal_ros.output.geojson import features
 
 POINTS = 400     # judgement: of a line or of the fixes, for a small file
+LOCAL = ('the positions are in a local frame, which has no place on a map; use trajectory.csv or '
+         'trajectory.tum')
 FIT = {'factor': 'm_per_unit', 'offset': 'm_per_s', 'lag': 's'}
 
 
@@ -30,8 +32,7 @@ def draw_map(result: Calibration, path: Path) -> None:
     shapes = [feature for number, leg in enumerate(result.legs, 1)
               for feature in features(number, leg, POINTS)]
     if not shapes:
-        raise BadUsage(f'export: {path}: the positions are in a local frame, which has no place '
-                       'on a map; use trajectory.csv or trajectory.tum')
+        raise BadUsage(f'export: {path}: {LOCAL}')
     with look():
         save_figure(map_figure(shapes), path)
 

@@ -154,7 +154,7 @@ def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | st
     if marks:
         return _marked(marks, last, bag)
     if config.leg.automatic:
-        return by_themselves(recorder, last, config) or [(first, last)]
+        return automatic_legs(recorder, last, config) or [(first, last)]
     return [_by_standstill(first, last, stops_known())]
 
 
@@ -177,7 +177,7 @@ def _ends(recorder: LegRecorder) -> dict[str, tuple[int, int]]:
     """Return the first and the last stamp of each required slot that has stamps."""
     rows = {slot: recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')}
     stamps = {slot: s[s > 0] for slot, s in rows.items()}
-    # percentiles of order, not extremes: one wild stamp must not move the leg
+    # percentiles, not extremes: one implausible stamp must not move the leg
     return {slot: (int(np.median(s[:5])), int(np.median(s[-5:]))) if len(s) > 20
             else (int(s.min()), int(s.max())) for slot, s in stamps.items() if len(s)}
 
@@ -222,7 +222,7 @@ def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
     return first + np.round(spans * 1e9).astype(np.int64), (metres, float(path_length[-1]))
 
 
-def by_themselves(recorder: LegRecorder, last: int, config: Config) -> Spans:
+def automatic_legs(recorder: LegRecorder, last: int, config: Config) -> Spans:
     """Return the legs that the node would start and end automatically."""
     search = LegSearch(config)
     for slot in ('fix', 'imu', 'odometer'):

@@ -147,7 +147,7 @@ def _whole(method: MethodResult) -> MethodResult:
 
 def ranked(found: list[Change], before: Plan, parameter: str) -> list[Change]:
     """Return the changes that help a parameter, best first."""
-    worth = 0.98    # of a sigma: a change that leaves more is no help
+    worth = 0.98    # of a sigma: a change that leaves more is not listed
     helpful = [c for c in found if c.gain(before, parameter) > 1 / worth]
     return sorted(helpful, key=lambda c: (-c.gain(before, parameter), c.sigma(parameter)))
 

@@ -111,10 +111,12 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
         heights = np.array([float(_child(p, 'ele') or 'nan') for p in points])
         times = [_seconds(_child(p, 'time')) for p in points]
     except ValueError as error:
-        raise BadUsage(f'{path}: a track point is not readable ({error})') from None
+        raise BadUsage(f'{path}: a track point is not readable ({error}); export '
+                       'the track again as GPX') from None
     lat, lon = np.deg2rad(level).T
     if not (np.abs(lat) < np.pi / 2).all() or not (np.abs(lon) <= 2 * np.pi).all():
-        raise BadUsage(f'{path}: a track point lacks a latitude or longitude in range')
+        raise BadUsage(f'{path}: the latitude or longitude of a track point is missing or out '
+                       'of range; export the track again as GPX')
     known = np.isfinite(heights)
     heights = np.interp(np.arange(len(heights)), np.flatnonzero(known), heights[known]) \
         if known.any() else np.zeros(len(heights))
@@ -159,8 +161,8 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
     begin = np.where(rest, t[b - 1], t[a])
     grid = np.arange(t[0], t[-1], max(DRIVE_STEP, (t[-1] - t[0]) / 50_000))
     if len(grid) < 2 or t[-1] - t[0] > MOST_SECONDS:
-        raise BadUsage(f'{path}: the track lasts {t[-1] - t[0]:.1f} s; the limit is '
-                       f'{MOST_SECONDS / 3600:g} h')
+        raise BadUsage(f'{path}: the track lasts {t[-1] - t[0]:.1f} s; required: above 0 s, '
+                       f'at most {MOST_SECONDS:g} s')
     piece = np.clip(np.searchsorted(t[b], grid), 0, len(b) - 1)
     moving = (grid >= begin[piece]) & (grid <= t[b][piece])
     speed = np.where(moving, (path_length / np.maximum(t[b] - begin, 1e-3))[piece], 0.0)

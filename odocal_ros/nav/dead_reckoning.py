@@ -163,7 +163,7 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
 
 def section_ratio(s: Floats, path: Floats, p: Floats, least: float) -> float | None:
     """
-    Return the median of distance between fixes over distance on a path, None if no section does.
+    Return the median ratio of distance between fixes to distance on a path, None without sections.
 
     s, path, p : (n,) travel, (n, k) path in its units, (n, 2) fixes, m, all at their times. The
     sections are equal in travel, as short as possible with a median of ``least`` m between fixes.

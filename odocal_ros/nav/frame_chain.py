@@ -147,7 +147,7 @@ class FrameChain:
                 good &= near
             position = _placed(values, position)
         first.drop(n)
-        for edge in others:     # the last one before is needed for later positions
+        for edge in others:     # the previous one is needed for later positions
             edge.drop(int(np.searchsorted(edge.stamps, stamps[-1], side='right')) - 1)
         return stamps[good], received[good], position[good]
 

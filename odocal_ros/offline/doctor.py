@@ -61,7 +61,7 @@ def _ros() -> list[tuple[str, str]]:
     """Return the state of the ROS installation."""
     if find_spec('rclpy') is None:
         return [('rclpy', 'none: the node cannot run here, bags can be replayed')]
-    # in a separate process, so that a broken one does no harm
+    # in a separate process: a crash does not end this one
     found = subprocess.run([sys.executable, '-c', PROBE], capture_output=True, text=True)
     if found.returncode:
         return [('rclpy', f'BROKEN: {(found.stderr.strip().splitlines() or ["?"])[-1]}')]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.bagio.read import Bag
-from odocal_ros.calib.drive import way_and_chord
+from odocal_ros.calib.drive import path_and_chord
 from odocal_ros.calib.judge import far_from_nominal
 from odocal_ros.calib.mounting import mounting, with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
@@ -67,7 +67,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
     drive = survey.survey_drive(inputs, config)
-    path_length, chord = way_and_chord(drive.t_fix, drive.fixes_n, inputs.least_motion)
+    path_length, chord = path_and_chord(drive.t_fix, drive.fixes_n, inputs.least_motion)
     driven = _driven(inputs, drive)
     long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %
     scale = path_length / driven if long and driven else drive.scale
@@ -165,8 +165,8 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, 
     def described(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
         here = (drive.t_fix >= start) & (drive.t_fix <= stop)
-        path_length, chord = way_and_chord(drive.t_fix[here], drive.fixes_n[here],
-                                           inputs.least_motion)
+        path_length, chord = path_and_chord(drive.t_fix[here], drive.fixes_n[here],
+                                            inputs.least_motion)
         return {'start': base + start, 'stop': base + stop, 'way': path_length,
                 'chord': chord} | more
 

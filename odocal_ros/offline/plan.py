@@ -49,12 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'floor: straight, square, figure_eight or spot (default: all)')
     add('--reference', metavar='NAME', help='with --indoor: mocap, total_station, slam, amcl or '
         'marks (default slam)')
-    add('--drive', metavar='NAME', help='with --indoor: as odometer.drive (default differential)')
+    add('--drive', metavar='NAME', help='with --indoor: drive of the robot, as in '
+        'odometer.drive (default differential)')
     add('--no-imu', action='store_true', help='with --indoor: a robot without an IMU')
     add('--size', type=float, metavar='M', help='with --indoor: length of a straight (default 4)')
-    add('--rounds', type=int, metavar='N', help='with --indoor: how often (default 1)')
-    add('--track-width', type=float, metavar='M', help='with --indoor: distance of left and right '
-        'wheels (default 0.3)')
+    add('--rounds', type=int, metavar='N', help='with --indoor: number of repetitions (default 1)')
+    add('--track-width', type=float, metavar='M', help='with --indoor: distance between left and '
+        'right wheels (default 0.3)')
     add('--config', metavar='FILE', help='ROS parameter file, as for replay')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')

@@ -29,10 +29,10 @@ NUMBERS = {
     'nominal_scale': ('K0', 'scale factor as configured'),
     'speed_noise': ('M/S', 'white noise of --odometer speed'),
     'odometer_delay': ('S', 'delay of odometer stamps, s'),
-    'wheel_difference': ('X', 'right scale divided by left scale, minus 1 (default 0.004); of '
-                         'more than 2 wheels 1 sigma of each'),
+    'wheel_difference': ('X', 'right scale divided by left scale, minus 1 (default 0.004); with '
+                         'more than 2 wheels: 1 sigma of each scale'),
     'track_width': ('M', 'distance between left and right wheels (default 1.6; indoor 0.3)'),
-    'wheelbase': ('M', 'distance of the front wheels from the odometer point (default 2.7)'),
+    'wheelbase': ('M', 'distance from the odometer point to the front wheels (default 2.7)'),
     'slip_events': ('N', 'wheel spins per hour of motion'),
     'slip_size': ('M', 'metres lost in each spin (default 0.1)'),
     'start_slip': ('SHARE', 'wheel spin after each start, as a fraction of travel'),
@@ -43,7 +43,7 @@ NUMBERS = {
     'fix_correlation_time': ('S', 'correlation time of --fix-noise correlated (default 60)'),
     'reference_drift': ('X', 'drift of the reference, m per square root of a metre (slam '
                         '0.01, amcl 0.05)'),
-    'drift_length': ('M', 'path in which this drift is forgotten (amcl 2; 0: never)'),
+    'drift_length': ('M', 'correlation length of this drift (amcl 2; 0: it accumulates)'),
     'closure_time': ('S', 'mean time between loop closures of the reference (slam 30; 0: none)'),
     'fix_delay': ('S', 'delay of fix stamps, s'),
     'outliers': ('SHARE', 'fraction of outliers among the fixes, 0 to 0.5'),
@@ -53,7 +53,7 @@ NUMBERS = {
     'velocity_rate': ('HZ', 'rate of /fix_velocity (default 10)'),
     'velocity_correlation_time': ('S', 'correlation time of its errors (default 0: white)'),
     'velocity_delay': ('S', 'delay of its stamps, s'),
-    'velocity_lag': ('S', 'time constant of its smoothing'),
+    'velocity_lag': ('S', 'time constant of its low-pass filter'),
     'velocity_scale_error': ('X', 'relative scale error; positive: too large (default 0)'),
     'velocity_outliers': ('SHARE', 'fraction of outliers in it, 0 to 0.5'),
     'height': ('M', 'ellipsoidal height at the start (default 50)'),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.drive import way_and_chord, white_noise, within_reach
+from odocal_ros.calib.drive import path_and_chord, white_noise, within_reach
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import across, lengths, median, medians
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
@@ -198,7 +198,7 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
     fixes_n = origin_amid(t, geodetic).to_n(geodetic)
     near = within_reach(t, fixes_n)
     t, t_ns, fixes_n = t[near], t_ns[near], fixes_n[near, :2]
-    path_length = way_and_chord(t, fixes_n)[0]
+    path_length = path_and_chord(t, fixes_n)[0]
     if path_length == 0:
         return None
     # of a usual cell: fix noise of both ends is below 15 % of its length, s and m

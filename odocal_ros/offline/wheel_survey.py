@@ -151,6 +151,6 @@ def in_words(facts: list[dict[str, Any]]) -> list[str]:
         side = f'; {f["side"]} side (matches gyro)' if f['side'] else ''
         grows = f', {f["scale"]:.3g} m/{f["unit"].rstrip("s")}' if f['scale'] else ''
         kind = f'a wheel{grows}{side}' if f['rolls'] else 'no wheel'
-        return (f'{f["key"]} travels {f["way"]:.5g} {f["unit"]} in all, range {f["span"]:.5g} '
+        return (f'{f["key"]} travels {f["way"]:.5g} {f["unit"]} in total, range {f["span"]:.5g} '
                 f'{f["unit"]}: {kind}')
     return [one(f) for f in facts]

@@ -204,7 +204,7 @@ def is_worse(old: Stored, new: Stored) -> str:
         codes = ', '.join(dict.fromkeys(rejecting[:3] or new.reasons[:3]))
         return f'the new result is rejected ({codes}), the old one is {old.verdict.value}'
     if old.legs and old.legs < new.legs \
-            or old.carried and new.carried and new.carried.goes_on_from(old.carried):
+            or old.carried and new.carried and new.carried.includes(old.carried):
         return ''
     for name in ('scale_factor', *wheel_factors(old.estimates), 'yaw_mounting_angle'):
         why = _worse(name.replace('_', ' '), old.estimates.get(name), new.estimates.get(name))

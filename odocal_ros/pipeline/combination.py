@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.carried import Carried
-from odocal_ros.calib.choice import choose, worth_saying
+from odocal_ros.calib.choice import choose, relevant_reasons
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.one_vehicle import unlike_legs
@@ -56,7 +56,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
         known = {(r.code, r.text) for r in reasons}
         rejecting = {r.code for r in reasons if r.code.gravity is Verdict.REJECTED}
         nominal = nominal_scale(config, estimates['scale_factor'].unit)
-        own = [r for n in giving for r in worth_saying(methods[n].reasons, n, estimates)
+        own = [r for n in giving for r in relevant_reasons(methods[n].reasons, n, estimates)
                if len(legs) == 1 or r.code in OF_ALL
                or n in on_border and r.code in ON_BORDER]
         reasons += [r for r in (*own, *judge(estimates, nominal, config))
@@ -152,7 +152,7 @@ def _leg_reasons(legs: Sequence[LegResult], good: Sequence[LegResult], twice: Se
         prefix = f'leg {number}: ' if len(legs) > 1 else ''
         methods = [leg.methods[n] for n in giving if n in leg.methods]
         own = [*leg.reasons, *(r for m in methods
-                               for r in worth_saying(_further(m, leg), m.name, estimates)
+                               for r in relevant_reasons(_further(m, leg), m.name, estimates)
                                if alone or r.code not in PER_LEG
                                and not (m.border and r.code in ON_BORDER))]
         if leg in twice:

@@ -12,7 +12,7 @@ import numpy as np
 
 from odocal_ros.calib.agreement import disagreements
 from odocal_ros.calib.choice import choose, deciding, passed_over
-from odocal_ros.calib.drive import way_and_chord
+from odocal_ros.calib.drive import path_and_chord
 from odocal_ros.calib.failed import failed, raised_if_wild
 from odocal_ros.calib.result import AS_SENT, LegResult, MethodResult
 from odocal_ros.calib.two_point import unsolved
@@ -134,7 +134,7 @@ def _path_of(t_fix: Floats, geodetic: Floats, least: float) -> float:
     if not len(t_fix):
         return 0.0
     fixes_n = origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic))
-    return way_and_chord(t_fix, fixes_n, least)[0]
+    return path_and_chord(t_fix, fixes_n, least)[0]
 
 
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:

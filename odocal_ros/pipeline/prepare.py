@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.drive import judge_drive, judge_way, not_moving, uncovered
+from odocal_ros.calib.drive import check_path, judge_drive, not_moving, uncovered
 from odocal_ros.calib.gyro_axes import gyro_axes
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
@@ -100,8 +100,8 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
 
 def checked_with_scale(prepared: PreparedLeg, scale: float) -> PreparedLeg:
     """Return a leg with distance and speed checked by a more accurate scale."""
-    distance, judged = judge_way(prepared.track, prepared.inputs.t_stop, scale,
-                                 prepared.config.leg)
+    distance, judged = check_path(prepared.track, prepared.inputs.t_stop, scale,
+                                  prepared.config.leg)
     return replace(prepared, metres_per_unit=scale, distance=distance, reasons=(
         *(r for r in prepared.reasons if r.code not in BY_SCALE), *judged))
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.check import stray, track_check
+from odocal_ros.calib.check import track_check, track_residuals
 from odocal_ros.calib.counter_change import counter_change
 from odocal_ros.calib.evidence import evidence, KEPT_ROWS
 from odocal_ros.calib.marks import MarkFix
@@ -41,7 +41,7 @@ def near(ready: PreparedLeg, path: Path, pin: MarkFix,
     """Return a mask of fixes, (k,), without gross outliers from a fitted path, and reasons."""
     if not between.any():
         return between, ()
-    off = np.hypot(*stray(path, pin, (ready.inputs.t_fix, ready.fixes_n))[:, :2].T)
+    off = np.hypot(*track_residuals(path, pin, (ready.inputs.t_fix, ready.fixes_n))[:, :2].T)
     usual = max(float(np.median(off[between])), ready.fix_sigma)
     track_outlier = 20.0    # times the usual distance from the track: a certain outlier
     far = off > track_outlier * usual
@@ -68,10 +68,10 @@ def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reas
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return more, found
     fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
-    more |= {name: track_check(stray(path, pin, fixes), path_length)
+    more |= {name: track_check(track_residuals(path, pin, fixes), path_length)
              for name, path in (('before', before), ('after', after))}
     path_at = np.interp(fixes[0], *driven(ready))
-    off_before, off_after = (stray(path, pin, fixes) for path in paths)
+    off_before, off_after = (track_residuals(path, pin, fixes) for path in paths)
     more['per_distance'] = per_distance(path_at, off_before, off_after)
     kept, far = near(ready, after, start, between)
     found += (*check_worse(path_at, off_before, off_after, bool(ready.nominal)), *far)
@@ -90,7 +90,7 @@ def check_of(ready: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reas
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return {}, found
     fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
-    check = track_check(stray(path, pin, fixes), path_length)
+    check = track_check(track_residuals(path, pin, fixes), path_length)
     return {'check': {name: getattr(check, name) for name in (
         'rms', 'max', 'mean', 'end', 'percent_of_distance')}}, found
 

@@ -15,7 +15,7 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.reversal import against_travel, pieces
 from odocal_ros.calib.slip import slip_reasons
-from odocal_ros.calib.slow_errors import marks_no_better
+from odocal_ros.calib.slow_errors import marks_with_slow_errors
 from odocal_ros.calib.two_point import (
     Chord,
     fit,
@@ -123,13 +123,13 @@ class TwoPointRun:
         fixes = self.inputs.t_fix[between], ready.fixes_n[between]
         drift_n = self._drift(chord, f)
         drift = float(np.linalg.norm(drift_n))
-        residual = check.stray(ready.path(f), chord.start, fixes)
-        up = check.stray(ready.path(solve(chord)[0]), chord.start, fixes)
+        residual = check.track_residuals(ready.path(f), chord.start, fixes)
+        up = check.track_residuals(ready.path(solve(chord)[0]), chord.start, fixes)
         residual[:, 2] = up[:, 2]              # without the error of the pitch
         covariance = self.inputs.covariance_n[between]
         factor = self._noise_factor(residual, covariance, drift, chord)
         if np.isnan(self.config.gnss.correlation_time):     # else configured
-            start, end = marks_no_better(
+            start, end = marks_with_slow_errors(
                 (chord.start, chord.end), ready.spans, fixes[0], self.track.at(fixes[0]) @ f,
                 chord.M @ f, residual / factor[0], covariance, drift_n / factor[0])
             chord = replace(chord, start=start, end=end)
@@ -164,7 +164,7 @@ class TwoPointRun:
                                self.config.odometer.signed)
         self.found += found
         if not found:
-            off = check.stray(ready.path(f), chord.start, fixes)
+            off = check.track_residuals(ready.path(f), chord.start, fixes)
             wrong = check.mismatch(check.track_check(off, ready.distance), ready.fix_sigma, drift,
                                    ready.distance)
             self.reasons += wrong or check.bent(t, off, chord.M @ f, ready.fix_sigma, drift,

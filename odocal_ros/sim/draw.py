@@ -44,7 +44,8 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
         if name not in EFFECTS | RARE:
             raise BadUsage(f'--effect {name}: required: one of {", ".join(EFFECTS | RARE)}')
     if set(ODOMETER_EFFECTS) <= set(effects or ()):
-        raise BadUsage(f'--effect {" and ".join(ODOMETER_EFFECTS)}: a vehicle has one odometer')
+        raise BadUsage(f'--effect {" and ".join(ODOMETER_EFFECTS)}: a vehicle has one odometer; '
+                       'select one of them')
     own = given.pop('real', {})
     vehicle, options = _clean(seed, kind, grade, alone=effects is not None)
     if 'scale' in given:

@@ -133,7 +133,9 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     least = min(numbers, default=1.0)
     if (name not in SIGNED and least < 0 or name in POSITIVE and least <= 0
             or name == 'drops' and least >= 1 or name == 'imu_batch' and least != int(least)):
-        raise BadUsage(f'--real {name}={value}: out of range')
+        limit = {'drops': '0 or more, below 1', 'imu_batch': 'a whole number, 1 or more'}.get(
+            name, 'above 0' if name in POSITIVE else '0 or more')
+        raise BadUsage(f'--real {name}={value}: required: {limit}')
     return value
 
 

@@ -208,7 +208,7 @@ def test_json_is_all_there_is_on_stdout_and_goes_with_a_picture(capsys, tables, 
     assert out['tables']['4']['phi_U0']['formula']['scale']['printed'] == 3.416e-6
     assert out['tables']['1']['dL']['phi_U'] == pytest.approx(
         {'printed': 2.2e-6, 'value': 2.195e-6, 'ratio': 0.9977, 'sign': -1}, rel=1e-4)
-    assert 'decade' in out['tables']['2']['phi_N']['dL']['remark']
+    assert 'factor of 10' in out['tables']['2']['phi_N']['dL']['remark']
 
 
 def test_page_says_all_and_fits_a_terminal(capsys, monkeypatch, tables):
@@ -216,8 +216,8 @@ def test_page_says_all_and_fits_a_terminal(capsys, monkeypatch, tables):
     assert main(['paper']) == 0
     out = capsys.readouterr().out
     for words in ('Table 1', 'Table 2', 'Table 3', 'Table 4', 'estimate - truth', 'ratio',
-                  '(15) has vE/R for vE tan L/R', 'a slip of a decade', '+5.960e-02', '-5.999e-02',
-                  '+8.333e-04', '3.416e-06'):
+                  '(15) has vE/R instead of vE tan L/R', 'a factor of 10', '+5.960e-02',
+                  '-5.999e-02', '+8.333e-04', '3.416e-06'):
         assert words in out
     assert max(map(len, out.splitlines())) < 100
 

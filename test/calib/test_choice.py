@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.agreement import disagreements
-from odocal_ros.calib.choice import choose, deciding, passed_over, worth_saying
+from odocal_ros.calib.choice import choose, deciding, passed_over, relevant_reasons
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -82,8 +82,8 @@ def test_the_operators_own_marks_are_always_computed(asked, run):
 def test_reasons_about_a_value_that_another_method_gives_are_not_said():
     both, _ = choose(several(method('smoother', 2.1, None, [NO_YAW]), method('two_point')), 'all')
     alone, _ = choose(several(method('smoother', 2.1, None, [NO_YAW])), 'all')
-    assert worth_saying([NO_YAW, REFUSED], 'smoother', both) == (REFUSED,)
-    assert worth_saying([NO_YAW, REFUSED], 'smoother', alone) == (NO_YAW, REFUSED)
+    assert relevant_reasons([NO_YAW, REFUSED], 'smoother', both) == (REFUSED,)
+    assert relevant_reasons([NO_YAW, REFUSED], 'smoother', alone) == (NO_YAW, REFUSED)
 
 
 def test_a_rejected_method_is_named_where_one_behind_it_gives():

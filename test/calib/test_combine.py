@@ -101,7 +101,7 @@ def test_a_spread_beyond_the_sigmas_is_named_and_widens():
     # chi-square 200 on two degrees: ten times the spread that the sigmas allow
     assert whole.estimates[SCALE].sigma / 0.02 == pytest.approx(10 * OWN / np.sqrt(3), rel=1e-3)
     assert [r.code for r in whole.reasons] == [Code.LEGS_DISAGREE]
-    assert whole.reasons[0].text == ('scale_factor: the 3 legs differ 10.0 times more than their '
+    assert whole.reasons[0].text == ('scale_factor: the scatter of 3 legs is 10.0 times their '
                                      'uncertainties')
 
 

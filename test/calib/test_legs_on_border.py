@@ -372,8 +372,8 @@ def test_a_dispute_names_leg_and_parameter(legs):
     whole = combine_legs([results[0], replace(results[1], border=changed), results[2]],
                          [0, 1, 2], config, [4, 7, 9])
     (said,) = [r.text for r in whole.reasons if r.code is Code.LEGS_DISAGREE]
-    assert said.startswith('yaw_mounting_angle: the 3 legs differ')
-    assert ', leg 7 most (+' in said
+    assert said.startswith('yaw_mounting_angle: the scatter of 3 legs')
+    assert '; leg 7 differs most (+' in said
     assert whole.estimates[YAW].sigma > 0.002
     # and what is not disputed is as sharp as before
     assert whole.estimates[SCALE].sigma == pytest.approx(
@@ -387,7 +387,7 @@ def test_two_legs_whose_scales_differ_dispute_it(legs, off):
     changed = replace(other.border, value=other.border.value + off * scale)
     whole = combine_legs([one, replace(other, border=changed)], [0, 1], config)
     (said,) = [r.text for r in whole.reasons if r.code is Code.LEGS_DISAGREE]
-    assert said.startswith('scale_factor: the 2 legs differ')
+    assert said.startswith('scale_factor: the scatter of 2 legs')
     e = whole.estimates[SCALE]
     assert 0.3 * abs(off) < e.sigma / e.value < 1.5 * abs(off)
     assert not any(r.code is Code.LEGS_DISAGREE

@@ -105,7 +105,7 @@ def test_a_border_with_errors_of_levels_has_the_sum_of_both_covariances():
     D, sigma, centre = A.T @ A, np.array([1.0, 2.0, 3.0, np.inf]), rng.standard_normal(4)
     border = Border(tuple('abcd'), np.zeros(4), D, A.T @ rng.standard_normal(9), centre, sigma,
                     sigma)
-    wider, weight = border.doubted(effects), 1 / sigma**2
+    wider, weight = border.with_errors(effects), 1 / sigma**2
 
     def posterior(one):
         P = np.linalg.inv(one.information + np.diag(weight))

@@ -10,7 +10,7 @@ import pytest
 
 from odocal_ros.calib.check import fix_noise_factor
 from odocal_ros.calib.marks import fix_at, MarkFix, mean_fix, standing_at
-from odocal_ros.calib.slow_errors import no_better, slow_share, slow_variance
+from odocal_ros.calib.slow_errors import slow_share, slow_variance, with_slow_errors
 
 pytestmark = pytest.mark.core
 STATED = np.diag([1.0, 1.0, 4.0])
@@ -215,12 +215,12 @@ def test_a_share_at_a_moment_and_of_lasting_errors():
     (0.5, 100, 0.8, 0.5),      # has seen slow errors itself: its own figure stands
     (0.2, 100, 0.8, 0.8)])     # unless the leg clearly says more
 def test_a_mark_is_widened_where_it_cannot_know_better(own, used, slow, after):
-    result = no_better(mark(own, used), slow, math.inf, (-30.0, 0.0), 1.0, 4.0)
+    result = with_slow_errors(mark(own, used), slow, math.inf, (-30.0, 0.0), 1.0, 4.0)
     np.testing.assert_allclose(result.covariance_n, after * np.diag([1.0, 1.0, 4.0]))
 
 
 def test_long_rest_lets_slow_errors_average_down():
-    result = no_better(mark(0.001, 1000), 0.8, 60.0, (-300.0, 0.0), 1.0, 4.0)
+    result = with_slow_errors(mark(0.001, 1000), 0.8, 60.0, (-300.0, 0.0), 1.0, 4.0)
     assert result.covariance_n[0, 0] == pytest.approx(0.8 * slow_share(300.0, 60.0))
     assert result.covariance_n[0, 0] < 0.4
 

@@ -135,8 +135,8 @@ def test_a_result_on_the_disk_goes_on(session, monkeypatch):
         assert a.value == pytest.approx(b.value, abs=1e-3 * b.sigma), name
         assert a.sigma == pytest.approx(b.sigma, rel=1e-3), name
     assert found.carried.legs == 3
-    assert found.carried.goes_on_from(carried)
-    assert not carried.goes_on_from(found.carried)
+    assert found.carried.includes(carried)
+    assert not carried.includes(found.carried)
     (text,) = changed(combine(legs_of(results, 0.02)[2:], config, carried))
     assert text.startswith('the scale changed by +')
     assert float(text.split()[4]) == pytest.approx(2.0, abs=0.1)

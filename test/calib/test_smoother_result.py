@@ -192,7 +192,7 @@ def test_an_imu_worse_than_its_grade_is_said():
 def still_moved(method, passes):
     """Return by how many sigmas a fit that was cut off still moved, as it says."""
     text, = (r.text for r in method.reasons if r.code is Code.MODEL_MISMATCH)
-    return float(re.search(f'after {passes} passes the estimates still changed by ([^ ]+) '
+    return float(re.search(f'after {passes} iterations the estimates still changed by ([^ ]+) '
                            'sigma', text)[1])
 
 

@@ -53,7 +53,7 @@ def test_at_the_limit_of_passes_the_best_so_far_is_stated_with_a_wider_sigma():
     few = smooth(leg, with_settings(config, {'leg.compute_limit': 5}))
     assert few.details['iterations'] == 5
     said = {r.code: r.text for r in few.reasons}
-    assert 'after 5 passes the estimates still changed' in said[Code.MODEL_MISMATCH]
+    assert 'after 5 iterations the estimates still changed' in said[Code.MODEL_MISMATCH]
     a, b = (m.estimates['scale_factor'] for m in (whole, few))
     assert b.sigma > 1.5 * a.sigma
     assert abs(b.value - drive.truth.scale) < 4 * b.sigma

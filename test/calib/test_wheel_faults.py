@@ -304,7 +304,7 @@ def test_a_gyro_that_does_not_turn_is_no_ground_for_factors():
     result = calibrate(leg, settings(made, method='smoother'))
     assert result.methods == {}
     said = next(r for r in result.reasons if r.code is Code.IMU_UNITS)
-    assert 'the gyro shows only' in said.text
+    assert 'turns by the gyro are only' in said.text
     assert 'gyro_scale' not in said.do
 
 

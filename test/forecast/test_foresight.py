@@ -16,7 +16,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import foresight
-from odocal_ros.forecast.forecast import as_keys, Forecast, Prospect
+from odocal_ros.forecast.forecast import as_keys, Forecast, Prospect, UNREACHABLE
 from odocal_ros.forecast.foresight import Abandoned, DriveSoFar, forecast_of
 from odocal_ros.forecast.leg_so_far import faults_in_cells, SmootherSoFar
 from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
@@ -436,7 +436,7 @@ NO_YAW = Prospect(None, 0.0087, None, (), 'limited by the heading uncertainty (1
 
 def test_a_coarse_scale_is_said_in_per_cent():
     assert Prospect(0.138, 1e-3, 2108.0, now='1.02').words('scale', 'ppm', 1e6) == (
-        'scale 1.02 ± 13.8 % so far; drive 2200 m more for the limit of 0.1 %')
+        'scale 1.02 ± 13.8 % so far; drive 2200 m more to reach the limit of 0.1 %')
     assert Prospect(0.0099, 1e-3, 0.0).words('scale', 'ppm', 1e6) == (
         'OK: scale 9900 ppm (limit 1000)')
 
@@ -452,17 +452,17 @@ def said(forecast, **more):
     (None, 0.0, 'stand still 10 s at the end point, then call ~/stop_leg'),
     (None, 5.0, 'stand still 5 s more, then call ~/stop_leg'),
     (None, 10.0, 'call ~/stop_leg'),
-    (Forecast(MORE, YAW), 5.0, 'scale uncertainty so far: 1820 ppm; drive 240 m more for the '
+    (Forecast(MORE, YAW), 5.0, 'scale uncertainty so far: 1820 ppm; drive 240 m more to reach the '
      'limit of 1000 ppm; OK: yaw 0.286 deg (limit 0.498)'),
     (Forecast(GOOD, YAW), 10.0, 'OK: scale 430 ppm (limit 1000); OK: yaw 0.286 deg (limit '
      '0.498); call ~/stop_leg'),
     (Forecast(GOOD, NO_YAW), 0.0, 'OK: scale 430 ppm (limit 1000); yaw: limited by the heading '
      'uncertainty (1 deg); stand still 10 s at the end point, then call ~/stop_leg'),
-    (Forecast(replace(MORE, metres=None, why='even 20 km more do not reach the limit'), YAW),
-     10.0, 'scale 1820 ppm: even 20 km more do not reach the limit; OK: yaw 0.286 deg (limit '
+    (Forecast(replace(MORE, metres=None, why=UNREACHABLE), YAW), 10.0,
+     'scale 1820 ppm: the limit is not reached within another 20 km; OK: yaw 0.286 deg (limit '
      '0.498); call ~/stop_leg'),
     (Forecast(replace(MORE, sigma=None), NO_YAW), 0.0, 'scale is not determined yet; drive 240 m '
-     'more for the limit of 1000 ppm; yaw: limited by the heading uncertainty (1 deg)'),
+     'more to reach the limit of 1000 ppm; yaw: limited by the heading uncertainty (1 deg)'),
 ])
 def test_the_hint_says_what_is_enough_and_what_more_it_takes(forecast, still_s, text):
     assert said(forecast, still_s=still_s) == text

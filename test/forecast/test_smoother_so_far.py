@@ -371,7 +371,8 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     far = of_sigmas(looks[-1], scale=2e-3, yaw=0.02)
     said = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
     # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
-    assert ' m/pulse ± 2000 ppm so far; drive 660 m more for the limit of 1000 ppm; yaw ' in said
+    assert (' m/pulse ± 2000 ppm so far; drive 660 m more to reach the limit of 1000 ppm; yaw '
+            in said)
     assert said.endswith('; for the yaw: stop and start 12 times, or make as many turns')
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=40.0, **known))
     assert '; estimate is 40 s old; ' in told

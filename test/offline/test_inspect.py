@@ -255,9 +255,9 @@ def test_units(tmp_path, capsys):
     assert f'--set imu.gyro_scale={math.pi / 180!r}' in seen['command']
     seen, text = inspect(ros_bags.write(tmp_path / 'twice', drive(gyro=2.0)), capsys)
     assert seen['drive']['gyro_over_course'] == pytest.approx(2, abs=0.1)
-    assert 'IMU_UNITS: the gyro shows 2.' in text
+    assert 'IMU_UNITS: turns by the gyro are 2.' in text
     seen, text = inspect(tmp_path / 'twice', capsys, '--set', f'odometer.nominal_scale={4 * K}')
-    assert 'typical for a counter of the four edges of a pulse' in ' '.join(text.split())
+    assert 'typical for counting four edges per pulse (x4)' in ' '.join(text.split())
     seen, _ = inspect(ros_bags.write(tmp_path / 'sign', drive(gyro=-1.0)), capsys)
     assert 'GYRO_SIGN' in codes(seen)
 

@@ -295,8 +295,8 @@ def test_a_gpx_route_without_times_needs_a_speed(tmp_path, capsys):
     (b'no xml at all', 'is not a GPX file'), (b'<gpx></gpx>', 'holds 0 track points'),
     (b'\xff\xfe\x00', 'is not a GPX file'), (b'', 'is not a GPX file'),
     (b'<gpx><trkpt lat="x" lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'not readable'),
-    (b'<gpx><trkpt lat="91" lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'in range'),
-    (b'<gpx><trkpt lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'in range'),
+    (b'<gpx><trkpt lat="91" lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'out of range'),
+    (b'<gpx><trkpt lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'out of range'),
     (b'<gpx><trkpt lat="1" lon="1"><time>now</time></trkpt><trkpt lat="1" lon="1"/></gpx>',
      'not readable'),
     (b'<gpx><trkpt lat="1" lon="1"><time>2026-01-01T00:00:00Z</time></trkpt>'

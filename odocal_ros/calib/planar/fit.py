@@ -22,18 +22,18 @@ from odocal_ros.data.arrays import Floats
 LEVELS = {'along': 2e-3**2, 'side': 1e-3**2, 'turn': 4e-3**2, 'spin': 4e-3**2, 'drift': 1e-2**2,
           'white': 1.0, 'gyro': 1.0}
 ESTIMATED = tuple(LEVELS)[:-1]       # the level of the gyro is its specification
-# sigmas of the hyperpriors, of the logarithm of a variance, judgement
+# judgement: sigmas of the hyperpriors of the logarithm of a variance
 WIDE, SPREAD = 3.0, dict.fromkeys(('along', 'turn', 'spin'), 1.0)
 # degrees of freedom of Student's distribution of white errors and of steps of correlated ones,
-# for outliers and loop closures. Judgement; 16 runs each, SLAM: without it, and a drift_length of
-# 5 m, the rms of error over sigma of the scale was 1.08, 1.39 and 1.63 (wheels, skid, mecanum),
-# now 0.79, 0.98 and 1.12
+# for outliers and loop closures. Judgement; 16 SLAM runs each: rms of error over sigma of the
+# scale 0.79, 0.98 and 1.12 (wheels, skid, mecanum); with a normal distribution and a drift_length
+# of 5 m 1.08, 1.39 and 1.63
 FREEDOM = 4.0
 # m/s, added to the speed of wheels, moving and at rest, for noise that grows with time. Judgement
 WITH_TIME, AT_REST = 0.1, 1e-3
 LEAST = 1e-4        # judgement: lowest level, over its median: no sensor is without noise
 MOST_PASSES = 80
-CONVERGED = 0.02    # sigmas of a constant, and of the logarithm of a level
+CONVERGED = 0.02    # largest last step: sigmas of a constant, logarithm of a level
 
 
 def fit(run: Run, known: Known, passed: Callable[[int, float], None] = lambda *_: None) -> Fit:
@@ -75,7 +75,7 @@ def fit(run: Run, known: Known, passed: Callable[[int, float], None] = lambda *_
 def fit_at(run: Run, known: Known, state: Floats, c: Floats, theta: dict[str, float],
            first: Floats, prior: Floats, student: dict[str, Floats] | None = None) -> Fit:
     """
-    Return the fit at states (n + 1, 5) and constants (m,): covariance, without a step.
+    Return the fit at given states (n + 1, 5) and constants (m,), with their covariance.
 
     theta : level of each noise, variance.   first : (3,) gains of forward, left and turn to which
     residuals refer.   prior : (m, m) information.   student : weights, None: equal.
@@ -140,10 +140,10 @@ def _after(rows: Rows, solved: Solved) -> Floats:
 def _level_steps(parts: dict[str, Equations], left: dict[str, Rows], theta: dict[str, float],
                  prior: Floats, solved: Solved) -> dict[str, float]:
     """
-    Return the step of the logarithm of each free level, towards the restricted likelihood.
+    Return the step of the logarithm of each estimated level towards the most likely value.
 
-    The degrees of freedom that the unknowns take from a level are the derivative of the log
-    determinant by the logarithm of its weight.
+    The likelihood is the restricted one. The degrees of freedom that the unknowns take from a
+    level are the derivative of the log determinant by the logarithm of its weight.
     """
     steps, h, whole = {}, 1e-3, solved.log_determinant()
     for name in ESTIMATED:
@@ -161,6 +161,18 @@ def _level_steps(parts: dict[str, Equations], left: dict[str, Rows], theta: dict
 def _rows(run: Run, known: Known, state: Floats, c: Floats, metres: Floats, first: Floats,
           student: dict[str, Floats]) -> dict[str, Rows]:
     """Return the residual rows of each level at a linearisation point."""
+    m, w = len(run.wheels.names), len(c)
+    rows = _wheel_rows(run, state, c, metres, first) | {
+        'drift': _drift_rows(state, metres / known.drift_length, w, student['drift']),
+        'white': _position_rows(run, state, c, m, student['white'])}
+    if len(run.gyro):
+        rows['gyro'] = _gyro_rows(run, known, state, c)
+    return rows
+
+
+def _wheel_rows(run: Run, state: Floats, c: Floats, metres: Floats, first: Floats,
+                ) -> dict[str, Rows]:
+    """Return rows of the increments: body motion between the states minus that by the wheels."""
     n, m, w = len(run.t) - 1, len(run.wheels.names), len(c)
     k, here = np.arange(n), np.zeros((n, 3, 5))
     model, J = run.wheels.increments(c[:m])
@@ -170,7 +182,7 @@ def _rows(run: Run, known: Known, state: Floats, c: Floats, metres: Floats, firs
     cos, sin = np.cos(middle), np.sin(middle)
     dx, dy = np.diff(state[:, :2], axis=0).T
     moved = np.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
-    chord = np.sinc(turned / (2 * np.pi))       # over the arc
+    chord = np.sinc(turned / (2 * np.pi))       # chord over arc
     here[:, 0, 0], here[:, 0, 1], here[:, 1, 0], here[:, 1, 1] = -cos, -sin, sin, -cos
     here[:, 2, 2] = -1.0
     ahead = -here
@@ -186,22 +198,23 @@ def _rows(run: Run, known: Known, state: Floats, c: Floats, metres: Floats, firs
                            + by_gain * (value / gain)[:, :, None])
     here, ahead = here * unit[:, :, None], ahead * unit[:, :, None]
     weight = np.stack([1 / metres, 1 / metres, 1 / (metres * curvature**2)], -1)
-    # the turn has a level of its own in intervals with more turn than travel
+    # intervals with more turn than travel have a separate level of the turn
     spins = run.wheels.spins
-    rows = {name: Rows(k[of], value[of, i:i + 1], here[of, i:i + 1], ahead[of, i:i + 1],
+    return {name: Rows(k[of], value[of, i:i + 1], here[of, i:i + 1], ahead[of, i:i + 1],
                        constant[of, i:i + 1], weight[of, i:i + 1])
             for name, i, of in (('along', 0, k), ('side', 1, k), ('turn', 2, k[~spins]),
                                 ('spin', 2, k[spins]))}
-    rows |= {'drift': _drift_rows(state, metres / known.drift_length, w, student['drift']),
-             'white': _position_rows(run, state, c, m, student['white'])}
-    if len(run.gyro):
-        dt, by, still = np.diff(run.t), np.zeros((n, 1, w)), np.zeros((n, 1, 5))
-        still[:, 0, 2] = -1.0
-        by[:, 0, m + 3], by[:, 0, m + 4] = -run.gyro, dt
-        off = turned - run.gyro * (1 + c[m + 3]) + dt * c[m + 4]
-        rows['gyro'] = Rows(k, off[:, None], still, -still, by,
-                            1 / (known.gyro_noise**2 * dt[:, None]))
-    return rows
+
+
+def _gyro_rows(run: Run, known: Known, state: Floats, c: Floats) -> Rows:
+    """Return rows of the gyro: turn between the states minus that by the gyro."""
+    n, m = len(run.t) - 1, len(run.wheels.names)
+    dt, by, here = np.diff(run.t), np.zeros((n, 1, len(c))), np.zeros((n, 1, 5))
+    here[:, 0, 2] = -1.0
+    by[:, 0, m + 3], by[:, 0, m + 4] = -run.gyro, dt
+    off = np.diff(state[:, 2]) - run.gyro * (1 + c[m + 3]) + dt * c[m + 4]
+    return Rows(np.arange(n), off[:, None], here, -here, by,
+                1 / (known.gyro_noise**2 * dt[:, None]))
 
 
 def _drift_rows(state: Floats, forgotten: Floats, w: int, student: Floats) -> Rows:

@@ -115,7 +115,7 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config,
     if scale.value and slopes > np.linalg.norm(effects['scale_factor']):
         reasons.append(Reason(
             Code.MODEL_MISMATCH, f'the ground is not level: slopes shorten the path by '
-            f'{100 * slopes:.2g} %, which is added to the sigma',
+            f'{100 * slopes:.2g} %, which is added to the uncertainty of the scale',
             'Drive on level ground, or record an IMU.'))
     if scale.value is not None and scale.sigma is not None and nominal:
         estimates['scale_ratio'] = Estimate(scale.value / nominal, scale.sigma / nominal, '1')
@@ -144,15 +144,15 @@ def unknown(unit: str) -> dict[str, Estimate]:
 def _doubts(fit: Fit) -> list[Reason]:
     """Return the reasons against a fit as a whole."""
     found = [] if fit.converged else [Reason(
-        Code.MODEL_MISMATCH, f'the planar fit has not converged after {fit.passes} passes')]
+        Code.MODEL_MISMATCH, f'the planar fit has not converged after {fit.passes} iterations')]
     if fit.swapped:
         found.append(Reason(Code.WHEELS_SWAPPED, 'the mirrored positions fit the wheels better: '
-                            'left and right are swapped'))
+                            'left and right wheels are swapped'))
     noisy = max(WHEEL_NOISE, key=lambda name: fit.levels[name])
     if fit.levels[noisy] > MOST_NOISE:
         found.append(Reason(
             Code.NOT_CONVERGED, f'wheels and positions differ by {1e3 * fit.levels[noisy]:.0f} mm '
-            f'in a metre ({noisy}); the limit is {1e3 * MOST_NOISE:.0f} mm',
+            f'per metre ({noisy}); the limit is {1e3 * MOST_NOISE:.0f} mm',
             'Check the order of odometer.wheels, odometer.drive and the time offsets.'))
     return found
 

@@ -33,7 +33,7 @@ def rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
 
 class Axle:
     """
-    Speeds and pushes of the origin of base_link, where the vehicle does not slide, at one state.
+    Speeds and accelerations of the origin of base_link, which does not slip sideways, at a state.
 
     v_n : (N, 3) its velocity at the keyframes, m/s.   wheel : (N,) speed along the vehicle where
     the odometer is, m/s.
@@ -74,7 +74,8 @@ class Axle:
         their rates of change, m/s^3.
         """
         T = np.diff(self.state.t)[:, None]
-        # by the axes at mid interval: those at its begin would take the push of a turn for braking
+        # axes at mid interval: with those at its start, centripetal acceleration looks like
+        # braking
         C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
         force = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
         force[:, 0] += G * self._slope()
@@ -85,8 +86,8 @@ class Axle:
         """
         Return the acceleration along the path plus the part of gravity on slopes: (K,) m/s^2.
 
-        The tyres produce both. From speeds, since the acceleration of a vehicle that slides in a
-        turn has a forward part.
+        The tyres produce both. By speeds: in a turn with sideslip, the acceleration has a forward
+        component.
         """
         speed = self._ahead(self.v_n)
         up: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
@@ -108,7 +109,7 @@ def varies_with(speed: Floats, t: Floats, faster: Floats) -> Floats:
 
     t : s since the begin of the leg.
     """
-    # m/s^2, 1/m: what a car's tyres pull at a steady speed, against rolling and air
+    # m/s^2, 1/m: acceleration that rolling and air resistance take from a car at constant speed
     force = faster + 0.1 + 1e-4 * speed**2
     warm = WARM_TIME * (1 - np.exp(-t / WARM_TIME))
     return np.stack([speed**2 / (2 * FAST_SPEED), warm, np.maximum(force, 0.0),

@@ -67,10 +67,10 @@ class Factor:
 
     name: ClassVar[str]
     state: State
-    levels: Levels           # weighed: by these,
-    n: int                   # of so many unknowns of a keyframe
-    m: int                   # and so many constants, the first ones: no row depends on others
-    log_R: float = 0.0       # log determinant of the rows' covariance, but for a constant
+    levels: Levels           # levels of a weighted factor
+    n: int                   # number of unknowns of a keyframe
+    m: int                   # number of constants: no row depends on later ones
+    log_R: float = 0.0       # log determinant of the rows' covariance, up to a constant
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state = point.state

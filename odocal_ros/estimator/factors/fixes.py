@@ -75,7 +75,7 @@ class Fixes(PointRows):
         added, self.by_motion, self.by_time = odometer_error(
             *track, state.constants[FIX_BY_MOTION], state.constants[FIX_TIME])
         stated = np.sqrt(leg.covariance_n[problem.use].diagonal(axis1=1, axis2=2))
-        # a constant error changes no result
+        # a constant error does not affect the results
         self.by_sigma = stated - np.median(stated, axis=0)
         raw[:, 2] -= state.constants[HEIGHT_DRIFT] * self.t_fix
         raw -= state.constants[BY_SIGMA] * self.by_sigma
@@ -106,7 +106,7 @@ class Fixes(PointRows):
         by_yaw, by_pitch = self.state.C_bv_gradient
         c[:, :, YAW], c[:, :, PITCH] = (-self.C_t @ (g @ self.arm_v) for g in (by_yaw, by_pitch))
         c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
-        # stamps late by d: the place is that of d before
+        # stamps late by d: the position is that of d earlier
         c[:, :, GNSS_DELAY] = self.v_n
         c[:, :, GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
         c[:, 2, HEIGHT_DRIFT] = -self.t_fix
@@ -152,5 +152,5 @@ def whitener(covariance_n: Floats, no_height: Bools) -> Floats:
     """Return inverse Cholesky factors of covariances; without a height only horizontal rows."""
     C = covariance_n.copy()
     C[no_height, 2, :] = C[no_height, :, 2] = 0.0
-    C[no_height, 2, 2] = 1e6**2     # m^2, of a height that is not there
+    C[no_height, 2, 2] = 1e6**2     # m^2, of a missing height
     return np.linalg.inv(np.linalg.cholesky(C))

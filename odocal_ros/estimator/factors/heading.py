@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A heading from outside as rows, docs/method.md (S19): yaw of the IMU's x axis.
+The factor of an external heading, docs/method.md (S19): yaw of the IMU's x axis.
 
-It has one error for the whole leg (a mounting, a declination, a compass), which no number of
-messages averages out, and white noise; a heading configured at the start mark is one such
-message.
+Its error is a constant of the leg (mounting, declination, compass), which does not average out,
+plus white noise. A heading configured at the start mark is one message.
 """
 
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ from odocal_ros.nav.rotations import matrix_from_quat, transpose
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
-# rad, of a heading given at the mark, beside its error. Judgement: next to none
+# rad, white noise of a heading configured at the mark. Judgement: negligible
 GIVEN_NOISE = 1e-4
 
 
@@ -38,7 +37,7 @@ class Heading(Outside):
     """
     Yaw of the IMU's x axis in n: (m,) rad.
 
-    noise : (m,) rad.   sigma : rad, of the error that is the same through the leg.
+    noise : (m,) rad.   sigma : rad, of the error that is constant over the leg.
     """
 
     yaw: Floats
@@ -78,7 +77,7 @@ class HeadingRows(OutsideRows):
 
     @classmethod
     def details(cls, sent: Heading, constants: Floats, sigma: Floats) -> dict[str, Any]:
-        """Return its source, the stated sigma and the error that was found."""
+        """Return its source, the stated sigma and the estimated error."""
         return {'source': sent.said_by, 'sigma_stated': sent.sigma,
                 'error': float(constants[HEADING]), 'error_sigma': float(sigma[HEADING])}
 

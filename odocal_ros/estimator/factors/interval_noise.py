@@ -38,7 +38,7 @@ GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(2)[0] + 1) / 2, \
 TURNING_RATE = 0.05
 # m in a second, minimum error of an odometer at rest: physical, play of a drive train
 REST_NOISE = 5e-4
-# rad/s, m/s^2, 1 sigma of motion that no sample shows: judgement, of a car in town
+# rad/s, m/s^2, 1 sigma of the motion between samples: judgement, of a car in town
 HIDDEN_RATE, HIDDEN_FORCE = 0.1, 1.5
 ABSENT_VARIANCE = 1e4   # m^2, of travel without odometer samples
 
@@ -123,7 +123,7 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     axes = axes + np.swapaxes(motion.C @ motion.state.C_bv, 1, 2)
     axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
     speed = np.linalg.norm(motion.way, axis=1) / T
-    share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero where a wheel hardly turns
+    share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero if a wheel hardly turns
     hard, turning = hard_and_turning(motion)
     spread = np.ones((K, SPREAD)) if spread is None else spread
     left = motion.state.C_bv[:, 1]
@@ -156,7 +156,7 @@ def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Float
         given = np.zeros((len(rest), ROWS, 1))
         given[:, D, 0] = axes[:, 0] * sigma[:, None]
         return given * ~rest[:, None, None]
-    # of any length, in the direction in which the wheels roll, without the pitching of the body
+    # of unknown length, in the direction of rolling, without the pitching of the body
     size = np.linalg.norm(motion.rolled, axis=1, keepdims=True)
     along = np.where(size > 1e-3, motion.rolled / np.maximum(size, 1e-3), axes[:, 0])
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)) * motion.T[:, 0]
@@ -192,7 +192,7 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     """Return variances of the motion within gaps: (K, 18)."""
     sums, T = motion.sums, motion.T[:, 0]
     extra = np.zeros((len(T), ROWS))
-    # s: a longer step between IMU samples hides motion
+    # s: motion within a longer step between IMU samples is unknown
     gap = np.where(sums.longest_step > max(0.06, 3 * np.median(sums.longest_step)),
                    sums.longest_step, 0.0)
     rate, force = HIDDEN_RATE, HIDDEN_FORCE
@@ -207,7 +207,7 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
         k = np.searchsorted(t, at) - 1
         if 0 <= k < len(T) and sigma > 0:
-            near = slice(max(k - 1, 0), k + 2)       # the row before the gap may lie in the last
+            near = slice(max(k - 1, 0), k + 2)       # the gap may begin one interval earlier
             extra[near, D] += (motion.state.scale * sigma)**2
     return extra
 
@@ -216,8 +216,8 @@ def _in_gaps(stamp: Floats, way: Travel, scale: float) -> Floats:
     """
     Return variances of travel that is interpolated across gaps of the odometer: (K,) m^2.
 
-    A speed that rises and falls within a gap is off the mean speed by up to half the gap times its
-    acceleration, and the travel of the whole gap is the most that an interval contains.
+    A speed that rises and falls within a gap differs from the mean speed by up to half the gap
+    times its acceleration. An interval contains at most the travel of the whole gap.
     """
     variance = np.zeros(len(stamp) - 1)
     for begin, end in gaps_in_rhythm(way.t):

@@ -4,11 +4,11 @@
 """
 The motion between keyframes, docs/method.md (S5) to (S9): residuals and their derivatives.
 
-Rows of an interval: [position, velocity, attitude, gyro bias, accelerometer bias, odometer], each
-the state at its end less the prediction from the state at its begin and the preintegrated sums. n
-turns with the Earth: Coriolis and the rotation of n within the interval are included to first
-order of the Earth rate (the remainder is below 1e-8 of the motion), gravity at the vehicle's
-place.
+Rows of an interval: [position, velocity, attitude, gyro bias, accelerometer bias, odometer]. Each
+is the state at the end minus its prediction from the state at the start and the preintegrated
+sums. n rotates with the Earth: Coriolis and the rotation of n within the interval are included to
+first order of the Earth rate (the remainder is below 1e-8 of the motion). Gravity is that at the
+position of the vehicle.
 """
 
 from copy import copy
@@ -52,7 +52,7 @@ D = slice(E, E + 3)     # definition: rows of the odometer, after those of the o
 ROWS = D.stop
 # judgement: intervals of a hill; faster pitching is a bump of the road, or squat
 HILL_INTERVALS = 5
-# of Motion, what each interval has
+# attributes of Motion with a row for each interval
 EACH = ('T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed',
         'nose_down', 'rate_n', 'level_left', 'swung', 'up_n', 'shorter', 'from_mean', 'varied',
         'travelled', 'residual')
@@ -105,7 +105,7 @@ class Motion:
         straight = turn(half @ self.C, turn(intervals.S, along))
         self.rolled = straight * self.varied * self._inclined(straight)[:, None]
         self.faster = self._by_odometer_filter()
-        self.way = self.rolled + self.heaved
+        self.way = self.rolled + self.vertical_shift
         self.unsaid = self._by_speed_offset(leg.travel.coarse)
         if self.unsaid is not None:
             self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
@@ -144,12 +144,12 @@ class Motion:
 
     @property
     def pitched(self) -> Floats:
-        """Return the derivatives of the path by the centres of pitching: (K, 3, 2)."""
+        """Return the derivatives of the path by the centres of pitch: (K, 3, 2)."""
         out: Floats = (self.C @ self.up)[:, :, None] * self.nose_down[:, None]
         return out
 
     @property
-    def heaved(self) -> Floats:
+    def vertical_shift(self) -> Floats:
         """Return the vertical displacement of the odometer by pitching: (K, 3) m."""
         out: Floats = self.pitched @ self.state.constants[PITCH_CENTRE]
         return out
@@ -220,7 +220,7 @@ class Motion:
     def _by_odometer_filter(self) -> Floats:
         """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
         wheel = self.axle.wheel / self.state.scale
-        # from the fit: its accelerometer determines it better than the readings
+        # from the fit: the accelerometer determines it better than the readings
         push = np.gradient(wheel, self.state.t)
         return np.stack([np.diff(wheel), -np.diff(push) / 2], -1)
 
@@ -234,7 +234,7 @@ class Motion:
         a[:, P, P], a[:, P, V], a[:, P, PHI] = -one, -one * T, skew(self.dp)
         gyro = self._by_gyro()
         a[:, :, BG] = gyro[:, :, :3]
-        # biases change little over HILL_INTERVALS: none of the faster part
+        # biases change little over HILL_INTERVALS: they do not affect the faster part
         lift = state.constants[PITCH_CENTRE][0] * T * (C @ self.up)[:, :, None]
         a[:, D, BG] += lift * turn(transpose(C), self.level_left)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
@@ -245,7 +245,7 @@ class Motion:
         by_begin, by_end = self._by_slope(C, arm_b, -1.0), self._by_slope(self.C_end, arm_b, 1.0)
         a[:, D, P] += by_begin[:, :, :3]
         a[:, D, PHI] += by_begin[:, :, 3:]
-        # a body that tilts about its forward axis has a part of its turn about the level one
+        # on a body with roll, part of the turn about its left axis is not about the level axis
         tilt = self.rate_n[:, 2, None] * level_left(self.level_left)
         a[:, D, PHI] -= lift * tilt[:, None]
         a[:, D, E] = -self.f_n
@@ -267,12 +267,12 @@ class Motion:
         s, C, state = self.sums, self.C, self.state
         c = np.zeros((len(self.T), ROWS, M))
         swing = self.C_end - C
-        # the lift of the odometer by pitching is in no count
+        # the odometer does not count its vertical motion by pitch
         way = self.way
-        if self.fitted:     # as travelled, without sway and heave, which are noise of the road
+        if self.fitted:     # without sway and vertical motion, which are road noise
             along = self.rolled / np.maximum(np.linalg.norm(self.rolled, axis=1), 1e-6)[:, None]
             way = along * np.einsum('ki,ki->k', along, self.travelled)[:, None]
-        c[:, D, LN_K] = self.heaved - way
+        c[:, D, LN_K] = self.vertical_shift - way
         by_scale = c[:, D, LN_K] / self.varied
         c[:, D, TYRES] = by_scale[:, :, None] * self.from_mean[:, None]
         c[:, D, BY_PITCHING] = by_scale * self.swung[:, None]
@@ -291,7 +291,7 @@ class Motion:
         ahead = (self.f_n + self.f_n_end) / 2
         c[:, D, [ODO_DELAY, ODO_LAG2]] = -ahead[:, :, None] * self.faster[:, None]
         c[:, D, ODO_CLOCK] = c[:, D, ODO_DELAY] * self.t_middle[:, None] - self.rolled
-        if self.by_steps:       # only the direction of the path is used; these do not change it
+        if self.by_steps:       # only the direction of the path is used, independent of these
             c[:, D, [LN_K, ODO_DELAY, ODO_CLOCK, ODO_LAG2, BY_PITCHING, SPEED_OFFSET]] = 0.0
             c[:, D, TYRES] = 0.0
         c[:, :, GYRO] = gyro[:, :, 3:]

@@ -173,7 +173,7 @@ class MotionRows(Factor):
         Returns
         -------
         g_i by the keyframes, (N, n, c p), and by the constants, (m, c p); C' R^-1 C, (c p, c p),
-        and C' R^-1 r, (c p,), of the columns C, whose places of one constant are adjacent.
+        and C' R^-1 r, (c p,), of the columns C; those of one constant are adjacent.
 
         """
         n, L = self.n, len(at) * len(constants)
@@ -203,7 +203,7 @@ class MotionRows(Factor):
             for rows in blocks(len(self.r)):
                 A = self.units(rows)
                 estimates[rows] = np.einsum('kic,ki->kc', A, self.r[rows])
-                fitted = marginals.spread_of(rows, self.J[rows])
+                fitted = marginals.covariance_form(rows, self.J[rows])
                 variances[rows] = (A * (A - fitted @ A)).sum(axis=1)
             self._found = ref(marginals), estimates, variances
         return self._found[1:]

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The odometer's readings as the wheel turned: without their delay and the filter of a speed."""
+"""The travel of the wheel, from readings with a delay and a low-pass filtered speed."""
 
 from collections.abc import Callable
 
@@ -11,8 +11,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.state import ODO_CLOCK, ODO_DELAY, ODO_LAG2
 from odocal_ros.nav.odometer import Travel
 
-# s to each side of a time, for the derivatives at it. Judgement: with a filter of 0.4 s the
-# rounding of a counter then adds twice what the reading has
+# s to each side of a time, for the derivatives at it. Judgement: with a filter of 0.4 s, the
+# rounding error of a counter adds twice the error of a reading
 REACH = 0.5
 # definition: differences over it
 STENCIL = REACH * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
@@ -42,7 +42,7 @@ def as_rolled(travel: Travel, constants: Floats) -> Callable[[Floats], Floats]:
 
     def rolled(t: Floats) -> Floats:
         at = stamp_of(t, constants)
-        # at the ends that of the first and last second: beyond them there is no reading
+        # at the ends the derivative of the first and last second: there are no readings beyond
         middle = np.clip(at, travel.t[0] + REACH, travel.t[-1] - REACH)
         out: Floats = travel.at(at) + sum(
             weight * travel.at(middle + step)

@@ -229,13 +229,13 @@ class PointRows(Factor):
 def alike(rows: PointRows) -> float:
     """Return rows per independent row, by the scatter of means of adjacent rows."""
     r = rows.r / np.sqrt(rows.weight)
-    r = (r - np.median(r, axis=0))[:, :2]       # horizontal: these determine scale and yaw
+    r = (r - np.median(r, axis=0))[:, :2]       # horizontal: determine scale and yaw
     scale = np.median(np.abs(r), axis=0) / NORMAL_MEDIAN
     r = np.clip(r, -TAIL_SIGMAS * scale, TAIL_SIGMAS * scale)
     r = r - r.mean(axis=0)
     power = (r**2).mean()
     most, length = 1.0, 2
-    while len(r) >= 12 * length and power > 0:      # bins: their spread is good to 20 %
+    while len(r) >= 12 * length and power > 0:      # bins: their variance is then known to 20 %
         bins = r[:len(r) // length * length].reshape(-1, length, r.shape[1])
         most = max(most, float(length * (bins.mean(axis=1)**2).mean() / power))
         length *= 2

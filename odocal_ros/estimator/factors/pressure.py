@@ -31,7 +31,7 @@ SCALE_HEIGHT = 8435.0
 # relative, 15 K
 PRIOR_SIGMAS = 1e4, 8.4 / 3600, 0.015, 0.05
 EARTH_RADIUS = 6.371e6      # m, physical: of the curvature, mean
-HEIGHT_SIGMA = 0.15     # m, to start from where a sensor does not say: physical
+HEIGHT_SIGMA = 0.15     # m, initial sigma if a sensor states none: physical
 RATE = 1.0              # Hz: judgement, heights of a vehicle change no faster
 
 
@@ -68,7 +68,7 @@ class PressureRows(OutsideRows):
 
     @staticmethod
     def prior_sigmas(sent: Pressure, config: Config) -> Floats:
-        """Return the prior sigmas of zero, weather, wind of driving, temperature: (4,)."""
+        """Return the prior sigmas of zero, weather, dynamic pressure, temperature: (4,)."""
         return np.array(PRIOR_SIGMAS)
 
     @staticmethod

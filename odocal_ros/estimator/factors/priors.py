@@ -48,13 +48,13 @@ SIZES, SIZE = tuple(f'size_{kind}' for kind in KIND_SIZES), 0.5
 # the logarithm apart: at 1 the sigma of the scale is up to 2.8 times as large in drives without
 # one, at 3 1.7 times (docs/decisions/0019)
 SIZE_SPREADS = dict.fromkeys(SIZES, 1.0) | {'size_fix_error_by_motion': 3.0}
-# definition: logarithms of sizes that are compared, from the least on
+# definition: grid of the logarithms of sizes, relative to the least
 LOG_SIZES = np.arange(np.log(1e-6), np.log(1e6), 0.05)
 # priors of the first keyframe: m, m/s, rad about east, north, up. Judgement: far wider than any
 # data
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
     'position': (P, 1e4), 'velocity': (V, 100.0), 'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
-# m: without heights; 1e4 m would be lost in rounding. Definition
+# m: without heights; with 1e4 m the rounding error is too large. Definition
 UP, LEVEL_START = slice(P.stop - 1, P.stop), 1.0
 # priors of the vehicle, shared by all legs
 SHARED: dict[str, slice | Ints] = {
@@ -100,17 +100,17 @@ class PriorRows(Factor):
 
     def sizes(self, marginals: JointMarginals) -> dict[str, float]:
         """
-        Return the expected size of each type, all else as it is: docs/method.md (S29).
+        Return the expected size of each type at the other current values: docs/method.md (S29).
 
-        An imperfection is weighted by the share of the drive in its information: a model error
-        elsewhere would move the size of one that is hardly observable. Of the wide prior of a
-        rare effect the most likely size: its mean is that of the few who have it.
+        An imperfection is weighted by the share of the drive in its information; otherwise model
+        errors would change the size of one that is hardly observable. For the wide prior of a rare
+        effect it is the most likely size: the mean is that of the few vehicles with the effect.
         """
         at = 2 * self.n + np.arange(IMPERFECT.start, IMPERFECT.stop)
         usual = self.base.constants[IMPERFECT]**2
         weight = 1 / self.priors.constants[IMPERFECT]**2
         total = 1 / marginals[0][at, at]
-        data = np.maximum(total - weight, 1e-9 * total)     # a share lost in rounding
+        data = np.maximum(total - weight, 1e-9 * total)     # the share is below rounding
         known = data / (data + 1 / (SIZE * usual))
         found = (self._constants_off()[IMPERFECT] * total / data)**2
         variance = np.exp(LOG_SIZES)[:, None] * usual + 1 / data

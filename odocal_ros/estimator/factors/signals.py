@@ -31,7 +31,7 @@ from odocal_ros.estimator.state import (
 )
 from odocal_ros.nav.rotations import transpose, turn
 
-FORCES = 3      # definition: signals of a gyro from there on are forces
+FORCES = 3      # definition: number of the first gyro signal that is a force
 
 
 class Signals:
@@ -87,12 +87,12 @@ class Signals:
         of_gyro : (k, 3, 3) effect of the gyro noise about each axis of b on the residual.
         """
         back = transpose(part.C)
-        turned = back @ of_gyro      # toward an axis of b, about one
+        turned = back @ of_gyro      # towards an axis of b, about an axis of b
         own = turn(back, residual) - turned.sum(axis=2)
         for i, (into, by) in enumerate(zip(ACCEL_AXIS, ACCEL_SIGNAL, strict=True)):
             noise = np.zeros_like(own)
             noise[:, into] = own[:, by] - sway[:, by]
-            if into == by:      # the force along it, turned about another, toward the third
+            if into == by:      # a force along one axis, turned about another, toward the third
                 for about, toward in ((into - 1, into - 2), (into - 2, into - 1)):
                     noise[:, toward] += turned[:, toward, about]
             columns[:, :, i] += turn(part.C, noise)

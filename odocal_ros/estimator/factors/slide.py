@@ -20,18 +20,18 @@ from odocal_ros.estimator.start import rest_bias
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import SWAY
 
-# m/sqrt(s), least slide where turns test it. Tuned: the simulator's vehicles, which do not slide,
-# then have the yaw sigma of their errors (docs/decisions/0005)
+# m/sqrt(s), lower limit of sideslip if turns determine it. Tuned: the yaw sigma of simulated
+# vehicles, which do not slide, then matches their errors (docs/decisions/0005)
 TURN_SLIDE = 2e-4
-# m/sqrt(s), least up and down: what springs, tyres and road do in a second that no unknown holds.
-# Tuned: with a tenth the pitch of yards was 3 sigmas off (docs/decisions/0005)
+# m/sqrt(s), lower limit of vertical motion that the unknowns do not describe: springs, tyres,
+# road. Tuned: with a tenth, pitch in yards was 3 sigmas off (docs/decisions/0005)
 HEAVE = 2e-3
 # m/rad, by which the pitch of a body within a second lifts its axle beyond the model, as kerbs
 # shorter than a wheelbase do: initial level and lower limit, judgement; each drive has its own
 PITCHING, PITCHING_LEAST = 0.03, 1e-4
 # m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
 ORDINARY_ROAD = SWAY / np.sqrt(10.0)
-# rad turned in all: less than one crossroads tests nothing, two do. Judgement
+# rad, total turn: one crossroads does not determine sideslip, two do. Judgement
 NO_TURN = np.pi / 2
 SIDEWAYS = ('side', 'side_turn', 'up')
 
@@ -54,9 +54,9 @@ def least_slide(angle: float) -> float:
 
 
 def assumed(problem: Problem, levels: Levels) -> list[Reason]:
-    """Return the reason that names an assumed road noise, if it matters."""
+    """Return the reason that reports an assumed road noise, if it affects the result."""
     least = problem.least['side']
-    if least < 2e-3**2 or all(      # m^2/s, worth a word
+    if least < 2e-3**2 or all(      # m^2/s, smallest that is reported
             levels[name] > 1.01 * least for name in SIDEWAYS):
         return []
     return [Reason(Code.PARAMETER_NOT_DETERMINED, 'turns faster than '

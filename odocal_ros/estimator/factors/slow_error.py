@@ -25,7 +25,7 @@ from odocal_ros.estimator.state import SLOW
 # prior of the correlation time, log-normal: s, and sigma of the logarithm. Physical: errors of
 # receivers over open land stay for a minute or several (docs/decisions/0009)
 USUAL_TIME, TIME_SPREAD = 100.0, 0.6
-WHITE_SHARE = 0.2       # of the variance, beside a slow part of 0.9, to start from: judgement
+WHITE_SHARE = 0.2       # initial white share of the variance; the slow share is 0.9: judgement
 
 
 class SlowError(Factor):
@@ -43,7 +43,7 @@ class SlowError(Factor):
         self.state, self.T = point.state, problem.drift_time
         self.jump = 1.0 if point.spread is None else point.spread[:, JUMP:]
         self.time_given = not np.isnan(problem.fix_time)
-        # where runs of intervals without fixes begin: a fix ends a run
+        # start of runs of intervals without fixes: a fix ends a run
         ends = np.bincount(point.points['fixes'].interval, minlength=len(self.T)) > 0
         self.runs = np.flatnonzero(np.append(True, ends[:-1] | ends[1:]))
 
@@ -53,7 +53,7 @@ class SlowError(Factor):
         gain = 2 * problem.fix_sigma**2 / USUAL_TIME
         return {'slow': gain, 'slow_up': 4 * gain}, {
             **dict.fromkeys(('slow', 'slow_up'), 2 * problem.fix_least**2 / USUAL_TIME),
-            'correlation_time': 5.0}      # s: less is not separable from white
+            'correlation_time': 5.0}      # s: shorter times are not separable from white noise
 
     def in_use(self, levels: Levels) -> bool:
         """Return True if correlated errors are estimated."""
@@ -164,7 +164,7 @@ class SlowError(Factor):
         return out
 
     def _by_time(self, s: Floats) -> Floats:
-        """Return minus the derivative of that by the logarithm of the correlation time: (N, 3)."""
+        """Return minus the derivative of ``_precision`` by the log correlation time: (N, 3)."""
         a, r = self.decay, s[1:] - self.decay * s[:-1]
         da = a * self.T[:, None] / self.levels.correlation_time
         dq = 1 - 2 * a * da / (1 - a**2)

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The steps of a coarse speed as rows, docs/method.md (S14): the speed where the value sent changes.
+The factor of a coarse speed, docs/method.md (S14): its value is known at a change by a step.
 
-The integral of such a speed is not used along the vehicle (interval_noise.py): its error is that
-of a cell while the value does not change.
+The integral of such a speed is not used along the path (interval_noise.py): while the value does
+not change, its error is up to a step.
 """
 
 import numpy as np
@@ -70,10 +70,10 @@ class SpeedSteps(PointRows):
         points = self.points
         super().__init__(points)
         self.sigma = self.instants.sigma * leg.rough_scale
-        # at an even acceleration the speed is at the same place of its cell again and again
+        # at constant acceleration the errors repeat from step to step
         self.per_effective = problem.per_effective.get(self.name, 1.0)
         self.v_b = turn(np.swapaxes(self.C_t, 1, 2), self.v_n)
-        # the forward axis turns too, and the IMU, beside the axle, moves across it
+        # the forward axis rotates, and an IMU beside the axle moves relative to the axle
         self.gained = np.einsum('ki,ki->k', self.ahead, turn(self.C, points.force) + g)\
             + np.einsum('ki,ki->k', np.cross(points.rate, state.forward), self.v_b)\
             + np.cross(points.spin, arm_b) @ state.forward
@@ -106,7 +106,7 @@ class SpeedSteps(PointRows):
         """
         Return the first level, a factor on the variances by the grid, and the least.
 
-        A quarter of the variance is the least: no vehicle crosses the edges more evenly.
+        The least is a quarter of the variance: real transitions are not more regular.
         """
         return {'steps': 1.0}, {'steps': 0.25}
 
@@ -128,7 +128,7 @@ class SpeedSteps(PointRows):
         c[:, GYRO] = by_gyro[:, 3:] + (by_rate[list(GYRO_AXIS)]
                                        * self.points.measured[:, GYRO_SIGNAL])
         K = state.scale * self.varied
-        # by what is said: the speed lies anywhere in its cell, so the error is the speed's alone
+        # by the published value: the speed is anywhere in its step, so only the speed has an error
         c[:, LN_K], c[:, SPEED_OFFSET] = self.said, K * self.instants.side
         c[:, TYRES] = (self.said / self.varied)[:, None] * self.from_mean
         rate = self.points.rate

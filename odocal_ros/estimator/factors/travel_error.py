@@ -76,7 +76,7 @@ def once_a_rest(still: Bools) -> Floats:
     """
     Return the weight of the prior of the rounding error at each keyframe, (N,).
 
-    The error is constant while the counter stands: the keyframes of a standstill count as one.
+    The error is constant at a standstill: its keyframes together have the weight of one.
     """
     starts = np.flatnonzero(np.diff(still, prepend=False) & still)
     stops = np.flatnonzero(np.diff(still, append=False) & still) + 1

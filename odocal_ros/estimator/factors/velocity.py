@@ -4,8 +4,8 @@
 """
 The horizontal velocity of the GNSS antenna as rows, docs/method.md (S18).
 
-Derivatives by the rate and force at an instant go by means of the interval. Those by samples
-contain vibration, by which a delay and axes look certain, and a lever arm short.
+Derivatives by turn rate and force use means over the interval. With single samples they would
+contain vibration: the sigmas of delay and axes, and the lever arm, would be too small.
 """
 
 from dataclasses import dataclass
@@ -48,11 +48,11 @@ from odocal_ros.nav.rotations import skew, transpose, turn
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 
-# m/s, to start from: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
+# m/s, initial: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
 FIRST_SIGMA = 0.5
 VELOCITY_SIGMA = 0.1      # m/s, initial if a receiver states none: physical, Doppler
-# of its stamps and its filter, s and s^2, 1 sigma: physical, receivers are late by up to 0.25 s
-# and smooth over as much
+# 1 sigma of the delay, s, and of the squared filter time constant, s^2: physical, of receivers
+# up to 0.25 s each
 TIME_SIGMA, LAG2_SIGMA = 0.25, 0.1
 
 
@@ -131,7 +131,8 @@ def _velocity(problem: Problem, point: LinearisationPoint, points: Points) -> Ro
     smoothed, by_lag = smoothing(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
                                  state.t[k] + points.tau, state.constants[VELOCITY_LAG2])
     v = state.v_n[k] + dv + g * tau + swing + smoothed
-    # on the prediction: on what is sent it would be on its noise too, and the smallest fit best
+    # the factor is on the prediction: on the measurement it would also scale its noise, and
+    # small factors would fit best
     times = 1 + state.constants[VELOCITY_SCALE]
     m, t, rate = len(k), tau[:, :, None], point.intervals.mean_rate[k]
     measured = np.concatenate([rate, point.intervals.mean_force[k]], axis=1)[:, None]
@@ -148,7 +149,7 @@ def _velocity(problem: Problem, point: LinearisationPoint, points: Points) -> Ro
     c[:, :, GNSS_ARM] = -W @ state.C_bv
     c[:, :, VELOCITY_DELAY], c[:, :, VELOCITY_LAG2] = faster, -by_lag
     force, signals = turn(transpose(C), faster - g), np.zeros((m, 3, len(ACCEL_AXIS)))
-    # as fitted, (m, 3) m/s^2, by the axes that it enters
+    # fitted force, (m, 3) m/s^2, by its axes
     signals[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]
     c[:, :, ACCEL] = C @ signals * t
     J, c = J[:, :2] * times, c[:, :2] * times

@@ -40,7 +40,7 @@ def as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Est
 
 
 def as_sent_of(legs: Sequence[MethodResult], scale: Estimate) -> dict[str, Estimate]:
-    """Return that of several legs: the joint scale times their mean ratio to their own scales."""
+    """Return the factor of several legs: joint scale times mean ratio of factor and scale."""
     ratios = [(leg.estimates[AS_SENT].value or 0.0) / (leg.estimates['scale_factor'].value or 1.0)
               for leg in legs if AS_SENT in leg.estimates]
     if not ratios or scale.value is None or scale.sigma is None:

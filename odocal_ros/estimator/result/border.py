@@ -34,5 +34,5 @@ def border_of(fit: Fit, configured: Floats) -> Border:
         CONSTANTS, at + configured,
         (reduced - np.diag(weight)) * np.outer(free, free),
         (g_reduced + weight * (at - priors.centre)) * free, priors.centre + configured,
-        fit.first.constants, priors.constants).doubted(
+        fit.first.constants, priors.constants).with_errors(
             fit.by_levels[:, :-len(SIZES)])     # sizes are of the priors, no data

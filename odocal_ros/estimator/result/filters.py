@@ -10,8 +10,8 @@ from odocal_ros.settings.levels import FAULT_SIGMAS, REMARK_SIGMAS
 
 
 def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
-    """Return FIXES_SMOOTHED, where so; of the filter's unknown and its sigma, s^2."""
-    worth = 0.1     # s: a fix at 10 Hz is as old anyway
+    """Return FIXES_SMOOTHED if the filter constant of the receiver, s^2, is significant."""
+    worth = 0.1     # s: the age of a fix at 10 Hz is up to this
     if abs(square) <= max(REMARK_SIGMAS * sigma, worth**2):
         return ()
     what, time = ('averages its fixes', np.sqrt(square)) if square > 0 else (
@@ -22,13 +22,13 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 def follows_odometer(share: float, sigma: float) -> bool:
     """Return True if the receiver has an odometer of its own, of this error."""
-    worth = 5e-4    # relative: less changes no scale by more than its sigma
+    worth = 5e-4    # relative: smaller ones do not change a scale by more than its sigma
     return bool(abs(share) > max(FAULT_SIGMAS * sigma, worth))
 
 
 def odometer_reasons(share: float, sigma: float, log_time: float,
                      by_map: float) -> tuple[Reason, ...]:
-    """Return FIXES_FOLLOW_ODOMETER, where so; by_map: sigma of ln K, 0 of no map."""
+    """Return FIXES_FOLLOW_ODOMETER if significant; by_map: sigma of ln K, 0 without a map."""
     if not follows_odometer(share, sigma):
         return ()
     return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes contain an odometer with a scale error '
@@ -49,8 +49,8 @@ def by_map_drift(share: float, log_time: float, duration: float) -> float:
 
 
 def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
-    """Return SPEED_FILTERED, where so; of the odometer's filter and its sigma, s^2."""
-    worth = 0.1     # s: a filter over less moves an interval by a centimetre, at 2 m/s^2
+    """Return SPEED_FILTERED if the filter constant of the odometer, s^2, is significant."""
+    worth = 0.1     # s: a shorter one has an effect of a centimetre, at 2 m/s^2
     if square <= max(REMARK_SIGMAS * sigma, worth**2):
         return ()
     return (Reason(Code.SPEED_FILTERED, 'the odometer speed is low-pass filtered with a time '
@@ -59,7 +59,7 @@ def filter_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
 
 def clock_reasons(name: str, rate: float, sigma: float, duration: float) -> tuple[Reason, ...]:
     """Return CLOCKS_DRIFT if a rate and its effect over ``duration``, s, are significant."""
-    worth = 0.01        # s: two samples of most odometers are further apart
+    worth = 0.01        # s: the samples of most odometers are farther apart
     if abs(rate) <= REMARK_SIGMAS * sigma or abs(rate) * duration <= worth:
         return ()
     return (Reason(Code.CLOCKS_DRIFT, f'{name} stamps: the clock is {1e6 * abs(rate):.0f} ppm (± '

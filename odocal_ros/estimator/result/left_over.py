@@ -37,11 +37,10 @@ def left_over(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, NDArray
 
     Returns
     -------
-    dict of arrays, a row's three values before their sigmas, NaN where the sensor says nothing.
-    Of an interval, at its end: ``left_odometer`` along, left, up, m; ``left_gyro`` x, y, z, rad/s,
-    and ``left_accelerometer`` x, y, z, m/s^2, means in b. ``left_fix``, of the fixes used, at
-    ``left_fix_t``, s: east, north, up, m, without the slow part of their error. Single precision,
-    for hours have many rows.
+    dict of (n, 6) arrays, three residuals and their sigmas; NaN: no data. For each interval, at
+    its end: ``left_odometer`` along, left, up, m; ``left_gyro`` and ``left_accelerometer``, means
+    about x, y, z of b, rad/s and m/s^2. ``left_fix``, for each fix used, at ``left_fix_t``, s:
+    east, north, up, m, without the time-correlated error. Single precision, to save memory.
 
     """
     rows = {**_of_intervals(fit), 'fix': _of_fixes(fit)}
@@ -51,7 +50,7 @@ def left_over(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, NDArray
 
 def correlation(t: Floats, residual: Floats, width: float = 2.0) -> tuple[float, float]:
     """
-    Return the correlation of neighbouring bins of residuals and its sigma, were they white.
+    Return the correlation of adjacent bins of residuals, and its sigma for white residuals.
 
     t : (m,) s.   residual : (m, c) in sigmas.   width : of a bin, s.
     """
@@ -70,7 +69,7 @@ def correlation(t: Floats, residual: Floats, width: float = 2.0) -> tuple[float,
 
 
 def normalised(weighted: Weighted) -> dict[str, dict[str, float]]:
-    """Return the whitened residuals' rms and tails by sensor, before weights take off tails."""
+    """Return rms and outlier share of whitened residuals by sensor, without outlier weights."""
     motion, fixes = weighted[MotionRows].r, weighted[Fixes]
     white = fixes.r / np.sqrt(fixes.weight / fixes.per_effective)
     return {name: {'rms': float(np.sqrt((r**2).mean())), 'rows': r.size,
@@ -80,7 +79,7 @@ def normalised(weighted: Weighted) -> dict[str, dict[str, float]]:
 
 
 def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
-    """Return of each sensor of the motion values and sigmas, (K, 3) each."""
+    """Return residuals and sigmas of odometer, gyro and accelerometer: (K, 3) each."""
     motion = fit.weighted[MotionRows]
     found: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in OF_INTERVALS}
     T, C, C_end = (getattr(motion.motion, name) for name in ('T', 'C', 'C_end'))
@@ -102,7 +101,7 @@ def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
 
 
 def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
-    """Return of the fixes values and sigmas, (m, 3) each."""
+    """Return residuals and sigmas of the fixes: (m, 3) each."""
     fixes = fit.weighted[Fixes]
     covariance_root = np.linalg.inv(fixes.root)
     factor = np.ones(3)

@@ -20,7 +20,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import grade_of, turn_on_bias
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: judgement
+WORSE_THAN_GRADE = 3.0      # judgement: times the noise of its grade
 # m/s in a second, share and number of the seconds, of outliers that are reported. Judgement:
 # aliased vibration makes 0.05 to 0.13 in 1.3 % or more, kerbs under a robot at most 0.01, ordinary
 # drives have outliers in 0.5 %; one or two shocks of a short drive are no vibration
@@ -33,7 +33,7 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     gyro_sold, accel_sold = turn_on_bias(config.imu)
     level = fit.levels.roots()
-    # of an accelerometer that is not there nothing is said
+    # no reasons about an accelerometer that does not exist
     sensors = {'gyro': 'gyro'} | (
         {'accel': 'accelerometer'} if problem.leg.has_accelerometer else {})
     remedy = noise_remedy(problem, level, [
@@ -55,24 +55,23 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     odd, move = [], 0.0
     if fit.creeping or not fit.settled:
         move = moving(fit)
-        odd.append(f'after {fit.iterations} passes ' + (
+        odd.append(f'after {fit.iterations} iterations ' + (
             f'the estimates still changed by {move:.2g} sigma'
             if move > CONVERGENCE.nearly else 'the noise levels still changed'))
-    odd_share = 0.15        # of fixes far off, of intervals with a slip: judgement
+    odd_share = 0.15        # share of outliers among the fixes, of intervals with slip: judgement
     noisy = []
-    if over_grade > WORSE_THAN_GRADE:      # vibration is not white, and of no known spectrum
+    if over_grade > WORSE_THAN_GRADE:      # vibration is not white, and its spectrum is unknown
         noisy = [f'IMU noise is {over_grade:.1f} times that of its grade and may not be white; '
                  'uncertainties were increased']
     odd += noisy
-    share = float((fit.weighted[Fixes].weight[:, 0] < 0.5).mean())
-    if share > odd_share:
-        odd.append(f'{100 * share:.0f} % of the fixes are outliers')
-    share = float((fit.spread[:, 0] > SLIP_VARIANCE).mean())
-    if share > odd_share:
-        odd.append(f'the wheel slips {100 * share:.0f} % of the time')
-    if max(level['side'], level['side_turn']) > 0.2:       # m/sqrt(s): no vehicle on wheels
-        odd.append(f'sideslip at the odometer is {max(level["side"], level["side_turn"]):.2f} '
-                   'm/√s')
+    for what, mask in (('of the fixes are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5),
+                       ('of the time the wheel slips', fit.spread[:, 0] > SLIP_VARIANCE)):
+        share = float(mask.mean())
+        if share > odd_share:
+            odd.append(f'{100 * share:.0f} % {what} (limit {100 * odd_share:.0f} %)')
+    sideslip, most = max(level['side'], level['side_turn']), 0.2    # m/sqrt(s), of wheels
+    if sideslip > most:
+        odd.append(f'sideslip at the odometer is {sideslip:.2f} m/√s (limit {most:g})')
     reasons += _heading(problem.outside.get('heading'), float(fit.state.constants[HEADING]))
     if odd:
         known = 'See IMU_WORSE_THAN_GRADE.' if worse else remedy

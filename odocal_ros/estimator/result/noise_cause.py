@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Why the noise of an IMU exceeds its grade: quantisation, vibration, or the sensor itself."""
+"""Cause of IMU noise above its grade: quantisation, vibration, or the sensor itself."""
 
 import numpy as np
 
@@ -10,14 +10,14 @@ from odocal_ros.estimator.imu_noise import of_samples
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
 
-FINEST = 1e-5           # rad/s and m/s^2, physical: finer steps are no output format that matters
-SAMPLES = 20_000        # judgement: rows in which the step shows
+FINEST = 1e-5           # rad/s and m/s^2, physical: finer steps have no effect
+SAMPLES = 20_000        # judgement: fewest rows for the detection of a step
 ROWS_A_VALUE = 20       # judgement: a signal that holds so few values is quantised
 EXPLAINED = 0.4         # judgement: share of the noise variance that quantisation must have
 # judgement: times that single samples vary more in motion than at rest. Real drives: vibrating
 # accelerometers 26 and 3.6, gyros 1.3 and 2.0
 VIBRATION = 3.0
-FEWEST_ROWS = 100       # judgement: samples at rest, of which a median is good to 15 %
+FEWEST_ROWS = 100       # judgement: samples at rest, whose median then has a sigma of 15 %
 NAMES = {'gyro': 'gyro', 'accel': 'accelerometer'}
 UNITS = {'gyro': 'rad/s/sqrt(Hz)', 'accel': 'm/s^2/sqrt(Hz)'}    # of white noise
 
@@ -42,7 +42,7 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
         elif not still and vary > VIBRATION * level[name]:
             vibrating.append(f'{NAMES[name]} samples vary {vary / level[name]:.0f} times as '
                              'much as their means over seconds')
-        else:       # less at rest than it adds up to: of no single samples
+        else:       # less at rest than its integral
             (own if VIBRATION * still > level[name] else unknown).append(name)
     said = []
     if coarse:
@@ -61,7 +61,7 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
 
 
 def at_rest_and_moving(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the noise of single samples in motion and at rest, as white; {} where too few."""
+    """Return the white noise of single samples in motion and at rest; {}: too few samples."""
     leg, keys = problem.leg, problem.imu.t[problem.imu.key]
     inside = (leg.t_imu >= keys[0]) & (leg.t_imu < keys[-1])
     interval = np.clip(np.searchsorted(keys, leg.t_imu, side='right') - 1, 0, len(keys) - 2)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The result of a leg that is refused: estimates without values, and why."""
+"""The result of a leg that is refused: reasons, and estimates without values."""
 
 from collections.abc import Iterable
 
@@ -17,7 +17,7 @@ from odocal_ros.reasons import Code, Reason
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-# estimates where the drive determines them: lever arms and delays
+# estimated if the drive determines them: lever arms and delays
 OPTIONAL = range(ODO_ARM.start, HEADING)
 
 
@@ -32,7 +32,7 @@ def no_imu(fit: Fit) -> list[Reason]:
     """Return the reasons against implausible errors of the IMU, [] if there are none."""
     c = fit.state.constants
     worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
-    if abs(c[worst]) <= 0.2:        # twenty times what a consumer's is off
+    if abs(c[worst]) <= 0.2:        # twenty times the error of a consumer IMU
         return []
     return [Reason(Code.NOT_CONVERGED, 'the fit converged to '
                    f'{CONSTANTS[worst].replace("_", " ")} {100 * c[worst]:+.0f} %, impossible '

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Places where a wheel turned more, or less, than the vehicle moved, from odometer noise."""
+"""Places where a wheel turned more or less than the vehicle moved, detected by odometer noise."""
 
 from dataclasses import dataclass
 
@@ -14,18 +14,18 @@ from odocal_ros.estimator.fit import Fit
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-# factor on the variance of an interval from which it is a slip. Statistical: it lies 3.7 sigmas
-# off, once in 4200 by chance
+# factor on the variance of an interval that is a slip. Statistical: 3.7 sigmas, by chance once in
+# 4200
 SLIP_VARIANCE = 1.5
 LEAST_SLIP = 0.05    # m: a shorter slip is not reported. Judgement
-# rows that a level must be worth to be reported. Statistical: its root, with a sigma of
-# root / sqrt(2 rows), then lies REMARK_SIGMAS above zero
+# effective rows of a level that is reported. Statistical: its root, with a sigma of root / sqrt(2
+# rows), is then REMARK_SIGMAS above zero
 LEVEL_ROWS = REMARK_SIGMAS**2 / 2
 
 
 @dataclass(frozen=True)
 class Slip:
-    """A run of slip: s since the start mark, s, m the wheel turned beyond the ground."""
+    """A run of slip: s since the start mark, duration s, wheel travel minus vehicle travel m."""
 
     t: float
     duration: float
@@ -42,7 +42,7 @@ def along(fit: Fit, marginals: JointMarginals) -> Floats:
 
 def find_slips(fit: Fit, turned: Floats, count: float = 0.0) -> tuple[Slip, ...]:
     """
-    Return the runs that lie far out along, by more than a count, m; largest first.
+    Return the runs with outliers along the path beyond a count, m, largest first.
 
     turned : (K,) m, as ``along`` has it.
     """
@@ -61,14 +61,14 @@ def find_slips(fit: Fit, turned: Floats, count: float = 0.0) -> tuple[Slip, ...]
 
 
 def level_when_changing(fit: Fit, marginals: JointMarginals, count: float = 0.0) -> str:
-    """Return the slip level at changes of speed in words, '' if it is not observable."""
+    """Return the slip level at changes of speed as text, '' if it is not observable."""
     level = fit.levels.roots()
-    # two readings differ by that whatever the wheel does, over the 10 s that a spell of it lasts
+    # the noise of the difference of two readings, over a phase of 10 s
     rounding = count * np.sqrt(2 / 12) / np.sqrt(10.0)
-    # one that no row determines stays where the fit began
+    # a level without information keeps its initial value
     known = {name for name, (_, rows) in fit.weighted[MotionRows].components(marginals).items()
              if rows > LEVEL_ROWS}
-    # m/sqrt(s), times even driving: no wheel without slip has so much when speeds change
+    # m/sqrt(s), times that at constant speed: without slip it is smaller
     if 'along_hard' not in known or level['along_hard'] <= max(
             0.006, 3 * level['along'], rounding):
         return ''
@@ -80,11 +80,11 @@ def level_when_changing(fit: Fit, marginals: JointMarginals, count: float = 0.0)
 
 def slip_reasons(slips: tuple[Slip, ...], level: str = '') -> list[Reason]:
     """
-    Return WHEEL_SLIP with where the wheels slipped and how much, empty where they did not.
+    Return WHEEL_SLIP with places and sizes of slip, empty without slip.
 
     level : of slip whenever the speed changes, in words.
     """
-    said, most = [], 3      # runs said one by one
+    said, most = [], 3      # runs listed singly
     if slips:
         one = [f'{s.metres:+.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
                for s in slips[:most]]

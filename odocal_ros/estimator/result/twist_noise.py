@@ -90,8 +90,8 @@ class TwistNoise:
         (width, sigma), hard = self._known('track_width'), leg['odometer']['hard']
         even, pulled, turning = (np.square(left['walk']) + np.square(right['walk'])) / 2
         walk = turning if w > TURNING_RATE else (1 - hard) * even + hard * pulled
-        # the mean of two wheels has half the variance of one; what one wheel departs from the
-        # mean by, the other does with the opposite sign
+        # the mean of two wheels has half the variance of one; their deviations from the mean have
+        # opposite signs
         white = leg['widened']**2 * (4 * walk * turned + 8 * reading)
         ratio = left['ratio_sigma'] + right['ratio_sigma']
         return float(white + (sigma * w)**2 + (ratio * v)**2) / width**2

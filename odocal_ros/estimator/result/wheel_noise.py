@@ -17,11 +17,12 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
 
-# of the logarithm of a level about its first value: walks may all be a thousand times smaller or
-# larger, one against their mean three times; a reading errs as its rounding says. Judgement
+# prior sigmas of the logarithm of a level: all walks together may differ by a factor of a thousand
+# from their first value, each from their mean by three; reading errors are those of rounding.
+# Judgement
 WALK_SPREAD, APART_SPREAD, READING_SPREAD = 7.0, 1.0, 0.5
-# judgement: of finding increments that lie far out, until their variances stay within a tenth;
-# each round takes nine tenths of what they add to a level
+# judgement: iterations of the search for outliers, until variances change by less than a tenth;
+# each removes nine tenths of their effect on a level
 TAIL_ROUNDS, TAIL_SETTLED = 8, 0.1
 
 
@@ -61,7 +62,7 @@ class Line:
 
 
 def fit_line(seen: Increments) -> Line:
-    """Return the line at the restricted maximum of the likelihood, far increments weighed less."""
+    """Return the line at the maximum of the restricted likelihood, with down-weighted outliers."""
     from scipy.optimize import minimize
     spread = np.ones(len(seen.y))
     log_levels = np.zeros(len(seen.walk) + 1)

@@ -22,8 +22,8 @@ from odocal_ros.settings.levels import (
 )
 
 Found = tuple[dict[str, Estimate], list[Reason]]
-FEWEST_ALIKE = 3        # definition: of fewer, the one that departs is unknown
-# judgement: of new tyres of one size; a tyre without a third of its air has lost half of that
+FEWEST_ALIKE = 3        # definition: with fewer, the wheel that differs is unknown
+# judgement: difference of new tyres of one size; a third less pressure changes half of that
 DEPARTS = 0.01
 
 
@@ -33,7 +33,7 @@ def wheel_details(wheels: Mapping[str, Wheel]) -> dict[str, Any]:
 
 
 def unknown_wheels(names: Iterable[str], scale_unit: str) -> dict[str, Estimate]:
-    """Return the estimates of wheels of which nothing is known, {} of one counter."""
+    """Return the estimates of wheels without values, {} for one counter."""
     names = list(names)
     return {FACTOR + name: Estimate(None, None, scale_unit) for name in names} | {
         width: Estimate(None, None, 'm') for width in _widths(names)}
@@ -44,16 +44,14 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
     """
     Return the estimates of several wheels and the reasons, docs/method.md (W4), (W8).
 
-    names : of the wheels.   wheels : by name, none where nothing is known of them.   scale : of
-    their mean.
+    names : of the wheels.   wheels : by name, empty if unknown.   scale : of their mean.
     """
     names = list(names)
     found = unknown_wheels(names, scale.unit)
     if scale.value is None or scale.sigma is None:
         return found, []
     limit = INFORMED_SHARE * (config.wheels.radius_range or TYRE_SPREAD)
-    # left and right are one line, seen twice: right by left is off by twice what either is off
-    # from the mean
+    # left and right have the same line: the error of right over left is twice that of either
     sigma = 2 * max((wheel.ratio_sigma for wheel in wheels.values()), default=np.inf)
     if sigma > limit:
         known = f'has an uncertainty of {100 * sigma:.2g} %' if wheels else 'is not known'
@@ -92,7 +90,7 @@ def _places(axle: Mapping[str, Wheel]) -> dict[str, Estimate]:
 
 
 def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
-    """Return the reason for one wheel whose factor differs from all others."""
+    """Return the reason that reports a wheel whose factor differs from all others."""
     if len(wheels) < FEWEST_ALIKE:
         return []
     off = {}
@@ -107,16 +105,19 @@ def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
 
 
 def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, list[Reason]]:
-    width, sigma = left.y - right.y, left.y_sigma + right.y_sigma     # one line, seen twice
+    width, sigma = left.y - right.y, left.y_sigma + right.y_sigma     # both have the same line
     none = Estimate(None, None, 'm')
     if given and sigma >= INFORMED_SHARE * TRACK_WIDTH.taped_share * given:
-        return none, []         # the tape knows it better
+        return none, []         # the configured width is more accurate
     if sigma < TRACK_WIDTH.least and width < TRACK_WIDTH.least:
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
-                             f'match the gyro turns: the track width would be {width:.2g} m')]
-    if sigma >= TRACK_WIDTH.determined_share * max(width, TRACK_WIDTH.least):
+                             f'match the gyro turns: the track width would be {width:.2g} m; '
+                             f'the lower limit is {TRACK_WIDTH.least:g} m')]
+    limit = TRACK_WIDTH.determined_share * max(width, TRACK_WIDTH.least)
+    if sigma >= limit:
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
-                             f'{sigma:.2g} m. Likely cause: too few turns')]
+                             f'{sigma:.2g} m; the limit is {limit:.2g} m. Likely cause: too few '
+                             'turns')]
     if given and abs(width - given) > REMARK_SIGMAS * np.hypot(
             TRACK_WIDTH.taped_share * given, sigma):
         return Estimate(width, sigma, 'm'), [Reason(
@@ -129,7 +130,7 @@ def joined(legs: Sequence[MethodResult]) -> dict[str, Wheel]:
     """
     Return the wheels of several legs, weighted by their variances; {} if no leg has any.
 
-    Where legs differ by more than their sigmas allow, the sigma is as much larger.
+    If legs differ beyond their sigmas, the sigma is increased accordingly.
     """
     each: dict[str, list[Mapping[str, Any]]] = {}
     for leg in legs:

@@ -12,7 +12,7 @@ and by the difference of the tyres; a steered wheel also rolls farther in turns,
 
 s_i and s the readings of wheel i and of the mean, psi the turn, y_i the wheel's place, positive to
 the left, x_i its distance ahead. The turn is from the attitudes of the fit; each wheel has one
-line. The positions include the effect of load in turns: the outer tyre carries more and has a
+line. The positions include the effect of load in turns: the outer tyre has a higher load and a
 smaller rolling radius.
 """
 
@@ -46,14 +46,14 @@ from odocal_ros.nav.rotations import rotvec
 from odocal_ros.screening.axles import STEER_GRID, steering_path
 
 OWN_DELAY = 0.02        # s, 1 sigma of a wheel's stamps against the others'. Judgement
-FIRST_WALK = 2e-3**2    # m^2/s, definition: where the levels set out
-DOUBTED = 1e10          # definition: share of a walk that makes an increment say nothing
-GAP = 0.3               # s, judgement: a line between readings is then off by a centimetre or two
-FEWEST = 20             # increments, judgement: levels by fewer are good to 30 % at best
-NUISANCE = range(2, 5)  # definition: unknowns of a line that nobody asks for
+FIRST_WALK = 2e-3**2    # m^2/s, definition: first levels
+DOUBTED = 1e10          # definition: share of a walk that removes the information of an increment
+GAP = 0.3               # s, judgement: interpolation errors are then 1 to 2 cm
+FEWEST = 20             # increments, judgement: with fewer, the sigma of a level is 30 % or more
+NUISANCE = range(2, 5)  # definition: nuisance parameters of a line
 # physical: 1 sigma of it by sideslip and body motion; 20 mm of 2.7 m in docs/decisions/0022
 PLACE_SHARE = 8e-3
-WHEELBASE = 5.0         # m, 1 sigma of how far a steered wheel is ahead. Physical: of a lorry
+WHEELBASE = 5.0         # m, 1 sigma of the distance of a steered wheel ahead. Physical: of a lorry
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +82,10 @@ class Wheel:
 def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
                   width: float) -> dict[str, Wheel]:
     """
-    Return each wheel of a leg by name, none where there are no two or too little motion.
+    Return the wheels of a leg by name; empty with fewer than two, or with too little motion.
 
     problem, fit : the leg and its fit.   covariance : (M, M) of the constants.   drift : sigma of
-    the gyro's bias about up, rad/s: of how the attitudes of the fit drift.   width : track width
+    the gyro bias about up, rad/s: the yaw of the fit drifts by it.   width : track width
     as set, m, 0: unknown.
     """
     wheels, state = problem.leg.wheels, fit.state
@@ -114,7 +114,7 @@ def _nodes(s: Floats, quantum: float) -> Ints:
     """Return the nodes at which readings (w, k) are compared: at least one count apart."""
     nodes = [0]
     for k in range(1, s.shape[1]):
-        # m: standing, a reading is one
+        # m: a standstill is one node
         if np.abs(s[:, k] - s[:, nodes[-1]]).max() > max(quantum, 1e-3):
             nodes.append(k)
     return np.array(nodes)
@@ -153,7 +153,7 @@ class _Common:
         kind = np.where(turns, 2, np.where(hard, 1, 0))
         self.kind = kind[np.clip(at[1:] - 1, 0, len(kind) - 1)]
         self.T, self.t = np.diff(state.t[at]), state.t[at]
-        # a second of driving each, less where wheels hardly turn, whatever they stood before
+        # a second of driving each, less if wheels hardly turn; standstills do not count
         rolled = np.abs(np.diff(s)).max(axis=0)
         self.share = np.clip(rolled, 0.02 * np.minimum(self.T, 1.0), self.T)
         stamp = stamp_of(self.t, state.constants)
@@ -206,7 +206,7 @@ class _Common:
         """Return the derivatives of a - 1, a y and a x^2 by ln K and the gyro's errors."""
         rows = [0, 1, *range(NUISANCE.stop, len(line.x))]
         by_scale, by_gyro = [0.0, line.x[1]], -line.gain[rows] @ self.turn_errors * line.x[1]
-        if i in self.steer:     # q grows with the square of the turn, and falls with the speed
+        if i in self.steer:     # q is proportional to the squared turn over the path
             by_scale.append(2 * line.x[-1])
             curvature = self.turn / np.where(self.way, self.way, np.inf)
             by_gyro += line.gain[rows] @ (curvature[:, None] * self.turn_errors) * line.x[-1]

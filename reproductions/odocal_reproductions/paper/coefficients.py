@@ -1,14 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables 1 and 2 of Shi et al. 2015: coefficients of the error equations, and their weight."""
+"""Tables 1 and 2 of Shi et al. 2015: coefficients of the error equations, and their effects."""
 
 import numpy as np
 
 from odocal_reproductions.paper.cells import Cell, TABLE_1, TABLE_2
 from odocal_reproductions.paper.error_model import coefficients, PAPER_RADIUS, STATES
 
-# definition: the errors as Shi et al. 2015 has them
+# definition: errors in Shi et al. 2015
 DRIFT = np.deg2rad(0.01) / 3600    # rad/s, 0.01 deg/h
 LEVEL, HEADING = np.deg2rad(0.5 / 60), np.deg2rad(3.6 / 60)    # 0.5', 3.6'
 # sizes of the errors that table 2 multiplies with: rad, rad/s
@@ -17,18 +17,18 @@ SIZES = {'dL': 10.0 / PAPER_RADIUS, 'phi_E': LEVEL, 'phi_N': LEVEL, 'phi_U': HEA
 OWN_DRIFT = {'phi_E': 'eps_E', 'phi_N': 'eps_N', 'phi_U': 'eps_U'}
 
 REMARKS_1 = {
-    ('phi_E', 'phi_N'): 'misprint: (15) has vE/R for vE tan L/R',
-    ('phi_U', 'phi_U'): 'misprint: without the tan L of (17)',
-    ('dlam', 'dL'): 'misprint: (19), (23) lack vE, the figure has it',
+    ('phi_E', 'phi_N'): 'misprint: (15) has vE/R instead of vE tan L/R',
+    ('phi_U', 'phi_U'): 'misprint: tan L of (17) is missing',
+    ('dlam', 'dL'): 'misprint: (19), (23) lack vE, the value has it',
 }
 MISSING = 'as in table 1: tan L is missing'
 REMARKS_2 = {
-    ('phi_N', 'dL'): 'misprint: a slip of a decade, 7.5e-11',
+    ('phi_N', 'dL'): 'misprint: wrong by a factor of 10, 7.5e-11',
     ('phi_U', 'phi_U'): MISSING,
     ('phi_E', 'phi_N'): MISSING,
 }
 ROUNDED = 'inputs rounded to two digits first'
-CUT = 'cut, not rounded'
+CUT = 'truncated, not rounded'
 
 
 def table_1() -> dict[str, dict[str, Cell]]:

@@ -15,7 +15,7 @@ from odocal_ros.output.drawing import new_figure, save_figure
 STYLES = {'phi_U0': ('#0072B2', '-'), 'all': ('#000000', '--'), 'eps_z': ('#D55E00', '-'),
           'phi_E0': ('#009E73', '-'), 'phi_N0': ('#CC79A7', '-'), 'eps_x': ('#E69F00', '-'),
           'eps_y': ('#56B4E9', '--')}
-LABELS = {'phi_U0': r'$\phi_{U0}$ = 3.6′', 'all': 'all of them',
+LABELS = {'phi_U0': r'$\phi_{U0}$ = 3.6′', 'all': 'all errors',
           'eps_z': r'$\varepsilon_z$ = 0.01 °/h', 'phi_E0': r'$\phi_{E0}$ = 0.5′',
           'phi_N0': r'$\phi_{N0}$ = 0.5′', 'eps_x': r'$\varepsilon_x$ = 0.01 °/h',
           'eps_y': r'$\varepsilon_y$ = 0.01 °/h'}

@@ -13,8 +13,8 @@ from odocal_reproductions.paper.coefficients import DRIFT, HEADING, table_1, tab
 from odocal_reproductions.paper.drive import Growth, GYRO_NOISE, Outcome, PaperDrive, SOURCES
 from odocal_reproductions.paper.error_forms import SpeedProfile
 
-SCALE_REMARK = ('the same within 2e-11 in every printed row, not explained by plane or tilt: a '
-                "constant of the paper's numerics, not a target")
+SCALE_REMARK = ('equal within 2e-11 in every printed row, not explained by plane or tilt: an '
+                'effect of numerics in the paper, not a reference value')
 FORMULA_REMARK = ("printed dK is the sphere's R in (30), (31) and the ellipsoid's C0 and C in "
                   '(13), (14): phi_U / 2 times 0.0059')
 SIGN_REMARK = '(30)-(33) are printed with the sign reversed against (27), (28)'
@@ -25,9 +25,10 @@ class Row:
     """
     A row of table 3.
 
-    yaw_deg, scale : ours beside the printed ones, deg and relative to K.
+    yaw_deg, scale : computed and printed values, deg and relative to K.
     model_deg : yaw error by the linear error model, deg.
-    noise_sigmas : printed less ours in sigmas of the yaw error by gyro noise; None: not printed.
+    noise_sigmas : printed minus computed yaw error, in sigmas of the effect of gyro noise; None:
+        not printed.
     """
 
     yaw_deg: Cell
@@ -39,10 +40,10 @@ class Row:
 @dataclass(frozen=True, eq=False)
 class PaperTables:
     """
-    The four tables, and what they were made of.
+    The four tables and the data from which they are computed.
 
     noise_deg : 1 sigma of the yaw error by the paper's gyro noise over the drive, deg.
-    sigma_deg : 1 sigma of the yaw that the pipeline itself states for the drive, deg.
+    sigma_deg : yaw uncertainty, 1 sigma, stated by the pipeline for the drive, deg.
     """
 
     table_1: dict[str, dict[str, Cell]]
@@ -69,12 +70,12 @@ class PaperTables:
 
 
 def _plain(table: Any) -> Any:
-    """Return cells, and tables of them in each other, as --json has them."""
+    """Return the content of nested tables of cells for --json."""
     return table.as_dict() if isinstance(table, Cell) else {k: _plain(v) for k, v in table.items()}
 
 
 def compute() -> PaperTables:
-    """Return the four tables; the drive of section 3 goes through the pipeline eight times."""
+    """Return the four tables; the pipeline processes the drive of section 3 eight times."""
     drive = PaperDrive()
     outcomes = {source: drive.outcome(source) for source in SOURCES}
     growths = {source: drive.growth(source) for source in SOURCES}
@@ -110,7 +111,7 @@ def _table_4(third: dict[str, Row],
             remarks = '', SCALE_REMARK
         else:
             dalpha, scale = formula[source]
-            scale = round(scale, 20)      # below is round-off of a variance that is nothing
+            scale = round(scale, 20)      # smaller digits are rounding errors of a zero variance
             yaw_deg, remarks = float(np.rad2deg(dalpha)), (SIGN_REMARK, FORMULA_REMARK)
         printed_scale, printed_yaw = TABLE_4[source][name]
         return {'yaw_deg': Cell(printed_yaw, yaw_deg, sense=-1, remark=remarks[0]),

@@ -10,9 +10,9 @@ from odocal_reproductions.paper.tables import PaperTables
 
 HEAD = """\
 Shi, Ma, Zhang, Zhang 2015, 'The initial calibration of odometer and error analysis':
-what the paper prints, what this package computes, and their ratio.
-Errors of this package are estimate - truth. The yaw errors that the paper prints in tables 3
-and 4 are truth - estimate; they stand here as printed, and the ratio takes the sign out."""
+printed values, values computed by this package, and their ratio.
+Errors of this package are estimate - truth. The yaw errors printed in tables 3 and 4 are
+truth - estimate; they are shown as printed, and the ratio accounts for the sign."""
 TITLE_1 = """\
 Table 1: coefficients of the error equations (15)-(23), corrected; sphere of 6378137 m,
 latitude 40 deg, 14 m/s east and north. Magnitudes; the sign is that of the equations."""
@@ -20,10 +20,10 @@ TITLE_2 = """\
 Table 2: the same times dL = 10 m / R, phi_E = phi_N = 0.5', phi_U = 3.6', eps = 0.01 deg/h."""
 TITLE_3 = """\
 Table 3: calibration errors of the drive of section 3 (11.2 km, K0 = 1.2 K, mounting 1 deg),
-simulated and put through the pipeline; `model` is the linear error model, (11)-(23) corrected."""
+simulated and processed by the pipeline; `model` is the linear error model, (11)-(23) corrected."""
 TITLE_4 = """\
-Table 4: the simulation and the closed forms (32), (33), here corrected and for the drive's
-own speed profile."""
+Table 4: the simulation and the closed forms (32), (33), corrected and evaluated for the speed
+profile of the drive."""
 
 
 def text_of(tables: PaperTables) -> str:
@@ -58,11 +58,11 @@ def _third(tables: PaperTables) -> str:
     below = next(r.yaw_deg.remark for r in tables.table_3.values() if r.yaw_deg.remark)
     notes = [
         f'* {below} (0.001 deg/sqrt(h) alone: {tables.noise_deg:.1e} deg, 1 sigma; printed and '
-        f'ours differ by {worst[0]:.1f} of these at most, in row {worst[1]}).',
+        f'ours differ by at most {worst[0]:.1f} sigma, in row {worst[1]}).',
         'Row none is not in the paper: it is the residual error of the method.',
         f'Printed scale errors: {tables.table_3["all"].scale.remark}.',
-        f'The sigma of this yaw in the pipeline is {tables.sigma_deg:.4f} deg: that of the given '
-        'heading.']
+        f'The yaw uncertainty stated by the pipeline is {tables.sigma_deg:.4f} deg: that of the '
+        'given heading.']
     return '\n'.join(lines + [_note(note) for note in notes])
 
 

@@ -107,7 +107,7 @@ def imbalance(rows: Ints, levels: tuple[int, ...]) -> float:
 
 
 def least_rows(levels: tuple[int, ...]) -> int:
-    """Return the number of rows that an orthogonal array's must be a multiple of."""
+    """Return the smallest number of rows of an orthogonal array; others are multiples."""
     return math.lcm(*(a * b for a, b in combinations(levels, 2))) if len(levels) > 1 \
         else int(levels[0])
 

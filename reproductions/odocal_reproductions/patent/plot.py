@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The picture of odocal patent: the valley that 441 combinations see, and how each line does."""
+"""The picture of odocal patent: mean distances of 441 combinations, and of each line."""
 
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,14 @@ import numpy as np
 from odocal_reproductions.patent.embodiment import Embodiment, LEVELS, RADIUS_STEP
 from odocal_ros.output.drawing import new_figure, save_figure
 
-# drawn in the valley: by the begin of the name, marker and colour (Okabe and Ito)
+# marker and colour (Okabe and Ito) by the first words of a line's name
 MARKS = {'printed as best': ('*', '#D55E00'), 'printed': ('x', 'black'),
          'best of all': ('s', '#009E73'), 'response surface': ('o', '#E69F00'),
          'least squares': ('+', '#CC79A7'), 'truth': ('D', 'none')}
 
 
 def draw(table: Embodiment, path: Path) -> None:
-    """Draw a table into a file; BadUsage where it cannot be written."""
+    """Draw a table into a file; BadUsage if it cannot be written."""
     figure = new_figure(12.0, 5.6)
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
     _valley(figure, left, table)
@@ -27,7 +27,7 @@ def draw(table: Embodiment, path: Path) -> None:
 
 
 def _valley(figure: Any, axes: Any, table: Embodiment) -> None:
-    """Draw the mean distance over the errors of both radii, the heading as each likes it best."""
+    """Draw the mean distance over the errors of both radii, each at its best heading."""
     mm = 1000.0
     levels = (np.arange(LEVELS[0]) - LEVELS[0] // 2) * RADIUS_STEP * mm
     mesh = axes.pcolormesh(levels, levels, table.grid.T, shading='nearest', cmap='viridis',
