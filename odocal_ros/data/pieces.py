@@ -81,14 +81,18 @@ def median(x: Floats) -> float:
     return float(amid[at] if len(x) % 2 else (amid[:at].max() + amid[at]) / 2)
 
 
-def medians(x: Floats) -> Floats:
-    """Return the median of each column: (n, k) to (k,)."""
-    column, found = room(len(x)), []
+def columns(x: Floats) -> Iterator[Floats]:
+    """Yield the columns of x, (n, k), one at a time in the same memory: (n,)."""
+    column = room(len(x))
     for k in range(x.shape[1]):
         for rows in chunks(len(x)):
             column[rows] = x[rows, k]
-        found.append(median(column))
-    return np.array(found)
+        yield column
+
+
+def medians(x: Floats) -> Floats:
+    """Return the median of each column: (n, k) to (k,)."""
+    return np.array([median(column) for column in columns(x)])
 
 
 def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Floats]]:

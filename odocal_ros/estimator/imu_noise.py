@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.pieces import by_step
 from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.imu_steps import ImuSteps
@@ -65,7 +65,7 @@ def vibrating(leg: SmootherLeg) -> dict[str, float]:
     return {name: sigma**2 for name, sigma in of_samples(leg, rows).items()}
 
 
-def of_samples(leg: SmootherLeg, rows: slice | Bools) -> dict[str, float]:
+def of_samples(leg: SmootherLeg, rows: slice | Ints) -> dict[str, float]:
     """Return the noise of differences of adjacent samples, as white noise, SI per sqrt(Hz)."""
     def jumps(x: Floats) -> Floats:
         out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)

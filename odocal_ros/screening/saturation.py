@@ -6,6 +6,7 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import columns
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
 from odocal_ros.settings.grades import G
@@ -26,7 +27,7 @@ def saturated(t_imu: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> tuple[
     for sensor, x_i, scale, unit, least in (
             ('gyro', w_i, imu.gyro_scale, 'rad/s', LEAST_GYRO),
             ('accelerometer', f_i, imu.accel_scale, 'm/s^2', LEAST_ACCELEROMETER)):
-        for axis, x in zip('xyz', x_i.T, strict=True):
+        for axis, x in zip('xyz', columns(x_i), strict=True):
             for limit, following in ((x.max(initial=0.0), _below), (x.min(initial=0.0), _above)):
                 at = x == limit
                 count, size = int(np.count_nonzero(at)), abs(limit * scale)

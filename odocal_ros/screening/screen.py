@@ -16,8 +16,9 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.inputs import INPUTS, OUTSIDE
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
+from odocal_ros.data.pieces import by_row, median
 from odocal_ros.data.samples import FixSamples, ImuSamples, VelocitySamples
-from odocal_ros.nav.integral import running_integral
+from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import usable_axles
@@ -33,6 +34,8 @@ from odocal_ros.screening.saturation import saturated
 from odocal_ros.screening.several_imus import alternating, other_imus
 from odocal_ros.screening.wheel_travel import Wheels, wheels
 from odocal_ros.settings.config import Config, SIDES
+
+TRACK_ROWS = 2**19      # judgement: of a rough track, an hour at 146 Hz; more only take memory
 
 
 def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
@@ -169,15 +172,17 @@ def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> In
     placed = place(inputs, config)
     if not placed.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs
-    rate = inputs.w_b @ inputs.up_b
+    rate = by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b)
     # the median is the bias: drives have straights, and turns to both sides
-    heading = np.exp(1j * running_integral(inputs.t_imu, rate - np.median(rate)))
+    rate -= median(rate)
+    t = inputs.t_imu[::1 + len(inputs.t_imu) // TRACK_ROWS]
+    heading = np.exp(1j * integral_at(t, inputs.t_imu, rate))
     x, y, _ = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
-    way = np.diff(inputs.travel.at(inputs.t_imu), prepend=0.0) * placed.rough
+    way = np.diff(inputs.travel.at(t), prepend=0.0) * placed.rough
     track = np.cumsum(heading * way) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
     lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma,
-                         np.interp(inputs.t_fix, inputs.t_imu, track))
+                         np.interp(inputs.t_fix, t, track))
     found += why
     return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],
                    covariance_n=inputs.covariance_n[~lost],

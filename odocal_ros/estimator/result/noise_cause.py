@@ -6,6 +6,7 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import Array, by_row
 from odocal_ros.estimator.imu_noise import of_samples
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
@@ -17,6 +18,7 @@ EXPLAINED = 0.4         # judgement: share of the noise variance that quantisati
 # judgement: times that single samples vary more in motion than at rest. Real drives: vibrating
 # accelerometers 26 and 3.6, gyros 1.3 and 2.0
 VIBRATION = 3.0
+MOST_SAMPLES = 2**18    # judgement: their median has a sigma of 0.2 %; more only take memory
 FEWEST_ROWS = 100       # judgement: samples at rest, whose median then has a sigma of 15 %
 NAMES = {'gyro': 'gyro', 'accel': 'accelerometer'}
 UNITS = {'gyro': 'rad/s/sqrt(Hz)', 'accel': 'm/s^2/sqrt(Hz)'}    # of white noise
@@ -63,11 +65,17 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
 def at_rest_and_moving(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
     """Return the white noise of single samples in motion and at rest; {}: too few samples."""
     leg, keys = problem.leg, problem.imu.t[problem.imu.key]
-    inside = (leg.t_imu >= keys[0]) & (leg.t_imu < keys[-1])
-    interval = np.clip(np.searchsorted(keys, leg.t_imu, side='right') - 1, 0, len(keys) - 2)
-    still = (problem.still[:-1] & problem.still[1:])[interval]
-    of = (of_samples(leg, inside & rows) if (inside & rows).sum() >= FEWEST_ROWS else {}
-          for rows in (~still, still))
+    still = problem.still[:-1] & problem.still[1:]
+
+    def part(t: Floats) -> Array:
+        """Return 0 in motion, 1 at rest, 2 outside the keyframes."""
+        at = np.searchsorted(keys, t, side='right') - 1
+        inside = (t >= keys[0]) & (t < keys[-1])
+        return np.where(inside, still[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
+
+    parts = by_row(part, leg.t_imu)
+    of = (of_samples(leg, rows) if len(rows) >= FEWEST_ROWS else {} for rows in (
+        np.flatnonzero(parts == kind)[:MOST_SAMPLES] for kind in (0, 1)))
     moving, rest = of
     return moving, rest
 
