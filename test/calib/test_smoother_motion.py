@@ -30,11 +30,16 @@ from odocal_ros.sim.real import Real
 from odocal_ros.sim.wheels import G
 
 
+def at_truth(t_stop=None, **options):
+    """Return a drive without noise, and problem and state of its leg."""
+    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, **options)
+    leg = replace(leg, t_stop=t_stop or leg.t_stop)
+    return drive, problem_of(leg, config), truth(drive, config, leg)
+
+
 @pytest.fixture(scope='module')
 def perfect():
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0)
-    leg = replace(leg, t_stop=60.0)
-    return problem_of(leg, config), truth(drive, config, leg)
+    return at_truth(60.0)[1:]
 
 
 @pytest.mark.parametrize('turned', [-2 * np.pi, np.pi, 2.0, 0.3])
@@ -80,10 +85,8 @@ def test_a_turn_of_a_body_that_rolls_does_not_pitch_it(perfect):
 def test_a_turn_is_no_braking():
     """Tyres that slip by 0.8 % for each m/s^2 of pull, half of it braking: a turn is none."""
     stiff = 0.04
-    drive, config, leg = made(
-        imu_grade='perfect', fix_sigma=0.0, duration=150.0, scale=1e-3, nominal_scale=1e-3,
-        real=Real(tyre_slip=stiff, driven=True))
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3,
+                                 real=Real(tyre_slip=stiff, driven=True))
     c = state.constants.copy()
     c[TYRES][2:] = 2 * stiff / G, stiff / G
     state = replace(state, constants=c)
@@ -102,10 +105,7 @@ def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
     """An IMU 0.6 m to the left feels 0.6 m times the change of the turn rate as a push ahead."""
     found = []
     for arm in ((0.0, 0.0, 0.0), (0.7, 0.6, 0.5)):
-        drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
-                                  imu_lever_arm=arm)
-        problem = problem_of(leg, config)
-        state = truth(drive, config, leg)
+        _, problem, state = at_truth(imu_lever_arm=arm)
         axle = Axle(problem, state)
         found.append((axle.accelerations()[:, :2], axle.acceleration(), problem))
     (at_axle, ahead, problem), (pushed, faster, _) = found
@@ -121,8 +121,7 @@ def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
 def test_a_lean_is_level_though_the_imu_is_rolled():
     """About axes of an IMU that is rolled by 5 deg a squat were a tenth of a sideslip too."""
     roll = 0.09
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, roll=roll)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    drive, problem, state = at_truth(roll=roll)
     motion = Equations(problem, state).parts['motion'].motion
     C_nv = state.C_nb[:-1] @ matrix_from_rpy([roll, drive.options.pitch, drive.options.yaw]).T
     by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(BARE)[2][:, 15:18, LEAN]
@@ -136,9 +135,7 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
 @pytest.mark.parametrize(('real', 'axis'), [(Real(sideslip=0.005), 1), (Real(squat=0.005), 2)])
 def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
     """A third at least of what is left of a lean goes with the change of the push."""
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, scale=1e-3,
-                              nominal_scale=1e-3, real=real)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3, real=real)
     part = Equations(problem, state).parts['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     off = (C_vn @ part.raw[:, 15:18, None])[:, axis, 0]
@@ -154,9 +151,8 @@ def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
 
 def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     """What is left is that the road bends within it: by (h / length)^2 of it, and seconds."""
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.1,
-                              scale=1e-3, nominal_scale=1e-3, real=Real(wheelbase=3.0))
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    _, problem, state = at_truth(slope=0.1, scale=1e-3, nominal_scale=1e-3,
+                                 real=Real(wheelbase=3.0))
     part = Equations(problem, state).parts['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     off = (C_vn @ part.raw[:, 15:18, None])[:, 2, 0]
@@ -175,8 +171,7 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
 
 
 def test_bumps_may_have_another_centre_than_hills():
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.05)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    _, problem, state = at_truth(slope=0.05)
     motion = Equations(problem, state).parts['motion'].motion
     hill, bump = (np.sin(2 * np.pi * np.arange(len(motion.T)) / period) for period in (40.0, 2.5))
     around = slice(HILL_INTERVALS, -HILL_INTERVALS)
@@ -189,8 +184,7 @@ def test_bumps_may_have_another_centre_than_hills():
 
 
 def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.1)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    drive, problem, state = at_truth(slope=0.1)
     motion = Equations(problem, state).parts['motion'].motion
     since = (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     there = drive.motion.at(since + (state.t[1:] + state.t[:-1]) / 2)
@@ -205,11 +199,7 @@ def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
 
 def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
     error = 0.01
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
-                              accel_scale_error=error)
-    leg = replace(leg, t_stop=60.0)
-    problem = problem_of(leg, config)
-    state = truth(drive, config, leg)
+    _, problem, state = at_truth(60.0, accel_scale_error=error)
     c = state.constants.copy()
     c[ACCEL.start:ACCEL.start + 2] = error / (1 + error)      # of what is measured
     # on a level road the force along z is gravity, but for the tilt: the error a bias
@@ -226,8 +216,7 @@ def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
 
 def test_the_scale_is_that_of_the_path_wherever_the_body_points():
     """Squat by 0.1 rad per m/s^2 turns the path within the body, and makes it no longer."""
-    drive, config, leg = made(scenario='town', imu_grade='perfect', fix_sigma=0.0, duration=150.0)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    _, problem, state = at_truth(scenario='town')
     c = np.zeros(M)
     c[LEAN.start] = 0.1
     level, leaning = (Equations(problem, state.moved(np.zeros((len(state.t), BARE)), step))

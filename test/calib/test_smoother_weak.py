@@ -37,33 +37,22 @@ SPEED, RADIUS, STRAIGHT = 9.0, 30.0, 60.0     # m/s, m, m
 START_NS = 1_700_000_000_000_000_000
 
 
-def results(noise):
-    """Return the smoother's results of a drive's windows, and the truth."""
+@pytest.mark.parametrize('noise', ['correlated', 'white'])
+def test_slow_errors_are_in_the_sigma_of_scale_and_pitch(noise):
     drive, config, leg = made(**TOWN, fix_noise=noise)
-    begins = 20.0 + WINDOW * np.arange(WINDOWS)
-    return drive.truth, [smooth(replace(leg, t_begin=begin, t_stop=begin + WINDOW), config)
-                         for begin in begins]
-
-
-def test_slow_errors_are_in_the_sigma_of_scale_and_pitch():
-    truth, found = results('correlated')
+    truth, found = drive.truth, [
+        smooth(replace(leg, t_begin=begin, t_stop=begin + WINDOW), config)
+        for begin in 20.0 + WINDOW * np.arange(WINDOWS)]
     for name, true in (('scale_factor', truth.scale), ('pitch_mounting_angle', truth.pitch)):
         out = [(e.value - true) / e.sigma for e in (r.estimates[name] for r in found)]
         # chi2 of 6, 1 in 1000; taken for white they are some 5 sigmas off each
         assert np.square(out).sum() < 22.5
-
-
-def test_a_slow_error_is_believed_of_white_fixes_too():
-    truth, found = results('white')
-    for name, true in (('scale_factor', truth.scale), ('pitch_mounting_angle', truth.pitch)):
-        out = [(e.value - true) / e.sigma for e in (r.estimates[name] for r in found)]
-        assert np.square(out).sum() < 22.5
-    for noise in (r.details['noise'] for r in found):
+    for level in (r.details['noise'] for r in found if noise == 'white'):
         # of 450 values 3 sigmas of their rms; of the slow error 45 s tell little: not more of it
         # than the receiver states
-        assert noise['fix'] == pytest.approx(1.0, abs=0.1)
-        assert 0.0 < noise['slow'] < 1.5
-        assert noise['correlation_time'] > 0
+        assert level['fix'] == pytest.approx(1.0, abs=0.1)
+        assert 0.0 < level['slow'] < 1.5
+        assert level['correlation_time'] > 0
 
 
 @pytest.mark.parametrize('stated', [0.5, 2.0])

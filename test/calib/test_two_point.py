@@ -85,11 +85,16 @@ def test_plane_and_geodesic_agree_with_the_solution_in_space(kind, ellipsoid):
     assert Code.PLANES_DISAGREE not in {r.code for r in result.reasons}
 
 
+def surveyed(fix, k):
+    """Return a fix as a surveyed point, good to 1 cm."""
+    return tuple(map(float, (np.rad2deg(fix.latitude[k]), np.rad2deg(fix.longitude[k]),
+                             fix.height[k], 0.01)))
+
+
 def test_surveyed_points_take_the_place_of_fixes():
     made = drive(**CLEAN, scenario='straight', duration=200.0)
     leg, fix = made.leg(), made.fix
-    ends = [tuple(map(float, (np.rad2deg(fix.latitude[k]), np.rad2deg(fix.longitude[k]),
-                              fix.height[k], 0.01))) for k in (0, -1)]
+    ends = [surveyed(fix, k) for k in (0, -1)]
     # fixes that are 50 m off, all alike but the last part: only the survey is right
     off = changed(fix, latitude=lambda a: a + 1e-6 * np.linspace(0, 8, len(a)))
     config = settings(made, reference__start=ends[0], reference__end=ends[1])
@@ -105,10 +110,8 @@ def test_surveyed_points_take_the_place_of_fixes():
 
 def test_a_surveyed_end_is_not_taken_for_where_a_holdout_ends():
     made = drive(**CLEAN, scenario='straight', duration=200.0)
-    fix = made.fix
-    end = tuple(map(float, (np.rad2deg(fix.latitude[-1]), np.rad2deg(fix.longitude[-1]),
-                            fix.height[-1], 0.01)))
-    result = calibrate(made.leg(), settings(made, reference__end=end), holdout=True)
+    config = settings(made, reference__end=surveyed(made.fix, -1))
+    result = calibrate(made.leg(), config, holdout=True)
     scale = result.methods['two_point'].estimates['scale_factor'].value
     assert scale == pytest.approx(made.truth.scale, rel=1e-5)
 
