@@ -9,7 +9,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.data.samples import HeadingSamples
+from odocal_ros.data.samples import HeadingSamples, take
 from odocal_ros.nav.angles import heading_from_yaw, wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en
@@ -52,7 +52,7 @@ class Case:
         leg = self.drive.leg()
         start_ns = leg.start_ns + round(later * 1e9)
         if forget:     # no pre-roll: the recording begins at the mark
-            from odocal_ros.data.samples import take
+
             leg = leg.with_rows(**{slot: take(leg.rows(slot),
                                              leg.rows(slot).stamp_ns >= start_ns)
                                   for slot in ('imu', 'odometer', 'fix', 'heading')})
@@ -315,19 +315,14 @@ def test_an_orientation_not_sent_or_worthless_is_refused(plain, source, variance
     assert says in reasons[0].text
 
 
-def test_a_quaternion_of_zeros_is_no_orientation(plain):
-    case = asked(plain, alignment__heading_source='imu_orientation')
-    a, reasons = case.align(q_ni=np.zeros_like(plain.inputs.q_ni),
-                            yaw_variance=np.zeros(len(plain.inputs.t_imu)))
+@pytest.mark.parametrize(('source', 'says', 'sent'), [
+    ('fixed', 'alignment.heading is not set', {}), ('heading_topic', 'no message', {}),
+    ('imu_orientation', '', {'q_ni': 0.0, 'yaw_variance': 0.0})])       # quaternions of zeros
+def test_a_source_without_data_is_refused(plain, source, says, sent):
+    a, reasons = asked(plain, alignment__heading_source=source).align(**{
+        name: value * getattr(plain.inputs, name) for name, value in sent.items()})
     assert a.heading_source == 'course'
     assert reasons[0].code is Code.HEADING_UNAVAILABLE
-
-
-@pytest.mark.parametrize(('source', 'says'), [
-    ('fixed', 'alignment.heading is not set'), ('heading_topic', 'no message')])
-def test_a_source_without_data_is_refused(plain, source, says):
-    a, reasons = asked(plain, alignment__heading_source=source).align()
-    assert a.heading_source == 'course'
     assert says in reasons[0].text
 
 
