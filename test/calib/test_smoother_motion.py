@@ -9,21 +9,11 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import Equations, sums as preintegrated
 from odocal_ros.estimator.factors.axle import Axle, WALK_SPEED
 from odocal_ros.estimator.factors.motion import D, HILL_INTERVALS, Motion, slowly
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.state import (
-    ACCEL,
-    BARE,
-    LEAN,
-    LN_K,
-    M,
-    PITCH,
-    PITCH_CENTRE,
-    TYRES,
-    YAW,
-)
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
 from odocal_ros.sim.real import Real
@@ -45,12 +35,12 @@ def perfect():
 @pytest.mark.parametrize('turned', [-2 * np.pi, np.pi, 2.0, 0.3])
 def test_a_step_that_turns_the_pitch_over_leaves_the_top_up(perfect, turned):
     _, state = perfect
-    step = np.zeros(M)
-    step[PITCH] = turned
-    moved = state.moved(np.zeros((len(state.t), BARE)), step)
-    assert abs(moved.constants[PITCH]) <= np.pi / 2
+    step = np.zeros(layout.M)
+    step[layout.PITCH] = turned
+    moved = state.moved(np.zeros((len(state.t), layout.BARE)), step)
+    assert abs(moved.constants[layout.PITCH]) <= np.pi / 2
     np.testing.assert_allclose(moved.forward, forward_b(
-        state.constants[YAW], state.constants[PITCH] + turned), atol=1e-12)
+        state.constants[layout.YAW], state.constants[layout.PITCH] + turned), atol=1e-12)
     assert moved.C_bv[2, 2] >= 0
 
 
@@ -88,7 +78,7 @@ def test_a_turn_is_no_braking():
     _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3,
                                  real=Real(tyre_slip=stiff, driven=True))
     c = state.constants.copy()
-    c[TYRES][2:] = 2 * stiff / G, stiff / G
+    c[layout.TYRES][2:] = 2 * stiff / G, stiff / G
     state = replace(state, constants=c)
     along = Equations(problem, state).parts['motion'].raw[:, 15]
     speed = np.linalg.norm(state.v_n, axis=1)
@@ -124,7 +114,7 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
     drive, problem, state = at_truth(roll=roll)
     motion = Equations(problem, state).parts['motion'].motion
     C_nv = state.C_nb[:-1] @ matrix_from_rpy([roll, drive.options.pitch, drive.options.yaw]).T
-    by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(BARE)[2][:, 15:18, LEAN]
+    by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(layout.BARE)[2][:, 15:18, layout.LEAN]
     sizes = np.linalg.norm(by, axis=1).max(axis=0)
     assert (sizes > 0.1).all()
     # the axis of the mounting's pitch is level to the second order of yaw and pitch, 1 deg each
@@ -139,7 +129,7 @@ def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
     part = Equations(problem, state).parts['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     off = (C_vn @ part.raw[:, 15:18, None])[:, axis, 0]
-    by = (C_vn @ part.jacobians(BARE)[2][:, 15:18, LEAN])[:, axis]
+    by = (C_vn @ part.jacobians(layout.BARE)[2][:, 15:18, layout.LEAN])[:, axis]
 
     def left(columns):
         c = np.linalg.lstsq(by[:, columns], off, rcond=None)[0]
@@ -156,18 +146,18 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     part = Equations(problem, state).parts['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     off = (C_vn @ part.raw[:, 15:18, None])[:, 2, 0]
-    by = (C_vn @ part.jacobians(BARE)[2][:, 15:18, PITCH_CENTRE])[:, 2, 0]
+    by = (C_vn @ part.jacobians(layout.BARE)[2][:, 15:18, layout.PITCH_CENTRE])[:, 2, 0]
     centre = -(by @ off) / (by @ by)
     assert np.abs(off).max() > 1e-3       # m in a second
     assert centre == pytest.approx(1.5, rel=0.02)
     assert np.sqrt(((off + by * centre)**2).mean()) < 0.05 * np.sqrt((off**2).mean())
     # no count lifts the odometer: what does is no part of what the scale multiplies
     c = state.constants.copy()
-    c[PITCH_CENTRE.start] = centre
+    c[layout.PITCH_CENTRE.start] = centre
     lifted = replace(state, constants=c)
     there = Equations(problem, lifted).parts['motion']
-    np.testing.assert_allclose(there.jacobians(BARE)[2][:, D, LN_K],
-                               part.jacobians(BARE)[2][:, D, LN_K], atol=1e-9)
+    np.testing.assert_allclose(there.jacobians(layout.BARE)[2][:, D, layout.LN_K],
+                               part.jacobians(layout.BARE)[2][:, D, layout.LN_K], atol=1e-9)
 
 
 def test_bumps_may_have_another_centre_than_hills():
@@ -201,7 +191,7 @@ def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
     error = 0.01
     _, problem, state = at_truth(60.0, accel_scale_error=error)
     c = state.constants.copy()
-    c[ACCEL.start:ACCEL.start + 2] = error / (1 + error)      # of what is measured
+    c[layout.ACCEL.start:layout.ACCEL.start + 2] = error / (1 + error)      # of what is measured
     # on a level road the force along z is gravity, but for the tilt: the error a bias
     bias = state.accel_bias + [0.0, 0.0, error * 9.80154]
     state = replace(state, constants=c, accel_bias=bias)
@@ -217,10 +207,10 @@ def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
 def test_the_scale_is_that_of_the_path_wherever_the_body_points():
     """Squat by 0.1 rad per m/s^2 turns the path within the body, and makes it no longer."""
     _, problem, state = at_truth(scenario='town')
-    c = np.zeros(M)
-    c[LEAN.start] = 0.1
-    level, leaning = (Equations(problem, state.moved(np.zeros((len(state.t), BARE)), step))
-                      .parts['motion'].motion for step in (np.zeros(M), c))
+    c = np.zeros(layout.M)
+    c[layout.LEAN.start] = 0.1
+    level, leaning = (Equations(problem, state.moved(np.zeros((len(state.t), layout.BARE)), step))
+                      .parts['motion'].motion for step in (np.zeros(layout.M), c))
     straight = np.abs(level.sums.mean_rate[:, 2]) < 1e-3
     # slower than a walk the direction of travel is not known
     walks = np.linalg.norm(level.travelled, axis=1) > WALK_SPEED * level.T[:, 0]
