@@ -172,8 +172,7 @@ def test_distance_survives_a_rollover_and_a_reset_is_none():
 @pytest.mark.parametrize(('quantity', 'unit', 'values', 'metres'), [
     ('increment', 'm/pulse', np.array([7, 10, 10]), 0.4),   # the first row's belongs to before
     ('rate', '1', np.array([2.0, 2.0, 3.0]), 5.0),
-    ('cumulative', 'm/rad', np.array([1.0, 2.0, 4.0]), 0.9),
-])
+    ('cumulative', 'm/rad', np.array([1.0, 2.0, 4.0]), 0.9)])
 def test_every_quantity_gives_metres(quantity, unit, values, metres):
     scale = {'m/pulse': 0.02, '1': 1.0, 'm/rad': 0.3}[unit]
     travel = Travel(OdometerForm(quantity, 0, unit))

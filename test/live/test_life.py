@@ -89,8 +89,7 @@ BAD_OVERRIDES = [
     ('qos_overrides./odometer.subscription.depth:=x', 'qos_overrides'),
     ('qos_overrides./odometer.subscription.reliability:=often', 'qos_overrides'),
     ('qos_overrides./imu/data.subscription.depth:=x', "'x' is not a whole number"),
-    ('leg.min_distance', "Couldn't parse parameter override rule"),
-]
+    ('leg.min_distance', "Couldn't parse parameter override rule")]
 # one process for all: most of a start is the import
 EACH = ('import sys\nfrom odocal_ros.live.node import main\nfor override in sys.argv[1:]:\n'
         '    sys.stderr.write(f"{main([\'\', \'--ros-args\', \'-p\', override])}\\n")')
