@@ -100,7 +100,7 @@ AT_REST = [
 def test_an_unusable_leg_is_rejected_for_its_cause(made, leg, spoil, code, text, nominal):
     with np.errstate(divide='raise', over='raise', invalid='raise'):
         result, said = run(spoil(leg), drives.settings(made, odometer__nominal_scale=nominal,
-                                                method='auto'))
+                                                       method='auto'))
     assert text in said[code]
     assert drives.rejecting(result) == {code}
 
@@ -185,7 +185,7 @@ def test_a_counter_that_counts_down(made, leg, known):
     scale = result.methods['two_point'].estimates['scale_factor']
     assert scale.value == pytest.approx(made.truth.scale, rel=2e-3)      # always above zero
     result, _ = run(down, drives.settings(made, heading_sigma=1e-3 if known else None,
-                                   odometer__reversed=True))
+                                          odometer__reversed=True))
     sound(result, made.truth)
 
 
@@ -218,7 +218,7 @@ def test_degrees_instead_of_radians(made, town, scenario):
 
 def test_a_z_down_imu_is_read_as_what_it_is(town):
     leg = replace(town.leg(), imu=drives.changed(town.imu, w_i=lambda a: a * [1.0, -1.0, -1.0],
-                                          f_i=lambda a: a * [1.0, -1.0, -1.0]))
+                                                 f_i=lambda a: a * [1.0, -1.0, -1.0]))
     result, said = run(leg, drives.settings(town))
     assert 'forward-right-down is assumed' in said[Code.IMU_LOOKS_Z_DOWN]
     assert result.verdict.value == 'caution'
@@ -257,7 +257,7 @@ def test_a_stray_fix_is_no_way_of_a_leg_that_is_refused(town):
         latitude[[400, 401, 900]] += np.deg2rad([4.0, 4.0, -0.01])      # 445 km, 1.1 km
         return latitude
     result, said = run(replace(leg, fix=drives.changed(leg.fix, latitude=stray)),
-                           drives.settings(town))
+                       drives.settings(town))
     assert Code.IMU_AXES in said
     assert result.distance == pytest.approx(plain.distance, rel=0.01)
 
@@ -319,7 +319,7 @@ def test_marks_outside_the_data(made, leg, shift):
 def test_one_wild_fix_costs_nothing(made, leg):
     for at in (250, 300, 310, 500, 700):       # one at the very start mark, too
         wild = drives.changed(leg.fix, latitude=lambda a, at=at: a.__setitem__(at, a[at] + 0.05),
-                       height=lambda a, at=at: a.__setitem__(at, 9000.0))
+                              height=lambda a, at=at: a.__setitem__(at, 9000.0))
         result, _ = run(replace(leg, fix=wild), drives.settings(made))
         sound(result, made.truth)
 

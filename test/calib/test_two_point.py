@@ -69,7 +69,7 @@ def test_plane_and_geodesic_agree_with_the_solution_in_space(kind, ellipsoid):
     """
     made = drives.drive(**CLEAN, scenario='straight', duration=200.0, height=1500.0)
     result = drives.two_point(made.leg(), drives.settings(made, projection__kind=kind,
-                                            projection__ellipsoid=ellipsoid))
+                                                          projection__ellipsoid=ellipsoid))
     for check in result.details['cross_check'].values():
         assert check['scale_factor'] == pytest.approx(made.truth.scale, rel=1e-6)
         assert check['alpha_psi'] == pytest.approx(made.truth.yaw, abs=2e-6)
@@ -175,7 +175,7 @@ def test_a_track_that_loops_where_the_fixes_do_not_is_refused():
 def test_a_heading_worse_than_the_asked_yaw_refuses_the_yaw_only(sigma, given):
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical')
     result = calibrate(made.leg(), drives.settings(made, heading_sigma=sigma,
-                                            verdict__max_yaw_sigma=0.0087))
+                                                   verdict__max_yaw_sigma=0.0087))
     e = result.methods['two_point'].estimates
     assert (e['yaw_mounting_angle'].value is not None) == given
     assert (Code.YAW_NOT_SEPARABLE in drives.everything_said(result)) != given
@@ -219,7 +219,7 @@ def test_the_imus_offset_is_that_of_the_others_turned_round():
 
 def test_two_wheels_give_the_scale_of_their_mean():
     made = drives.drive(**(CLEAN | {'odometer': 'counts'}), scenario='straight', duration=200.0,
-                 two_wheels=True)
+                        two_wheels=True)
     # one count of 2 cm a wheel on 1 km
     assert found(made)[0] == pytest.approx(made.truth.scale, rel=4e-5)
 

@@ -72,7 +72,7 @@ def said(made, **wheels):
     """Return what screening says of a leg whose counters are changed."""
     leg = made.leg()
     leg = leg.with_rows(**{slot: changed(leg.rows(slot), value=change)
-                          for slot, change in wheels.items()})
+                           for slot, change in wheels.items()})
     return {r.code: r.text for r in screen(leg, settings(made))[1]}
 
 

@@ -36,8 +36,7 @@ DRIVES = {
     'noisy town': {'scenario': 'town', 'two_wheels': True, 'duration': 300.0, 'outliers': 0.02},
     'out and back': RTK | {'scenario': 'out_and_back', 'duration': 400.0},
     'straight': {'scenario': 'straight', 'two_wheels': True, 'duration': 400.0},
-    'paper': {'scenario': 'paper', 'two_wheels': True, 'odometer': 'angle'},
-}
+    'paper': {'scenario': 'paper', 'two_wheels': True, 'odometer': 'angle'}}
 # on the straight ones positions are blind to left against right: nothing to agree on
 TURNING = ['town', 'another town', 'noisy town', 'out and back']
 TRUE = np.array([0.99, 1.015, 0.03])       # of the drives on a plane

@@ -289,8 +289,7 @@ def test_a_sensors_type_as_an_odometer_is_read_by_its_field():
      r'data\[0\]'),
     ('odometer', 'std_msgs/msg/Int64', {'odometer.left': 'a', 'odometer.right': 'b'}, BadConfig,
      "use 'topic'"),
-    ('odometer', 'sensor_msgs/msg/JointState', {'odometer.left': 'a'}, BadConfig, 'together'),
-])
+    ('odometer', 'sensor_msgs/msg/JointState', {'odometer.left': 'a'}, BadConfig, 'together')])
 def test_refused(slot, msgtype, settings_, error, says):
     with pytest.raises(error, match=says):
         make_reader(slot, msgtype, with_settings(Config(), settings_))

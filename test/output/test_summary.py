@@ -40,8 +40,7 @@ def test_the_largest_error_source_is_given_with_its_share_of_the_variance(good, 
     (0.5, 0.0, '0.500000 ± 0.000000'),
     (0.5, None, '0.5'),
     (0.5, math.nan, '0.5'),
-    (math.nan, 0.1, 'unknown'),
-])
+    (math.nan, 0.1, 'unknown')])
 def test_digits_stop_where_the_sigma_begins(value, sigma, text):
     assert with_sigma(value, sigma) == text
 

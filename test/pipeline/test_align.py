@@ -10,17 +10,11 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.data.samples import HeadingSamples, take
+from odocal_ros.nav import rotations
 from odocal_ros.nav.angles import heading_from_yaw, wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.rotations import (
-    matrix_from_rpy,
-    quat_from_matrix,
-    quat_from_rotvec,
-    rpy_from_matrix,
-    transpose,
-)
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.align import align, choose_standstill, with_seen_walk
 from odocal_ros.pipeline.prepared import attitude_of
@@ -54,8 +48,8 @@ class Case:
         if forget:     # no pre-roll: the recording begins at the mark
 
             leg = leg.with_rows(**{slot: take(leg.rows(slot),
-                                             leg.rows(slot).stamp_ns >= start_ns)
-                                  for slot in ('imu', 'odometer', 'fix', 'heading')})
+                                              leg.rows(slot).stamp_ns >= start_ns)
+                                   for slot in ('imu', 'odometer', 'fix', 'heading')})
         self.leg = replace(leg, start_ns=start_ns)
         self.mark = (start_ns - self.drive.options.start_ns) * 1e-9     # s of the motion
         self.inputs, _ = screen(self.leg, self.config)
@@ -75,14 +69,14 @@ class Case:
         """Return the true C_nb at t, n being that of the origin."""
         state = self.drive.motion.at(np.array([self.mark + t]))
         o = self.drive.options
-        C_vb = matrix_from_rpy([o.roll, o.pitch, o.yaw])
-        C_np = transpose(C_en(self.origin.latitude, self.origin.longitude)) @ C_en(
+        C_vb = rotations.matrix_from_rpy([o.roll, o.pitch, o.yaw])
+        C_np = rotations.transpose(C_en(self.origin.latitude, self.origin.longitude)) @ C_en(
             state.latitude[0], state.longitude[0])
         return C_np @ attitude(state)[0] @ C_vb
 
     def miss(self, alignment):
         """Return how the alignment turns n against the truth, as a rotation vector, rad."""
-        return np.array(rpy_from_matrix(alignment.C_nb @ self.truth(alignment.t).T))
+        return np.array(rotations.rpy_from_matrix(alignment.C_nb @ self.truth(alignment.t).T))
 
 
 @pytest.fixture(scope='module')
@@ -242,12 +236,12 @@ def test_a_fixed_heading_at_a_moving_mark_is_carried_back_to_the_standstill(late
 def orientations(case, yaw, variance):
     """Return inputs for an IMU that sends one orientation, of its own frame i, all the time."""
     n = len(case.inputs.t_imu)
-    q = quat_from_matrix(matrix_from_rpy([0.0, 0.0, yaw]) @ case.inputs.C_bi)
+    q = rotations.quat_from_matrix(rotations.matrix_from_rpy([0.0, 0.0, yaw]) @ case.inputs.C_bi)
     return {'q_ni': np.tile(q, (n, 1)), 'yaw_variance': np.full(n, variance)}
 
 
 def heading_rows(yaw, variance, t):
-    q = quat_from_rotvec(np.outer(np.broadcast_to(yaw, np.shape(t)), [0, 0, 1]))
+    q = rotations.quat_from_rotvec(np.outer(np.broadcast_to(yaw, np.shape(t)), [0, 0, 1]))
     stamp_ns = np.round(t * 1e9)
     sent = HeadingSamples(stamp_ns, stamp_ns, q, np.full(len(t), variance))
     return {'outside': {'heading': UsableRows(sent, t)}}

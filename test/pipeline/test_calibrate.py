@@ -24,7 +24,7 @@ SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 def test_error_free_sensors_give_the_truth_of_the_papers_drive(odometer):
     """K0 wrong by 20 %, mounting 1 deg: scale within 1e-6, yaw within 0.001 deg."""
     made = drives.drive(scenario='paper', imu_grade='perfect', fix_sigma=0.0, yaw=np.deg2rad(1.0),
-                 odometer=odometer, imu_rate=100.0)
+                        odometer=odometer, imu_rate=100.0)
     assert made.options.nominal_scale == pytest.approx(1.2 * made.truth.scale)
     result = calibrate(made.leg(), drives.settings(made, heading_sigma=1e-5))
     e = result.methods['two_point'].estimates
@@ -73,7 +73,7 @@ def test_speeds_that_are_said_are_by_the_calibrated_scale(town):
     leg = replace(town.leg(), fix=drives.changed(
         town.fix, covariance_n=lambda c: np.tile(225 * np.eye(3), (len(c), 1, 1))))
     result = calibrate(leg, drives.settings(town, heading_sigma=None, method='smoother',
-                                     leg__min_speed=50.0, gnss__max_sigma=0.0))
+                                            leg__min_speed=50.0, gnss__max_sigma=0.0))
     text, = (r.text for r in result.reasons if r.code is Code.SPEED_TOO_LOW)
     said = float(text.split('highest speed (mean over 1 s) ')[1].split(' m/s')[0])
     t = (town.odometer.stamp_ns - town.odometer.stamp_ns[0]) * 1e-9
@@ -108,7 +108,7 @@ def test_the_check_shows_the_correction(made):
 
 def test_several_legs_of_one_vehicle(made):
     others = [drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=s,
-                    start_ns=s * 10**12)
+                           start_ns=s * 10**12)
               for s in (5, 6, 7, 8)]
     legs = [calibrate(d.leg(), drives.settings(d)) for d in others]
     whole = combine(legs, drives.settings(made))
@@ -126,7 +126,7 @@ def test_several_legs_of_one_vehicle(made):
     ('heading_sigma', 0.002), ('orientation_sigma', 0.002), ('imu_lever_arm', (1.0, 0.4, 0.5))])
 def test_what_drives_are_like(option, value):
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=9,
-                 **{option: value})
+                        **{option: value})
     own = option in ('heading_sigma', 'orientation_sigma')
     result = calibrate(made.leg(), drives.settings(made, heading_sigma=None if own else 1e-3))
     z = drives.errors_in_sigmas(result, made.truth)
@@ -214,7 +214,7 @@ class Corruption:
         if kind == 'false stamp':
             return drives.changed(samples, stamp_ns=lambda a: a.__setitem__(rows, a[rows] + jump))
         return drives.changed(samples, **{str(rng.choice(self.COLUMNS[slot])):
-                                   lambda a: self._values(kind, a, rows)})
+                                          lambda a: self._values(kind, a, rows)})
 
     def _values(self, kind, a, rows):
         whole = a.dtype != float
