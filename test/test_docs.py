@@ -30,8 +30,7 @@ ELSEWHERE = {
     '.venv/bin/ruff': '.ci/run runs it',
     '.venv/bin/mypy': '.ci/run runs it',
     'export': 'the TLS of a Dask cluster: test/fleet',
-    '.venv/bin/python': 'test_comma2k19.py runs that module',
-}
+    '.venv/bin/python': 'test_comma2k19.py runs that module'}
 # pages whose commands go on from each other
 FLEET, INDOOR = 'docs/first_fleet.md', 'docs/indoor.md'
 RESULTS = ('ACCEPTED: ', 'CAUTION: ', 'REJECTED: ')     # a block that shows what is printed

@@ -48,8 +48,7 @@ WORDS = {
     r'believes?|doubts?|doubted|in doubt': 'has the prior, uncertainty',
     r'(?:is|are|was|were) taken for|passes for|passed for': 'is treated as, looks like',
     r'settles?|goes on|by hand|speaks?|spoke': 'converges, continues, manually, reports',
-    r'in vain|hence|thereof|therein|aught|naught|thence|whereof': 'plain words',
-}
+    r'in vain|hence|thereof|therein|aught|naught|thence|whereof': 'plain words'}
 UNUSED = re.compile(r'(?<![\w/.`:-])(?:(?i:' + '|'.join(WORDS) + r')|Imus?)(?![\w/`-])')
 MODULES = [path for folder in (
             'odocal_ros', 'reproductions/odocal_reproductions', 'benchmarks', 'tools', 'examples')

@@ -52,6 +52,12 @@ def codes(reasons):
     return {reason.code: reason.text for reason in reasons}
 
 
+def with_dead(one, dead):
+    """Return the leg of a drive on which some wheels do not count."""
+    return replace(one.leg(), **{WHEELS[k]: changed(one.wheels[k], value=lambda a: 0 * a)
+                                 for k in dead})
+
+
 @pytest.mark.parametrize('options', [
     {}, {'front_steers': False}, {'wheels': 3}, {'wheels': 6}, {'imu_grade': 'consumer'},
     {'wheelbase': 1.0, 'track_width': 0.6}], ids=str)
@@ -128,9 +134,7 @@ def test_a_steered_wheel_on_a_circle_rolls_about_the_centre():
     (True, (1,)), (False, (0,)), (False, (3,))], ids=str)
 def test_an_axle_with_a_dead_wheel_is_left_out_with_a_caution(steers, dead):
     one = made(front_steers=steers)
-    leg = replace(one.leg(), **{WHEELS[k]: changed(one.wheels[k], value=lambda a: 0 * a)
-                                for k in dead})
-    result = calibrate(leg, config(one, method='smoother'))
+    result = calibrate(with_dead(one, dead), config(one, method='smoother'))
     said = codes(result.reasons)
     assert Code.WHEEL_DEAD not in said
     assert FOUR[dead[0]] in said[Code.WHEEL_LEFT_OUT]
@@ -147,17 +151,14 @@ def test_an_axle_with_a_dead_wheel_is_left_out_with_a_caution(steers, dead):
 def test_without_an_axle_that_is_known_not_to_steer_the_leg_is_rejected(dead):
     """Of the rear axle nothing is left, or both front wheels: nobody knows what steers."""
     one = made()
-    leg = replace(one.leg(), **{WHEELS[k]: changed(one.wheels[k], value=lambda a: 0 * a)
-                                for k in dead})
-    _, found = screen(leg, config(one))
+    _, found = screen(with_dead(one, dead), config(one))
     assert Code.WHEEL_DEAD in codes(found)
     assert Code.WHEEL_LEFT_OUT not in codes(found)
 
 
 def test_a_single_wheel_that_is_dead_is_found():
     one = made(wheels=3)
-    leg = replace(one.leg(), odometer_3=changed(one.wheels[2], value=lambda a: 0 * a))
-    _, found = screen(leg, config(one))
+    _, found = screen(with_dead(one, (2,)), config(one))
     assert codes(found)[Code.WHEEL_DEAD].startswith('front did not count while others advanced')
 
 
@@ -185,13 +186,9 @@ def test_the_share_of_a_slip_in_the_mean_is_one_over_the_wheels():
         assert np.linalg.norm(sigma[inside]) == pytest.approx(size / 4)
 
 
-def wheels_by(**ratios):
-    return {name: Wheel(ratio, 1e-4, side * 0.8, 1e-3, (1e-3,))
-            for (name, ratio), side in zip(ratios.items(), (1, -1) * 2, strict=True)}
-
-
 def departing(**ratios):
-    wheels = wheels_by(**ratios)
+    wheels = {name: Wheel(ratio, 1e-4, side * 0.8, 1e-3, (1e-3,))
+              for (name, ratio), side in zip(ratios.items(), (1, -1) * 2, strict=True)}
     _, reasons = wheel_estimates(wheels, wheels, Estimate(0.3, 3e-5, 'm/rad'), Config())
     return codes(reasons).get(Code.WHEEL_DEPARTS, '')
 

@@ -9,13 +9,8 @@ from odocal_ros.apply.odometry import Odometry
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.calib.result import Estimate
 from odocal_ros.data.samples import take
+from odocal_ros.nav import rotations
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.rotations import (
-    matrix_from_quat,
-    quat_from_matrix,
-    quat_from_rotvec,
-    quat_multiply,
-)
 from odocal_ros.settings.config import with_settings
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.motion import attitude
@@ -69,10 +64,11 @@ def alignment_of(drive, row, tilt=(0.003, -0.002, 0.01), bias=(2e-5, -1e-5, 3e-5
     """Return an alignment at a row of the IMU, s since the start mark; not the true one."""
     stamp_ns = int(drive.imu.stamp_ns[row])
     state = drive.motion.at(np.array([(stamp_ns - drive.options.start_ns) * 1e-9]))
-    q = quat_multiply(quat_from_rotvec(np.array(tilt)),
-                      quat_from_matrix(attitude(state)[0] @ imu_rotation(drive.options)))
+    q = rotations.quat_multiply(
+        rotations.quat_from_rotvec(np.array(tilt)),
+        rotations.quat_from_matrix(attitude(state)[0] @ imu_rotation(drive.options)))
     return Alignment(
-        t=(stamp_ns - drive.truth.start_ns) * 1e-9, C_nb=matrix_from_quat(q),
+        t=(stamp_ns - drive.truth.start_ns) * 1e-9, C_nb=rotations.matrix_from_quat(q),
         gyro_bias=np.array(bias), level_sigma=0.003, heading_sigma=0.002,
         gyro_bias_sigma=np.full(3, 1e-5), gyro_noise=1e-5, gyro_bias_walk=1e-8,
         heading_source='fixed', heading_shared=True)

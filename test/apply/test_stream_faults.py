@@ -163,19 +163,24 @@ def test_streams_that_were_beyond_their_covariance(number):
     assert said
 
 
+def sifted(rows, block):
+    """Return the rows that a screen keeps where they come in blocks."""
+    screen, held, kept = SpikeScreen(), [], []
+    for begin in range(0, len(rows), block):
+        new, held = screen.sift(held + rows[begin:begin + block])
+        kept += new
+    return kept
+
+
 def test_a_step_of_the_gyro_is_doubted_where_it_stands_alone():
     t = np.arange(200) * 0.01
     w = 0.002 * np.random.default_rng(1).standard_normal((200, 3))
     turns = np.minimum(np.maximum(t - 1.0, 0.0) * 2.0, 0.2)        # as a vehicle starts to turn
     for add, odd in ((0.2 * (t >= 1.0), 1), (turns, 0)):
+        z = w[:, 2] + add
+        rows = [Row(t[k], k, (*w[k, :2], z[k]), (5.0, 5.0, 5.0)) for k in range(len(t))]
         for block in (1, 7, 200):
-            screen, held, kept = SpikeScreen(), [], []
-            z = w[:, 2] + add
-            rows = [Row(t[k], k, (*w[k, :2], z[k]), (5.0, 5.0, 5.0)) for k in range(len(t))]
-            for begin in range(0, len(t), block):
-                new, held = screen.sift(held + rows[begin:begin + block])
-                kept += new
-            found = [row.stamp_ns for row in kept if any(row.strange)]
+            found = [row.stamp_ns for row in sifted(rows, block) if any(row.strange)]
             assert found[:odd] == [100] * odd
             assert bool(found) is bool(odd)
 
@@ -187,19 +192,13 @@ def test_the_screen_keeps_the_same_rows_in_blocks_of_any_size():
         x[at:at + rows, 2] += step
     x[150:180] = x[150]      # hangs for longer than STUCK_TIME
     x[180:, 1] += 0.1
-    rows = [Row(k * 0.01, k, tuple(x[k, :3].tolist()), tuple(x[k, 3:].tolist()))
-            for k in range(n)]
-    found = []
-    for block in (1, 2, 7, n):
-        screen, held, kept = SpikeScreen(), [], []
-        for begin in range(0, n, block):
-            new, held = screen.sift(held + rows[begin:begin + block])
-            kept += new
-        found.append(kept)
-    assert [row.stamp_ns for row in found[0]] == [
+    rows = [Row(k * 0.01, k, tuple(w), tuple(f)) for k, (w, f) in enumerate(
+        zip(x[:, :3].tolist(), x[:, 3:].tolist(), strict=True))]
+    first, *others = (sifted(rows, block) for block in (1, 2, 7, n))
+    assert [row.stamp_ns for row in first] == [
         k for k in range(n) if k not in (100, 200, 201, 202) and not 160 <= k < 180]
-    assert {row.stamp_ns for row in found[0] if any(row.strange)} >= {300, 400}
-    assert all(kept == found[0] for kept in found)
+    assert {row.stamp_ns for row in first if any(row.strange)} >= {300, 400}
+    assert all(kept == first for kept in others)
 
 
 def test_a_turn_that_no_vehicle_begins_is_doubted():

@@ -3,6 +3,7 @@
 
 """Files that ask for more than their size can explain: a sentence, in bounded time and memory."""
 
+from contextlib import closing
 import os
 import sqlite3
 import struct
@@ -120,12 +121,10 @@ def test_an_index_that_names_a_chunk_many_times(tmp_path):
 @pytest.mark.parametrize('table', ['messages', 'topics', 'message_definitions'])
 def test_a_schema_that_makes_rows_of_its_own(tmp_path, table, sql):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5), 'sqlite3')
-    db = sqlite3.connect(path / 'bag.db3')
-    db.execute(f'ALTER TABLE {table} RENAME TO before')
-    for line in sql:
-        db.execute(line.format(t=table))
-    db.commit()
-    db.close()
+    with closing(sqlite3.connect(path / 'bag.db3')) as db, db:
+        db.execute(f'ALTER TABLE {table} RENAME TO before')
+        for line in sql:
+            db.execute(line.format(t=table))
     assert peak(path)[0] < MOST
 
 
@@ -168,12 +167,10 @@ def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
     monkeypatch.setattr('odocal_ros.bagio.types.SECONDS', 3)
     path = ros_bags.write(tmp_path / 'bag', [('/x', T0, b'\0\1\0\0' + bytes(40))], 'sqlite3',
                           types={'/x': 'std_msgs/msg/String'})
-    db = sqlite3.connect(path / 'bag.db3')
-    db.execute("UPDATE topics SET type = 'a/msg/B'")
-    db.execute("UPDATE message_definitions SET topic_type = 'a/msg/B', encoding = ?, "
-               'encoded_message_definition = ?', DEFINITIONS[kind])
-    db.commit()
-    db.close()
+    with closing(sqlite3.connect(path / 'bag.db3')) as db, db:
+        db.execute("UPDATE topics SET type = 'a/msg/B'")
+        db.execute("UPDATE message_definitions SET topic_type = 'a/msg/B', encoding = ?, "
+                   'encoded_message_definition = ?', DEFINITIONS[kind])
     most, said = peak(path)
     assert most < MOST
     assert 'exceeds the limit of' in said or 'cannot be parsed' in said
@@ -295,8 +292,6 @@ def test_a_file_of_many_names_is_read_once(tmp_path, link):
 
 def test_one_message_of_a_database_is_bounded(tmp_path):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5), 'sqlite3')
-    db = sqlite3.connect(path / 'bag.db3')
-    db.execute('UPDATE messages SET data = zeroblob(200000000) WHERE rowid = 3')
-    db.commit()
-    db.close()
+    with closing(sqlite3.connect(path / 'bag.db3')) as db, db:
+        db.execute('UPDATE messages SET data = zeroblob(200000000) WHERE rowid = 3')
     assert peak(path)[0] < 2**27

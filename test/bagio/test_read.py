@@ -3,6 +3,7 @@
 
 """Bags of every kind and every kind of damage, through the one way in."""
 
+from contextlib import closing
 import dataclasses
 import hashlib
 from pathlib import Path
@@ -225,10 +226,8 @@ def test_foreign_types_come_with_the_bag(tmp_path):
             assert recorder.rows('odometer').value.tolist() == [0, 10, 20, 30, 40]
             assert recorder.rows('odometer').stamp_ns.tolist() == [T0 + i for i in range(5)]
     # without the definition nothing can be done, and it is said
-    db = sqlite3.connect(tmp_path / 'sqlite3' / 'sqlite3.db3')
-    db.execute('DELETE FROM message_definitions')
-    db.commit()
-    db.close()
+    with closing(sqlite3.connect(tmp_path / 'sqlite3' / 'sqlite3.db3')) as db, db:
+        db.execute('DELETE FROM message_definitions')
     with open_bag(tmp_path / 'sqlite3') as bag:
         reader = make_reader('odometer', kind.__msgtype__, settings)
         with pytest.raises(BadData, match='holds no definition'):

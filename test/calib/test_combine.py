@@ -44,11 +44,6 @@ def leg(result, *codes):
                      methods={'two_point': result} if result else {}, C_bi=np.eye(3))
 
 
-def test_one_leg_is_itself():
-    one = method()
-    assert combine_method('two_point', [one]) is one
-
-
 @pytest.mark.parametrize('n', [2, 5, 16])
 def test_own_errors_average_down_and_shared_ones_stay(n):
     e = combine_method('two_point', [method()] * n).estimates
@@ -132,17 +127,6 @@ def test_a_level_that_was_drawn_anew_is_no_disagreement():
     assert combine_method('two_point', [pitched(0.0), pitched(0.005)]).reasons != ()
 
 
-def test_the_combined_sigma_holds_for_drawn_legs():
-    """1000 draws of four legs with a common heading error: variance within 5 * sqrt(2/1000)."""
-    rng, z = np.random.default_rng(6), []
-    for _ in range(1000):
-        common = HEADING * rng.standard_normal()
-        legs = [method(yaw=0.01 + common + OWN * x) for x in rng.standard_normal(4)]
-        e = combine_method('two_point', legs).estimates[YAW]
-        z.append((e.value - 0.01) / e.sigma)
-    assert 0.88 < np.std(z) < 1.11
-
-
 def weekly(scales):
     """Return legs a week apart."""
     week = 7 * 86_400 * 10**9
@@ -183,12 +167,18 @@ def test_a_leg_without_a_yaw_still_gives_its_scale():
     assert nobody.estimates[SCALE].value is not None
 
 
-def test_the_combined_sources_make_the_combined_sigma():
-    whole = combine_method('two_point', [method(), method(own=2 * OWN)])
+def test_the_combined_sources_and_the_budget_make_the_combined_sigma():
+    one = method()
+    assert combine_method('two_point', [one]) is one
+    whole = combine_method('two_point', [one, method(own=2 * OWN)])
     total = sum(s.effects @ s.effects.T for s in whole.sources)
     for i, (name, scale) in enumerate(((SCALE, 0.02), (YAW, 1.0), (PITCH, 1.0))):
-        assert np.sqrt(total[i, i]) * scale == pytest.approx(whole.estimates[name].sigma)
+        by_name = np.linalg.norm([row[name] for row in whole.details['budget'].values()])
+        assert [np.sqrt(total[i, i]) * scale, by_name] == pytest.approx(
+            [whole.estimates[name].sigma] * 2)
     assert {s.name for s in whole.sources if s.shared} == {'initial_heading', 'initial_level'}
+    assert set(whole.details['budget']) == {s.name for s in whole.sources}
+    assert all(abs(rho) <= 1 + 1e-12 for rho in whole.details['correlation'].values())
 
 
 def test_a_rejected_leg_is_left_out_and_named():
@@ -228,16 +218,6 @@ def test_the_rotation_is_the_mounting_on_top_of_the_nominal_one():
     turned = replace(leg(method()), C_bi=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
     rpy = combine([turned], CONFIG).imu_rotation_rpy
     assert rpy[2] == pytest.approx(np.pi / 2 + 0.01)
-
-
-def test_a_combination_states_its_budget_and_correlation():
-    whole = combine_method('two_point', [method(), method()])
-    assert set(whole.details['budget']) == {s.name for s in whole.sources}
-    total = {p: sum(row[p]**2 for row in whole.details['budget'].values())
-             for p in (YAW, 'scale_factor')}
-    for name, variance in total.items():
-        assert np.sqrt(variance) == pytest.approx(whole.estimates[name].sigma)
-    assert all(abs(rho) <= 1 + 1e-12 for rho in whole.details['correlation'].values())
 
 
 def test_a_drive_given_twice_counts_once():

@@ -181,9 +181,9 @@ def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, text, d
     assert ('easure' in reason.do) != ('larger' in text)
 
 
-def test_a_lever_arm_that_is_off_is_not_called_unobservable_too():
-    _, config, leg = made(scenario='town', duration=300.0, imu_grade='consumer', seed=4,
-                          antenna_lever_arm=(1.5, 0.0, 1.0))
+def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_a_value_is():
+    usual = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'consumer', 'seed': 4}
+    _, config, leg = made(**usual, antenna_lever_arm=(1.5, 0.0, 1.0))
     config = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0),
                                     'gnss.lever_arm_sigma': 0.1})
     found = smooth(replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0])), config)
@@ -193,10 +193,7 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_too():
     assert found.details['posterior_to_prior']['antenna_lever_arm_x'] > 0.5
     assert 'the antenna lever arm (left, up)' in said[Code.PARAMETER_NOT_DETERMINED]
 
-
-def test_a_delay_without_a_value_is_called_unobservable_also_if_it_is_off():
-    _, config, leg = made(scenario='town', duration=300.0, imu_grade='consumer', seed=4,
-                          odometer_delay=0.06)
+    _, config, leg = made(**usual, odometer_delay=0.06)
     found = smooth(leg, with_settings(config, {'odometer.time_sigma': 2e-3}))
     assert found.details['posterior_to_prior']['odometer_delay'] > 0.5
     assert found.estimates['odometer_delay'].value is None

@@ -34,6 +34,13 @@ def in_halves(rows):
     return np.hsplit(rows.astype(float), 2)
 
 
+def left_by_odometer(leg, config):
+    """Return the fit of a leg, and the odometer's residuals and sigmas."""
+    problem = problem_of(leg, config)
+    fit = best_fit(problem, config)
+    return fit, *in_halves(left_over(leg, problem, fit)['left_odometer'])
+
+
 def test_it_is_the_residual_of_the_equations_made_anew_at_the_end():
     """The fit has brought its rows there to first order; it ended within 0.03 sigma."""
     _, _, leg, problem, fit = fitted()
@@ -103,9 +110,7 @@ def test_a_wheel_that_slipped_is_seen_where_it_did():
     more = np.round(share * metres / drive.truth.scale).astype(int)
     leg = leg_of(replace(rows, odometer=changed(rows.odometer, value=lambda value: value + more)),
                  config)
-    problem = problem_of(leg, config)
-    fit = best_fit(problem, config)
-    value, sigma = in_halves(left_over(leg, problem, fit)['left_odometer'])
+    fit, value, sigma = left_by_odometer(leg, config)
     t, along = fit.state.t, value[:, 0]
     slipping = (t[1:] > begin) & (t[:-1] < begin + seconds)
     # the fit has gone less far than the wheel said; the IMU tells the way of a second to 1 mm,
@@ -121,9 +126,7 @@ def test_where_no_odometer_was_there_is_nothing():
     when = (rows.odometer.stamp_ns - rows.start_ns) * 1e-9
     leg = leg_of(replace(rows, odometer=changed(rows.odometer, **dict.fromkeys(
         ('stamp_ns', 'received_ns', 'value'), lambda column: column[when < 150.0]))), config)
-    problem = problem_of(leg, config)
-    fit = best_fit(problem, config)
-    value, sigma = in_halves(left_over(leg, problem, fit)['left_odometer'])
+    fit, value, sigma = left_by_odometer(leg, config)
     absent = fit.state.t[1:] > 152.0
     assert absent.sum() > 20
     assert np.isnan(value[absent]).all()

@@ -233,15 +233,15 @@ def test_what_no_constant_explains_widens_all():
     assert found.factor > 1.5
 
 
-def test_a_leg_far_from_where_it_was_linearised_counts_less():
-    D, unit = np.diag([1e8, 1e8]), np.full(2, np.inf)
-    names = ('k', 'yaw')
+def scale_and_yaw(yaw, *information):
+    unit = np.full(2, np.inf)
+    return Border(('k', 'yaw'), np.array([0.0, yaw]), np.diag(information), np.zeros(2),
+                  np.zeros(2), unit, unit)
 
-    def leg(yaw, information):
-        return Border(names, np.array([0.0, yaw]), information, np.zeros(2), np.zeros(2), unit,
-                      unit)
+
+def test_a_leg_far_from_where_it_was_linearised_counts_less():
     # the first knows nothing of the yaw and was linearised 0.1 rad off: its scale is 0.5 % off
-    legs = [leg(0.1, np.diag([1e12, 1e-2])), leg(0.0, D)]
+    legs = [scale_and_yaw(0.1, 1e12, 1e-2), scale_and_yaw(0.0, 1e8, 1e8)]
     found = joint(legs, [0.0], 'k', ('yaw',), ('k', 'yaw'))
     assert found.bent == pytest.approx([0.005, 0.0], abs=1e-9)
     assert np.sqrt(found.covariance[0, 0]) == pytest.approx(1e-4, rel=1e-3)
@@ -249,11 +249,8 @@ def test_a_leg_far_from_where_it_was_linearised_counts_less():
 
 
 def test_angles_about_half_a_turn_are_one():
-    D, unit = np.eye(2) * 1e6, np.full(2, np.inf)
-
-    def leg(yaw):
-        return Border(('k', 'yaw'), np.array([0.0, yaw]), D, np.zeros(2), np.zeros(2), unit, unit)
-    found = joint([leg(np.pi - 1e-3), leg(1e-3 - np.pi)], [0.0], 'k', ('yaw',), ('yaw',))
+    legs = [scale_and_yaw(yaw, 1e6, 1e6) for yaw in (np.pi - 1e-3, 1e-3 - np.pi)]
+    found = joint(legs, [0.0], 'k', ('yaw',), ('yaw',))
     assert abs(found.value[1]) == pytest.approx(np.pi, abs=1e-9)
     assert not found.disputed
 

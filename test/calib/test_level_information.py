@@ -60,6 +60,9 @@ def test_average_information_is_the_curvature_of_the_cost(weighed):
     at, levels = weighed
     both, solved = at()
     information = both.information(solved)
+    A = information.average
+    np.testing.assert_allclose(A, A.T, atol=1e-9 * A.max())
+    assert np.linalg.eigvalsh(A).min() > -1e-9 * A.max()
 
     def cost(**by):
         return at(**by)[0].cost()
@@ -76,14 +79,6 @@ def test_average_information_is_the_curvature_of_the_cost(weighed):
                      for a in (1, -1) for b in (1, -1)) / (4 * STEP**2)
         assert information.average[j, information.names.index(other)] == pytest.approx(
             across / 4, rel=ROUGH, abs=ROUGH * abs(slope) + rounding), (name, other)
-
-
-def test_information_is_symmetric_and_not_negative(weighed):
-    at, _ = weighed
-    both, solved = at()
-    A = both.information(solved).average
-    np.testing.assert_allclose(A, A.T, atol=1e-9 * A.max())
-    assert np.linalg.eigvalsh(A).min() > -1e-9 * A.max()
 
 
 def test_levels_that_are_known_add_nothing_unknown_ones_their_prior(weighed):

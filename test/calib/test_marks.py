@@ -137,29 +137,30 @@ def test_a_mark_in_motion_is_fitted_with_the_motion_taken_out():
     assert mark.used == 8
 
 
+def at_rest(mark, span, t, p, correlation_time=np.nan):
+    """Return the mark of fixes of a vehicle that stands."""
+    return fix_at(mark, span, (t, p, np.tile(STATED, (len(t), 1, 1))),
+                  lambda times: np.zeros((len(times), 3)), correlation_time, 2.0)
+
+
 def test_no_fix_near_a_mark_is_none():
-    t, p, c = np.arange(5.0), np.zeros((5, 3)), np.tile(STATED, (5, 1, 1))
-    still = lambda times: np.zeros((len(times), 3))      # noqa: E731
-    assert fix_at(20.0, None, (t, p, c), still, np.nan, 2.0) is None
-    assert fix_at(20.0, (15.0, 25.0), (t, p, c), still, np.nan, 2.0) is None
-    assert fix_at(5.5, (5.0, 25.0), (t, p, c), still, np.nan, 2.0).used == 1
-    assert fix_at(0.0, (0.0, 1.0), (t[:0], p[:0], c[:0]), still, np.nan, 2.0) is None
+    t, p = np.arange(5.0), np.zeros((5, 3))
+    assert at_rest(20.0, None, t, p) is at_rest(20.0, (15.0, 25.0), t, p) is None
+    assert at_rest(5.5, (5.0, 25.0), t, p).used == 1
+    assert at_rest(0.0, (0.0, 1.0), t[:0], p[:0]) is None
 
 
 def test_one_fix_without_height_leaves_the_height_unknown():
-    t, p = np.arange(5.0), np.ones((5, 3))
+    p = np.ones((5, 3))
     p[3, 2] = np.nan
-    mark = fix_at(2.0, (0.0, 4.0), (t, p, np.tile(STATED, (5, 1, 1))),
-                  lambda times: np.zeros((len(times), 3)), np.nan, 2.0)
+    mark = at_rest(2.0, (0.0, 4.0), np.arange(5.0), p)
     assert not mark.height_known
     assert np.isfinite(mark.position_n).all()
     np.testing.assert_allclose(mark.position_n[:2], 1.0)
 
 
 def test_a_mark_is_no_better_than_the_slow_errors_seen_elsewhere():
-    mark = fix_at(0.0, (0.0, 100.0), (np.arange(0.0, 100.0, 0.2), np.zeros((500, 3)),
-                                      np.tile(STATED, (500, 1, 1))),
-                  lambda times: np.zeros((len(times), 3)), 0.0, 2.0)
+    mark = at_rest(0.0, (0.0, 100.0), np.arange(0.0, 100.0, 0.2), np.zeros((500, 3)), 0.0)
     wider = mark.at_least(0.25, 4.0)
     np.testing.assert_allclose(np.diag(wider.covariance_n), [0.25, 0.25, 1.0], rtol=0.01)
     np.testing.assert_array_equal(wider.at_least(0.1, 4.0).covariance_n, wider.covariance_n)
@@ -201,12 +202,9 @@ def test_the_share_is_that_of_a_mean_of_gauss_markov_errors(seconds, tau):
     # the sum of 801^2 against the integral: the diagonal weighs 1 / 801
     assert slow_share(seconds, tau) == pytest.approx(
         mean_square(seconds) / mean_square(20.0), rel=3e-3)
-
-
-def test_a_share_at_a_moment_and_of_lasting_errors():
-    assert slow_share(0.0, 60.0) > 1.0
-    assert slow_share(300.0, math.inf) == 1.0
-    assert slow_share(0.0, math.inf) == 1.0
+    # at a moment, and of lasting errors
+    assert slow_share(0.0, tau) > 1.0
+    assert slow_share(seconds, math.inf) == slow_share(0.0, math.inf) == 1.0
 
 
 @pytest.mark.parametrize(('own', 'used', 'slow', 'after'), [

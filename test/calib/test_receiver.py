@@ -61,7 +61,7 @@ def test_a_filter_of_position_and_velocity_is_said_with_its_time():
 
 def test_of_a_plain_receiver_nothing_is_said():
     _, _, said = smoothed()
-    assert not {Code.FIXES_FOLLOW_ODOMETER, Code.FIXES_SMOOTHED} & said.keys()
+    assert not {Code.FIXES_FOLLOW_ODOMETER, Code.FIXES_SMOOTHED, Code.CLOCKS_DRIFT} & said.keys()
 
 
 def test_an_odometer_in_the_receiver_is_found_beside_a_consumer_accelerometer():
@@ -119,24 +119,14 @@ def test_errors_whose_rate_lasts_grow_more_than_their_steps_say():
     assert np.mean(factors) > 0.6 * seconds
 
 
-@pytest.fixture(scope='module', params=['fix', 'odometer'])
-def drifting(request):
-    """Return the name, the drive and the result of a leg in motion with one fast clock."""
-    name = request.param
+@pytest.mark.parametrize('name', ['fix', 'odometer'])
+def test_the_rate_of_a_fast_clock_is_stated_and_the_scale_is_that_of_the_wheel(name):
     drive, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01,
                               duration=300.0, real=Real(**{f'{name}_clock_rate': FAST}))
-    return name, drive, smooth(replace(leg, t_begin=60.0, t_stop=240.0), config)
-
-
-def test_the_scale_is_that_of_the_wheel(drifting):
-    _, drive, result = drifting
+    result = smooth(replace(leg, t_begin=60.0, t_stop=240.0), config)
     scale = result.estimates['scale_factor']
     assert abs(scale.value - drive.truth.scale) < 3 * scale.sigma
     assert scale.sigma / scale.value < FAST / 3     # an error of FAST would show
-
-
-def test_the_rate_is_stated(drifting):
-    name, _, result = drifting
     text, = (r.text for r in result.reasons if r.code is Code.CLOCKS_DRIFT)
     ppm = int(text.split('clock is ')[1].split(' ppm')[0])
     sigma = int(text.split('(± ')[1].split(')')[0])
@@ -147,50 +137,31 @@ def test_the_rate_is_stated(drifting):
         r.code for r in result.reasons}
 
 
-def test_clocks_that_agree_are_not_named():
-    _, config, leg = made(scenario='town', fix_noise='rtk', fix_sigma=0.01, duration=300.0)
-    assert Code.CLOCKS_DRIFT not in {r.code for r in smooth(leg, config).reasons}
+def path_of(drive):
+    return drive.truth.scale * np.abs(np.diff(drive.odometer.value.astype(float))).sum()
 
 
-@pytest.fixture(scope='module')
-def drifting_heights():
-    """Return the drive and the result of a town whose heights drift, else good to 5 cm."""
+def test_heights_that_drift_are_found_and_the_pitch_is_within_its_sigma():
     drive, config, leg = made(scenario='town', duration=500.0, fix_noise='white', fix_sigma=0.05)
-    covariance = leg.covariance_n.copy()
+    covariance, fixes = leg.covariance_n.copy(), leg.fixes_n.copy()
     covariance[:, 2, 2] = STATED**2
-    fixes = leg.fixes_n.copy()
     fixes[:, 2] += CHANGE * leg.t_fix / leg.t_fix[-1]
-    return drive, leg, smooth(replace(leg, fixes_n=fixes, covariance_n=covariance), config)
-
-
-def test_the_drift_is_found_and_the_pitch_is_within_its_sigma(drifting_heights):
-    drive, leg, result = drifting_heights
+    result = smooth(replace(leg, fixes_n=fixes, covariance_n=covariance), config)
     found = result.details[CONSTANTS[HEIGHT_DRIFT]]
     assert abs(found['value'] - CHANGE / leg.t_fix[-1]) < 3 * found['sigma']
     pitch = result.estimates['pitch_mounting_angle']
     assert abs(pitch.value - drive.truth.pitch) < 3 * pitch.sigma
-    # if the rise were the pitch's, it would show
-    path = drive.truth.scale * np.abs(np.diff(drive.odometer.value.astype(float))).sum()
-    assert pitch.sigma < CHANGE / path / 2
+    assert pitch.sigma < CHANGE / path_of(drive) / 2        # the rise as the pitch's would show
 
 
-@pytest.fixture(scope='module')
-def converging():
-    """Return a drive along a motorway whose fixes converge, its leg and its result."""
+def test_fixes_that_converge_are_found_and_the_scale_is_within_its_sigma():
     drive, config, leg = made(scenario='motorway', duration=500.0, fix_noise='white',
                               fix_sigma=WHITE, imu_grade='industrial')
     stated = np.hypot(WHITE, START * np.exp(-leg.t_fix / TIME))[:, None] * np.ones(3)
-    return drive, leg, smooth(replace(
-        leg, fixes_n=leg.fixes_n + IN_SIGMAS * stated,
-        covariance_n=stated[:, :, None]**2 * np.eye(3)), config)
-
-
-def test_the_error_is_found_and_the_scale_is_within_its_sigma(converging):
-    drive, leg, result = converging
+    result = smooth(replace(leg, fixes_n=leg.fixes_n + IN_SIGMAS * stated,
+                            covariance_n=stated[:, :, None]**2 * np.eye(3)), config)
     scale = result.estimates['scale_factor']
     assert abs(scale.value - drive.truth.scale) < 3 * scale.sigma
-    # if the error were the scale's, it would show
-    path = drive.truth.scale * np.abs(np.diff(drive.odometer.value.astype(float))).sum()
-    assert scale.sigma / drive.truth.scale < START / path / 2
+    assert scale.sigma / drive.truth.scale < START / path_of(drive) / 2     # it would show there
     for name, true in zip(CONSTANTS[BY_SIGMA], IN_SIGMAS, strict=True):
         assert abs(result.details[name]['value'] - true) < 3 * result.details[name]['sigma']

@@ -104,11 +104,14 @@ def test_the_sigma_is_that_of_white_fixes():
     assert 0.9 < np.sqrt(np.mean(np.square(z))) < 1.5
 
 
-def test_a_short_or_empty_leg_has_no_windows():
+def test_a_leg_that_is_short_or_stands_or_moves_in_one_part_has_no_windows():
     assert window_scale(T[:0], np.empty((0, 2)), np.empty((0, 2))).shape == (0, 4)
     _, dead = driven()
     assert window_scale(T[:20], dead[:20], dead[:20])[:, 0].max(initial=0.0) <= 2.0
     assert not len(window_scale(T, dead, np.zeros_like(dead)))
+    dead = np.zeros((len(T), 2))
+    dead[:, 0] = 1e-9 * T + 1e9 * np.clip(T - 1600.0, 0.0, None)      # all of it, within rounding
+    assert not len(window_scale(T, 1.001 * dead, dead))
 
 
 def test_a_last_window_may_end_a_rounding_after_the_last_fix():
@@ -116,12 +119,6 @@ def test_a_last_window_may_end_a_rounding_after_the_last_fix():
     t[-1] = 34.203      # the last window, 32.203 to 34.203 s, ends at 34.203000000000003 s
     even = np.stack([t, t], axis=-1)
     assert window_scale(t, 1.001 * even, even)[0, 1] == pytest.approx(0.001)
-
-
-def test_a_way_within_one_part_of_the_leg_has_no_scatter():
-    dead = np.zeros((len(T), 2))
-    dead[:, 0] = 1e-9 * T + 1e9 * np.clip(T - 1600.0, 0.0, None)      # all of it, within rounding
-    assert not len(window_scale(T, 1.001 * dead, dead))
 
 
 def straight(factor=0.98, offset=0.12, lag=0.3, noise=0.0, reverse=False):
@@ -157,18 +154,24 @@ def test_the_sigmas_hold_with_noise():
         assert 0 < abs(value - truth) < 4 * sigma
 
 
-def test_at_one_speed_no_offset_is_stated():
+def even(t_fix, t):
+    """Return what is found at 10 m/s, where the odometer counts half metres."""
+    place = np.stack([10 * t_fix, 0 * t_fix], -1)
+    return speed_scale(t_fix, place, place, 10 * t_fix, Travel(t, 10 * t / 0.5, 0.0))
+
+
+def test_at_one_speed_no_offset_is_stated_and_too_few_sections_are_no_result():
     t = np.arange(0.0, 200.0, 0.1)
-    place = np.stack([10 * t, 0 * t], -1)[::10]
-    found = speed_scale(t[::10], place, place, 10 * t[::10], Travel(t, 10 * t / 0.5, 0.0))
+    found = even(t[::10], t)
     assert found.offset is None
     assert found.bins[:, 1] == pytest.approx(0.5)
+    assert not len(even(t[:80], t[:80]).bins)
 
 
-def test_too_few_sections_are_no_result():
-    t = np.arange(0.0, 8.0, 0.1)
-    place = np.stack([10 * t, 0 * t], -1)
-    assert not len(speed_scale(t, place, place, 10 * t, Travel(t, 10 * t, 0.0)).bins)
+def test_cells_that_end_at_the_last_fix_may_be_rounded_beyond_it():
+    t = (7_369_999_872 + np.arange(496) * 10**9) * 1e-9     # 99 cells of 5 s and 6e-14 s
+    assert np.arange(t[0], t[-1], 5.0)[-1] > t[-1]
+    assert even(t, t).bins[:, 1] == pytest.approx(0.5)
 
 
 @pytest.mark.slow
@@ -179,11 +182,3 @@ def test_the_delay_of_a_simulated_odometer():
     found = leg.evidence.by_speed
     assert abs(found.lag[0] - 0.2) < 4 * found.lag[1] < 0.2
     assert abs(found.factor[0] - made.truth.scale) < 4 * found.factor[1]
-
-
-def test_cells_that_end_at_the_last_fix_may_be_rounded_beyond_it():
-    t = (7_369_999_872 + np.arange(496) * 10**9) * 1e-9     # 99 cells of 5 s and 6e-14 s
-    assert np.arange(t[0], t[-1], 5.0)[-1] > t[-1]
-    place = np.stack([10 * t, 0 * t], -1)
-    found = speed_scale(t, place, place, 10 * t, Travel(t, 10 * t / 0.5, 0.0))
-    assert found.bins[:, 1] == pytest.approx(0.5)

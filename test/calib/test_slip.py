@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odocal_ros.calib.result import Source
 from odocal_ros.calib.slip import find_slips
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import gravity
@@ -46,6 +45,8 @@ def test_spins_are_named_and_the_sigma_holds_what_they_did(seed):
     scale = leg.methods['two_point'].estimates['scale_factor']
     assert abs(scale.value - drive.truth.scale) < 2 * scale.sigma
     slip = next(s for s in leg.methods['two_point'].sources if s.name == 'wheel_slip')
+    assert slip.effects.shape[1] == 1       # spins add up rather than average
+    assert not slip.shared
     # all spins together: about what they moved the scale by, within the two ends' fix noise
     off = abs(scale.value / drive.truth.scale - 1)
     assert abs(np.linalg.norm(slip.effects[0]) - off) < 0.5 * off + 1e-4
@@ -91,14 +92,6 @@ def test_spins_are_found_of_a_late_or_filtered_odometer(how):
         drive.leg(), held_up(drive.leg(), 0.4, how)))
     found, wanted = (r.text.split('in total at ')[1].split(' place')[0] for r in (reason, sound))
     assert found == wanted
-
-
-def test_a_source_of_slip_adds_spins_rather_than_averaging_them():
-    _, leg = result(scenario='straight', slip_events=30.0, slip_size=1.0)
-    slip = next(s for s in leg.methods['two_point'].sources if s.name == 'wheel_slip')
-    assert isinstance(slip, Source)
-    assert slip.effects.shape[1] == 1
-    assert not replace(slip).shared
 
 
 @pytest.mark.parametrize(('slip', 'bends'), [(1.0, False), (0.0, False), (0.0, True)])

@@ -9,43 +9,38 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import Equations, sums as preintegrated
 from odocal_ros.estimator.factors.axle import Axle, WALK_SPEED
 from odocal_ros.estimator.factors.motion import D, HILL_INTERVALS, Motion, slowly
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.state import (
-    ACCEL,
-    BARE,
-    LEAN,
-    LN_K,
-    M,
-    PITCH,
-    PITCH_CENTRE,
-    TYRES,
-    YAW,
-)
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.wheels import G
 
 
+def at_truth(t_stop=None, **options):
+    """Return a drive without noise, and problem and state of its leg."""
+    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, **options)
+    leg = replace(leg, t_stop=t_stop or leg.t_stop)
+    return drive, problem_of(leg, config), truth(drive, config, leg)
+
+
 @pytest.fixture(scope='module')
 def perfect():
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0)
-    leg = replace(leg, t_stop=60.0)
-    return problem_of(leg, config), truth(drive, config, leg)
+    return at_truth(60.0)[1:]
 
 
 @pytest.mark.parametrize('turned', [-2 * np.pi, np.pi, 2.0, 0.3])
 def test_a_step_that_turns_the_pitch_over_leaves_the_top_up(perfect, turned):
     _, state = perfect
-    step = np.zeros(M)
-    step[PITCH] = turned
-    moved = state.moved(np.zeros((len(state.t), BARE)), step)
-    assert abs(moved.constants[PITCH]) <= np.pi / 2
+    step = np.zeros(layout.M)
+    step[layout.PITCH] = turned
+    moved = state.moved(np.zeros((len(state.t), layout.BARE)), step)
+    assert abs(moved.constants[layout.PITCH]) <= np.pi / 2
     np.testing.assert_allclose(moved.forward, forward_b(
-        state.constants[YAW], state.constants[PITCH] + turned), atol=1e-12)
+        state.constants[layout.YAW], state.constants[layout.PITCH] + turned), atol=1e-12)
     assert moved.C_bv[2, 2] >= 0
 
 
@@ -80,12 +75,10 @@ def test_a_turn_of_a_body_that_rolls_does_not_pitch_it(perfect):
 def test_a_turn_is_no_braking():
     """Tyres that slip by 0.8 % for each m/s^2 of pull, half of it braking: a turn is none."""
     stiff = 0.04
-    drive, config, leg = made(
-        imu_grade='perfect', fix_sigma=0.0, duration=150.0, scale=1e-3, nominal_scale=1e-3,
-        real=Real(tyre_slip=stiff, driven=True))
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3,
+                                 real=Real(tyre_slip=stiff, driven=True))
     c = state.constants.copy()
-    c[TYRES][2:] = 2 * stiff / G, stiff / G
+    c[layout.TYRES][2:] = 2 * stiff / G, stiff / G
     state = replace(state, constants=c)
     along = Equations(problem, state).parts['motion'].raw[:, 15]
     speed = np.linalg.norm(state.v_n, axis=1)
@@ -102,10 +95,7 @@ def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
     """An IMU 0.6 m to the left feels 0.6 m times the change of the turn rate as a push ahead."""
     found = []
     for arm in ((0.0, 0.0, 0.0), (0.7, 0.6, 0.5)):
-        drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
-                                  imu_lever_arm=arm)
-        problem = problem_of(leg, config)
-        state = truth(drive, config, leg)
+        _, problem, state = at_truth(imu_lever_arm=arm)
         axle = Axle(problem, state)
         found.append((axle.accelerations()[:, :2], axle.acceleration(), problem))
     (at_axle, ahead, problem), (pushed, faster, _) = found
@@ -121,11 +111,10 @@ def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
 def test_a_lean_is_level_though_the_imu_is_rolled():
     """About axes of an IMU that is rolled by 5 deg a squat were a tenth of a sideslip too."""
     roll = 0.09
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, roll=roll)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    drive, problem, state = at_truth(roll=roll)
     motion = Equations(problem, state).parts['motion'].motion
     C_nv = state.C_nb[:-1] @ matrix_from_rpy([roll, drive.options.pitch, drive.options.yaw]).T
-    by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(BARE)[2][:, 15:18, LEAN]
+    by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(layout.BARE)[2][:, 15:18, layout.LEAN]
     sizes = np.linalg.norm(by, axis=1).max(axis=0)
     assert (sizes > 0.1).all()
     # the axis of the mounting's pitch is level to the second order of yaw and pitch, 1 deg each
@@ -136,13 +125,11 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
 @pytest.mark.parametrize(('real', 'axis'), [(Real(sideslip=0.005), 1), (Real(squat=0.005), 2)])
 def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
     """A third at least of what is left of a lean goes with the change of the push."""
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, scale=1e-3,
-                              nominal_scale=1e-3, real=real)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3, real=real)
     part = Equations(problem, state).parts['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     off = (C_vn @ part.raw[:, 15:18, None])[:, axis, 0]
-    by = (C_vn @ part.jacobians(BARE)[2][:, 15:18, LEAN])[:, axis]
+    by = (C_vn @ part.jacobians(layout.BARE)[2][:, 15:18, layout.LEAN])[:, axis]
 
     def left(columns):
         c = np.linalg.lstsq(by[:, columns], off, rcond=None)[0]
@@ -154,29 +141,27 @@ def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
 
 def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     """What is left is that the road bends within it: by (h / length)^2 of it, and seconds."""
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.1,
-                              scale=1e-3, nominal_scale=1e-3, real=Real(wheelbase=3.0))
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    _, problem, state = at_truth(slope=0.1, scale=1e-3, nominal_scale=1e-3,
+                                 real=Real(wheelbase=3.0))
     part = Equations(problem, state).parts['motion']
     C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
     off = (C_vn @ part.raw[:, 15:18, None])[:, 2, 0]
-    by = (C_vn @ part.jacobians(BARE)[2][:, 15:18, PITCH_CENTRE])[:, 2, 0]
+    by = (C_vn @ part.jacobians(layout.BARE)[2][:, 15:18, layout.PITCH_CENTRE])[:, 2, 0]
     centre = -(by @ off) / (by @ by)
     assert np.abs(off).max() > 1e-3       # m in a second
     assert centre == pytest.approx(1.5, rel=0.02)
     assert np.sqrt(((off + by * centre)**2).mean()) < 0.05 * np.sqrt((off**2).mean())
     # no count lifts the odometer: what does is no part of what the scale multiplies
     c = state.constants.copy()
-    c[PITCH_CENTRE.start] = centre
+    c[layout.PITCH_CENTRE.start] = centre
     lifted = replace(state, constants=c)
     there = Equations(problem, lifted).parts['motion']
-    np.testing.assert_allclose(there.jacobians(BARE)[2][:, D, LN_K],
-                               part.jacobians(BARE)[2][:, D, LN_K], atol=1e-9)
+    np.testing.assert_allclose(there.jacobians(layout.BARE)[2][:, D, layout.LN_K],
+                               part.jacobians(layout.BARE)[2][:, D, layout.LN_K], atol=1e-9)
 
 
 def test_bumps_may_have_another_centre_than_hills():
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.05)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    _, problem, state = at_truth(slope=0.05)
     motion = Equations(problem, state).parts['motion'].motion
     hill, bump = (np.sin(2 * np.pi * np.arange(len(motion.T)) / period) for period in (40.0, 2.5))
     around = slice(HILL_INTERVALS, -HILL_INTERVALS)
@@ -189,8 +174,7 @@ def test_bumps_may_have_another_centre_than_hills():
 
 
 def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.1)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    drive, problem, state = at_truth(slope=0.1)
     motion = Equations(problem, state).parts['motion'].motion
     since = (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     there = drive.motion.at(since + (state.t[1:] + state.t[:-1]) / 2)
@@ -205,13 +189,9 @@ def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
 
 def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
     error = 0.01
-    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
-                              accel_scale_error=error)
-    leg = replace(leg, t_stop=60.0)
-    problem = problem_of(leg, config)
-    state = truth(drive, config, leg)
+    _, problem, state = at_truth(60.0, accel_scale_error=error)
     c = state.constants.copy()
-    c[ACCEL.start:ACCEL.start + 2] = error / (1 + error)      # of what is measured
+    c[layout.ACCEL.start:layout.ACCEL.start + 2] = error / (1 + error)      # of what is measured
     # on a level road the force along z is gravity, but for the tilt: the error a bias
     bias = state.accel_bias + [0.0, 0.0, error * 9.80154]
     state = replace(state, constants=c, accel_bias=bias)
@@ -226,12 +206,11 @@ def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
 
 def test_the_scale_is_that_of_the_path_wherever_the_body_points():
     """Squat by 0.1 rad per m/s^2 turns the path within the body, and makes it no longer."""
-    drive, config, leg = made(scenario='town', imu_grade='perfect', fix_sigma=0.0, duration=150.0)
-    problem, state = problem_of(leg, config), truth(drive, config, leg)
-    c = np.zeros(M)
-    c[LEAN.start] = 0.1
-    level, leaning = (Equations(problem, state.moved(np.zeros((len(state.t), BARE)), step))
-                      .parts['motion'].motion for step in (np.zeros(M), c))
+    _, problem, state = at_truth(scenario='town')
+    c = np.zeros(layout.M)
+    c[layout.LEAN.start] = 0.1
+    level, leaning = (Equations(problem, state.moved(np.zeros((len(state.t), layout.BARE)), step))
+                      .parts['motion'].motion for step in (np.zeros(layout.M), c))
     straight = np.abs(level.sums.mean_rate[:, 2]) < 1e-3
     # slower than a walk the direction of travel is not known
     walks = np.linalg.norm(level.travelled, axis=1) > WALK_SPEED * level.T[:, 0]

@@ -136,6 +136,8 @@ def test_no_velocity_is_used_without_an_accelerometer():
     silent = replace(leg, imu=changed(leg.imu, f_i=lambda f: f.fill(0.0)))
     assert 'velocity' in leg_of(leg, config).outside
     assert 'velocity' not in leg_of(silent, config).outside
+    # nor the orientation of an IMU unless it is asked for
+    assert 'heading' not in made(**STRAIGHT, orientation_sigma=1e-3)[2].outside
 
 
 def test_white_errors_are_not_alike():
@@ -169,11 +171,6 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
     assert method.details['outside']['heading']['source'].startswith(how[:3]) or how == 'topic'
     shared = {s.name for s in method.sources if s.shared}
     assert 'heading' in shared
-
-
-def test_the_orientation_of_an_imu_is_used_only_when_asked_for():
-    drive, config, leg = made(**STRAIGHT, orientation_sigma=1e-3)
-    assert 'heading' not in leg.outside
 
 
 def test_a_wrong_heading_is_said_and_gives_way():

@@ -10,6 +10,7 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 from smoother_legs import leg_of, made, truth, with_velocity
 
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import Normal, solve
 from odocal_ros.estimator.equations import Equations, FACTORS
 from odocal_ros.estimator.factors.axle import Axle
@@ -17,44 +18,16 @@ from odocal_ros.estimator.factors.motion import D
 from odocal_ros.estimator.factors.priors import PriorRows, SIZE, SIZE_SPREADS
 from odocal_ros.estimator.factors.slow_error import SlowError, TIME_SPREAD, USUAL_TIME
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.state import (
-    ACCEL,
-    BA,
-    BG,
-    BY_SIGMA,
-    CONSTANTS,
-    constants_from,
-    E,
-    FIX_LAG2,
-    FIX_TIME,
-    GNSS_ARM,
-    GNSS_CLOCK,
-    GNSS_DELAY,
-    GYRO,
-    IMPERFECT,
-    LN_K,
-    M,
-    ODO_CLOCK,
-    ODO_DELAY,
-    ODO_LAG2,
-    P,
-    PHI,
-    PITCH,
-    SLOW,
-    SPEED_OFFSET,
-    VELOCITY_DELAY,
-    VELOCITY_LAG2,
-    WITH_SLOW,
-    YAW,
-)
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.earth import rate_without_north
 from odocal_ros.nav.odometer import Travel
 
 pytestmark = pytest.mark.slow
-N = WITH_SLOW
-CLOCKS = {GNSS_CLOCK: GNSS_DELAY, ODO_CLOCK: ODO_DELAY}    # and the delays they grow to
+N = layout.WITH_SLOW
+# clocks, and the delays they grow to
+CLOCKS = {layout.GNSS_CLOCK: layout.GNSS_DELAY, layout.ODO_CLOCK: layout.ODO_DELAY}
 END = 60.0      # s
+COLUMNS = range(layout.M)
 # relative errors that are left out of derivatives. Motion: Earth rate times a second, 7e-5 rad,
 # and half the attitude residual, 2e-4. Instants: what a turn of 1e-3 rad leaves of second order
 LOOSE = {'motion': 3e-4, 'fixes': 1e-3, 'velocity': 2e-3, 'heading': 2e-3, 'steps': 2e-3}
@@ -63,8 +36,8 @@ LOOSE = {'motion': 3e-4, 'fixes': 1e-3, 'velocity': 2e-3, 'heading': 2e-3, 'step
 SWING = {'fixes': 1e-2, 'steps': 0.03, 'motion': 2e-3}
 # rows of a velocity have means of their second: right are those of all its rows, but for what the
 # second of a jump of turn rate, or of 2 m/s^2, has before and after it
-MEANS = dict.fromkeys((YAW, PITCH, *range(GNSS_ARM.start, GNSS_ARM.stop)), 0.02) | dict.fromkeys(
-    (*range(GYRO.start, GYRO.stop), *range(ACCEL.start, ACCEL.stop)), 0.13) | {VELOCITY_DELAY: 0.1}
+MEANS = dict.fromkeys((layout.YAW, layout.PITCH, *COLUMNS[layout.GNSS_ARM]), 0.02) | dict.fromkeys(
+    (*COLUMNS[layout.GYRO], *COLUMNS[layout.ACCEL]), 0.13) | {layout.VELOCITY_DELAY: 0.1}
 
 
 def by_second(rows, k):
@@ -83,15 +56,15 @@ def moved():
     problem, state = problem_of(leg, config), truth(drive, config, leg)
     rng = np.random.default_rng(1)
     step = 1e-3 * rng.standard_normal((len(state.t), N))
-    step[:, PHI.start:BG.stop] *= 0.1
-    c = 1e-3 * np.insert(rng.standard_normal(M - 3), 3 * [BY_SIGMA.start], 1.0)
+    step[:, layout.PHI.start:layout.BG.stop] *= 0.1
+    c = 1e-3 * np.insert(rng.standard_normal(layout.M - 3), 3 * [layout.BY_SIGMA.start], 1.0)
     # derivatives by biases take these as constant over HILL_INTERVALS: no centre of bumps
     # of the size that there is: derivatives leave out how these change what the others do
-    c[SPEED_OFFSET], c[FIX_TIME] = 0.0, np.log(5.0)
-    c[IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03, 0.003,
-                     0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0]
-    c[FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
-    c[VELOCITY_LAG2] = 2.1e-4
+    c[layout.SPEED_OFFSET], c[layout.FIX_TIME] = 0.0, np.log(5.0)
+    c[layout.IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03, 0.003,
+                            0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0]
+    c[layout.FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
+    c[layout.VELOCITY_LAG2] = 2.1e-4
     return problem, state.moved(step, c)
 
 
@@ -104,8 +77,8 @@ def stepping(moved):
     speed = np.diff(leg.travel.at(np.append(t, t[-1] + 0.1))) / 0.1 * leg.rough_scale
     coarse = CoarseSpeed(step, t, np.floor(speed / step) * step)
     way = Travel(t, np.cumsum(coarse.value) * 0.1, 0.0, coarse)
-    c = np.zeros(M)
-    c[LN_K], c[SPEED_OFFSET] = -np.log(leg.rough_scale), 0.1
+    c = np.zeros(layout.M)
+    c[layout.LN_K], c[layout.SPEED_OFFSET] = -np.log(leg.rough_scale), 0.1
     state = state.moved(np.zeros((len(state.t), N)), c)
     return replace(problem, leg=replace(leg, travel=way, rough_scale=1.0)), state
 
@@ -133,21 +106,22 @@ def test_derivatives_are_those_of_finite_differences(moved, stepping, name):
     *ends, constants = part.jacobians(N)
     begin, end = ends if len(ends) == 2 else (*ends, np.zeros_like(ends[0]))
     if name == 'fixes':
-        end[:, :, SLOW] = -np.eye(3) * part.share[:, None, None]
+        end[:, :, layout.SLOW] = -np.eye(3) * part.share[:, None, None]
     k = np.arange(len(part.raw)) if name == 'motion' else part.k
     # every second keyframe moves: each row sees one end move only
     even = np.arange(len(state.t)) % 2 == 0
-    for i in range(N + M):
-        if (i, name) == (N + ODO_LAG2, 'motion'):   # of seconds: test_odometer_filter.py
+    for i in range(N + layout.M):
+        if (i, name) == (N + layout.ODO_LAG2, 'motion'):   # of seconds: test_odometer_filter.py
             continue
-        h = 1.0 if (i, name) == (E, 'motion') else 1e-5 if name == 'motion' else 1e-4
+        h = 1.0 if (i, name) == (layout.E, 'motion') else 1e-5 if name == 'motion' else 1e-4
         h /= END if i - N in CLOCKS else 1.0
         point = problem
-        if i - N in (ODO_DELAY, ODO_CLOCK) and name == 'motion':      # counts have steps
+        # counts have steps
+        if i - N in (layout.ODO_DELAY, layout.ODO_CLOCK) and name == 'motion':
             point, h = without_steps(problem, state), 1e-3 / (END if i - N in CLOCKS else 1.0)
 
         def raw(size, i=i, point=point):
-            step, c = np.zeros((len(state.t), N)), np.zeros(M)
+            step, c = np.zeros((len(state.t), N)), np.zeros(layout.M)
             if i < N:
                 step[even, i] = size
             else:
@@ -157,22 +131,23 @@ def test_derivatives_are_those_of_finite_differences(moved, stepping, name):
         expected = constants[:, :, i - N] if i >= N else np.where(
             even[k][:, None], begin[:, :, i], end[:, :, i])
         # g times the 1e-3 that another constant turns it by
-        loose = 0.01 if name == 'steps' and ACCEL.start <= i - N < ACCEL.stop else LOOSE[name]
-        loose = SWING.get(name, loose) if i - N in (GNSS_DELAY, ODO_DELAY, *CLOCKS) else loose
+        loose = 0.01 if name == 'steps' and i - N in COLUMNS[layout.ACCEL] else LOOSE[name]
+        if i - N in (layout.GNSS_DELAY, layout.ODO_DELAY, *CLOCKS):
+            loose = SWING.get(name, loose)
         found, size = (raw(h) - raw(-h)) / (2 * h), max(1.0, np.abs(expected).max())
         if i - N in CLOCKS:         # a delay of so much at the end of the leg
             size = max(1.0, END * np.abs(constants[:, :, CLOCKS[i - N]]).max())
         if name == 'velocity' and i - N in MEANS:
             found, expected, loose = by_second(found, k), by_second(expected, k), MEANS[i - N]
         np.testing.assert_allclose(found, expected, err_msg=str(i), atol=loose * size)
-    assert begin[:, :, P].any() == (name in ('motion', 'fixes'))
+    assert begin[:, :, layout.P].any() == (name in ('motion', 'fixes'))
 
 
 def test_the_way_of_a_speed_in_coarse_steps_tells_nothing_of_its_size(stepping):
     problem, state = stepping
     by_constants = part_at(problem, state, 'motion').jacobians(N)[2]
-    assert not by_constants[:, D, [LN_K, ODO_DELAY, SPEED_OFFSET]].any()
-    assert by_constants[:, D, YAW].any()
+    assert not by_constants[:, D, [layout.LN_K, layout.ODO_DELAY, layout.SPEED_OFFSET]].any()
+    assert by_constants[:, D, layout.YAW].any()
 
 
 def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
@@ -182,11 +157,11 @@ def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
     assert not problem.leg.by_steps
 
     def raw(size):
-        c = np.zeros(M)
-        c[SPEED_OFFSET] = size
+        c = np.zeros(layout.M)
+        c[layout.SPEED_OFFSET] = size
         return part_at(problem, state.moved(np.zeros((len(state.t), N)), c), 'motion').raw
 
-    by_offset = part_at(problem, state, 'motion').jacobians(N)[2][:, :, SPEED_OFFSET]
+    by_offset = part_at(problem, state, 'motion').jacobians(N)[2][:, :, layout.SPEED_OFFSET]
     np.testing.assert_allclose((raw(0.01) - raw(-0.01)) / 0.02, by_offset, atol=1e-9)
     moves = np.linalg.norm(by_offset, axis=1)
     assert {0, 1} == set(np.rint(moves))        # seconds that moved, of each interval
@@ -198,12 +173,13 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(moved, stepping, nam
     # so wide that nothing lies far out: squares only
     wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'heading', 'pressure', 'steps'), 1e8)
     levels = problem.first_levels.but(correlation_time=40.0, **wide)
-    part = part_at(problem, state, name).weighed(levels, M)
-    normal = Normal(len(state.t), N, M)
+    part = part_at(problem, state, name).weighed(levels, layout.M)
+    normal = Normal(len(state.t), N, layout.M)
     part.add(normal)
     rng = np.random.default_rng(2)
-    x, c = 1e-4 * rng.standard_normal((len(state.t), N)), 1e-4 * rng.standard_normal(M)
-    x[0, P.start:PHI.stop] = 0.0      # the start is held, that the chain can be solved: no prior
+    x, c = 1e-4 * rng.standard_normal((len(state.t), N)), 1e-4 * rng.standard_normal(layout.M)
+    # the start is held, that the chain can be solved: no prior
+    x[0, layout.P.start:layout.PHI.stop] = 0.0
     # H x by blocks of the chain
     Hx = np.einsum('kij,kj->ki', normal.diagonal, x) + normal.border @ c
     Hx[:-1] += np.einsum('kij,kj->ki', normal.beside, x[1:])
@@ -267,8 +243,8 @@ def sized(problem, where, sigma, centre):
 
 # alone and two of a kind. The drive knows them to 1e-4 s^2 and 6e-4: of their priors by 1e-4
 @pytest.mark.parametrize(('name', 'where', 'prior'), [
-    ('size_fix_lag_square', constants_from('fix_lag_square', 'fix_lag_square'), 1.0),
-    ('size_scale_by_force', constants_from('scale_by_pull', 'scale_by_braking'), 0.1)])
+    ('size_fix_lag_square', layout.constants_from('fix_lag_square', 'fix_lag_square'), 1.0),
+    ('size_scale_by_force', layout.constants_from('scale_by_pull', 'scale_by_braking'), 0.1)])
 def test_sizes_of_what_is_well_known_are_the_mean_of_their_likelihood(moved, name, where, prior):
     problem, state = moved
     problem = sized(problem, where, prior, 1.5 * prior)
@@ -286,7 +262,7 @@ def test_sizes_of_what_is_well_known_are_the_mean_of_their_likelihood(moved, nam
 
 def test_what_the_drive_hardly_knows_has_no_say_in_its_size(moved):
     problem, state = moved
-    where = CONSTANTS.index('squat_by_jerk')
+    where = layout.CONSTANTS.index('squat_by_jerk')
     # known to 1e-3 by the drive, to 7e-6 by the prior; a misfit pulls by 100 sigmas of the drive
     problem = sized(problem, where, 1e-5, 0.1)
     levels = problem.first_levels
@@ -304,10 +280,11 @@ def test_the_bias_turns_with_a_robot_in_a_local_frame(moved):
     problem = replace(problem, leg=replace(problem.leg, origin=origin))
     part, h = part_at(problem, state, 'fixes'), 1e-4
     even = np.arange(len(state.t)) % 2 == 0
-    for i in range(BA.start, BA.stop):
+    for i in range(layout.BA.start, layout.BA.stop):
         step = np.zeros((len(state.t), N))
         step[even, i] = h
-        a, b = (part_at(problem, state.moved(x, np.zeros(M)), 'fixes').raw for x in (step, -step))
+        a, b = (part_at(problem, state.moved(x, np.zeros(layout.M)), 'fixes').raw
+                for x in (step, -step))
         expected = np.where(even[part.k][:, None], part.jacobians(N)[0][:, :, i], 0.0)
         # of a bias under constant attitude: 0.1
         assert (a - b) / (2 * h) == pytest.approx(expected, abs=LOOSE['fixes'])

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""x."""
+"""Steps of the fit: damped where they would oscillate, and cut off at the limit of passes."""
 
 from dataclasses import dataclass
 

@@ -13,14 +13,7 @@ from smoother_legs import made, truth
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.estimator import bound, smooth
-from odocal_ros.estimator.factors.slide import (
-    HEAVE,
-    least_slide,
-    ORDINARY_ROAD,
-    SIDEWAYS,
-    TURN_SLIDE,
-    turned,
-)
+from odocal_ros.estimator.factors import slide
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.nav.earth import gravity
@@ -37,33 +30,22 @@ SPEED, RADIUS, STRAIGHT = 9.0, 30.0, 60.0     # m/s, m, m
 START_NS = 1_700_000_000_000_000_000
 
 
-def results(noise):
-    """Return the smoother's results of a drive's windows, and the truth."""
+@pytest.mark.parametrize('noise', ['correlated', 'white'])
+def test_slow_errors_are_in_the_sigma_of_scale_and_pitch(noise):
     drive, config, leg = made(**TOWN, fix_noise=noise)
-    begins = 20.0 + WINDOW * np.arange(WINDOWS)
-    return drive.truth, [smooth(replace(leg, t_begin=begin, t_stop=begin + WINDOW), config)
-                         for begin in begins]
-
-
-def test_slow_errors_are_in_the_sigma_of_scale_and_pitch():
-    truth, found = results('correlated')
+    truth, found = drive.truth, [
+        smooth(replace(leg, t_begin=begin, t_stop=begin + WINDOW), config)
+        for begin in 20.0 + WINDOW * np.arange(WINDOWS)]
     for name, true in (('scale_factor', truth.scale), ('pitch_mounting_angle', truth.pitch)):
         out = [(e.value - true) / e.sigma for e in (r.estimates[name] for r in found)]
         # chi2 of 6, 1 in 1000; taken for white they are some 5 sigmas off each
         assert np.square(out).sum() < 22.5
-
-
-def test_a_slow_error_is_believed_of_white_fixes_too():
-    truth, found = results('white')
-    for name, true in (('scale_factor', truth.scale), ('pitch_mounting_angle', truth.pitch)):
-        out = [(e.value - true) / e.sigma for e in (r.estimates[name] for r in found)]
-        assert np.square(out).sum() < 22.5
-    for noise in (r.details['noise'] for r in found):
+    for level in (r.details['noise'] for r in found if noise == 'white'):
         # of 450 values 3 sigmas of their rms; of the slow error 45 s tell little: not more of it
         # than the receiver states
-        assert noise['fix'] == pytest.approx(1.0, abs=0.1)
-        assert 0.0 < noise['slow'] < 1.5
-        assert noise['correlation_time'] > 0
+        assert level['fix'] == pytest.approx(1.0, abs=0.1)
+        assert 0.0 < level['slow'] < 1.5
+        assert level['correlation_time'] > 0
 
 
 @pytest.mark.parametrize('stated', [0.5, 2.0])
@@ -122,7 +104,7 @@ def test_a_straight_drive_states_the_bound_of_an_ordinary_road(sway):
     method = smooth(leg, config)
     # the road's noise in the place of what the fit made of the seconds
     levels = Levels.of_roots(method.details['noise']).but(
-        **dict.fromkeys(SIDEWAYS, 0.05**2 / 10.0))
+        **dict.fromkeys(slide.SIDEWAYS, 0.05**2 / 10.0))
     sigma = np.sqrt(bound(leg, config, truth(drive, config, leg), levels)[1, 1])
     stated = method.estimates['yaw_mounting_angle'].sigma
     # linearised at the estimate and not at the truth, heavy tails: 3 %; a second sways
@@ -139,8 +121,8 @@ def test_a_leg_with_turns_tests_it_itself():
     assert not said(method)
     # wheels that never slide: far below a road's; up and down springs and road do what they do
     noise = method.details['noise']
-    assert max(noise['side'], noise['side_turn']) < ORDINARY_ROAD / 10
-    assert method.details['noise']['up'] == pytest.approx(HEAVE)
+    assert max(noise['side'], noise['side_turn']) < slide.ORDINARY_ROAD / 10
+    assert method.details['noise']['up'] == pytest.approx(slide.HEAVE)
 
 
 def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
@@ -149,7 +131,7 @@ def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
     t = problem.imu.t[problem.imu.key] + (drive.truth.start_ns - drive.options.start_ns) * 1e-9
     yaw = np.abs(np.diff(drive.motion.at(t).yaw))
     # slower than TURNING between turns: less than that rate for all the time
-    assert turned(leg, problem.imu) == pytest.approx(yaw[yaw > 0.05].sum(), rel=0.02)
+    assert slide.turned(leg, problem.imu) == pytest.approx(yaw[yaw > 0.05].sum(), rel=0.02)
     biased = replace(leg, w_b=leg.w_b + [0.0, 0.0, 0.06])
     assert problem_of(biased, config).turned == pytest.approx(problem.turned, rel=0.02)
     _, config, leg = straight()
@@ -158,11 +140,12 @@ def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
 
 def test_the_least_falls_from_a_road_to_what_turns_can_test_without_a_step():
     angles = np.deg2rad(np.arange(0.0, 270.0))
-    least = np.array([least_slide(a) for a in angles])
-    assert least[:90] == pytest.approx(ORDINARY_ROAD)
-    assert least[181:] == pytest.approx(TURN_SLIDE)
+    least = np.array([slide.least_slide(a) for a in angles])
+    assert least[:90] == pytest.approx(slide.ORDINARY_ROAD)
+    assert least[181:] == pytest.approx(slide.TURN_SLIDE)
     # a factor of 80 over 90 deg: 5 % a degree
-    assert np.abs(np.diff(np.log(least))).max() < np.log(ORDINARY_ROAD / TURN_SLIDE) / 90 * 1.001
+    by_90 = np.log(slide.ORDINARY_ROAD / slide.TURN_SLIDE)
+    assert np.abs(np.diff(np.log(least))).max() < by_90 / 90 * 1.001
 
 
 def circles(heading, seed, duration=300.0, rate=100.0):

@@ -10,12 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.estimator.result.wheel_result import (
-    joined,
-    unknown_wheels,
-    wheel_details,
-    wheel_estimates,
-)
+from odocal_ros.estimator.result import wheel_result
 from odocal_ros.estimator.result.wheels import Wheel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
@@ -153,7 +148,7 @@ def pair(delta=2e-3, sigma=1e-6, width=1.6, width_sigma=1e-3):
 def said(wheels, scale=SCALE, **changed_settings):
     config = with_settings(Config(), {k.replace('__', '.'): v
                                       for k, v in changed_settings.items()})
-    return wheel_estimates(SIDES, wheels, scale, config)
+    return wheel_result.wheel_estimates(SIDES, wheels, scale, config)
 
 
 def test_the_sigma_of_a_wheel_is_that_of_scale_and_ratio():
@@ -171,11 +166,11 @@ def test_wheels_that_are_not_known_are_not_stated_and_said():
     assert near['scale_factor_left'].value is not None
     for wheels, text in ((pair(sigma=0.0126), '2.5 %'), ({}, 'is not known')):
         found, (reason,) = said(wheels)
-        assert found == unknown_wheels(SIDES, 'm/pulse')
+        assert found == wheel_result.unknown_wheels(SIDES, 'm/pulse')
         assert reason.code is Code.WHEELS_NOT_SEPARABLE
         assert text in reason.text
     # why there is no scale the method says itself
-    assert said(pair(), Estimate(None, None, '1')) == (unknown_wheels(SIDES, '1'), [])
+    assert said(pair(), Estimate(None, None, '1')) == (wheel_result.unknown_wheels(SIDES, '1'), [])
 
 
 @pytest.mark.parametrize(('width', 'sigma', 'given', 'code'), [
@@ -199,22 +194,22 @@ def test_a_width_far_from_the_one_given_is_said():
 
 
 def leg_of(wheels):
-    return MethodResult('smoother', (), {}, details=wheel_details(wheels))
+    return MethodResult('smoother', (), {}, details=wheel_result.wheel_details(wheels))
 
 
 def test_several_legs_are_a_mean_by_variance():
     one, other = pair(delta=2e-3, sigma=1e-5), pair(delta=2.01e-3, sigma=2e-5, width=1.601)
-    left, right = joined([leg_of(one), leg_of({}), leg_of(other)]).values()
+    left, right = wheel_result.joined([leg_of(one), leg_of({}), leg_of(other)]).values()
     weight = np.array([4.0, 1.0]) / 5
     both = [legs['left'].ratio for legs in (one, other)]
     assert left.ratio == pytest.approx(weight @ both, rel=1e-12)
     assert left.ratio_sigma == pytest.approx(1e-5 / np.sqrt(1.25))
     assert left.y - right.y == pytest.approx(1.6005)
-    assert joined([leg_of({}), leg_of({})]) == {}
+    assert wheel_result.joined([leg_of({}), leg_of({})]) == {}
 
 
 def test_legs_that_differ_widen_the_sigma():
     legs = [leg_of(pair(delta=delta, sigma=1e-5)) for delta in (1e-3, 2e-3, 3e-3)]
-    left, _ = joined(legs).values()
+    left, _ = wheel_result.joined(legs).values()
     # 1 permille apart beside 10 ppm: their scatter decides
     assert left.ratio_sigma == pytest.approx(1e-3 / np.sqrt(3), rel=0.01)

@@ -108,10 +108,6 @@ def test_truncation_or_rounding_is_found(how, share):
     offset = result.methods['smoother'].details['speed_offset']
     assert offset['value'] == pytest.approx(share * KMH, abs=3 * offset['sigma'])
     assert offset['sigma'] < KMH / 20
-
-
-def test_the_sentence_tells_the_step():
-    _, result = calibrated()
     text = next(r.text for r in result.reasons if r.code is Code.SPEED_COARSE)
     assert 'resolution is 0.278 m/s (1 km/h)' in text
 

@@ -5,16 +5,7 @@
 
 from dataclasses import replace
 
-from drives import (
-    changed,
-    drive,
-    errors_in_sigmas,
-    everything_said,
-    seconds,
-    settings,
-    shifted,
-    two_point,
-)
+import drives
 import numpy as np
 import pytest
 
@@ -29,7 +20,7 @@ DEG = np.pi / 180
 
 
 def found(made, config=None, leg=None):
-    e = two_point(leg or made.leg(), config or settings(made)).estimates
+    e = drives.two_point(leg or made.leg(), config or drives.settings(made)).estimates
     return e['scale_factor'].value, e['yaw_mounting_angle'].value, \
         e['pitch_mounting_angle'].value
 
@@ -51,7 +42,7 @@ def test_error_free_data_give_the_truth(options):
     A turn of w rad/s bends a step by w^2 dt^2 / 12 of itself: at 0.3 rad/s 3e-6, on the quarter
     of the way that is turns; yaw and pitch alike.
     """
-    made = drive(**CLEAN, **options)
+    made = drives.drive(**CLEAN, **options)
     scale, yaw, pitch = found(made)
     assert scale == pytest.approx(made.truth.scale, rel=1e-6)
     assert yaw == pytest.approx(made.truth.yaw, abs=3e-6)
@@ -59,10 +50,10 @@ def test_error_free_data_give_the_truth(options):
 
 
 def test_the_ratio_is_to_the_nominal_scale_and_without_one_is_unknown():
-    made = drive(**CLEAN, scenario='straight', duration=200.0)
-    e = two_point(made.leg(), settings(made)).estimates['scale_ratio']
+    made = drives.drive(**CLEAN, scenario='straight', duration=200.0)
+    e = drives.two_point(made.leg(), drives.settings(made)).estimates['scale_ratio']
     assert e.value == pytest.approx(made.truth.scale_ratio, rel=1e-6)
-    e = two_point(made.leg(), settings(made, odometer__nominal_scale=0.0)).estimates
+    e = drives.two_point(made.leg(), drives.settings(made, odometer__nominal_scale=0.0)).estimates
     assert e['scale_ratio'].value is None
     assert e['scale_factor'].value == pytest.approx(made.truth.scale, rel=1e-6)
 
@@ -76,27 +67,32 @@ def test_plane_and_geodesic_agree_with_the_solution_in_space(kind, ellipsoid):
     Between ends 1.2 times as far apart it changes by less than 1e-7 a km; 116 deg lies 1 deg
     from the meridian of its zone. The plane's bearings differ by its convergence, alike for both.
     """
-    made = drive(**CLEAN, scenario='straight', duration=200.0, height=1500.0)
-    result = two_point(made.leg(), settings(made, projection__kind=kind,
-                                            projection__ellipsoid=ellipsoid))
+    made = drives.drive(**CLEAN, scenario='straight', duration=200.0, height=1500.0)
+    result = drives.two_point(made.leg(), drives.settings(made, projection__kind=kind,
+                                                          projection__ellipsoid=ellipsoid))
     for check in result.details['cross_check'].values():
         assert check['scale_factor'] == pytest.approx(made.truth.scale, rel=1e-6)
         assert check['alpha_psi'] == pytest.approx(made.truth.yaw, abs=2e-6)
     assert Code.PLANES_DISAGREE not in {r.code for r in result.reasons}
 
 
+def surveyed(fix, k):
+    """Return a fix as a surveyed point, good to 1 cm."""
+    return tuple(map(float, (np.rad2deg(fix.latitude[k]), np.rad2deg(fix.longitude[k]),
+                             fix.height[k], 0.01)))
+
+
 def test_surveyed_points_take_the_place_of_fixes():
-    made = drive(**CLEAN, scenario='straight', duration=200.0)
+    made = drives.drive(**CLEAN, scenario='straight', duration=200.0)
     leg, fix = made.leg(), made.fix
-    ends = [tuple(map(float, (np.rad2deg(fix.latitude[k]), np.rad2deg(fix.longitude[k]),
-                              fix.height[k], 0.01))) for k in (0, -1)]
+    ends = [surveyed(fix, k) for k in (0, -1)]
     # fixes that are 50 m off, all alike but the last part: only the survey is right
-    off = changed(fix, latitude=lambda a: a + 1e-6 * np.linspace(0, 8, len(a)))
-    config = settings(made, reference__start=ends[0], reference__end=ends[1])
+    off = drives.changed(fix, latitude=lambda a: a + 1e-6 * np.linspace(0, 8, len(a)))
+    config = drives.settings(made, reference__start=ends[0], reference__end=ends[1])
     scale, yaw, _ = found(made, config, replace(leg, fix=off))
     assert scale == pytest.approx(made.truth.scale, rel=1e-6)
     assert yaw == pytest.approx(made.truth.yaw, abs=1e-5)
-    sources = {s.name: s for s in two_point(replace(leg, fix=off), config).sources}
+    sources = {s.name: s for s in drives.two_point(replace(leg, fix=off), config).sources}
     track_n = calibrate(leg, config).track_n
     length = np.hypot(*(track_n[-1][:2] - track_n[0][:2]))
     # 1 cm at each end; residuals of the bad fixes may widen it
@@ -104,22 +100,20 @@ def test_surveyed_points_take_the_place_of_fixes():
 
 
 def test_a_surveyed_end_is_not_taken_for_where_a_holdout_ends():
-    made = drive(**CLEAN, scenario='straight', duration=200.0)
-    fix = made.fix
-    end = tuple(map(float, (np.rad2deg(fix.latitude[-1]), np.rad2deg(fix.longitude[-1]),
-                            fix.height[-1], 0.01)))
-    result = calibrate(made.leg(), settings(made, reference__end=end), holdout=True)
+    made = drives.drive(**CLEAN, scenario='straight', duration=200.0)
+    config = drives.settings(made, reference__end=surveyed(made.fix, -1))
+    result = calibrate(made.leg(), config, holdout=True)
     scale = result.methods['two_point'].estimates['scale_factor'].value
     assert scale == pytest.approx(made.truth.scale, rel=1e-5)
 
 
 def test_marks_in_motion_are_fitted_and_their_time_errors_are_budgeted():
-    made = drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=8)
-    moving = shifted(made.leg(), start=30.0, stop=-90.0)       # both at 12 m/s
-    result = calibrate(moving, settings(made))
-    assert all(abs(z) < 4 for z in errors_in_sigmas(result, made.truth).values())
+    made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=8)
+    moving = drives.shifted(made.leg(), start=30.0, stop=-90.0)       # both at 12 m/s
+    result = calibrate(moving, drives.settings(made))
+    assert all(abs(z) < 4 for z in drives.errors_in_sigmas(result, made.truth).values())
     # only the stop moves now: 12 m/s times 0.05 s over the chord
-    half = calibrate(shifted(made.leg(), stop=-90.0), settings(made))
+    half = calibrate(drives.shifted(made.leg(), stop=-90.0), drives.settings(made))
     latency = half.methods['two_point'].details['budget']['fix_latency']
     length = np.hypot(*(half.track_n[-1] - half.track_n[0])[:2])
     assert latency['scale_factor'] / made.truth.scale == pytest.approx(0.6 / length, rel=0.05)
@@ -129,23 +123,23 @@ def test_marks_in_motion_are_fitted_and_their_time_errors_are_budgeted():
 
 
 def test_late_fixes_at_a_moving_mark_cost_what_the_budget_says():
-    made = drive(**CLEAN, scenario='straight', duration=200.0)
-    moving = shifted(made.leg(), stop=-90.0)
-    config = settings(made)
-    late = replace(moving, fix=changed(made.fix, stamp_ns=lambda a: a + 50_000_000))
-    e, b = (two_point(x, config).estimates['scale_factor'].value for x in (late, moving))
-    told = two_point(moving, config).details['budget']['fix_latency']['scale_factor']
+    made = drives.drive(**CLEAN, scenario='straight', duration=200.0)
+    moving = drives.shifted(made.leg(), stop=-90.0)
+    config = drives.settings(made)
+    late = replace(moving, fix=drives.changed(made.fix, stamp_ns=lambda a: a + 50_000_000))
+    e, b = (drives.two_point(x, config).estimates['scale_factor'].value for x in (late, moving))
+    told = drives.two_point(moving, config).details['budget']['fix_latency']['scale_factor']
     assert abs(e - b) == pytest.approx(told, rel=0.02)
 
 
 def test_without_heights_the_scale_stands_and_the_pitch_is_refused():
-    made = drive(scenario='straight', duration=200.0, imu_grade='tactical', pitch=0.4 * DEG)
-    flat = replace(made.leg(), fix=changed(made.fix, height=lambda a: a * np.nan))
-    result = calibrate(flat, settings(made))
+    made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', pitch=0.4 * DEG)
+    flat = replace(made.leg(), fix=drives.changed(made.fix, height=lambda a: a * np.nan))
+    result = calibrate(flat, drives.settings(made))
     e = result.methods['two_point'].estimates
     assert e['pitch_mounting_angle'].value is None
-    assert Code.PITCH_NOT_DETERMINED in everything_said(result)
-    assert abs(errors_in_sigmas(result, made.truth)['scale_factor']) < 4
+    assert Code.PITCH_NOT_DETERMINED in drives.everything_said(result)
+    assert abs(drives.errors_in_sigmas(result, made.truth)['scale_factor']) < 4
     # the pitch that is not known is half its square in the scale (152 ppm a degree), and the
     # height above the ellipsoid that is not known is 500 m of the Earth's radius
     budget = result.methods['two_point'].details['budget']
@@ -154,48 +148,48 @@ def test_without_heights_the_scale_stands_and_the_pitch_is_refused():
 
 
 def test_a_closed_loop_is_refused_with_what_would_help():
-    made = drive(scenario='out_and_back', duration=300.0, imu_grade='industrial')
-    result = calibrate(made.leg(), settings(made))
-    said = everything_said(result)
+    made = drives.drive(scenario='out_and_back', duration=300.0, imu_grade='industrial')
+    result = calibrate(made.leg(), drives.settings(made))
+    said = drives.everything_said(result)
     assert 'less than a fifth of the' in said[Code.CHORD_TOO_SHORT]
     assert '--leg' in Code.CHORD_TOO_SHORT.remedy
     assert all(e.value is None for e in result.methods['two_point'].estimates.values())
     assert result.verdict.value == 'rejected'
     # its way out alone is a leg
-    t = seconds(made.leg(), made.imu)
+    t = drives.seconds(made.leg(), made.imu)
     stop = float(t[-1]) / 2 - 20.0
     part = replace(made.leg(), stop_ns=made.truth.start_ns + round(stop * 1e9))
-    result = calibrate(part, settings(made))
-    assert abs(errors_in_sigmas(result, made.truth)['scale_factor']) < 4
+    result = calibrate(part, drives.settings(made))
+    assert abs(drives.errors_in_sigmas(result, made.truth)['scale_factor']) < 4
 
 
 def test_a_track_that_loops_where_the_fixes_do_not_is_refused():
-    made = drive(scenario='straight', duration=200.0, imu_grade='tactical')
-    spun = changed(made.imu, w_i=lambda a: a + [0.0, 0.0, 0.5] * (
-        seconds(made.leg(), made.imu) > 5.0)[:, None])
-    said = everything_said(calibrate(replace(made.leg(), imu=spun), settings(made)))
+    made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical')
+    spun = drives.changed(made.imu, w_i=lambda a: a + [0.0, 0.0, 0.5] * (
+        drives.seconds(made.leg(), made.imu) > 5.0)[:, None])
+    said = drives.everything_said(calibrate(replace(made.leg(), imu=spun), drives.settings(made)))
     assert 'dead-reckoned track' in said[Code.CHORD_TOO_SHORT]
 
 
 @pytest.mark.parametrize(('sigma', 'given'), [(0.05, False), (0.004, True)])
 def test_a_heading_worse_than_the_asked_yaw_refuses_the_yaw_only(sigma, given):
-    made = drive(scenario='straight', duration=200.0, imu_grade='tactical')
-    result = calibrate(made.leg(), settings(made, heading_sigma=sigma,
-                                            verdict__max_yaw_sigma=0.0087))
+    made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical')
+    result = calibrate(made.leg(), drives.settings(made, heading_sigma=sigma,
+                                                   verdict__max_yaw_sigma=0.0087))
     e = result.methods['two_point'].estimates
     assert (e['yaw_mounting_angle'].value is not None) == given
-    assert (Code.YAW_NOT_SEPARABLE in everything_said(result)) != given
+    assert (Code.YAW_NOT_SEPARABLE in drives.everything_said(result)) != given
     assert e['scale_factor'].value == pytest.approx(made.truth.scale, rel=2e-3)
 
 
 def test_the_course_is_no_heading_to_find_a_yaw_by():
-    made = drive(scenario='straight', duration=200.0, imu_grade='consumer')
-    result = calibrate(made.leg(), settings(made, heading_sigma=None))
-    assert 'course' in everything_said(result)[Code.YAW_NOT_SEPARABLE]
+    made = drives.drive(scenario='straight', duration=200.0, imu_grade='consumer')
+    result = calibrate(made.leg(), drives.settings(made, heading_sigma=None))
+    assert 'course' in drives.everything_said(result)[Code.YAW_NOT_SEPARABLE]
     e = result.methods['two_point'].estimates
     assert e['yaw_mounting_angle'].value is None
-    assert abs(errors_in_sigmas(result, made.truth)['scale_factor']) < 4
-    assert combine([result], settings(made)).imu_rotation_xyzw is None
+    assert abs(drives.errors_in_sigmas(result, made.truth)['scale_factor']) < 4
+    assert combine([result], drives.settings(made)).imu_rotation_xyzw is None
 
 
 @pytest.mark.parametrize(('setting', 'late', 'scenario', 'stop'), [
@@ -203,10 +197,10 @@ def test_the_course_is_no_heading_to_find_a_yaw_by():
     ('gnss__time_offset', 'fix_delay', 'straight', -90.0)])         # a mark at 12 m/s shows it
 def test_time_offsets_have_the_sign_of_being_added(setting, late, scenario, stop):
     """A sensor whose stamps are 0.2 s late is put right by -0.2, twice as wrong by +0.2."""
-    made = drive(**CLEAN, scenario=scenario, duration=200.0, seed=2, **{late: 0.2})
-    leg = shifted(made.leg(), stop=stop)
+    made = drives.drive(**CLEAN, scenario=scenario, duration=200.0, seed=2, **{late: 0.2})
+    leg = drives.shifted(made.leg(), stop=stop)
     truth = np.array([made.truth.scale, made.truth.yaw])
-    off = {x: np.abs(found(made, settings(made, **{setting: x}), leg)[:2] / truth - 1)
+    off = {x: np.abs(found(made, drives.settings(made, **{setting: x}), leg)[:2] / truth - 1)
            for x in (-0.2, 0.0, 0.2)}
     worst = int(np.argmax(off[0.0]))
     assert off[0.0][worst] > 1e-3
@@ -215,25 +209,25 @@ def test_time_offsets_have_the_sign_of_being_added(setting, late, scenario, stop
 
 
 def test_the_imus_offset_is_that_of_the_others_turned_round():
-    made = drive(**CLEAN, scenario='town', duration=200.0, seed=2)
-    late = replace(made.leg(), imu=changed(made.imu, stamp_ns=lambda a: a + 200_000_000),
+    made = drives.drive(**CLEAN, scenario='town', duration=200.0, seed=2)
+    late = replace(made.leg(), imu=drives.changed(made.imu, stamp_ns=lambda a: a + 200_000_000),
                    start_ns=made.truth.start_ns + 200_000_000,
                    stop_ns=made.truth.stop_ns + 200_000_000)
-    np.testing.assert_allclose(found(made, settings(made, imu__time_offset=-0.2), late),
+    np.testing.assert_allclose(found(made, drives.settings(made, imu__time_offset=-0.2), late),
                                found(made), rtol=1e-6)
 
 
 def test_two_wheels_give_the_scale_of_their_mean():
-    made = drive(**(CLEAN | {'odometer': 'counts'}), scenario='straight', duration=200.0,
-                 two_wheels=True)
+    made = drives.drive(**(CLEAN | {'odometer': 'counts'}), scenario='straight', duration=200.0,
+                        two_wheels=True)
     # one count of 2 cm a wheel on 1 km
     assert found(made)[0] == pytest.approx(made.truth.scale, rel=4e-5)
 
 
 def test_a_mark_between_fixes_far_apart_still_finds_one():
-    made = drive(scenario='straight', duration=200.0, imu_grade='tactical', fix_rate=0.2)
-    result = calibrate(made.leg(), settings(made))
-    assert all(abs(z) < 4 for z in errors_in_sigmas(result, made.truth).values())
+    made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', fix_rate=0.2)
+    result = calibrate(made.leg(), drives.settings(made))
+    assert all(abs(z) < 4 for z in drives.errors_in_sigmas(result, made.truth).values())
     few = take(made.fix, np.arange(len(made.fix.stamp_ns)) % 3 == 0)
-    result = calibrate(replace(made.leg(), fix=few), settings(made))
-    assert all(abs(z) < 4 for z in errors_in_sigmas(result, made.truth).values())
+    result = calibrate(replace(made.leg(), fix=few), drives.settings(made))
+    assert all(abs(z) < 4 for z in drives.errors_in_sigmas(result, made.truth).values())

@@ -4,6 +4,7 @@
 """Wheels that fail one by one are named, with where; wheels that count are let be."""
 
 from dataclasses import replace
+from functools import reduce
 
 from drives import cached, changed, drive, seconds, settings
 import numpy as np
@@ -71,7 +72,7 @@ def said(made, **wheels):
     """Return what screening says of a leg whose counters are changed."""
     leg = made.leg()
     leg = leg.with_rows(**{slot: changed(leg.rows(slot), value=change)
-                          for slot, change in wheels.items()})
+                           for slot, change in wheels.items()})
     return {r.code: r.text for r in screen(leg, settings(made))[1]}
 
 
@@ -253,30 +254,21 @@ def test_a_ratio_that_changes_anywhere_is_said_with_where(share):
 
 
 def test_one_counter_sent_twice_is_no_second_wheel():
-    assert 'one counter is sent twice' in said_of_copies()[Code.WHEEL_DEAD]
     options = TOWN | {'seed': 3}
+    left = drive(**options).odometer.value
+    assert 'one counter is sent twice' in said(
+        drive(**options), odometer_right=lambda _: left)[Code.WHEEL_DEAD]
     inputs = prepared(**options)[0]
     copied = np.floor(inputs.travels[0].s / 2)      # in another resolution: not to the digit
     reasons, _ = faults(options, right=lambda s: copied, rough=4 / 3, track_width=1.6)
     assert 'one counter is sent twice' in {r.code: r.text for r in reasons}[Code.WHEEL_DEAD]
 
 
-def said_of_copies():
-    made = drive(**TOWN, seed=3)
-    leg = replace(made.leg(), odometer_right=made.odometer)
-    return {r.code: r.text for r in screen(leg, settings(made))[1]}
-
-
 def test_slips_by_the_dozen_are_counted():
     options = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True, 'seed': 8}
     at = np.arange(60.0, 240.0, 30.0)
     spins = [spun(options, t, 1.0, 0.4) for t in at]
-
-    def all_of_them(s):
-        for spin in spins:
-            s = spin(s)
-        return s
-    (reason,), slips = faults(options, right=all_of_them)
+    (reason,), slips = faults(options, right=lambda s: reduce(lambda s, spin: spin(s), spins, s))
     assert np.abs(slips.t - at - 0.5).max() < 0.5
     assert slips.wheel.tolist() == [1] * len(at)
     assert f'{len(at)} such places' in reason.text
@@ -308,19 +300,23 @@ def test_a_gyro_that_does_not_turn_is_no_ground_for_factors():
     assert 'gyro_scale' not in said.do
 
 
+def with_gyro_noise(sigma, grade):
+    """Return a drive in town, its leg with that gyro noise, rad/s, and its settings."""
+    made = drive(**TOWN | {'duration': 200.0}, seed=3, imu_grade=grade)
+    noise = np.random.default_rng(0).normal(0.0, sigma, made.imu.w_i.shape)
+    leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
+    return made, leg, settings(made, method='smoother')
+
+
 def test_a_gyro_of_noise_ends_in_reasons_too():
     """Heights left out in the last round: what was solved with them has another length."""
-    made = drive(**TOWN | {'duration': 200.0}, seed=3, imu_grade='industrial')
-    noise = np.random.default_rng(0).normal(0.0, 0.3, made.imu.w_i.shape)
-    leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
-    assert calibrate(leg, settings(made, method='smoother')).methods['smoother'].reasons
+    _, leg, config = with_gyro_noise(0.3, 'industrial')
+    assert calibrate(leg, config).methods['smoother'].reasons
 
 
 def test_a_gyro_of_less_noise_widens_the_track_width():
-    made = drive(**TOWN | {'duration': 200.0}, seed=3, imu_grade='consumer')
-    noise = np.random.default_rng(0).normal(0.0, 0.1, made.imu.w_i.shape)
-    leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
-    noisy, clean = (calibrate(x, settings(made, method='smoother')).methods['smoother']
-                    .estimates['track_width'] for x in (leg, made.leg()))
+    made, leg, config = with_gyro_noise(0.1, 'consumer')
+    noisy, clean = (calibrate(x, config).methods['smoother'].estimates['track_width']
+                    for x in (leg, made.leg()))
     assert abs(noisy.value - made.options.track_width) < 4 * noisy.sigma
     assert noisy.sigma > 3 * clean.sigma

@@ -53,8 +53,7 @@ def test_counters_stay_whole_and_speeds_stay_real():
     lambda: s.OdometerSamples([1, 2], [1, 2], np.zeros(3)),
     lambda: s.OdometerSamples([1, 2], [1], np.zeros(2)),
     lambda: s.ImuSamples([1], [1], np.zeros((1, 2)), np.zeros((1, 3)), np.zeros((1, 4)), [0.0]),
-    lambda: s.FixSamples([1], [1], [0.0], [0.0], [0.0], np.zeros((1, 9)), [0], [0]),
-])
+    lambda: s.FixSamples([1], [1], [0.0], [0.0], [0.0], np.zeros((1, 9)), [0], [0])])
 def test_a_wrong_shape_is_refused_by_name(bad):
     with pytest.raises(BadData, match=r'Samples\.\w+: required shape'):
         bad()

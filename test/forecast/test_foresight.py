@@ -84,8 +84,7 @@ def test_vibration_is_no_turn():
     (OdometerForm('cumulative', 256, 'm/pulse'), lambda n: (15 * np.arange(n)) % 256),
     (OdometerForm('cumulative', 2**64, 'm/pulse'), lambda n: 2**63 - 700 + 15 * np.arange(
         n, dtype=np.uint64)),
-    (OdometerForm('increment', 2**16, 'm/pulse'), lambda n: np.full(n, 15)),
-])
+    (OdometerForm('increment', 2**16, 'm/pulse'), lambda n: np.full(n, 15))])
 def test_counts_never_roll_over_however_the_blocks_are_cut(form, sent):
     t = np.arange(0.0, 10.0, 0.01)
     value = sent(len(t)).astype(np.uint64).view(np.int64)
@@ -462,8 +461,7 @@ def said(forecast, **more):
      'scale 1820 ppm: the limit is not reached within another 20 km; OK: yaw 0.286 deg (limit '
      '0.498); call ~/stop_leg'),
     (Forecast(replace(MORE, sigma=None), NO_YAW), 0.0, 'scale is not determined yet; drive 240 m '
-     'more to reach the limit of 1000 ppm; yaw: limited by the heading uncertainty (1 deg)'),
-])
+     'more to reach the limit of 1000 ppm; yaw: limited by the heading uncertainty (1 deg)')])
 def test_the_hint_says_what_is_enough_and_what_more_it_takes(forecast, still_s, text):
     assert said(forecast, still_s=still_s) == text
 

@@ -94,8 +94,7 @@ def test_a_configured_track_width_is_not_asked_of_the_drive():
     (Forecast(GOOD, YAW, 0.001, WheelsForecast(2e-4, 0.01)), 'yes yes yes yes yes'),
     (Forecast(BAD, NO_YAW, None, WheelsForecast(None, None)), 'no no no no no'),
     (Forecast(GOOD, YAW, 0.01, WheelsForecast(2e-3, 0.06)), 'yes yes no no no'),
-    (Forecast(GOOD, YAW, 0.001), 'yes yes yes unknown unknown'),
-])
+    (Forecast(GOOD, YAW, 0.001), 'yes yes yes unknown unknown')])
 def test_a_leg_that_is_recorded_is_judged_by_its_forecast(forecast, found):
     assert ok(forecast) == found
     assert set(quantities.of_forecast(None, CONFIG, True).values()) == {'unknown'}
@@ -220,8 +219,7 @@ def test_seconds_to_stand():
     ({'method': 'two_point', 'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002},
      {'two_wheels': True}, 'observable: the scale, the yaw (from the configured heading, 0.11 '
      'deg) and the pitch; not observable: left and right wheel separately (method two_point uses '
-     'their mean)'),
-])
+     'their mean)')])
 def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, received, said):
     monkeypatch.setattr(ability_module, 'METHODS', ('two_point',))
     known = Received(**({'variances': NONE, 'rested_s': 30.0} | received))

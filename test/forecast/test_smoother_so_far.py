@@ -75,16 +75,19 @@ def apart(one, other):
             for n in NAMES]
 
 
+def errors_in_sigmas(running, drive):
+    true = (drive.truth.scale, drive.truth.yaw, drive.truth.pitch)
+    return [(running.method.estimates[n].value - t) / running.method.estimates[n].sigma
+            for n, t in zip(NAMES, true, strict=True)]
+
+
 def test_it_ends_as_the_result_and_is_within_its_sigma_all_along(drive, config, looks):
     result = calibrate(drive.leg(), config).methods['smoother'].estimates
     for off, ratio in apart(looks[-1].running.method.estimates, result):
         assert abs(off) < 0.5
         assert 0.9 < ratio < 1.3       # a little is put on: noise levels from 150 s of driving
-    truth = drive.truth
     for seen in looks:
-        for name, true in zip(NAMES, (truth.scale, truth.yaw, truth.pitch), strict=True):
-            e = seen.running.method.estimates[name]
-            assert abs(e.value - true) < 4 * e.sigma        # 24 of them: 1 in 700 by chance
+        assert np.abs(errors_in_sigmas(seen.running, drive)).max() < 4    # 24: 1 in 700 by chance
 
 
 def test_a_look_goes_on_from_the_last_and_comes_out_as_one_from_nothing(config, looks):
@@ -122,10 +125,7 @@ def test_a_long_leg_is_looked_at_in_windows(drive, config, looks, monkeypatch):
         # the end of a window is the begin of the next, with states that it does not know
         assert abs(off) < 1.0
         assert 0.9 < ratio < 1.6
-    truth = drive.truth
-    for name, true in zip(NAMES, (truth.scale, truth.yaw, truth.pitch), strict=True):
-        e = windowed.method.estimates[name]
-        assert abs(e.value - true) < 4 * e.sigma
+    assert np.abs(errors_in_sigmas(windowed, drive)).max() < 4
     # a window that cannot be fitted leaves the finished ones
     monkeypatch.setattr(growing, 'outcome', lambda *_: np.linalg.inv(np.zeros((2, 2))))
     assert so_far.look(thinned, config) is past

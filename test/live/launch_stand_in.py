@@ -8,7 +8,10 @@ from pathlib import Path
 import re
 import sys
 from types import ModuleType
+from unittest.mock import patch
 from xml.etree import ElementTree
+
+import yaml
 
 ROOT = Path(__file__).resolve().parents[2]     # config/ and launch/ lie alike in share/odocal_ros
 
@@ -83,19 +86,13 @@ def of_python(path: Path, given: dict[str, str]) -> tuple[dict, list[Started]]:
             lambda a: _truth(text_of(value, a)) if value_type is bool
             else value_type(text_of(value, a)))},
         'launch_ros.substitutions': {'FindPackageShare': package_share}}
-    before = {name: sys.modules.get(name) for name in stand_ins}
-    try:
-        for name, content in stand_ins.items():
-            sys.modules[name] = ModuleType(name)
-            sys.modules[name].__dict__.update(content)
+    modules = {name: ModuleType(name) for name in stand_ins}
+    for name, content in stand_ins.items():
+        modules[name].__dict__.update(content)
+    with patch.dict(sys.modules, modules):
         scope: dict = {}
         exec(compile(path.read_text(encoding='utf-8'), str(path), 'exec'), scope)
         nodes = [e for e in scope['generate_launch_description']() if e is not None]
-    finally:
-        for name, module in before.items():
-            sys.modules.pop(name)
-            if module is not None:
-                sys.modules[name] = module
     arguments = {name: default for name, (default, _) in declared.items()} | given
     return declared, [_started(node, arguments) for node in nodes if _wanted(node, arguments)]
 
@@ -144,16 +141,11 @@ def _walk(element, arguments, remaps, nodes) -> None:
 
 def _of_element(node, arguments, remaps) -> Started:
     files = [_filled(p.get('from'), arguments) for p in node.findall('param') if p.get('from')]
-    values = {p.get('name'): _typed(_filled(p.get('value'), arguments))
+    values = {p.get('name'): yaml.safe_load(_filled(p.get('value'), arguments))
               for p in node.findall('param') if p.get('name')}
     return Started(node.get('pkg'), node.get('exec'), node.get('name'),
                    _filled(node.get('namespace'), arguments), dict(remaps), [*files, values],
                    _filled(node.get('args', ''), arguments).split())
-
-
-def _typed(text: str):
-    import yaml
-    return yaml.safe_load(text)
 
 
 def _filled(text: str, arguments) -> str:

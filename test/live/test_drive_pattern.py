@@ -8,6 +8,7 @@ import math
 import signal
 import threading
 import time
+from unittest.mock import patch
 
 from bench import Client, given, NodeProcess, wait_for
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
@@ -121,15 +122,6 @@ def test_a_pattern_is_driven_to_its_end_inside_the_rectangle():
 
 
 @contextlib.contextmanager
-def changed(owner, name, value):
-    """Change an attribute as long as the block lasts."""
-    before = getattr(owner, name)
-    setattr(owner, name, value)
-    yield
-    setattr(owner, name, before)
-
-
-@contextlib.contextmanager
 def bumped(robot):
     """Press the bumper as long as the block lasts."""
     robot.bump(True)
@@ -139,11 +131,12 @@ def bumped(robot):
 
 # the cause, how it is made, and whether a start is refused for it
 CAUSES = {
-    'no pose for 0.5 s': (lambda robot: changed(robot, 'blind', True), True),
+    'no pose for 0.5 s': (lambda robot: patch.object(robot, 'blind', True), True),
     'the bumper is pressed': (bumped, True),
     'the robot is outside the rectangle, at x': (
-        lambda robot: changed(robot, 'pose', [0.0, 1.2, 0.0]), True),
-    'the pose has not changed for 2 s': (lambda robot: changed(robot, 'frozen', True), False)}
+        lambda robot: patch.object(robot, 'pose', [0.0, 1.2, 0.0]), True),
+    'the pose has not changed for 2 s': (
+        lambda robot: patch.object(robot, 'frozen', True), False)}
 
 
 def test_each_cause_stops_and_a_start_goes_on():

@@ -25,26 +25,68 @@ BAD = Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
 
 
 @pytest.fixture
-def save(tmp_path):
-    """Return a function that saves a calibration and returns the answer and where latest is."""
-    worker = Worker()
-    log = SimpleNamespace(info=lambda text: None, warning=lambda text: None)
-    filing = Filing(worker, log, lambda: None, '/calibrator')
-    config = with_settings(Config(), {'output.directory': str(tmp_path)})
+def filing():
+    """Return worker, filing, the warnings of both, and a function that saves and answers."""
+    worker, said = Worker(), []
+    filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=said.append),
+                    lambda: None, '/calibrator')
 
-    def run(calibration, asked=True):
+    def run(calibration, folder, asked=True):
+        config = with_settings(Config(), {'output.directory': str(folder)})
         future = filing.save(calibration, config, {}, 'imu_link', NOW_NS, asked)
-
-        def done():
-            worker.poll()
-            return future.done()
-        wait_for(done, 'the answer of save')
-        success, text = future.result()
-        assert success
-        assert filing.saved in text
-        return text, (tmp_path / 'latest').resolve().name == filing.saved.rpartition('/')[2]
-    yield run
+        wait_for(lambda: worker.poll() or future.done(), 'the answer of save')
+        return future.result()
+    yield SimpleNamespace(worker=worker, filing=filing, said=said, save=run)
     worker.close()
+
+
+@pytest.fixture
+def save(filing, tmp_path):
+    """Return a function that saves a calibration and returns the answer and where latest is."""
+    def run(calibration, asked=True):
+        success, text = filing.save(calibration, tmp_path, asked)
+        assert success
+        saved = filing.filing.saved
+        assert saved in text
+        return text, (tmp_path / 'latest').resolve().name == saved.rpartition('/')[2]
+    return run
+
+
+def test_what_cannot_be_saved_is_a_warning_until_it_is(filing, tmp_path):
+    (tmp_path / 'file').touch()
+    success, text = filing.save(GOOD, tmp_path / 'file')
+    assert not success
+    assert filing.said == [text]
+    assert filing.filing.trouble in text
+    assert 'output.directory' in filing.filing.trouble
+    assert filing.save(GOOD, tmp_path)[0]
+    assert filing.filing.trouble == ''
+
+
+def test_the_saves_of_the_node_itself_do_not_count_nor_a_warning_of_another_result(save):
+    assert save(GOOD, asked=False)[1]
+    for _ in range(2):
+        assert not save(BAD, asked=False)[1]
+    assert not save(BAD)[1]
+    assert not save(Calibration(BAD.reasons, {}, {}, ()))[1]
+    assert not save(BAD)[1]
+    assert save(BAD)[1]
+
+
+def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(filing, tmp_path, monkeypatch):
+    gate, worker, done = threading.Event(), filing.worker, []
+    monkeypatch.setattr('odocal_ros.output.files.report_or_why', lambda *_: (
+        gate.wait(20), ('<html></html>', ''))[1])
+    filing.save(GOOD, tmp_path)
+    assert (tmp_path / 'latest' / 'calibration.json').exists()
+    assert not (tmp_path / 'latest' / 'report.html').exists()
+    worker.submit(lambda: 'a leg', lambda result, error: done.append(result))
+    wait_for(lambda: worker.poll() or done, 'the leg')
+    assert filing.filing.busy
+    assert not filing.filing.close(0.05)
+    gate.set()
+    wait_for((tmp_path / 'latest' / 'report.html').exists, 'the report')
+    assert done + filing.said == ['a leg']
 
 
 def test_a_worse_result_needs_the_second_save(save):
@@ -70,63 +112,6 @@ def test_what_a_killed_node_has_left_is_removed_by_the_next_save(save, tmp_path)
     save(GOOD)
     assert {one.name for one in (empty, full, new, other, link, young) if one.is_symlink()
             or one.exists()} == {full.name, new.name, other.name, young.name}
-
-
-def test_what_cannot_be_saved_is_a_warning_until_it_is(tmp_path):
-    worker, said = Worker(), []
-    filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=said.append),
-                    lambda: None, '/calibrator')
-
-    def save(folder):
-        future = filing.save(GOOD, with_settings(Config(), {'output.directory': str(folder)}), {},
-                             'imu_link', NOW_NS, True)
-        wait_for(lambda: worker.poll() or future.done(), 'the answer of save')
-        return future.result()
-    (tmp_path / 'file').touch()
-    success, text = save(tmp_path / 'file')
-    assert not success
-    assert said == [text]
-    assert filing.trouble in text
-    assert 'output.directory' in filing.trouble
-    assert save(tmp_path)[0]
-    assert filing.trouble == ''
-    worker.close()
-
-
-def test_the_saves_of_the_node_itself_do_not_count(save):
-    assert save(GOOD, asked=False)[1]
-    for _ in range(2):
-        assert not save(BAD, asked=False)[1]
-    assert not save(BAD)[1]
-    assert save(BAD)[1]
-
-
-def test_a_warning_holds_for_its_own_result_only(save):
-    save(GOOD)
-    save(BAD)
-    other = Calibration(BAD.reasons, {}, {}, ())
-    assert not save(other)[1]
-
-
-def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(tmp_path, monkeypatch):
-    gate, worker, done = threading.Event(), Worker(), []
-    monkeypatch.setattr('odocal_ros.output.files.report_or_why', lambda *_: (
-        gate.wait(20), ('<html></html>', ''))[1])
-    filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=done.append),
-                    lambda: None, '/calibrator')
-    config = with_settings(Config(), {'output.directory': str(tmp_path)})
-    future = filing.save(GOOD, config, {}, 'imu_link', NOW_NS, True)
-    wait_for(lambda: worker.poll() or future.done(), 'the answer')
-    assert (tmp_path / 'latest' / 'calibration.json').exists()
-    assert not (tmp_path / 'latest' / 'report.html').exists()
-    worker.submit(lambda: 'a leg', lambda result, error: done.append(result))
-    wait_for(lambda: worker.poll() or done, 'the leg')
-    assert filing.busy
-    assert not filing.close(0.05)
-    gate.set()
-    wait_for((tmp_path / 'latest' / 'report.html').exists, 'the report')
-    assert done == ['a leg']
-    worker.close()
 
 
 def test_jobs_given_before_the_end_are_done():

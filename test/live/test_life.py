@@ -3,6 +3,7 @@
 
 """Start and end of the node's process, its inputs, and its times."""
 
+from dataclasses import replace
 import math
 import os
 import signal
@@ -10,7 +11,7 @@ import subprocess
 import sys
 
 from bench import answer_of, NODE, NodeProcess, PATIENCE, ROOT, wait_for
-from player import ended, messages_of, part, Player, recording, Sent, with_clock
+from player import ended, messages_of, part, Player, recording, with_clock
 import pytest
 from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import SetParameters
@@ -20,8 +21,6 @@ from odocal_ros import __version__
 from odocal_ros.bagio import encode
 from odocal_ros.settings.config import SETTINGS
 from odocal_ros.sim.scenarios import SimOptions, simulate
-
-RELIABLE, BEST_EFFORT = 'reliable', 'best effort'
 
 
 @pytest.fixture(scope='module')
@@ -90,8 +89,7 @@ BAD_OVERRIDES = [
     ('qos_overrides./odometer.subscription.depth:=x', 'qos_overrides'),
     ('qos_overrides./odometer.subscription.reliability:=often', 'qos_overrides'),
     ('qos_overrides./imu/data.subscription.depth:=x', "'x' is not a whole number"),
-    ('leg.min_distance', "Couldn't parse parameter override rule"),
-]
+    ('leg.min_distance', "Couldn't parse parameter override rule")]
 # one process for all: most of a start is the import
 EACH = ('import sys\nfrom odocal_ros.live.node import main\nfor override in sys.argv[1:]:\n'
         '    sys.stderr.write(f"{main([\'\', \'--ros-args\', \'-p\', override])}\\n")')
@@ -314,21 +312,14 @@ def test_a_forgotten_leg_is_stopped(start, connect, sent):
     assert 'LEG_TOO_SHORT' in answer.message
 
 
-def counter_messages(messages, kind):
-    """Return the speed messages of a drive replaced by a headerless counter."""
-    drive = simulate(SimOptions(duration=180.0, imu_rate=20.0, odometer_rate=10.0))
-    topic = encode.counter('odometer', drive.odometer)
-    raws = [row.tobytes() for row in topic.pack(slice(0, len(messages)))]
-    assert kind == 'std_msgs/msg/Int64'
-    return [Sent(one.stamp_ns, 'odometer', raw) for one, raw in zip(messages, raws, strict=False)]
-
-
 def test_the_odometer_type_is_taken_from_its_publisher(start, connect, sent):
     node, client = start(), connect()
     types = sent[0] | {'odometer': 'std_msgs/msg/Int64'}
     others = [one for one in sent[1] if one.slot != 'odometer']
-    counters = counter_messages([one for one in sent[1] if one.slot == 'odometer'],
-                                types['odometer'])
+    speeds = [one for one in sent[1] if one.slot == 'odometer']
+    counts = encode.counter('odometer', simulate(SimOptions(
+        duration=180.0, imu_rate=20.0, odometer_rate=10.0)).odometer).pack(slice(len(speeds)))
+    counters = [replace(one, raw=row.tobytes()) for one, row in zip(speeds, counts, strict=True)]
     player = Player.connected(client, types)
     wait_for(lambda: 'odometer: std_msgs/msg/Int64 on /odometer, best effort' in node.text,
              'the log line')
@@ -344,16 +335,14 @@ def test_the_odometer_type_is_taken_from_its_publisher(start, connect, sent):
     assert 'use_sim_time' in answer.message
 
 
-@pytest.mark.parametrize('reliable', [True, False])
-def test_increments_are_asked_for_reliably_where_offered(start, connect, reliable):
+@pytest.mark.parametrize('offer', ['reliable', 'best effort'])
+def test_increments_are_asked_for_reliably_where_offered(start, connect, offer):
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from std_msgs.msg import Int32
     node = start('-p', 'odometer.quantity:=increment')
     client = connect()
     client.node.create_publisher(Int32, 'odometer', QoSProfile(
-        depth=10, reliability=(ReliabilityPolicy.RELIABLE if reliable
-                               else ReliabilityPolicy.BEST_EFFORT)))
-    offer = RELIABLE if reliable else BEST_EFFORT
+        depth=10, reliability=ReliabilityPolicy[offer.upper().replace(' ', '_')]))
     wait_for(lambda: f'Int32 on /odometer, {offer}' in node.text, f'a {offer} subscription')
 
 

@@ -313,7 +313,7 @@ def test_results_are_set_in_one_event(session):
     assert session.results['result.stamp'].endswith(' UTC')
 
 
-def test_paths_are_latched_and_decimated(session, connect):
+def test_paths_are_latched_and_decimated(session):
     for path in session.paths.values():
         assert path.header.frame_id == 'odocal_enu'
         assert 100 < len(path.poses) <= 2000

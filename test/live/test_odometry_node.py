@@ -8,10 +8,13 @@ from types import SimpleNamespace
 
 from bench import Client, NodeProcess, ROOT, wait_for
 from drives import settings
+from geometry_msgs.msg import TwistWithCovarianceStamped
 from launch_stand_in import of_xml
+from nav_msgs.msg import Odometry
 import numpy as np
 from player import messages_of, part, Player, sent_of, with_clock
 import pytest
+from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile
 from test_policy import allowed, seen
 
@@ -84,9 +87,6 @@ def given(replayed):
 @pytest.fixture(scope='module')
 def received(drive, replayed):
     """Play the drive to a node with that calibration; keep what it publishes."""
-    from geometry_msgs.msg import TwistWithCovarianceStamped
-    from nav_msgs.msg import Odometry
-    from rclpy.qos import QoSProfile
     node = NodeProcess('--params-file', str(replayed.path), *given(replayed), module='odometry')
     client = Client('odometry')
     seen = SimpleNamespace(odometry=[], twists=[], node=node)
@@ -226,8 +226,7 @@ def sent():
 
 @pytest.mark.parametrize('simulated', [False, True])
 def test_it_goes_on_after_an_error_of_its_own(sent, simulated):
-    from nav_msgs.msg import Odometry
-    from rcl_interfaces.srv import GetParameters
+
     node = NodeProcess(*RESULT, '-p', f'use_sim_time:={str(simulated).lower()}', before=FAILS,
                        module='odometry')
     client, seen = Client('odometry'), []

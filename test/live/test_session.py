@@ -111,8 +111,7 @@ def test_a_reset_drops_all_legs_and_what_is_carried_on():
 @pytest.mark.parametrize(('command', 'words'), [
     (lambda s: s.stop(1), 'no leg is running: call ~/start_leg first'),
     (lambda s: s.cancel(), 'no leg is running'),
-    (lambda s: s.begin_undo(), 'no leg to undo'),
-])
+    (lambda s: s.begin_undo(), 'no leg to undo')])
 def test_an_idle_session_refuses(command, words):
     with pytest.raises(Refused, match=words):
         command(Session())

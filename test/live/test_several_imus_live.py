@@ -3,10 +3,11 @@
 
 """Two IMUs alternate on one topic, over DDS: both nodes say so, and the leg is rejected."""
 
+from contextlib import ExitStack
 from types import SimpleNamespace
 
-from bench import Client, NodeProcess, wait_for
-from player import ended, messages_of, part, Player, Sent, straight
+from bench import NodeProcess, wait_for
+from player import ended, messages_of, part, playing_to, Sent, straight
 import pytest
 
 from odocal_ros.messages.cdr import FRAME_AT
@@ -27,30 +28,26 @@ def alternating(sent):
 @pytest.fixture(scope='module')
 def seen(tmp_path_factory):
     """Drive one leg; keep what the nodes said."""
-    drive = straight(imu_grade='industrial')
-    types, sent = messages_of(drive)
+    types, sent = messages_of(straight(imu_grade='industrial'))
     sent = alternating(sent)
     file = tmp_path_factory.mktemp('given') / 'calibration.yaml'
     file.write_text('/**: {ros__parameters: {result: {scale_factor: 1.0, scale_factor_sigma: '
                     '0.001, valid: true, stamp: "2026-01-01"}}}')
-    node = NodeProcess('-p', f'output.directory:={tmp_path_factory.mktemp("out")}')
     odometry = NodeProcess('--params-file', str(file), module='odometry')
-    client, found = Client(), SimpleNamespace(node=node, odometry=odometry)
-    try:
-        player = Player(client.node, types)
-        wait_for(lambda: player.matched() and player.publishers['imu'].get_subscription_count()
-                 == 2, 'subscriptions of the nodes')
+    found = SimpleNamespace(odometry=odometry)
+    folder = tmp_path_factory.mktemp('out')
+    with ExitStack() as ends:
+        ends.callback(odometry.end)
+        found.node, client, player = ends.enter_context(
+            playing_to(types, '-p', f'output.directory:={folder}'))
+        wait_for(lambda: player.publishers['imu'].get_subscription_count() == 2, 'both nodes')
         player.play(part(sent, FIRST_S, MARK_S), SPEED)
-        found.start = client.start()
+        client.start()
         player.play(part(sent, MARK_S, STOP_S), SPEED)
         found.recording = client.status
         found.stop = ended(client, player, part(sent, STOP_S, END_S), SPEED)
         found.status = client.until(state='rejected')
         wait_for(lambda: 'several IMUs' in odometry.text, f'a word: {odometry.text}')
-    finally:
-        node.end()
-        odometry.end()
-        client.close()
     return found
 
 

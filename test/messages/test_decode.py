@@ -192,31 +192,23 @@ def test_joint_by_name_wherever_it_stands_and_not_in_messages_without_it():
     assert 'names: arm' in reader.trouble
 
 
-def test_two_wheels_in_one_message():
-    for messages, left, right in (
-            ([make.joints(1, ['l', 'r'], [1, 2])], 'l', 'r'),
-            ([make.whole_array([1, 2])], '0', '1')):
-        pairs, _ = read('odometer', messages, config(odometer__left=left, odometer__right=right))
-        assert [slot for slot, _ in pairs] == ['odometer', 'odometer_right']
-        assert [block.value.tolist() for _, block in pairs] == [[1], [2]]
+TWO, FIVE = make.joints(1, ['l', 'r'], [1, 2]), make.joints(1, list('xabcd'), [0, 1, 2, 3, 4])
 
 
-def test_any_number_of_wheels_in_one_message():
-    for messages, keys in (
-            ([make.joints(1, ['x', 'a', 'b', 'c', 'd'], [0, 1, 2, 3, 4])], ('a', 'b', 'c', 'd')),
-            ([make.whole_array([0, 1, 2, 3, 4])], ('1', '2', '3', '4'))):
-        pairs, reader = read('odometer', messages, config(odometer__wheels=keys))
-        assert [slot for slot, _ in pairs] == list(WHEELS[:4])
-        assert [block.value.tolist() for _, block in pairs] == [[1], [2], [3], [4]]
-        assert reader.wheels == keys
+@pytest.mark.parametrize(('message', 'more', 'keys'), [
+    (TWO, {'odometer__left': 'l', 'odometer__right': 'r'}, 'lr'),
+    (TWO, {'odometer__wheels': ('l', 'r')}, 'lr'),
+    (make.whole_array([1, 2]), {'odometer__left': '0', 'odometer__right': '1'}, '01'),
+    (FIVE, {'odometer__wheels': tuple('abcd')}, 'abcd'),
+    (make.whole_array([0, 1, 2, 3, 4]), {'odometer__wheels': tuple('1234')}, '1234')], ids=str)
+def test_wheels_in_one_message(message, more, keys):
+    pairs, reader = read('odometer', [message], config(**more))
+    assert [(slot, block.value.tolist()) for slot, block in pairs] == [
+        (slot, [i]) for i, slot in enumerate(WHEELS[:len(keys)], 1)]
+    assert reader.wheels == tuple(keys)
 
 
 def test_two_wheels_as_a_list_are_left_and_right():
-    message = [make.joints(1, ['l', 'r'], [1, 2])]
-    as_list, _ = read('odometer', message, config(odometer__wheels=('l', 'r')))
-    by_side, _ = read('odometer', message, config(odometer__left='l', odometer__right='r'))
-    assert [(slot, block.value.tolist()) for slot, block in as_list] == [
-        (slot, block.value.tolist()) for slot, block in by_side]
     assert config(odometer__wheels=('l', 'r')).odometer.names(2) == ('left', 'right')
     # a list of indices is one of numbers in YAML
     assert config(odometer__wheels=[0, 1]).odometer.keys == ('0', '1')
@@ -225,16 +217,12 @@ def test_two_wheels_as_a_list_are_left_and_right():
 @pytest.mark.parametrize(('more', 'words'), [
     ({'odometer__wheels': ('a', 'b'), 'odometer__left': 'a'}, 'only one of both'),
     ({'odometer__wheels': tuple('abcdefghi')}, '8 at most'),
-    ({'odometer__wheels': ('a', 'a')}, "'a', 'a'; required: different wheels")], ids=str)
+    ({'odometer__wheels': ('a', 'a')}, "'a', 'a'; required: different wheels"),
+    ({'odometer__left': 'a', 'odometer__right': 'a'}, "'a', 'a'; required: different wheels")],
+    ids=str)
 def test_impossible_lists_of_wheels_are_refused(more, words):
     with pytest.raises(BadConfig, match=words):
         read('odometer', [make.joints(1, ['a', 'b'], [1, 2])], config(**more))
-
-
-def test_one_joint_is_not_two_wheels():
-    with pytest.raises(BadConfig, match="'l', 'l'; required: different wheels"):
-        read('odometer', [make.joints(1, ['l', 'r'], [1, 2])],
-             config(odometer__left='l', odometer__right='l'))
 
 
 def test_two_wheels_on_two_topics():
@@ -301,8 +289,7 @@ def test_a_sensors_type_as_an_odometer_is_read_by_its_field():
      r'data\[0\]'),
     ('odometer', 'std_msgs/msg/Int64', {'odometer.left': 'a', 'odometer.right': 'b'}, BadConfig,
      "use 'topic'"),
-    ('odometer', 'sensor_msgs/msg/JointState', {'odometer.left': 'a'}, BadConfig, 'together'),
-])
+    ('odometer', 'sensor_msgs/msg/JointState', {'odometer.left': 'a'}, BadConfig, 'together')])
 def test_refused(slot, msgtype, settings_, error, says):
     with pytest.raises(error, match=says):
         make_reader(slot, msgtype, with_settings(Config(), settings_))

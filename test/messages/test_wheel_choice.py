@@ -37,8 +37,7 @@ REAL = {
                ('leftTrack', 'rightTrack')),
     'one word': (['leftwheel', 'rightwheel'], ('leftwheel', 'rightwheel')),
     'unlike stems': (['left_wheel', 'right_motor_wheel'], ('left_wheel', 'right_motor_wheel')),
-    'a third one': (['wheel_left', 'wheel_right', 'wheel_rear'], ('wheel_left', 'wheel_right')),
-}
+    'a third one': (['wheel_left', 'wheel_right', 'wheel_rear'], ('wheel_left', 'wheel_right'))}
 
 
 @pytest.mark.parametrize('robot', REAL)

@@ -114,9 +114,8 @@ def test_earth_rate_points_north_and_up():
     assert_allclose(earth.OMEGA, 2 * np.pi / 86164.09, rtol=2e-7)
 
 
-@given(lat=st.floats(-1.4, 1.4), lon=st.floats(-3, 3), ve=st.floats(-60, 60),
-       vn=st.floats(-60, 60))
-def test_earth_rate_is_the_axis_seen_from_anywhere(lat, lon, ve, vn):
+@given(lat=st.floats(-1.4, 1.4), lon=st.floats(-3, 3))
+def test_earth_rate_is_the_axis_seen_from_anywhere(lat, lon):
     assert_allclose(earth.C_en(lat, lon) @ earth.earth_rate_n(lat), [0, 0, earth.OMEGA],
                     atol=1e-19)
 

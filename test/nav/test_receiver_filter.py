@@ -16,33 +16,23 @@ def swaying(t):
     return [20.0, 3.0] * np.sin(phase), [10.0, 2.1] * np.cos(phase)
 
 
-@pytest.mark.parametrize('tau', [0.005, 0.3, 1.0, 2.5])
-def test_a_sine_comes_out_as_a_first_order_filter_has_it(tau):
-    t, at = np.arange(0.0, 60.0, 0.2), np.linspace(25.0, 50.0, 40)
-    late, rate = smoothing(t, *swaying(t), at, tau**2)
-    w = np.array([0.5, 0.7])
-    sines = np.exp(1j * np.multiply.outer(at, w)) * (np.exp(1j * w * tau) / (1 + 1j * w * tau) - 1)
-    want = [20.0, 3.0] * sines.imag
-    # the bend of a cubic over 0.2 s errs by (0.2 w)^2 / 12
-    assert_allclose(late, want, rtol=0, atol=3e-3 * np.abs(want).max())
-    h = 1e-3 * max(tau**2, LEAST_LAG2)
-    above, below = (smoothing(t, *swaying(t), at, tau**2 + x)[0] for x in (h, -h))
-    # the product's own difference is one-sided, 1e-4 of tau^2 long
-    assert_allclose(rate, (above - below) / (2 * h), rtol=0, atol=1e-3 * np.abs(rate).max())
+W = np.array([0.5, 0.7])
 
 
 @pytest.mark.parametrize('tau', [0.005, 0.3, 1.0, 2.5])
-def test_a_sine_comes_out_as_a_filter_of_position_and_velocity_has_it(tau):
-    t, at, square = np.arange(0.0, 60.0, 0.2), np.linspace(35.0, 50.0, 40), -2 * tau**2
+@pytest.mark.parametrize(('square', 'error'), [
+    (1, lambda s: np.exp(s) / (1 + s) - 1),                     # of first order
+    (-2, lambda s: -s**2 / (s**2 + np.sqrt(2) * s + 1))])       # of position and velocity
+def test_a_sine_comes_out_as_the_filter_has_it(square, error, tau):
+    t, at, square = np.arange(0.0, 60.0, 0.2), np.linspace(35.0, 50.0, 40), square * tau**2
     off, rate = smoothing(t, *swaying(t), at, square)
-    w = np.array([0.5, 0.7])
-    s = 1j * w * tau
-    sines = np.exp(1j * np.multiply.outer(at, w)) * -s**2 / (s**2 + np.sqrt(2) * s + 1)
-    want = [20.0, 3.0] * sines.imag
-    # as above; of what the begin left, exp(-35 / (2.5 sqrt(2)))
+    want = [20.0, 3.0] * (np.exp(1j * np.multiply.outer(at, W)) * error(1j * W * tau)).imag
+    # the bend of a cubic over 0.2 s errs by (0.2 w)^2 / 12; of what the begin left,
+    # exp(-35 / (2.5 sqrt(2)))
     assert_allclose(off, want, rtol=0, atol=3e-3 * np.abs(want).max())
-    h = 1e-3 * max(-square, LEAST_LAG2)
+    h = 1e-3 * max(abs(square), LEAST_LAG2)
     above, below = (smoothing(t, *swaying(t), at, square + x)[0] for x in (h, -h))
+    # the product's own difference is one-sided, 1e-4 of tau^2 long
     assert_allclose(rate, (above - below) / (2 * h), rtol=0, atol=1e-3 * np.abs(rate).max())
 
 

@@ -76,8 +76,7 @@ def test_the_table_reads_well(run):
     (calibration(), {}, 'no scale factor to compare'),
     ([], SIMULATED, 'wrong file'),
     ({'config': {}}, SIMULATED, 'wrong file'),
-    (calibration(), [1], 'wrong file'),
-])
+    (calibration(), [1], 'wrong file')])
 def test_what_cannot_be_compared_is_said(run, content, truth, match):
     code, out, err = run(content, truth)
     assert (code, out) == (2, '')

@@ -213,11 +213,14 @@ def test_the_search_is_bounded():
     assert image.trouble == 'no numeric field'
 
 
+def plain(path, made, *more, **changes):
+    """Write IMU, fixes and counter of a drive, and more topics."""
+    return write_bag(path, [imu('/imu/data', changed(made.imu, **changes)), fix('/fix', made.fix),
+                            counter('/odometer', made.odometer), *more])
+
+
 def test_a_limit_that_drops_most_fixes_is_lifted(tmp_path, capsys):
-    made = drive(scenario='town', duration=200.0, seed=4, fix_sigma=1.0)
-    path = tmp_path / 'bag'
-    write_bag(path, [imu('/imu/data', made.imu), fix('/fix', made.fix),
-                     counter('/odometer', made.odometer)])
+    path = plain(tmp_path / 'bag', drive(scenario='town', duration=200.0, seed=4, fix_sigma=1.0))
     assert 'gnss.max_sigma' not in inspected(path, capsys)[0]['command']
     found, _ = inspected(path, capsys, '--set', 'gnss.max_sigma=0.5')
     assert found['command'].endswith('--set gnss.max_sigma=nan')
@@ -225,10 +228,7 @@ def test_a_limit_that_drops_most_fixes_is_lifted(tmp_path, capsys):
 
 def test_no_axes_are_given_without_an_accelerometer(tmp_path, capsys):
     made = drive(scenario='town', duration=200.0, seed=4)
-    path = tmp_path / 'bag'
-    write_bag(path, [imu('/imu/data', changed(made.imu, f_i=lambda f: 0 * f)),
-                     fix('/fix', made.fix), counter('/odometer', made.odometer)])
-    found, text = inspected(path, capsys)
+    found, text = inspected(plain(tmp_path / 'bag', made, f_i=lambda f: 0 * f), capsys)
     assert 'gravity' not in text
     assert 'an upright IMU is assumed' in text
     assert found['mounting']['rpy'] is None
@@ -236,10 +236,8 @@ def test_no_axes_are_given_without_an_accelerometer(tmp_path, capsys):
 
 def test_a_component_of_a_velocity_is_not_called_speed(tmp_path, capsys):
     made = drive(scenario='yard', duration=300.0, seed=4, fix_sigma=0.2, velocity_sigma=0.05)
-    path = tmp_path / 'bag'
-    write_bag(path, [imu('/imu/data', made.imu), fix('/fix', made.fix),
-                     counter('/odometer', made.odometer), velocity('/vel', made.velocity)])
-    found, text = inspected(path, capsys)
+    found, text = inspected(plain(
+        tmp_path / 'bag', made, velocity('/vel', made.velocity)), capsys)
     block = text.partition('\n/vel\n')[2].partition('\n\n')[0]
     assert block.strip().startswith('one component of a velocity')
     assert found['still'] == ['/vel']
@@ -247,9 +245,7 @@ def test_a_component_of_a_velocity_is_not_called_speed(tmp_path, capsys):
 
 def test_without_messages_nothing_is_said_of_standing(tmp_path, capsys):
     made = drive(scenario='town', duration=200.0, seed=4)
-    path = tmp_path / 'bag'
-    write_bag(path, [fix('/fix', made.fix)])
-    _, text = inspected(path, capsys)
+    _, text = inspected(write_bag(tmp_path / 'bag', [fix('/fix', made.fix)]), capsys)
     assert 'stand' not in text
     assert 'all data for a calibration' not in text
 

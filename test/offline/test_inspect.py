@@ -6,7 +6,6 @@
 import json
 import math
 import shlex
-import warnings
 
 import numpy as np
 import pytest
@@ -315,24 +314,24 @@ def test_fixes_that_are_none(tmp_path, capsys):
     assert len(seen['standstills']) == 2            # seen without fixes too
 
 
+@pytest.mark.filterwarnings('error')
 def test_fixes_off_the_earth(tmp_path, capsys):
-    fixes = [row for row in drive() if row[0] == '/fix']
-    for (_, _, message), latitude in zip(fixes, (1e300, -1e308, np.inf, 91.0), strict=False):
-        message.latitude = latitude
-    rest = [row for row in drive() if row[0] != '/fix']
-    with warnings.catch_warnings():
-        warnings.simplefilter('error')
-        seen, _ = inspect(ros_bags.write(tmp_path / 'bag', fixes + rest), capsys)
+    rows = drive()
+    fixes = (message for name, _, message in rows if name == '/fix')
+    for latitude in (1e300, -1e308, np.inf, 91.0):
+        next(fixes).latitude = latitude
+    seen, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
     assert topic(seen, '/fix')['fix']['positions'] == 750 - 4
 
 
 def test_orientation_as_heading(tmp_path, capsys):
+    def xyz(vector):
+        return vector.x, vector.y, vector.z
+
     def with_orientation(q, variance):
-        covariance = np.zeros(9)
-        covariance[8] = variance
         return [(name, ns, m if name != '/imu/data' else make.imu(
-            ns, w=_xyz(m.angular_velocity), f=_xyz(m.linear_acceleration), q=q,
-            covariance=covariance)) for name, ns, m in drive()]
+            ns, w=xyz(m.angular_velocity), f=xyz(m.linear_acceleration), q=q,
+            covariance=np.append(np.zeros(8), variance))) for name, ns, m in drive()]
 
     for q, variance, says in (((0, 0, 0.6, 0.8), 1e-6, None),
                               ((0, 0, 0.6, 0.8), 0.01, 'uncertainty of 5.7 deg'),
@@ -345,17 +344,10 @@ def test_orientation_as_heading(tmp_path, capsys):
         assert says is None or says in texts[0]
 
 
-def _xyz(vector):
-    return vector.x, vector.y, vector.z
-
-
-def test_a_loop_is_told_with_its_ends(tmp_path, capsys):
-    seen, _ = inspect(ros_bags.write(tmp_path / 'bag', drive(loop=True)), capsys)
+def test_loops_short_drives_and_odd_values(tmp_path, capsys):
+    seen, _ = inspect(ros_bags.write(tmp_path / 'loop', drive(loop=True)), capsys)
     assert 'CHORD_TOO_SHORT' in codes(seen)
     assert seen['legs'][0]['chord'] < 5
-
-
-def test_short_slow_and_odd_values(tmp_path, capsys):
     rows = drive(30)
     at = next(i for i, row in enumerate(rows) if i > 5 and row[0] == '/imu/data')
     rows[at] = ('/imu/data', rows[at][1], make.imu(rows[at][1], w=(math.nan, 0, 0)))

@@ -31,8 +31,7 @@ S = 10**9
      LegSpan(1_750_000_000_123_456_789, 1_750_000_100_000_000_001, (False, False))),
     ('2015-05-21T10:00:00Z/2015-05-21T10:01:00.5+00:00',
      LegSpan(1_432_202_400 * S, 1_432_202_460 * S + S // 2, (False, False))),
-    ('2015-05-21T10:00:00/', LegSpan(1_432_202_400 * S, None, (False, False))),
-])
+    ('2015-05-21T10:00:00/', LegSpan(1_432_202_400 * S, None, (False, False)))])
 def test_leg_is_parsed_to_the_nanosecond(text, span):
     assert parse_leg(text) == span
 

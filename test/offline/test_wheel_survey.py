@@ -36,19 +36,20 @@ def drive(message, seconds=120):
     return rows
 
 
-def inspect(path, capsys):
+def inspect(folder, capsys, message):
+    """Return path, JSON, the wheels' topic and the text of a drive with such an odometer."""
+    path = ros_bags.write(folder / 'bag', drive(message))
     assert main(['inspect', str(path), '--json']) == 0
     told = json.loads(capsys.readouterr().out)
     assert main(['inspect', str(path)]) == 0
     wheels = next(t for t in told['topics'] if t['name'] == '/wheels')
-    return told, wheels, capsys.readouterr().out
+    return path, told, wheels, capsys.readouterr().out
 
 
 def test_unnamed_joints_are_told_apart_by_how_they_move(tmp_path, capsys):
     names = ['j1', 'j2', 'j3']
-    path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.joints(
-        ns, names, [0.4 * np.sin(i / 30), right, left])))
-    told, wheels, text = inspect(path, capsys)
+    _, told, wheels, text = inspect(tmp_path, capsys, lambda ns, i, left, right: make.joints(
+        ns, names, [0.4 * np.sin(i / 30), right, left]))
     assert [v['side'] for v in wheels['values']] == ['', 'right', 'left']
     assert [v['rolls'] for v in wheels['values']] == [False, True, True]
     assert 'the wheels among the joints j1, j2, j3 are not clear' in wheels['trouble']
@@ -57,17 +58,15 @@ def test_unnamed_joints_are_told_apart_by_how_they_move(tmp_path, capsys):
 
 
 def test_four_unnamed_joints_are_a_list_of_axles(tmp_path, capsys):
-    path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.joints(
-        ns, ['a', 'b', 'c', 'd'], [right, left, 1.01 * right, 0.99 * left])))
-    found, wheels, _ = inspect(path, capsys)
+    _, found, wheels, _ = inspect(tmp_path, capsys, lambda ns, i, left, right: make.joints(
+        ns, ['a', 'b', 'c', 'd'], [right, left, 1.01 * right, 0.99 * left]))
     assert [v['side'] for v in wheels['values']] == ['right', 'left', 'right', 'left']
     assert found['command'].endswith("--set 'odometer.wheels=[b, a, d, c]'")
 
 
 def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, capsys):
-    path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.whole_array(
-        [int(right * 50), int(left * 50)])))
-    told, wheels, text = inspect(path, capsys)
+    path, told, wheels, _ = inspect(tmp_path, capsys, lambda ns, i, left, right: (
+        make.whole_array([int(right * 50), int(left * 50)])))
     assert 'the mean of 0 and 1 is used' in wheels['chosen']
     options = ['--set', 'odometer.left=1', '--set', 'odometer.right=0']
     assert told['command'].split()[-4:] == options
@@ -80,11 +79,9 @@ def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, caps
 
 def test_wheels_told_by_their_names_are_shown_with_the_settings_to_write(tmp_path, capsys):
     names = ['left_steer', 'left_wheel', 'right_steer', 'right_wheel']
-    path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.joints(
-        ns, names, velocity=[0.1, left, 0.1, right])))
-    found, wheels, _ = inspect(path, capsys)
-    assert 'left_wheel is used as left wheel, right_wheel as right' in \
-        wheels['chosen']
+    _, found, wheels, _ = inspect(tmp_path, capsys, lambda ns, i, left, right: make.joints(
+        ns, names, velocity=[0.1, left, 0.1, right]))
+    assert 'left_wheel is used as left wheel, right_wheel as right' in wheels['chosen']
     assert found['command'].endswith(
         '--set odometer.left=left_wheel --set odometer.right=right_wheel')
     assert 'trouble' not in wheels

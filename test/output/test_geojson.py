@@ -24,9 +24,8 @@ CREATED = '2026-01-02T03:04:05+00:00'
 def driven(good):
     """Return an accepted calibration of a leg of 1 km to the east at 50 N, 8 E."""
     track = np.column_stack([np.linspace(0, 1000, 21), np.zeros(21), np.zeros(21)])
-    leg = replace(good.legs[0], origin=tuple(np.deg2rad([50.0, 8.0])) + (200.0,), track_n=track,
-                  track_before_n=track * 0.9, reference_n=track[::2] + [0.0, 1.0, 0.0])
-    return replace(good, legs=(leg,))
+    return with_leg(good, origin=(*np.deg2rad([50.0, 8.0]), 200.0), track_n=track,
+                    track_before_n=track * 0.9, reference_n=track[::2] + [0.0, 1.0, 0.0])
 
 
 def features(calibration):
@@ -37,6 +36,10 @@ def features(calibration):
 
 def of_kind(calibration, kind):
     return [f for f in features(calibration)['features'] if f['properties']['kind'] == kind]
+
+
+def with_leg(calibration, **changed):
+    return replace(calibration, legs=(replace(calibration.legs[0], **changed),))
 
 
 def test_the_shape_is_that_of_rfc_7946(driven):
@@ -76,17 +79,15 @@ def test_the_marks_are_the_ends_of_the_track(driven):
 def test_fixes_without_a_height_have_two_coordinates(driven):
     flat = driven.legs[0].reference_n.copy()
     flat[3, 2] = np.nan
-    leg = replace(driven.legs[0], reference_n=flat)
-    fixes, = of_kind(replace(driven, legs=(leg,)), 'fixes')
+    fixes, = of_kind(with_leg(driven, reference_n=flat), 'fixes')
     assert {len(p) for p in fixes['geometry']['coordinates']} == {2}
 
 
 def test_a_line_over_the_180th_meridian_is_cut_there(driven):
     track = driven.legs[0].track_n + [0.0, 0.0, 5.0]
     track[:, 1] = track[:, 0]           # to the north-east
-    leg = replace(driven.legs[0], origin=tuple(np.deg2rad([-17.0, 179.9952])) + (0.0,),
-                  track_n=track)
-    line = of_kind(replace(driven, legs=(leg,)), 'corrected')[0]['geometry']
+    there = with_leg(driven, origin=(*np.deg2rad([-17.0, 179.9952]), 0.0), track_n=track)
+    line = of_kind(there, 'corrected')[0]['geometry']
     assert line['type'] == 'MultiLineString'
     west, east = (np.array(piece) for piece in line['coordinates'])
     assert west[-1, 0] == 180.0
@@ -104,8 +105,7 @@ def test_a_line_over_the_180th_meridian_is_cut_there(driven):
 def test_a_long_leg_is_thinned_and_says_so(driven):
     rows = np.zeros((MOST * 3, 3))
     rows[:, 0] = np.arange(len(rows))
-    leg = replace(driven.legs[0], reference_n=rows)
-    fixes, = of_kind(replace(driven, legs=(leg,)), 'fixes')
+    fixes, = of_kind(with_leg(driven, reference_n=rows), 'fixes')
     assert len(fixes['geometry']['coordinates']) == MOST
     assert (fixes['properties']['points'], fixes['properties']['of']) == (MOST, MOST * 3)
 

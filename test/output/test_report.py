@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.evidence import Evidence
-from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, Source
+from odocal_ros.calib.result import Calibration, Estimate, MethodResult, Source
 from odocal_ros.calib.sections import Sections
 from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.output import plots_scale, report
@@ -197,6 +197,11 @@ def test_what_is_rejected_or_missing_renders_too(rejected, nothing, good):
         'track_width': Estimate(1.5, None, 'm')})
     page_of(drawn(broken))
     page_of(Calibration((), {}, {}, ()), inputs=[])
+    bare = replace(good.legs[0], track_n=None, before=None, after=None, evidence=None)
+    _, text, parsed = page_of(replace(good, legs=(bare,)))
+    assert parsed.tags['svg'] == 0
+    assert 'No figures for this leg' in text
+    assert '4 fixes see the reasons' in text
 
 
 @pytest.mark.parametrize('rows', [0, 1, 2])
@@ -352,15 +357,6 @@ def test_a_browser_shows_the_figures_and_nothing_sticks_out(good, tmp_path):
     shown(page, tmp_path, f'--print-to-pdf={paper}')
     sheets = len(re.findall(rb'/Type\s*/Page\b', paper.read_bytes()))
     assert 3 <= sheets <= 30
-
-
-def test_a_leg_without_tracks_has_its_numbers(good):
-    bare = replace(good.legs[0], track_n=None, before=None, after=None, evidence=None)
-    assert isinstance(bare, LegResult)
-    _, text, parsed = page_of(replace(good, legs=(bare,)))
-    assert parsed.tags['svg'] == 0
-    assert 'No figures for this leg' in text
-    assert '4 fixes see the reasons' in text
 
 
 def test_the_four_most_important_values_stand_under_the_verdict_of_a_result(good, nothing):

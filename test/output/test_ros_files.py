@@ -127,7 +127,4 @@ def test_numbers_stay_doubles_for_every_yaml_reader(value):
     assert yaml.safe_load(text) == value
     assert isinstance(yaml.safe_load(text), float)
     assert re.search(r'[.]', text)
-
-
-def test_what_is_not_known_is_nan_in_parameter_files():
-    assert number(None) == number(math.inf) == '.nan'
+    assert number(None) == number(math.inf) == '.nan'       # what is not known

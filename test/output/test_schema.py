@@ -110,7 +110,7 @@ def test_json_of_a_method_and_a_leg(good):
                                          'percent_of_distance': 1.8e-4}
 
 
-def test_json_holds_no_nan_and_says_null_for_what_is_not_known(good, nothing):
+def test_json_holds_no_nan_and_says_null_for_what_is_not_known(good, nothing, rejected):
     content = as_json(good, Config(), [], CREATED)
     assert content['result']['pitch_mounting_angle']['value'] is None
     assert content['methods']['two_point']['odd'] is None
@@ -122,17 +122,11 @@ def test_json_holds_no_nan_and_says_null_for_what_is_not_known(good, nothing):
                                                'method': None}
     assert empty['check'] == {'before': None, 'after': None, 'per_distance': []}
     json.dumps(empty, allow_nan=False)
-
-
-def test_a_rejected_result_keeps_its_values(rejected):
-    content = as_json(rejected, Config(), [], CREATED)
-    assert content['verdict'] == 'rejected'
-    assert content['result']['scale_factor']['value'] == 0.05
-
-
-def test_numpy_arrays_in_inputs_and_details_become_lists():
     assert files.plain({'a': np.arange(2), 'b': (np.float64(1.5), np.int64(2), np.inf)}) == {
         'a': [0, 1], 'b': [1.5, 2, None]}
+    kept = as_json(rejected, Config(), [], CREATED)         # a rejected result has its values
+    assert kept['verdict'] == 'rejected'
+    assert kept['result']['scale_factor']['value'] == 0.05
 
 
 def test_write_returns_what_lies_there(good, tmp_path):

@@ -9,18 +9,12 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.data.samples import HeadingSamples
+from odocal_ros.data.samples import HeadingSamples, take
+from odocal_ros.nav import rotations
 from odocal_ros.nav.angles import heading_from_yaw, wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.rotations import (
-    matrix_from_rpy,
-    quat_from_matrix,
-    quat_from_rotvec,
-    rpy_from_matrix,
-    transpose,
-)
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.align import align, choose_standstill, with_observed_walk
 from odocal_ros.pipeline.prepared import attitude_of
@@ -52,10 +46,10 @@ class Case:
         leg = self.drive.leg()
         start_ns = leg.start_ns + round(later * 1e9)
         if forget:     # no pre-roll: the recording begins at the mark
-            from odocal_ros.data.samples import take
+
             leg = leg.with_rows(**{slot: take(leg.rows(slot),
-                                             leg.rows(slot).stamp_ns >= start_ns)
-                                  for slot in ('imu', 'odometer', 'fix', 'heading')})
+                                              leg.rows(slot).stamp_ns >= start_ns)
+                                   for slot in ('imu', 'odometer', 'fix', 'heading')})
         self.leg = replace(leg, start_ns=start_ns)
         self.mark = (start_ns - self.drive.options.start_ns) * 1e-9     # s of the motion
         self.inputs, _ = screen(self.leg, self.config)
@@ -75,14 +69,14 @@ class Case:
         """Return the true C_nb at t, n being that of the origin."""
         state = self.drive.motion.at(np.array([self.mark + t]))
         o = self.drive.options
-        C_vb = matrix_from_rpy([o.roll, o.pitch, o.yaw])
-        C_np = transpose(C_en(self.origin.latitude, self.origin.longitude)) @ C_en(
+        C_vb = rotations.matrix_from_rpy([o.roll, o.pitch, o.yaw])
+        C_np = rotations.transpose(C_en(self.origin.latitude, self.origin.longitude)) @ C_en(
             state.latitude[0], state.longitude[0])
         return C_np @ attitude(state)[0] @ C_vb
 
     def miss(self, alignment):
         """Return how the alignment turns n against the truth, as a rotation vector, rad."""
-        return np.array(rpy_from_matrix(alignment.C_nb @ self.truth(alignment.t).T))
+        return np.array(rotations.rpy_from_matrix(alignment.C_nb @ self.truth(alignment.t).T))
 
 
 @pytest.fixture(scope='module')
@@ -242,12 +236,12 @@ def test_a_fixed_heading_at_a_moving_mark_is_carried_back_to_the_standstill(late
 def orientations(case, yaw, variance):
     """Return inputs for an IMU that sends one orientation, of its own frame i, all the time."""
     n = len(case.inputs.t_imu)
-    q = quat_from_matrix(matrix_from_rpy([0.0, 0.0, yaw]) @ case.inputs.C_bi)
+    q = rotations.quat_from_matrix(rotations.matrix_from_rpy([0.0, 0.0, yaw]) @ case.inputs.C_bi)
     return {'q_ni': np.tile(q, (n, 1)), 'yaw_variance': np.full(n, variance)}
 
 
 def heading_rows(yaw, variance, t):
-    q = quat_from_rotvec(np.outer(np.broadcast_to(yaw, np.shape(t)), [0, 0, 1]))
+    q = rotations.quat_from_rotvec(np.outer(np.broadcast_to(yaw, np.shape(t)), [0, 0, 1]))
     stamp_ns = np.round(t * 1e9)
     sent = HeadingSamples(stamp_ns, stamp_ns, q, np.full(len(t), variance))
     return {'outside': {'heading': UsableRows(sent, t)}}
@@ -316,19 +310,14 @@ def test_an_orientation_not_sent_or_worthless_is_refused(plain, source, variance
     assert says in reasons[0].text
 
 
-def test_a_quaternion_of_zeros_is_no_orientation(plain):
-    case = asked(plain, alignment__heading_source='imu_orientation')
-    a, reasons = case.align(q_ni=np.zeros_like(plain.inputs.q_ni),
-                            yaw_variance=np.zeros(len(plain.inputs.t_imu)))
+@pytest.mark.parametrize(('source', 'says', 'sent'), [
+    ('fixed', 'alignment.heading is not set', {}), ('heading_topic', 'no message', {}),
+    ('imu_orientation', '', {'q_ni': 0.0, 'yaw_variance': 0.0})])       # quaternions of zeros
+def test_a_source_without_data_is_refused(plain, source, says, sent):
+    a, reasons = asked(plain, alignment__heading_source=source).align(**{
+        name: value * getattr(plain.inputs, name) for name, value in sent.items()})
     assert a.heading_source == 'course'
     assert reasons[0].code is Code.HEADING_UNAVAILABLE
-
-
-@pytest.mark.parametrize(('source', 'says'), [
-    ('fixed', 'alignment.heading is not set'), ('heading_topic', 'no message')])
-def test_a_source_without_data_is_refused(plain, source, says):
-    a, reasons = asked(plain, alignment__heading_source=source).align()
-    assert a.heading_source == 'course'
     assert says in reasons[0].text
 
 

@@ -5,15 +5,7 @@
 
 from dataclasses import replace
 
-from drives import (
-    changed,
-    drive,
-    errors_in_sigmas,
-    everything_said,
-    rejecting,
-    settings,
-    shifted,
-)
+import drives
 import numpy as np
 import pytest
 
@@ -31,10 +23,10 @@ SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 @pytest.mark.parametrize('odometer', ['counts', 'angle', 'speed'])
 def test_error_free_sensors_give_the_truth_of_the_papers_drive(odometer):
     """K0 wrong by 20 %, mounting 1 deg: scale within 1e-6, yaw within 0.001 deg."""
-    made = drive(scenario='paper', imu_grade='perfect', fix_sigma=0.0, yaw=np.deg2rad(1.0),
-                 odometer=odometer, imu_rate=100.0)
+    made = drives.drive(scenario='paper', imu_grade='perfect', fix_sigma=0.0, yaw=np.deg2rad(1.0),
+                        odometer=odometer, imu_rate=100.0)
     assert made.options.nominal_scale == pytest.approx(1.2 * made.truth.scale)
-    result = calibrate(made.leg(), settings(made, heading_sigma=1e-5))
+    result = calibrate(made.leg(), drives.settings(made, heading_sigma=1e-5))
     e = result.methods['two_point'].estimates
     assert result.verdict.value == 'accepted'
     assert e['scale_factor'].value == pytest.approx(made.truth.scale, rel=1e-6)
@@ -45,7 +37,7 @@ def test_error_free_sensors_give_the_truth_of_the_papers_drive(odometer):
 
 
 def test_the_same_leg_gives_the_same_result_to_the_last_bit(made):
-    first, second = (calibrate(made.leg(), settings(made)) for _ in range(2))
+    first, second = (calibrate(made.leg(), drives.settings(made)) for _ in range(2))
     assert first.methods['two_point'].estimates == second.methods['two_point'].estimates
     assert first.reasons == second.reasons
     np.testing.assert_array_equal(first.track_n, second.track_n)
@@ -59,14 +51,14 @@ def test_a_recorded_leg_gives_what_the_whole_drive_gives(made):
         for first in range(0, len(block.stamp_ns), 997):
             recorder.feed(slot, take(block, slice(first, first + 997)))
     leg = recorder.close(made.truth.start_ns, made.truth.stop_ns)
-    results = [calibrate(x, settings(made)) for x in (leg, made.leg())]
+    results = [calibrate(x, drives.settings(made)) for x in (leg, made.leg())]
     a, b = (r.methods['two_point'].estimates for r in results)
     assert a == b
 
 
 def test_the_counts_of_a_result_are_those_of_the_leg(made):
     leg = made.leg()
-    result = calibrate(leg, settings(made))
+    result = calibrate(leg, drives.settings(made))
     assert (result.start_ns, result.stop_ns) == (leg.start_ns, leg.stop_ns)
     assert result.duration == pytest.approx((leg.stop_ns - leg.start_ns) * 1e-9)
     assert result.distance == pytest.approx(made.truth.distance, rel=0.02)
@@ -78,10 +70,10 @@ def test_the_counts_of_a_result_are_those_of_the_leg(made):
 
 def test_speeds_that_are_said_are_by_the_calibrated_scale(town):
     # of fixes that state 15 m the rough scale is by chords of 120 m, through the corners of a town
-    leg = replace(town.leg(), fix=changed(
+    leg = replace(town.leg(), fix=drives.changed(
         town.fix, covariance_n=lambda c: np.tile(225 * np.eye(3), (len(c), 1, 1))))
-    result = calibrate(leg, settings(town, heading_sigma=None, method='smoother',
-                                     leg__min_speed=50.0, gnss__max_sigma=0.0))
+    result = calibrate(leg, drives.settings(town, heading_sigma=None, method='smoother',
+                                            leg__min_speed=50.0, gnss__max_sigma=0.0))
     text, = (r.text for r in result.reasons if r.code is Code.SPEED_TOO_LOW)
     said = float(text.split('highest speed (mean over 1 s) ')[1].split(' m/s')[0])
     t = (town.odometer.stamp_ns - town.odometer.stamp_ns[0]) * 1e-9
@@ -92,34 +84,34 @@ def test_speeds_that_are_said_are_by_the_calibrated_scale(town):
 
 def test_notes_of_the_door_are_kept_and_weigh(made):
     note = Reason(Code.BAG_TRUNCATED, '3 s are missing at the end')
-    result = calibrate(made.leg(), settings(made), notes=(note,))
+    result = calibrate(made.leg(), drives.settings(made), notes=(note,))
     assert note in result.reasons
     assert result.verdict.value == 'caution'
 
 
 def test_a_holdout_checks_what_the_fit_has_not_seen(made):
-    result = calibrate(made.leg(), settings(made), holdout=True)
+    result = calibrate(made.leg(), drives.settings(made), holdout=True)
     # the last fifth by the nominal scale is 6.1 % short; fixes of 1.5 m, each axis, on top
     short = 0.061 * 0.2 * made.truth.distance
     assert result.before.max == pytest.approx(short, abs=4 * 1.5)
     assert result.before.rms > result.after.rms + 1.0
     assert result.after.rms < 4.0
-    assert all(abs(z) < 5 for z in errors_in_sigmas(result, made.truth).values())
+    assert all(abs(z) < 5 for z in drives.errors_in_sigmas(result, made.truth).values())
 
 
 def test_the_check_shows_the_correction(made):
-    result = calibrate(made.leg(), settings(made))
+    result = calibrate(made.leg(), drives.settings(made))
     assert result.before.max > 0.05 * made.truth.distance
     assert result.after.rms == pytest.approx(1.5 * np.sqrt(2), rel=0.15)
     assert result.after.max < 5 * 1.5 * np.sqrt(2)
 
 
 def test_several_legs_of_one_vehicle(made):
-    others = [drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=s,
-                    start_ns=s * 10**12)
+    others = [drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=s,
+                           start_ns=s * 10**12)
               for s in (5, 6, 7, 8)]
-    legs = [calibrate(d.leg(), settings(d)) for d in others]
-    whole = combine(legs, settings(made))
+    legs = [calibrate(d.leg(), drives.settings(d)) for d in others]
+    whole = combine(legs, drives.settings(made))
     one = legs[0].methods['two_point'].estimates
     assert Code.LEGS_DISAGREE not in {r.code for r in whole.reasons}
     assert whole.estimates[SCALE].sigma == pytest.approx(one[SCALE].sigma / 2, rel=0.25)
@@ -133,22 +125,22 @@ def test_several_legs_of_one_vehicle(made):
     ('two_wheels', True), ('odometer', 'speed'), ('odometer', 'angle'), ('roll', 0.05),
     ('heading_sigma', 0.002), ('orientation_sigma', 0.002), ('imu_lever_arm', (1.0, 0.4, 0.5))])
 def test_what_drives_are_like(option, value):
-    made = drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=9,
-                 **{option: value})
+    made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=9,
+                        **{option: value})
     own = option in ('heading_sigma', 'orientation_sigma')
-    result = calibrate(made.leg(), settings(made, heading_sigma=None if own else 1e-3))
-    z = errors_in_sigmas(result, made.truth)
+    result = calibrate(made.leg(), drives.settings(made, heading_sigma=None if own else 1e-3))
+    z = drives.errors_in_sigmas(result, made.truth)
     assert set(z) == {SCALE, YAW, PITCH}
-    assert not rejecting(result), everything_said(result)
+    assert not drives.rejecting(result), drives.everything_said(result)
     assert all(abs(x) < 5 for x in z.values()), z
 
 
 def test_moving_the_marks_within_the_standstills_changes_little(made):
     """Both marks stand: the same travel, the same fixes but for those outside."""
-    config = settings(made)
+    config = drives.settings(made)
     base = calibrate(made.leg(), config).methods['two_point'].estimates[SCALE]
     for start, stop in ((-10.0, 0.0), (0.0, -15.0), (-40.0, -30.0)):
-        moved = calibrate(shifted(made.leg(), start=start, stop=stop), config)
+        moved = calibrate(drives.shifted(made.leg(), start=start, stop=stop), config)
         e = moved.methods['two_point'].estimates[SCALE]
         assert abs(e.value - base.value) < 0.5 * base.sigma
 
@@ -168,10 +160,10 @@ def test_sigmas_are_honest_over_many_drives(grade, noise):
                                    imu_grade=grade, fix_noise=noise, imu_rate=25.0,
                                    odometer_rate=10.0))
         error = 1e-3 * np.random.default_rng(seed).standard_normal()
-        config = with_settings(settings(made), {
+        config = with_settings(drives.settings(made), {
             'alignment.heading': float(made.truth.heading + error), 'verdict.max_yaw_sigma': 1.0,
             'imu.misalignment_sigma': 0.0})      # the axes of this IMU are square
-        z.append(list(errors_in_sigmas(calibrate(made.leg(), config), made.truth).values()))
+        z.append(list(drives.errors_in_sigmas(calibrate(made.leg(), config), made.truth).values()))
     z = np.array(z)
     assert z.shape == (runs, 3)
     rms, stray = np.sqrt((z**2).mean(axis=0)), 4 * np.sqrt(2 / runs)
@@ -214,15 +206,15 @@ class Corruption:
         if kind == 'late block':
             return take(samples, np.concatenate([np.delete(order, order[rows]), order[rows]]))
         if kind == 'no stamp':
-            return changed(samples, stamp_ns=lambda a: a.__setitem__(rows, 0))
+            return drives.changed(samples, stamp_ns=lambda a: a.__setitem__(rows, 0))
         jump = int(rng.choice([10**6, 10**8, 10**10, -10**8, -10**10]))
         if kind == 'set clock':
-            return changed(samples, stamp_ns=lambda a: a.__setitem__(
+            return drives.changed(samples, stamp_ns=lambda a: a.__setitem__(
                 slice(first, None), a[first:] + jump))
         if kind == 'false stamp':
-            return changed(samples, stamp_ns=lambda a: a.__setitem__(rows, a[rows] + jump))
-        return changed(samples, **{str(rng.choice(self.COLUMNS[slot])):
-                                   lambda a: self._values(kind, a, rows)})
+            return drives.changed(samples, stamp_ns=lambda a: a.__setitem__(rows, a[rows] + jump))
+        return drives.changed(samples, **{str(rng.choice(self.COLUMNS[slot])):
+                                          lambda a: self._values(kind, a, rows)})
 
     def _values(self, kind, a, rows):
         whole = a.dtype != float
@@ -241,7 +233,7 @@ class Corruption:
 def test_nothing_raises_and_nothing_wrong_is_accepted(made, town, which, runs):
     """80 corrupted legs: an accepted one is within six sigmas, a rejected one says why."""
     it = made if which == 'straight' else town
-    config, verdicts = settings(it), []
+    config, verdicts = drives.settings(it), []
     for seed in range(runs):
         fault = Corruption(seed)
         leg = fault.leg(it.leg())
@@ -249,9 +241,9 @@ def test_nothing_raises_and_nothing_wrong_is_accepted(made, town, which, runs):
         whole = combine([result], config)
         verdicts.append(whole.verdict.value)
         if verdicts[-1] == 'rejected':
-            assert rejecting(result), fault.what
+            assert drives.rejecting(result), fault.what
         if verdicts[-1] == 'accepted':
-            z = errors_in_sigmas(result, it.truth)
+            z = drives.errors_in_sigmas(result, it.truth)
             assert all(abs(x) < 6 for x in z.values()), (seed, fault.what, z)
     # the faults are such that most legs can still be used
     assert verdicts.count('accepted') > runs / 2, verdicts

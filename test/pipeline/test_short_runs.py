@@ -12,7 +12,8 @@ import pytest
 from odocal_ros.calib.drive import not_moving
 from odocal_ros.calib.turning import turn_ratio
 from odocal_ros.estimator.leg import drift_time, SmootherLeg
-from odocal_ros.nav.dead_reckoning import rough_scale
+from odocal_ros.nav.dead_reckoning import Origin, rough_scale
+from odocal_ros.nav.earth import rate_without_north
 from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate
@@ -57,6 +58,11 @@ def test_limits_are_those_of_the_frame_the_smaller_of_both():
     assert config.gnss.default_sigma == 2.5
 
 
+def origin(local):
+    """Return an origin on the equator, of a local frame or not."""
+    return replace(Origin(0.0, 0.0, 0.0), local=rate_without_north(0.7) if local else None)
+
+
 def room(rng):
     """Return times, fixes and travel of a robot that drives sides of 2 m and turns between."""
     t = np.arange(0.0, 200.0, 0.1)
@@ -91,7 +97,7 @@ def test_errors_in_a_local_frame_change_with_the_path_of_the_wheels():
     leg = object.__new__(SmootherLeg)
     turning = Travel(t, np.interp(t, [0.0, 6.0, 8.0, 10.0], [0.0, 0.0, 1.0, 1.0]), 0.0)
     for name, value in {'travel': Travel(t, way, 0.0), 'wheels': (Travel(t, way, 0.0), turning),
-                        'origin': replace_origin(True), 'rough_scale': 1.0}.items():
+                        'origin': origin(True), 'rough_scale': 1.0}.items():
         object.__setattr__(leg, name, value)
     # 3 m, then 1 m of one wheel; at rest a hundredth
     expected = np.where((t[:-1] >= 4) & (t[:-1] < 6), 10 * 1.5 / 4, np.where(
@@ -100,13 +106,5 @@ def test_errors_in_a_local_frame_change_with_the_path_of_the_wheels():
     object.__setattr__(leg, 'rough_scale', 4.0)      # 6 m/s: a car
     assert (drift_time(leg, t) == 1.0).all()
     object.__setattr__(leg, 'rough_scale', 1.0)
-    object.__setattr__(leg, 'origin', replace_origin(False))
+    object.__setattr__(leg, 'origin', origin(False))
     assert (drift_time(leg, t) == 1.0).all()
-
-
-def replace_origin(local):
-    """Return an origin on the equator, of a local frame or not."""
-    from odocal_ros.nav.dead_reckoning import Origin
-    from odocal_ros.nav.earth import rate_without_north
-    origin = Origin(0.0, 0.0, 0.0)
-    return replace(origin, local=rate_without_north(0.7)) if local else origin

@@ -15,6 +15,7 @@ from odocal_ros.estimator.fit import CONVERGENCE
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.pipeline.smoother_run import _late_path
 from odocal_ros.reasons import Code, Verdict
 
@@ -85,6 +86,15 @@ def test_the_fifth_held_back_is_met_by_dead_reckoning_with_the_values_found(made
     whole = calibrate(made.leg(), settings(made, **ASKED))
     assert whole.methods['smoother'].estimates['scale_factor'].value \
         != held.methods['smoother'].estimates['scale_factor'].value
+
+
+@pytest.mark.parametrize(('stage', 'words'), [
+    (Stage(), ''),
+    (Stage('two_point', 0.0), 'two_point'),
+    (Stage('smoother', 0.1, 1, 51234.5), 'smoother, 1 pass done, remaining change 51234 sigma'),
+    (Stage('smoother', 0.1, 7, 0.4249), 'smoother, 7 passes done, remaining change 0.42 sigma')])
+def test_a_stage_says_passes_and_change_and_no_share(stage, words):
+    assert stage.words() == words
 
 
 def test_auto_takes_it_and_computes_two_point_beside_it(made):

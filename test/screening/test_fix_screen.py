@@ -51,19 +51,19 @@ def stated(sigma):
     return np.full(len(at_s), sigma)
 
 
-@pytest.mark.parametrize('length', [20, 60, 120])
+@pytest.mark.parametrize(('length', 'stop'), [
+    (20, (0, 0)), (60, (0, 0)), (120, (0, 0)), (80, (220, 240))], ids=str)
 @pytest.mark.parametrize('sigma', [0.05, 0.5])
-def test_a_tunnel_is_found_with_its_ends(sigma, length):
-    begin = 150.0
-    found, why = reckoned(at_s, received(sigma, (begin, begin + length)), stated(sigma),
-                          1j * driven())
-    inside = (at_s >= begin) & (at_s < begin + length)
+def test_a_tunnel_is_found_with_its_ends_at_a_standstill_too(sigma, length, stop):
+    begin, end = 150, 150 + length
+    found, why = reckoned(at_s, received(sigma, (begin, end), stop=stop), stated(sigma),
+                          1j * driven(stop))
     assert [r.code for r in why] == [Code.FIXES_DEAD_RECKONED]
-    assert f'to {begin + length - 1:.0f} s' in why[0].text
+    assert f'to {end - 1} s' in why[0].text
     # the window holds three rows of noise at most
     assert not found[at_s < begin - 5].any()
-    assert not found[at_s >= begin + length].any()
-    assert found[inside].mean() > 0.8
+    assert not found[at_s >= end].any()
+    assert found[begin:end].mean() > 0.8
 
 
 def test_fixes_of_one_moment_are_too_few():
@@ -72,18 +72,6 @@ def test_fixes_of_one_moment_are_too_few():
         found, why = reckoned(t, received(0.01, (0, 0)), stated(0.01), 1j * driven())
     assert not found.any()
     assert not why
-
-
-@pytest.mark.parametrize('sigma', [0.05, 0.5])
-def test_a_tunnel_that_ends_at_a_standstill_is_found(sigma):
-    begin, end, stop = 150, 230, (220, 240)
-    found, why = reckoned(at_s, received(sigma, (begin, end), stop=stop), stated(sigma),
-                          1j * driven(stop))
-    assert [r.code for r in why] == [Code.FIXES_DEAD_RECKONED]
-    assert f'to {end - 1} s' in why[0].text
-    assert not found[at_s < begin - 5].any()
-    assert not found[at_s >= end].any()
-    assert found[begin:end].mean() > 0.8
 
 
 @pytest.mark.parametrize('sigma', [0.01, 0.05, 0.5])
@@ -175,8 +163,5 @@ def test_nothing_is_said_of_a_velocity_that_is_not_wanted(drive):
 def test_a_vehicle_that_stands_says_nothing(drive):
     leg = drive.leg()
     keep = leg.fix.stamp_ns < drive.options.start_ns + 5 * 10**9
-    still = replace(leg, fix=type(leg.fix)(*(getattr(leg.fix, f)[keep] for f in (
-        'stamp_ns', 'received_ns', 'latitude', 'longitude', 'height', 'covariance_n',
-        'covariance_type', 'status'))))
-    inputs, _ = screen(still, settings(drive, None))
+    inputs, _ = screen(replace(leg, fix=take(leg.fix, keep)), settings(drive, None))
     assert len(inputs.outside['fix_velocity'].t)

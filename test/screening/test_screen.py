@@ -16,21 +16,11 @@ from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
-MS = 10**6
 
 
 def said(leg, config=None):
     inputs, found = screen(leg, config or Config())
     return inputs, {r.code: r.text for r in found}, [r.text for r in found]
-
-
-def test_fixes_screened_by_a_setting_name_it_and_are_no_gap(leg):
-    poor = changed(leg.fix, covariance_n=lambda a: a.__setitem__(slice(100, 300), 25 * np.eye(3)))
-    _, found = screen(replace(leg, fix=poor), Config())
-    (reason,) = found
-    assert reason.code is Code.BAD_ROWS_DROPPED
-    assert '200 with sigma above 3 m' in reason.text
-    assert 'gnss.max_sigma' in reason.remedy
 
 
 def test_a_clean_leg_is_used_to_the_last_row(leg):
@@ -314,12 +304,14 @@ def test_the_limit_of_poor_fixes_rises_with_the_median_of_the_leg(leg):
     assert codes[Code.FIXES_UNUSABLE].endswith('with sigma above 3 m')
 
 
-def test_poor_fixes_are_left_out_by_the_limit_and_zero_takes_it_off(leg):
-    bad = changed(leg.fix, covariance_n=lambda a: a.__setitem__(slice(20, 26), np.eye(3) * 25.0))
-    inputs, codes, _ = said(replace(leg, fix=bad))
-    assert codes[Code.BAD_ROWS_DROPPED].endswith('6 with sigma above 3 m')
-    assert inputs.fixes_rejected == 6
-    inputs, codes, _ = said(replace(leg, fix=bad), with_settings(Config(), {'gnss.max_sigma': 0}))
+def test_poor_fixes_are_left_out_by_a_setting_no_gap_and_zero_takes_it_off(leg):
+    poor = changed(leg.fix, covariance_n=lambda a: a.__setitem__(slice(100, 300), 25 * np.eye(3)))
+    inputs, (reason,) = screen(replace(leg, fix=poor), Config())
+    assert reason.code is Code.BAD_ROWS_DROPPED
+    assert reason.text.endswith('200 with sigma above 3 m')
+    assert 'gnss.max_sigma' in reason.remedy
+    assert inputs.fixes_rejected == 200
+    inputs, codes, _ = said(replace(leg, fix=poor), with_settings(Config(), {'gnss.max_sigma': 0}))
     assert codes == {}
     assert inputs.fixes_rejected == 0
 

@@ -77,8 +77,7 @@ def test_nested_names_whole_numbers_and_what_a_node_dumps_are_read(write):
     ('    gnss.lever_arm: [[1.0], 2.0, 3.0]\n', BadConfig, r'\[1.0\] is not a number'),
     ('    odometer.left: 0\n', BadConfig, 'write it in quotes'),
     ('    method: [all\n', BadConfig, 'line 4: not valid YAML: '),
-    ('    method: "a\x07b"\n', BadConfig, 'not valid YAML: '),
-])
+    ('    method: "a\x07b"\n', BadConfig, 'not valid YAML: ')])
 def test_what_is_wrong_is_told_with_its_line(write, text, error, match):
     with pytest.raises(error, match=match) as caught:
         read_config_file(write(BLOCK + text))
@@ -114,8 +113,7 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
     ('frames.imu=', 'frames.imu', ''),
     ('odometer.signed=false', 'odometer.signed', False),
     ('verdict.min_legs=3', 'verdict.min_legs', 3),
-    (' method = all ', 'method', 'all'),
-])
+    (' method = all ', 'method', 'all')])
 def test_set_takes_yaml_and_gives_the_settings_type(text, name, value):
     got = parse_set(text)
     assert got == (name, value)
@@ -139,8 +137,7 @@ def test_set_takes_nan_where_a_setting_may_be_unset():
     ('verdict.min_legs=2.5', BadConfig, 'is not a whole number'),
     ('leg.max_gap={a: 1}', BadConfig, 'is not a number'),
     ('imu.nominal_yaw=1.0e+308', BadConfig, 'imu.nominal_yaw = 1e.308: the limit is 1e.09'),
-    ('reference.start=[1.0, 2.0, -1.0e+300, 1.0]', BadConfig, 'the limit is'),
-])
+    ('reference.start=[1.0, 2.0, -1.0e+300, 1.0]', BadConfig, 'the limit is')])
 def test_set_says_what_is_wrong(text, error, match):
     with pytest.raises(error, match=match) as caught:
         parse_set(text)
@@ -165,8 +162,7 @@ BLOCKS = {
     'the node after a wildcard wins': ['/**', 'calibrator'],
     'a key that comes again keeps its place': ['/**', 'calibrator', '/**'],
     'four ways to say it': ['/calibrator', '/**/calibrator', '/*', 'calibrator'],
-    'others are passed over': ['/**', '/car/calibrator', 'driver', '/*/calibrator'],
-}
+    'others are passed over': ['/**', '/car/calibrator', 'driver', '/*/calibrator']}
 READ_BY_ROS = """
 import json, sys, rclpy
 from rclpy.node import Node

@@ -17,7 +17,6 @@ from odocal_ros.sim.zoo import G
 
 pytestmark = pytest.mark.core
 KERBS = ((5.0, 0.08), (9.0, -0.08))
-YARD = resolved(SimOptions(scenario='yard', duration=120.0))
 
 
 def test_slopes_are_derivatives_and_chords_their_means():

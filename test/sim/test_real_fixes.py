@@ -17,6 +17,7 @@ from odocal_ros.sim.scenarios import motion_of, simulate
 
 pytestmark = pytest.mark.core
 PAPER = SimOptions(scenario='paper', duration=600.0, imu_rate=20.0, heading=0.0)
+TAU = 0.8
 
 
 def north(drive, times):
@@ -26,33 +27,22 @@ def north(drive, times):
     return (latitude - options.latitude) * 6.36e6
 
 
-def test_a_receiver_that_filters_lags_by_its_closed_form():
-    tau = 0.8
-    slow, exact = (replace(PAPER, real=Real(receiver_lag=x)) for x in (tau, 0.0))
-    # at 20 m/s the lag is tau; in the ramp of 0.5 m/s^2 since 300 s the filter has settled
-    for t, want in ((450.0, 20 * tau), (330.0, 0.5 * 30 * tau - 0.5 * tau**2)):
-        late = (north(exact, [t]) - north(slow, [t]))[0]
-        # 1e-3: the metres of a radian of latitude here
-        assert late == pytest.approx(want, rel=3e-3)
-    # round-off of 4.5e6 m
-    assert north(slow, [0.3])[0] == pytest.approx(0, abs=1e-8)
-
-
-def test_a_receiver_of_position_and_velocity_overshoots_by_its_closed_form():
-    tau = 0.8
-    tracked, exact = (replace(PAPER, real=Real(receiver_tracking=x)) for x in (tau, 0.0))
+@pytest.mark.parametrize(('receiver', 'behind', 'tolerance'), [
+    # at 20 m/s the lag is tau; in the ramp of 0.5 m/s^2 since 300 s the filter has settled;
+    # 3e-3: the metres of a radian of latitude here
+    ({'receiver_lag': TAU}, {450.0: 20 * TAU, 330.0: 15 * TAU - 0.5 * TAU**2}, {'rel': 3e-3}),
     # a steady speed is followed without lag; an even acceleration with tau^2 of it
-    for t, want in ((450.0, 0.0), (330.0, 0.5 * tau**2)):
-        behind = (north(exact, [t]) - north(tracked, [t]))[0]
-        assert behind == pytest.approx(want, abs=2e-3)
-
-
-def test_an_odometer_in_the_receiver_adds_its_share_of_the_last_motion():
-    fused, exact = (replace(PAPER, real=Real(receiver_odometer=x, receiver_odometer_time=15.0))
-                    for x in (0.02, 0.0))
-    ahead = (north(fused, [450.0]) - north(exact, [450.0]))[0]
+    ({'receiver_tracking': TAU}, {450.0: 0.0, 330.0: 0.5 * TAU**2}, {'abs': 2e-3}),
     # at 20 m/s since 340 s: exp(-110 / 15) of it is missing
-    assert ahead == pytest.approx(0.02 * 20 * 15, rel=3e-3)
+    ({'receiver_odometer': 0.02, 'receiver_odometer_time': 15.0}, {450.0: -0.02 * 20 * 15},
+     {'rel': 3e-3})], ids=['lag', 'tracking', 'odometer'])
+def test_a_receiver_that_filters_is_behind_by_its_closed_form(receiver, behind, tolerance):
+    filtered = replace(PAPER, real=Real(**receiver))
+    for t, want in behind.items():
+        late = (north(PAPER, [t]) - north(filtered, [t]))[0]
+        assert late == pytest.approx(want, **tolerance)
+    # round-off of 4.5e6 m
+    assert north(filtered, [0.3])[0] == pytest.approx(0, abs=1e-8)
 
 
 def test_errors_of_satellites_are_smoothed_by_an_odometer_in_the_receiver():
