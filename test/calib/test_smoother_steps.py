@@ -23,6 +23,7 @@ class Step:
     step: np.ndarray
     step_border: np.ndarray
     reduced: np.ndarray
+    taken: float = 1.0
 
 
 def walked(slope, passes):
@@ -42,6 +43,8 @@ def test_steps_that_would_oscillate_are_damped_and_others_taken_as_they_are():
     assert walked(2.0, 1) == pytest.approx(1.0)
     assert walked(2.0, 2) < 1e-12
     assert walked(0.4, 3) == pytest.approx(0.6**3)
+    back = np.array([-2.0, 1.0])
+    assert damped(Step(back[None, :], back, np.eye(2)), -back).taken == pytest.approx(0.5)
     step = np.array([3.0, -1.0])
     found = damped(Step(step[None, :], step, np.eye(2)), np.zeros(2))
     assert np.array_equal(found.step_border, step)
