@@ -7,9 +7,10 @@ from odocal_reproductions.patent.embodiment import Embodiment
 
 HEAD = """\
 CN104359492A, embodiment: errors of both wheel radii and of the heading by a search over
-combinations, as printed, and as computed for a simulated town drive of ten minutes. Nominal radius
-{radius:g} m (the patent states none); true errors {left:+g} m left, {right:+g} m right, heading
-{heading:+g} deg. Distances are between the dead-reckoned track and the fixes ({fix_noise})."""
+combinations, as printed, and as computed for a simulated town drive of ten minutes.
+Nominal radius {radius:g} m (the patent states none); true errors {left:+g} m left,
+{right:+g} m right, heading {heading:+g} deg. Distances are between the dead-reckoned
+track and the fixes ({fix_noise})."""
 COLUMNS = (f'  {"":22} {"left m":>9} {"right m":>9} {"head deg":>9} {"max m":>9} {"mean m":>9} '
            f'{"rms m":>9}')
 
@@ -22,8 +23,8 @@ def text_of(table: Embodiment, fix_noise: str, truth: tuple[float, float, float]
     lines += [f'  {row.name:22} {row.left:+9.5f} {row.right:+9.5f} {row.heading_deg:+9.4f} '
               f'{row.criteria["max"]:9.3f} {row.criteria["mean"]:9.3f} {row.criteria["rms"]:9.3f}'
               for row in table.rows]
-    lines += ['', f'array of 81 rows: counts of pairs deviate by at most {table.imbalance:.2f}; '
-              f'an orthogonal array has a multiple of {table.least} rows',
+    lines += ['', f'array of 81 rows: counts of pairs deviate by at most {table.imbalance:.2f}',
+              f'(an orthogonal array has a multiple of {table.least} rows)',
               f'response surface: {r.iterations} fits, {"" if r.settled else "not "}converged, '
               f'{"" if r.on_edge else "not "}on the edge of the range; R^2 '
               f'{r.first.r_squared:.4f} first, {r.last.r_squared:.7f} last',
