@@ -248,5 +248,5 @@ def test_plots_that_cannot_be_are_refused_in_one_line(capsys, tmp_path):
 def test_a_picture_that_cannot_be_written_is_one_line_too(tables, tmp_path):
     from odocal_reproductions.paper.plot import draw
     from odocal_ros.errors import BadUsage
-    with pytest.raises(BadUsage, match='cannot write'):
+    with pytest.raises(BadUsage, match='cannot be written'):
         draw(tables, tmp_path / 'gone' / 'a.png')

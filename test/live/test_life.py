@@ -355,7 +355,8 @@ def test_waiting_says_why(start, connect, sent):
                  'driver or remap imu/data')
     silent = client.node.create_publisher(
         Imu, 'imu/data', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-    client.until(hint='/imu/data: 1 publisher found (best effort) but no message yet')
+    client.until(hint='/imu/data: 1 publisher found (best effort) but no message yet; check the '
+                      'driver')
     client.node.create_publisher(Image, 'odometer', 1)
     wait_for(lambda: 'sensor_msgs/msg/Image' in client.status['missing'], 'the foreign type')
     client.node.create_publisher(Image, 'fix', 1)
