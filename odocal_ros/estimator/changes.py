@@ -21,9 +21,6 @@ from odocal_ros.settings.levels import FAULT_SIGMAS
 
 STEP_PLACES = 15       # judgement: times of a step, at equal distances along the path
 STEPPING = LN_K, YAW, PITCH      # definition: constants that are tested
-# relative, of the scale: less is reported as a slope (SCALE_VARIES). Judgement: tyres that warm up
-# change it by 0.4 %; of 80 zoo drives without a step 2 are beyond 5 sigma, with 0.1 and 0.3 %
-LEAST_SCALE_STEP = 5e-3
 
 
 @dataclass(frozen=True)
@@ -38,8 +35,7 @@ class Step:
     @property
     def certain(self) -> bool:
         """Return True if noise does not explain the step."""
-        return abs(self.size) > FAULT_SIGMAS * self.sigma and (
-            self.constant != LN_K or abs(self.size) > LEAST_SCALE_STEP)
+        return abs(self.size) > FAULT_SIGMAS * self.sigma
 
 
 def changes(weighted: Weighted, solved: Solved) -> tuple[Step, ...]:

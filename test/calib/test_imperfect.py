@@ -159,9 +159,9 @@ def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_o
     imu = Config().imu
     grade = GRADES['tactical']
     tactical = {'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2}
-    for told, seen in (('navigation', 'tactical'), ('tactical', 'tactical'),
-                       ('consumer', 'consumer')):
-        assert imu_as_seen(replace(imu, grade=told), tactical).grade == seen
+    for given, seen in (('navigation', 'tactical'), ('tactical', 'tactical'),
+                        ('consumer', 'consumer')):
+        assert imu_as_seen(replace(imu, grade=given), tactical).grade == seen
     vibrating = {name: 100.0 * value for name, value in tactical.items()}
     assert imu_as_seen(replace(imu, grade='tactical'), vibrating).grade == 'consumer'
     assert imu_as_seen(replace(imu, grade='navigation'), {}).grade == 'navigation'

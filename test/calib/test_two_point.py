@@ -128,8 +128,8 @@ def test_late_fixes_at_a_moving_mark_cost_what_the_budget_says():
     config = drives.settings(made)
     late = replace(moving, fix=drives.changed(made.fix, stamp_ns=lambda a: a + 50_000_000))
     e, b = (drives.two_point(x, config).estimates['scale_factor'].value for x in (late, moving))
-    told = drives.two_point(moving, config).details['budget']['fix_latency']['scale_factor']
-    assert abs(e - b) == pytest.approx(told, rel=0.02)
+    stated = drives.two_point(moving, config).details['budget']['fix_latency']['scale_factor']
+    assert abs(e - b) == pytest.approx(stated, rel=0.02)
 
 
 def test_without_heights_the_scale_stands_and_the_pitch_is_refused():

@@ -103,19 +103,19 @@ def test_a_reader_that_goes_away_takes_no_file_with_it(drive, bag, tmp_path):
 @pytest.mark.core
 def test_result_meets_the_truth_within_its_sigma(drive, bag, tmp_path, capsys):
     assert replay(bag, *known(drive), '--output', tmp_path / 'out', '--json') == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     written = json.loads((tmp_path / 'out' / 'calibration.json').read_text())
-    assert told == written
-    assert told['schema'] == 1
+    assert printed == written
+    assert printed['schema'] == 1
     for name, truth in (('scale_factor', drive.truth.scale),
                         ('scale_ratio', drive.truth.scale_ratio),
                         ('yaw_mounting_angle', drive.truth.yaw)):
-        estimate = told['result'][name]
+        estimate = printed['result'][name]
         assert abs(estimate['value'] - truth) < 4 * estimate['sigma']    # one draw in 16 000
-    assert told['result']['scale_factor']['sigma'] < 1e-3 * drive.truth.scale
+    assert printed['result']['scale_factor']['sigma'] < 1e-3 * drive.truth.scale
     values = yaml.safe_load((tmp_path / 'out' / 'calibration.yaml').read_text())
     parameters = values['/**']['ros__parameters']
-    assert parameters['result']['scale_factor'] == told['result']['scale_factor']['value']
+    assert parameters['result']['scale_factor'] == printed['result']['scale_factor']['value']
 
 
 def test_replay_of_a_bag_is_the_pipeline_on_the_samples(drive, bag, tmp_path, capsys):
@@ -127,7 +127,7 @@ def test_replay_of_a_bag_is_the_pipeline_on_the_samples(drive, bag, tmp_path, ca
 
     assert replay(bag, *known(drive), '--leg', f'{decimal(start)}:{decimal(stop)}', '--json',
                   '--output', tmp_path / 'out') == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     recorder = LegRecorder()
     for slot in ('imu', 'odometer'):
         recorder.feed(slot, getattr(drive, slot))
@@ -138,8 +138,8 @@ def test_replay_of_a_bag_is_the_pipeline_on_the_samples(drive, bag, tmp_path, ca
     config = with_settings(Config(), dict(parse_set(s) for s in known(drive)[1::2]))
     result = calibrate(recorder.close(start, stop, config.leg.preroll), config)
     for name, estimate in leg_estimates(result).items():
-        assert told['result'][name]['value'] == estimate.value
-        assert told['result'][name]['sigma'] == estimate.sigma
+        assert printed['result'][name]['value'] == estimate.value
+        assert printed['result'][name]['sigma'] == estimate.sigma
 
 
 @pytest.mark.parametrize(('storage', 'compression'), [
@@ -160,12 +160,12 @@ def test_several_bags_are_legs_of_one_vehicle(tmp_path, capsys):
     common = ['--set', f'odometer.nominal_scale={drive.options.nominal_scale!r}', '--set',
               'imu.grade=tactical', '--json']
     assert replay(*paths, *common, *QUICK, '--output', tmp_path / 'all') == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [Path(leg['bag']).stem for leg in told['legs']] == ['drive1', 'drive2', 'drive3']
-    assert len({entry['sha256'] for entry in told['inputs']}) == 3
-    whole = told['result']['scale_ratio']
+    printed = json.loads(capsys.readouterr().out)
+    assert [Path(leg['bag']).stem for leg in printed['legs']] == ['drive1', 'drive2', 'drive3']
+    assert len({entry['sha256'] for entry in printed['inputs']}) == 3
+    whole = printed['result']['scale_ratio']
     single = [leg['methods']['two_point']['estimates']['scale_ratio']['sigma']
-              for leg in told['legs']]
+              for leg in printed['legs']]
     assert abs(whole['value'] - ratio) < 4 * whole['sigma']
     # own errors average down: between the best of three alone and a third of it
     assert min(single) / 3 < whole['sigma'] < min(single)
@@ -182,14 +182,14 @@ def test_no_heading_refuses_yaw_with_a_remedy_but_gives_scale(drive, bag, tmp_pa
 
 def test_holdout_checks_on_what_was_not_fitted(drive, bag, tmp_path, capsys):
     assert replay(bag, *known(drive), '--holdout', '--json', '--output', tmp_path / 'out') == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     replay(bag, *known(drive), *QUICK, '--holdout', '--output', tmp_path / 'again')
     assert 'last fifth' in capsys.readouterr().out
     whole = drive.truth.distance
-    assert told['check']['after']['rms'] < told['check']['before']['rms']
+    assert printed['check']['after']['rms'] < printed['check']['before']['rms']
     # K0 is 6 % off and the mounting 1 deg: a fifth of the way strays by 6 % of it at its end
     off = abs(1 / drive.truth.scale_ratio - 1) + abs(drive.truth.yaw)
-    assert told['check']['before']['end'] < off * whole / 5 + 20
+    assert printed['check']['before']['end'] < off * whole / 5 + 20
 
 
 def test_an_existing_result_is_not_replaced_without_force(drive, bag, tmp_path, capsys):
@@ -206,9 +206,9 @@ def test_config_file_then_set_then_default(drive, bag, tmp_path, capsys):
     config.write_text('/**/calibrator:\n  ros__parameters:\n    leg:\n      min_distance: 9000\n'
                       '    imu: {grade: tactical}\n')
     assert replay(bag, *QUICK, '--config', config, '--output', tmp_path / 'a', '--json') == 1
-    told = json.loads(capsys.readouterr().out)
-    assert 'LEG_TOO_SHORT' in {r['code'] for r in told['reasons']}
-    assert told['config']['leg.min_distance'] == 9000.0
+    printed = json.loads(capsys.readouterr().out)
+    assert 'LEG_TOO_SHORT' in {r['code'] for r in printed['reasons']}
+    assert printed['config']['leg.min_distance'] == 9000.0
     assert replay(bag, *QUICK, '--config', config, '--set', 'leg.min_distance=200', '--output',
                   tmp_path / 'b', '--quiet') == 0
 
@@ -273,10 +273,10 @@ def test_husky_loop_is_refused_by_its_ends_and_its_straight_parts_meet_accept(
               f'odometer.nominal_scale={k0}', '--json']
     by_ends = [*common, '--method', 'two_point']
     assert replay(*by_ends, '--output', tmp_path / 'loop') == 1
-    told = json.loads(capsys.readouterr().out)
-    reasons = {r['code']: r for r in told['reasons']}
+    printed = json.loads(capsys.readouterr().out)
+    reasons = {r['code']: r for r in printed['reasons']}
     assert 'straight' in reasons['CHORD_TOO_SHORT']['remedy']
-    assert told['result']['scale_factor']['value'] is None
+    assert printed['result']['scale_factor']['value'] is None
     for leg in STRAIGHT:
         replay(*by_ends, '--leg', leg, '--set', 'leg.min_distance=30', '--output',
                tmp_path / leg.replace(':', '_'))

@@ -40,20 +40,20 @@ def inspect(folder, capsys, message):
     """Return path, JSON, the wheels' topic and the text of a drive with such an odometer."""
     path = ros_bags.write(folder / 'bag', drive(message))
     assert main(['inspect', str(path), '--json']) == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     assert main(['inspect', str(path)]) == 0
-    wheels = next(t for t in told['topics'] if t['name'] == '/wheels')
-    return path, told, wheels, capsys.readouterr().out
+    wheels = next(t for t in printed['topics'] if t['name'] == '/wheels')
+    return path, printed, wheels, capsys.readouterr().out
 
 
 def test_unnamed_joints_are_told_apart_by_how_they_move(tmp_path, capsys):
     names = ['j1', 'j2', 'j3']
-    _, told, wheels, text = inspect(tmp_path, capsys, lambda ns, i, left, right: make.joints(
+    _, printed, wheels, text = inspect(tmp_path, capsys, lambda ns, i, left, right: make.joints(
         ns, names, [0.4 * np.sin(i / 30), right, left]))
     assert [v['side'] for v in wheels['values']] == ['', 'right', 'left']
     assert [v['rolls'] for v in wheels['values']] == [False, True, True]
     assert 'the wheels among the joints j1, j2, j3 are not clear' in wheels['trouble']
-    assert told['command'].endswith('--set odometer.left=j3 --set odometer.right=j2')
+    assert printed['command'].endswith('--set odometer.left=j3 --set odometer.right=j2')
     assert 'j1 travels' in text
 
 
@@ -65,11 +65,11 @@ def test_four_unnamed_joints_are_a_list_of_axles(tmp_path, capsys):
 
 
 def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, capsys):
-    path, told, wheels, _ = inspect(tmp_path, capsys, lambda ns, i, left, right: (
+    path, printed, wheels, _ = inspect(tmp_path, capsys, lambda ns, i, left, right: (
         make.whole_array([int(right * 50), int(left * 50)])))
     assert 'the mean of 0 and 1 is used' in wheels['chosen']
     options = ['--set', 'odometer.left=1', '--set', 'odometer.right=0']
-    assert told['command'].split()[-4:] == options
+    assert printed['command'].split()[-4:] == options
     assert main(['replay', str(path), *options, '--output', str(tmp_path / 'out'), '--json',
                  '--set', 'output.formats=[params]']) < 2
     said = capsys.readouterr().out
