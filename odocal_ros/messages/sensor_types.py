@@ -79,7 +79,7 @@ def _heading(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw
 
 def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
     """Return covariance[8]; NaN without orientation (REP-145's -1 or an all-zero quaternion)."""
-    some = across(np.logical_or, q_ni) & (of_roll.view(np.int64)[:, 0] != NONE_SENT)
+    some = across(np.logical_or, q_ni != 0) & (of_roll.view(np.int64)[:, 0] != NONE_SENT)
     return np.where(some, of_yaw[:, 0], np.nan)
 
 
