@@ -21,7 +21,7 @@ from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config, LegConfig
 
 # judgement: newest legs kept with their tracks, for plots; a day of legs must not fill the memory
-LEGS_HELD = 30
+LEGS_HELD = 20
 
 
 class Refused(OdocalError):

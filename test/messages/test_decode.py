@@ -17,7 +17,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import make_reader
-from odocal_ros.messages.sensor_types import _fix
+from odocal_ros.messages.sensor_types import _fix, _heading
 from odocal_ros.settings.config import Config, with_settings
 
 STD = ('Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64')
@@ -457,8 +457,11 @@ def test_what_rclpy_serialises_has_the_same_layout(message):
 
 def test_a_nan_that_signals_is_one_in_silence():
     position = np.zeros((2, 3))
-    position.view(np.uint64)[1, 0] = 0x7ff0000000000001
+    position.view(np.uint64)[1] = 0x7ff0000000000001
     ns = np.zeros(2, np.int64)
     with np.errstate(all='raise'):
         fixes = _fix(ns, ns, position, np.zeros((2, 9)), *np.zeros((2, 2, 1)))
+        q_ni = np.pad(position, ((0, 0), (0, 1)))
+        heading = _heading(ns, ns, q_ni, np.ones((2, 1)), np.ones((2, 1)))
     assert np.isnan(fixes.latitude).tolist() == [False, True]
+    assert np.isnan(heading.yaw_variance).tolist() == [True, False]     # of zeros: no orientation

@@ -55,7 +55,7 @@ class MotionRows(Factor):
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.motion = Motion(problem, point.state, point.intervals, point.fitted)
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
-        self.signals = Signals(self.motion) if point.fitted else None
+        self.signals = Signals(self.motion)
         self.noise = interval_noise(self.motion, problem.leg,
                                     problem.still[:-1] & problem.still[1:], point.spread)
 
@@ -100,10 +100,11 @@ class MotionRows(Factor):
     def derivatives(self, rows: slice, units: Floats) -> tuple[Floats, Floats, Floats]:
         """Return derivatives of some intervals as ``Motion.jacobians``, by fitted signals."""
         begin, end, constants = self.motion.take(rows).jacobians(self.n)
-        if self.signals is not None:
-            gyro = units[:, :, self.of('gyro')]
+        gyro = units[:, :, self.of('gyro')]
+        self.signals.fit_rates(rows, constants, begin[:, :, BG], gyro)
+        if self.motion.fitted:
             found = np.einsum('kic,ki->kc', self.whiten[rows] @ gyro, self.r[rows])
-            self.signals.fit(rows, constants, begin[:, :, BG], gyro, found)
+            self.signals.fit_forces(rows, constants, gyro, found)
         return begin, end, constants
 
     def add(self, out: Normal) -> None:

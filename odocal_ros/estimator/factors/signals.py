@@ -9,6 +9,9 @@ biases the estimate towards smaller signals. Once steps are below a sigma, the e
 subtracted: the residual of the axis, and the effect of gyro noise on the direction of gravity
 within an interval.
 
+A rate as small as the noise that is left is likely noise, too. A rate w of an interval counts as
+w / (1 + (3 sigma / w)^2), which leaves turns, banked curves and kerbs as they are.
+
 Sway and heave that odometer and attitude do not predict are road noise, which has levels of its
 own in the fit. They are subtracted as well.
 """
@@ -32,6 +35,8 @@ from odocal_ros.estimator.state import (
 from odocal_ros.nav.rotations import transpose, turn
 
 FORCES = 3      # definition: number of the first gyro signal that is a force
+# judgement, measured in decision 9: sigmas of the noise of an interval
+LIKELY_NOISE = 3.0
 
 
 class Signals:
@@ -49,34 +54,36 @@ class Signals:
         moved = across(motion.residual[:, D], forward_n[:-1]) - noise[:-1] * motion.T
         self.sway = (V, np.diff(noise, axis=0)), (P, moved)
 
-    def fit(self, rows: slice, constants: Floats, by_bias: Floats, gyro: Floats,
-            found: Floats) -> None:
+    def fit_rates(self, rows: slice, constants: Floats, by_bias: Floats, gyro: Floats) -> None:
         """
-        Subtract the noise from the derivatives by IMU errors, in place.
+        Subtract the noise from the derivatives that are turn rates, in place.
 
         rows : slice of the intervals.   constants : (k, 18, M) derivatives, corrected in place.
         by_bias : (k, 18, 3) derivatives by the gyro bias.   gyro : (k, 18, 3 p) columns of unit
-        gyro noises along the axes of n at p points.   found : (k, 3 p) estimates of these noises.
+        gyro noises along the axes of n at p points.
         Derivatives by g-sensitivity stay as they are: accelerometer noise is independent of the
         gyro.
         """
+        part, columns = self.motion.take(rows), constants[:, :, GYRO]
+        noise = turn(transpose(part.C), part.residual[:, PHI]) / part.T * part.fitted
+        rate = part.sums.mean_rate - self.motion.state.gyro_bias[rows] + noise
+        bound = LIKELY_NOISE**2 * (gyro[:, PHI]**2).sum(axis=(1, 2))[:, None] / 3 / part.T**2
+        noise -= rate * bound / (rate**2 + bound)
+        by_bias = by_bias.copy()
+        by_bias[:, BG] = 0.0        # which walks, as a scale does not
+        for i, (into, by) in enumerate(zip(GYRO_AXIS, GYRO_SIGNAL, strict=True)):
+            if by < FORCES:
+                columns[:, :, i] += by_bias[:, :, into] * noise[:, by, None]
+
+    def fit_forces(self, rows: slice, constants: Floats, gyro: Floats, found: Floats) -> None:
+        """Subtract noise from those that are forces; found : (k, 3 p) estimates of gyro noises."""
         part = self.motion.take(rows)
-        self._by_rates(part, constants[:, :, GYRO], by_bias)
         k, C = len(part.C), part.C[:, None]
         # of the noise about each axis of b
         of_gyro = ((gyro.reshape(k, ROWS, -1, 3) @ C) * (found.reshape(k, 1, -1, 3) @ C)).sum(2)
         for axes, sway in self.sway:
             self._by_forces(part, constants[:, axes, ACCEL], turn(transpose(part.C), sway[rows]),
                             part.residual[:, axes], of_gyro[:, axes])
-
-    def _by_rates(self, part: Motion, columns: Floats, by_bias: Floats) -> None:
-        """Correct the derivatives that are turn rates: columns (k, 18, g)."""
-        noise = turn(transpose(part.C), part.residual[:, PHI]) / part.T
-        by_bias = by_bias.copy()
-        by_bias[:, BG] = 0.0        # which walks, as a scale does not
-        for i, (into, by) in enumerate(zip(GYRO_AXIS, GYRO_SIGNAL, strict=True)):
-            if by < FORCES:
-                columns[:, :, i] += by_bias[:, :, into] * noise[:, by, None]
 
     def _by_forces(self, part: Motion, columns: Floats, sway: Floats, residual: Floats,
                    of_gyro: Floats) -> None:
