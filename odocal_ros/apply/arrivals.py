@@ -3,6 +3,7 @@
 
 """Stamps of a stream: selection of usable ones, and row times without arrival jitter."""
 
+from bisect import bisect_left
 from collections import deque
 import math
 
@@ -22,19 +23,20 @@ LAG_ROWS = 1000      # judgement: accepted rows over which the least lag increas
 # row, largest change of the median lag; lags are not used if a bag is played faster or slower by
 # this share
 MOVED_ROWS, MOVED_S, STAYS_ROWS, FOLLOW_NS, PLAYED = 3, 0.03, 50, 1e4, 0.05
-# judgement: rows before the line is used; rows of its memory: crystals are stable for longer, and
-# the sigma of the line is sqrt(4 / rows) of the jitter
-FIRST_ROWS, LINE_ROWS = 20, 300
+# judgement: rows before the line is used; rows of its memory, crystals are stable for longer
+FIRST_ROWS, LINE_ROWS = 20, 1000
 UNEVEN_ROWS = 100          # judgement: rows in motion of the mean roughness
 # judgement: ratio of the roughness on the line to that at arrival: the line is no longer used
 # above the first, and used again below the second
 AS_EVEN, EVENER = 1.0, 0.8
-LATE_SIGMA = 1.5           # judgement: sigma over mean deviation of delays, 1.3 if exponential
-MOST_LATE = 3.0            # judgement: limit of the deviation of a row, in mean deviations
+LATE_SIGMA = 1.5           # judgement: sigma over mean of delays, 1 if exponential
 LATE_ROWS = 50             # judgement: rows of the mean deviation
-SURE_STEP = 4.0            # judgement: least counts per interval to detect lost rows
-FAR = 0.5                  # judgement: least deviation of lost rows, intervals
-FAR_ROWS = 25              # judgement: rows that all deviate by FAR: not jitter
+# judgement: least counts per interval, and least speed, m/s, to detect lost rows by the travel
+SURE_STEP, SURE_SPEED = 4.0, 0.5
+FAR = 0.5                  # judgement: least lateness of lost rows, intervals
+# judgement: consecutive rows at rest that are late by FAR: rows before them are lost; rows after
+# which this is no longer questioned
+FAR_ROWS, SURE_LOST = 25, 100
 LONG_GAP = 1.0             # s; judgement: gap with lost rows at a slow wheel
 MOST_LOST = 5              # judgement: largest gap, intervals, without a new line
 
@@ -120,9 +122,10 @@ class Rhythm:
     """
     Row times of a counter without arrival jitter.
 
-    A counter is sampled evenly: a line through the arrivals (row number to time) gives better
-    times if the travel on it is smoother. ``error_s`` is the sigma of the times, s, by the
-    roughness of the travel, without a constant delay.
+    A counter is sampled evenly, and no row arrives before it is sampled: the highest line below
+    all arrivals (row number to time) gives better times if the travel on it is smoother. It is an
+    edge of the lower convex hull, as in the estimation of the skew of two clocks. ``error_s`` is
+    the sigma of the times, s, by the roughness of the travel, without a constant delay.
     """
 
     def __init__(self) -> None:
@@ -137,9 +140,11 @@ class Rhythm:
 
     def _restart(self) -> None:
         """Remove the line; the next rows determine another."""
-        self._count = self._shifted = 0
-        self._line = self._interval = self._late = 0.0
-        self._off: deque[float] = deque(maxlen=FAR_ROWS)
+        self._count = self._row = self._assumed = 0
+        self._line = self._interval = self._late = self._step = 0.0
+        self._hull: list[tuple[int, float]] = []      # rows and arrivals below all others
+        self._far: list[float] = []     # s, lateness of consecutive rows at rest
+        self._before = (0, 0.0, 1.0)    # row, time, interval
 
     def place(self, t: float, travel: float, speed: float, quantum: float) -> float:
         """
@@ -147,9 +152,9 @@ class Rhythm:
 
         t : s, arrival.   travel : m, up to the row.   speed : m/s, before it.   quantum : m.
         """
-        expected = abs(speed) * self._interval
+        expected = max(abs(speed) * self._interval, self._step) if speed else 0.0
         step = abs(travel - self._rows[-1][2]) if self._rows else 0.0
-        sure = expected > SURE_STEP * quantum
+        sure = expected > max(SURE_STEP * quantum, SURE_SPEED * self._interval)
         if not sure and t - self._line > LONG_GAP and not 0 < step <= 2 * SURE_STEP * quantum:
             self._restart()      # lost rows; late ones arrive one after the other
         self._follow(t, step, expected if sure else 0.0)
@@ -165,53 +170,78 @@ class Rhythm:
         """Return the sigma of the constant delay of the times, s."""
         return LATE_SIGMA * self._late if self._in_use() else 0.0
 
+    @property
+    def rate_error(self) -> float:
+        """Return the relative sigma of the interval between rows."""
+        if not self._in_use():
+            return 0.0
+        return LATE_SIGMA * self._late / (self._row - self._hull[0][0]) / self._interval
+
     def _in_use(self) -> bool:
         return self._even and self._late > LEAST_JITTER and self._count > FIRST_ROWS
 
     def _follow(self, t: float, step: float, expected: float) -> None:
         """
-        Advance the line to the next row, by recursive least squares.
+        Advance the line to the next row.
 
         t : s, arrival.   step : m, travel since the last row.   expected : m, travel in an
         interval, 0 if it is too small to detect lost rows.
         """
-        self._count += 1
-        k = min(self._count, LINE_ROWS)
-        if k == 1:
-            self._line = t
-            return
         off = t - self._line - self._interval
         intervals = 1
-        if expected and off > FAR * self._interval and k > FIRST_ROWS:
+        if expected and off > FAR * self._interval and self._count > FIRST_ROWS:
             intervals = max(1, round(step / expected))
         if intervals > MOST_LOST:
             self._restart()
-            return
-        self._line += intervals * self._interval
-        off = t - self._line
-        if k > 2:       # two rows determine a line
-            self._off.append(off)
-            self._late += (abs(off) - self._late) / min(k - 2, LATE_ROWS)
-        if k > FIRST_ROWS:
-            most = MOST_LATE * self._late
-            off = min(max(off, -most), most)
-        self._line += off * 2 * (2 * k - 1) / (k * (k + 1))
-        self._interval += off * 6 / (k * (k + 1)) / intervals
-        if self._count > FIRST_ROWS:
-            self._shift()
+        self._step = step / intervals
+        intervals += self._lost_at_rest(t, off, expected > 0)
+        self._count += 1
+        self._row += intervals
+        self._fit(t)
+        if self._count > 2:       # two rows determine a line
+            self._late += (t - self._line - self._late) / min(self._count - 2, LATE_ROWS)
 
-    def _shift(self) -> None:
-        """Shift the line by whole intervals if all of the last rows deviate in one direction."""
-        least, largest = min(self._off), max(self._off)
-        far = least if least > 0 else -largest if largest < 0 else 0.0
-        if len(self._off) < FAR_ROWS or far <= FAR * self._interval:
-            return
-        if self._count - self._shifted < 4 * FAR_ROWS and self._shifted:
-            self._restart()      # the interval is wrong
-            return
-        self._shifted = self._count
-        self._line += math.copysign(round(far / self._interval) or 1, least) * self._interval
-        self._off.clear()
+    def _lost_at_rest(self, t: float, off: float, moves: bool) -> int:
+        """
+        Return lost rows that the travel does not show, less those that were only late.
+
+        t : s, arrival.   off : s, behind the line.   moves : the travel shows lost rows.
+        """
+        if self._assumed:
+            row, at, interval = self._before
+            least = round((t - at) / interval) - (self._row + 1 - self._assumed - row)
+            back = min(self._assumed, max(self._assumed - least, 0))
+            self._hull = [(r - back if r > row else r, s) for r, s in self._hull]
+            self._assumed = self._assumed - back if self._row - row < SURE_LOST else 0
+            if back:
+                return -back
+        if moves or off <= FAR * self._interval or self._count <= FIRST_ROWS:
+            self._far.clear()
+            return 0
+        self._far.append(off)
+        if len(self._far) < FAR_ROWS:
+            return 0
+        lost = round(min(self._far) / self._interval)
+        self._far.clear()
+        if not self._assumed:
+            self._before = self._row, self._line, self._interval
+        self._assumed += lost
+        return lost
+
+    def _fit(self, t: float) -> None:
+        """Fit the line: the edge below the middle row of the lower convex hull."""
+        hull, row = self._hull, self._row
+        while len(hull) > 1 and (t - hull[-2][1]) * (hull[-1][0] - hull[-2][0]) <= (
+                hull[-1][1] - hull[-2][1]) * (row - hull[-2][0]):
+            hull.pop()
+        hull.append((row, t))
+        if len(hull) > 2 and row - hull[1][0] > LINE_ROWS:
+            del hull[0]
+        if len(hull) > 1:
+            end = max(bisect_left(hull, ((row + hull[0][0]) / 2, 0.0)), 1)
+            (row0, t0), (row1, t1) = hull[end - 1:end + 1]
+            self._interval = (t1 - t0) / (row1 - row0)
+        self._line = t if len(hull) == 1 else t1 + self._interval * (row - row1)
 
     def _test(self, quantum: float) -> None:
         """Compare the roughness of the travel at arrival and on the line."""

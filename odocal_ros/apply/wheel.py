@@ -102,8 +102,10 @@ class Wheel:
         """Return the variance by arrival jitter of the travel in the T s before t, m^2."""
         if self.form.quantity == 'rate':
             return 0.0
-        off = self._rhythm.error_s * (self.at(t) - self.at(t - T)) / T
-        return 2.0 * off**2 * min(1.0, T / self.usual if self.usual else 1.0)**2
+        travel = self.at(t) - self.at(t - T)
+        off = self._rhythm.error_s * travel / T
+        return 2.0 * off**2 * min(1.0, T / self.usual if self.usual else 1.0)**2 + (
+            self._rhythm.rate_error * travel)**2
 
     @property
     def delay_s(self) -> float:
