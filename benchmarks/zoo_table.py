@@ -21,7 +21,7 @@ GENERAL = {'MODEL_MISMATCH', 'METHODS_DISAGREE'}     # something is wrong, and n
 FIXES = {'FIXES_NOISIER_THAN_SAID', 'PLANES_DISAGREE', *GENERAL}
 IMU = {'IMU_WORSE_THAN_GRADE', 'IMU_AXES_SKEW', *GENERAL}
 TYRES = {'SCALE_VARIES'}
-WHEELS = {'WHEEL_SLIP', 'TRAVEL_MISSING', *GENERAL}
+WHEELS = {'WHEEL_SLIP', 'TRAVEL_MISSING', 'TRAVEL_EXCESS', *GENERAL}
 EXPLAINS = {
     'triads': IMU, 'g_sensitivity': IMU, 'bias': {'TRACK_MISMATCH', *IMU},
     'temperature': {'TRACK_MISMATCH', *IMU},      # values from the standstill are no longer valid

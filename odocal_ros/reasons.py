@@ -138,6 +138,8 @@ class Code(Enum):
                            'The uncertainty was increased by the slip found.')
     TRAVEL_MISSING = NOTE, ('Check the odometer at low speed: truncated speeds, a dead band, or a '
                             'sensor that misses pulses. The uncertainty was increased.')
+    TRAVEL_EXCESS = NOTE, ('Check the odometer before stops: a speed that is held or late. The '
+                           'uncertainty was increased.')
     SCALE_VARIES = NOTE, ('No action needed. For a value that stays valid longer, drive with '
                           'warm tyres at typical speeds, and combine several legs.')
     CHANGE_IN_LEG = CAUTION, ('Check that the IMU and its bracket are fixed, and tyres, load and '

@@ -194,6 +194,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.TRAVEL_MISSING: 'Within a few seconds the odometer travelled less than the vehicle, '
         'which did not brake by 0.5 m/s^2. A sliding wheel brakes, a spinning one travels '
         'farther, so no wheel slipped: the odometer lost travel, often at a start from rest.',
+        Code.TRAVEL_EXCESS: 'The odometer travelled farther than a vehicle that brakes to a stop: '
+        'brakes do not spin a wheel. The speed is likely held or late there.',
         Code.SCALE_VARIES: 'The tyre radius grows with speed and temperature: the scale is not '
         'constant in this leg. The stated value is its mean over the path; `scale_by_speed` and '
         '`scale_by_time` are its slopes.',

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from odocal_ros.calib.result import Source
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import Track
@@ -39,6 +39,7 @@ SPIN_TURN = 0.1
 PIN_COUNTS = 8.0
 # m/s^2: a sliding wheel brakes the vehicle by at least this, even on ice (friction 0.1). Physical
 LEAST_BRAKING = 0.5
+STOPS = 0.5          # m/s, a speed below is a stop: judgement
 BRAKES_BESIDE = 1.0  # s around a slip searched for braking, a keyframe interval: judgement
 # s, delays of the odometer that are tested: judgement; a bus or a filter has less
 LATE = 0.05 * np.arange(-10, 21)
@@ -50,13 +51,13 @@ class Slips(NamedTuple):
 
     t : (k,) s, middle of each slip.   size : (k,) m, > 0 if the wheel spun, < 0 if it slid.
     late : delay of the odometer relative to the IMU, s, if it would look like slip, else 0.
-    missing : (k,) bool, travel missing in the odometer although no wheel slid.
+    unforced : (k,) 0 for a slip, else the sign of travel that no force explains.
     """
 
     t: Floats
     size: Floats
     late: float = 0.0
-    missing: Bools = np.empty(0, bool)
+    unforced: Ints = np.empty(0, int)
 
 
 def rounding(travel: Travel) -> float:
@@ -90,9 +91,9 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     t, size = windows.events(late)
     hidden = len(windows.events(0.0)[0]) > len(t)
     speed = K * np.diff(np.interp(grid + late, track.t, track.s)) / SPIN_GRID
-    missing = [without_braking(at - SPIN_WINDOW / 2, SPIN_WINDOW, metres, grid[:-5], np.convolve(
+    sign = [unforced(at - SPIN_WINDOW / 2, SPIN_WINDOW, metres, grid[:-5], np.convolve(
         speed, np.full(5, 0.2), 'valid')) for at, metres in zip(t, size, strict=True)]
-    return Slips(t, size, late if hidden else 0.0, np.array(missing, bool))
+    return Slips(t, size, late if hidden else 0.0, np.array(sign, int))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,28 +168,47 @@ def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Float
     return middle[k], excess[k]
 
 
-def without_braking(t: float, duration: float, metres: float, t_speed: Floats,
-                    speed: Floats) -> bool:
+def unforced(t: float, duration: float, metres: float, t_speed: Floats, speed: Floats) -> int:
     """
-    Return True if a wheel travels less than a vehicle that does not brake: it does not slide.
+    Return -1 or 1 for travel that no force explains, 0 for slip.
+
+    A sliding wheel brakes the vehicle: -1 if the wheel travels less, and the vehicle does not
+    brake. Brakes do not spin a wheel: 1 if it travels more, and the vehicle brakes to a stop.
 
     t, duration : s, of the slip.   metres : wheel travel minus vehicle travel.   t_speed, speed :
     (n,) s, m/s, of the vehicle, < 0 backwards.
     """
-    inside = slice(*np.searchsorted(t_speed, (t - BRAKES_BESIDE, t + duration + BRAKES_BESIDE)))
-    size, way = np.abs(speed[inside]), speed[inside].sum()
-    if len(size) < 2 or metres * way >= 0:
-        return False
-    return bool((np.diff(size) / np.diff(t_speed[inside])).min() > -LEAST_BRAKING)
+    def within(beside: float) -> tuple[Floats, Floats, float]:
+        """Return the sizes of the speed, their changes, and a signed sum, near the slip."""
+        first, last = np.searchsorted(t_speed, (t - beside, t + duration + beside + 1e-9))
+        part = np.abs(speed[first:last])
+        return part, np.diff(part) / np.diff(t_speed[first:last]), speed[first:last].sum()
+
+    _, change, direction = within(BRAKES_BESIDE)
+    if metres * direction < 0:
+        return -int(len(change) and change.min() > -LEAST_BRAKING)
+    size, change, _ = within(0.0)
+    stops = len(change) and ((change < -LEAST_BRAKING) | (size[1:] < STOPS)).all()
+    return int(stops and size.min() < STOPS)
 
 
-def missing_reasons(t: Floats, metres: Floats) -> list[Reason]:
-    """Return TRAVEL_MISSING for travel missing in the odometer, (k,) s, m; empty if none."""
-    if not len(t):
-        return []
-    return [Reason(Code.TRAVEL_MISSING, f'the odometer counts {np.abs(metres).sum():.2f} m less '
-                   f'than the vehicle moves, at {len(t)} place{"s" * (len(t) > 1)} without '
-                   f'braking, most at t = {t[np.argmax(np.abs(metres))]:.0f} s')]
+def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
+    """
+    Return TRAVEL_MISSING and TRAVEL_EXCESS for travel that no force explains; empty if none.
+
+    t, metres : (k,) s, m.   sign : (k,) as by ``unforced``.
+    """
+    found = []
+    for code, of, relation, where in (
+            (Code.TRAVEL_MISSING, -1, 'less', 'without braking'),
+            (Code.TRAVEL_EXCESS, 1, 'more', 'while it brakes to a stop')):
+        size, at = np.abs(metres[sign == of]), t[sign == of]
+        if len(at):
+            found.append(Reason(code, (
+                f'the odometer counts {size.sum():.2f} m {relation} than the vehicle moves, at '
+                f'{len(at)} place{"s" * (len(at) > 1)} {where}, most at t = '
+                f'{at[np.argmax(size)]:.0f} s')))
+    return found
 
 
 def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floats) -> Source:
@@ -199,12 +219,12 @@ def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floa
 
 def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
     """
-    Return DELAY_SEEN, WHEEL_SLIP and TRAVEL_MISSING for detected faults, empty if there are none.
+    Return the reasons for delay, slip and travel that no force explains; empty if there are none.
 
     slips : Slips.   time_offset : odometer.time_offset in force, s.
     """
     found: tuple[Reason, ...] = ()
-    t, size, late = slips.t[~slips.missing], slips.size[~slips.missing], slips.late
+    t, size, late = slips.t[slips.unforced == 0], slips.size[slips.unforced == 0], slips.late
     if late:
         found += (Reason(
             Code.DELAY_SEEN, f'odometer stamps are about {abs(late):.2f} s '
@@ -215,4 +235,4 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
             Code.WHEEL_SLIP, f'odometer and IMU disagree by {np.abs(size).sum():.2f} m in total '
             f'at {len(t)} place{"s" * (len(t) > 1)}, first by {size[0]:+.2f} m at t = {t[0]:.1f} '
             's: the wheel spun or slid'),)
-    return (*found, *missing_reasons(slips.t[slips.missing], slips.size[slips.missing]))
+    return (*found, *travel_reasons(slips.t, slips.size, slips.unforced))

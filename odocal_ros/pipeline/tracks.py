@@ -135,4 +135,4 @@ def slip_check(ready: PreparedLeg, track: Track, f: Floats,
                        rounding(ready.inputs.travel))
     known = (np.abs(slips.t[:, None] - ready.wheel_slips.t) < SPIN_WINDOW).any(axis=1)
     held = (slips.t >= between[0]) & (slips.t <= between[1]) & ~known
-    return slips._replace(t=slips.t[held], size=slips.size[held], missing=slips.missing[held])
+    return slips._replace(t=slips.t[held], size=slips.size[held], unforced=slips.unforced[held])

@@ -12,7 +12,7 @@ import pytest
 from reversing_drives import made as by_hand
 from smoother_legs import leg_of, made
 
-from odocal_ros.calib.slip import without_braking
+from odocal_ros.calib.slip import unforced
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.factors.factor import ACCEL_NOISE, SPREAD
 from odocal_ros.estimator.result import mismatch
@@ -21,6 +21,7 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code
 from odocal_ros.sim import routes
 from odocal_ros.sim.profile import hold, ramp
+from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
@@ -137,13 +138,34 @@ def test_travel_that_a_counter_loses_without_braking_is_no_slip():
 
 
 @pytest.mark.parametrize('forward', [1.0, -1.0])
-@pytest.mark.parametrize(('metres', 'acceleration', 'slides'), [
-    (0.5, 1.0, True), (0.5, -2.0, True), (-0.5, 1.0, False), (-0.5, 0.0, False),
-    (-0.5, -0.3, False), (-0.5, -2.0, True)])
-def test_a_wheel_slips_only_as_a_force_makes_it(metres, acceleration, slides, forward):
+@pytest.mark.parametrize(('begin', 'metres', 'acceleration', 'sign'), [
+    (10.0, 0.5, 1.0, 0), (10.0, 0.5, -2.0, 0), (10.0, -0.5, 1.0, -1), (10.0, -0.5, 0.0, -1),
+    (10.0, -0.5, -0.3, -1), (10.0, -0.5, -2.0, 0), (4.0, 0.5, -2.0, 1), (4.0, -0.5, -2.0, 0)])
+def test_a_wheel_slips_only_as_a_force_makes_it(begin, metres, acceleration, sign, forward):
     t = np.arange(0.0, 20.0, 1.0)
-    speed = 10.0 + acceleration * np.clip(t - 9.0, 0.0, 2.0)
-    assert without_braking(9.0, 2.0, forward * metres, t, forward * speed) is not slides
+    speed = begin + acceleration * np.clip(t - 9.0, 0.0, 2.0)
+    assert unforced(9.0, 2.0, forward * metres, t, forward * speed) == sign
+
+
+def test_a_speed_that_is_held_before_stops_is_no_slip():
+    """A wheel sensor that is silent below 0.5 m/s; the bus repeats its last value for 2 s."""
+    drive = simulate(SimOptions(scenario='town', seed=100, duration=300.0, imu_rate=50.0,
+                                odometer='speed', odometer_rate=10.0, imu_grade='industrial',
+                                fix_noise='rtk', fix_sigma=0.02))
+    rows, held, since = drive.odometer, 0.0, -2.0
+    value, t = rows.value.copy(), (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9
+    for k, speed in enumerate(rows.value):
+        if abs(speed) >= 0.5:
+            held, since = speed, t[k]
+        value[k] = held if t[k] - since < 2.0 else 0.0
+    leg = replace(drive, wheels=(replace(rows, value=value),)).leg()
+    config = settings(drive, None)
+    method = smooth(leg_of(leg, config), config)
+    assert not said(method)
+    (extra,) = (r.text for r in method.reasons if r.code is Code.TRAVEL_EXCESS)
+    assert 'while it brakes to a stop' in extra
+    assert abs(method.estimates['scale_factor'].value - drive.truth.scale) < (
+        3.3 * method.estimates['scale_factor'].sigma)
 
 
 def low_passed(leg, seconds):

@@ -13,7 +13,7 @@ from odocal_ros.calib.evidence import KEPT_ROWS
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.mounting import FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
-from odocal_ros.calib.slip import missing_reasons, without_braking
+from odocal_ros.calib.slip import travel_reasons, unforced
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.equations import OUTSIDE
@@ -141,13 +141,13 @@ def _slips(leg: SmootherLeg, fit: Fit, near: JointMarginals, count: float, *,
         return (), []
     turned = along(fit, near)
     slips = find_slips(fit, turned, count)
-    # the shape of a filter is unknown: its residuals at changes of speed are no slip
-    level = '' if filtered else level_when_changing(fit, near, count)
     speed = np.einsum('ni,nij,j->n', fit.state.v_n, fit.state.C_nb, fit.state.forward)
-    missing = [s for s in slips if without_braking(s.t, s.duration, s.metres, fit.state.t, speed)]
-    slid = tuple(s for s in slips if s not in missing)
-    return slips, [*slip_reasons(slid, level), *missing_reasons(
-        np.array([s.t for s in missing]), np.array([s.metres for s in missing]))]
+    sign = np.array([unforced(s.t, s.duration, s.metres, fit.state.t, speed) for s in slips], int)
+    # the shape of a filter is unknown, and a late or held speed errs at changes of speed: no slip
+    level = '' if filtered or (sign > 0).any() else level_when_changing(fit, near, count)
+    slid = tuple(s for s, of in zip(slips, sign, strict=True) if not of)
+    return slips, [*slip_reasons(slid, level), *travel_reasons(
+        np.array([s.t for s in slips]), np.array([s.metres for s in slips]), sign)]
 
 
 def floored(covariance: Floats) -> Floats:
