@@ -10,7 +10,7 @@ subtracted: the residual of the axis, and the effect of gyro noise on the direct
 within an interval.
 
 A rate as small as the noise that is left is likely noise, too. A rate w of an interval counts as
-w / (1 + (3 sigma / w)^2), which leaves turns, banked curves and kerbs as they are.
+w / (1 + (10 sigma / w)^2), which leaves turns, banked curves and kerbs as they are.
 
 Sway and heave that odometer and attitude do not predict are road noise, which has levels of its
 own in the fit. They are subtracted as well.
@@ -36,7 +36,7 @@ from odocal_ros.nav.rotations import transpose, turn
 
 FORCES = 3      # definition: number of the first gyro signal that is a force
 # judgement, measured in decision 9: sigmas of the noise of an interval
-LIKELY_NOISE = 3.0
+LIKELY_NOISE = 10.0
 
 
 class Signals:
