@@ -63,7 +63,9 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
         if len(rows) >= fewest and np.ptp(way[rows]) > 0:
             # means of fixes: 24 of them, with little noise from fix to fix
             blocks = np.array_split(rows, min(len(rows), 24))
-            fits[i] = _stretched(*(np.array([x[b].mean() for b in blocks]) for x in (z, w)))
+            z_b, w_b = (np.array([x[b].mean() for b in blocks]) for x in (z, w))
+            if (z_b != z_b[0]).any():      # else the path stays where it is
+                fits[i] = _stretched(z_b, w_b)
     for i, found in zip(fits, _errors(list(fits.values()), float(np.median(sigma))),
                         strict=True):
         if found < 1.0:

@@ -136,6 +136,8 @@ def test_what_the_fixes_do_not_tell_is_nan_and_too_little_is_nothing():
     z = np.stack([way, 0 * way, 0 * way], -1)
     assert len(sections(way[:5], z[:5], z[:5], np.ones(5)).ratio) == 0
     assert len(sections(way[:0], z[:0], z[:0], np.ones(0)).ratio) == 0
+    with np.errstate(all='raise'):      # a path that stays where it is
+        assert np.isnan(sections(way, 0 * z, z, np.ones(20)).ratio).all()
     found = sections(way, z, z, np.full(20, 5e4))
     assert len(found.ratio) == 2
     assert np.isnan(found.ratio).all()
