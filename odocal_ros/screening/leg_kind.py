@@ -80,7 +80,8 @@ def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     if not why:
         return leg, ()
     up_i = matrix_from_rpy(config.imu.mounting_rpy).T[:, 2]
-    gravity_i = np.tile(up_i * G / max(config.imu.accel_scale, 1e-12), (len(leg.imu.f_i), 1))
+    scale = config.imu.accel_scale
+    gravity_i = np.tile(up_i * G / (scale if scale > 1e-12 else 1.0), (len(leg.imu.f_i), 1))
     return replace(leg, imu=replace(leg.imu, f_i=gravity_i)), (Reason(
         Code.NO_ACCELEROMETER, f'the IMU {why}. The scale is estimated from gyro, odometer and '
         'fixes on assumed level ground; yaw and pitch mounting need an accelerometer (yaw: or an '
