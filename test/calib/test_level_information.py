@@ -12,7 +12,7 @@ from smoother_legs import made
 from odocal_ros.calib.border import Border
 from odocal_ros.estimator.chain import solve
 from odocal_ros.estimator.equations import Equations
-from odocal_ros.estimator.factors import point_rows
+from odocal_ros.estimator.factors import point_rows, signals
 from odocal_ros.estimator.level_steps import prior_information
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.smoother import best_fit
@@ -32,6 +32,7 @@ def weighed():
     fit = best_fit(problem, config)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(point_rows, 'TAIL_SIGMAS', 1e3)   # weights would change with the levels
+        patch.setattr(signals, 'LIKELY_NOISE', 1e-3)    # and derivatives by small rates
         equations = Equations(problem, fit.state, fit.priors, fit.spread, True)
 
         def at(**by):
