@@ -85,7 +85,6 @@ def relay(args) -> None:
     """Publish a message of each type at ``--rate`` for what comes, without any odometry."""
     from geometry_msgs.msg import TwistWithCovarianceStamped
     from nav_msgs.msg import Odometry
-    import numpy as np
     import rclpy
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import Imu
@@ -95,8 +94,8 @@ def relay(args) -> None:
     from odocal_ros.live.odometry import LOOK_S, NumbersPublisher, SERVE_S
     rclpy.init()
     node = rclpy.create_node(args.role)
-    publishers = [(NumbersPublisher(node, f'{args.role}/{name}', kind()), np.zeros(size))
-                  for name, kind, size in (('odometry', Odometry, 91),
+    publishers = [(NumbersPublisher(node, f'{args.role}/{name}', kind()), bytes(8 * size))
+                  for name, kind, size in (('odometry', Odometry, 85),
                                            ('twist', TwistWithCovarianceStamped, 42))]
     qos = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
     due = 0.0

@@ -5,11 +5,10 @@
 
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Sequence
 import math
 
-import numpy as np
-
-from odocal_ros.data.arrays import Bools, Ints
+from odocal_ros.data.samples import Reading
 from odocal_ros.screening.imu_rhythm import APART
 from odocal_ros.screening.late_rows import LEAST_JITTER
 
@@ -73,12 +72,12 @@ class Arrivals:
         least = max(min(last) - self._usual_ns, self._usual_ns - max(last)) * 1e-9
         return abs(sum(last) / rows - self._usual_ns) * 1e-9 if least > MOVED_S else 0.0
 
-    def usable(self, stamp_ns: Ints, received_ns: Ints) -> Bools:
-        """Return a mask of rows of the next block with a usable stamp: (n,)."""
-        good = [False] * len(stamp_ns)
+    def usable(self, rows: Sequence[Reading]) -> list[Reading]:
+        """Return the rows of the next block with a usable stamp."""
+        good: list[Reading] = []
         self.jump_row = self.dropped = 0
-        for k, (stamp, received) in enumerate(zip(stamp_ns.tolist(), received_ns.tolist(),
-                                                  strict=True)):
+        for k, row in enumerate(rows):
+            stamp, received = row[:2]
             if not 0 < stamp < LATEST_NS:
                 self.dropped += 1
                 continue
@@ -91,16 +90,17 @@ class Arrivals:
                 self.off_s = (-behind if behind > ODD_NS else ahead) * 1e-9
                 self.jumped |= self._odd >= ODD_ROWS
             elif behind < 0:
-                good[k], self._odd, self._newest_ns = True, 0, stamp
+                self._odd, self._newest_ns = 0, stamp
+                good.append(row)
                 if self.lag_ns is None or ahead > 0:
                     self.lag_ns = lag
                 else:
                     self.lag_ns -= ahead / LAG_ROWS
-            self.dropped += not good[k] and behind != 0
+            self.dropped += behind > 0 or behind < 0 and self._odd > 0
             if not self._odd:
                 self._follow(lag)
-        self._take_rate(int(received_ns[-1]) if len(received_ns) else 0)
-        return np.array(good, bool)
+        self._take_rate(rows[-1][1] if rows else 0)
+        return good
 
     def _follow(self, lag: int) -> None:
         """Update the median lag by a lag, ns; it changes slowly, as two clocks drift."""

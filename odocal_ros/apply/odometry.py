@@ -19,7 +19,13 @@ from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
 from odocal_ros.data.leg import COUNTER
-from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
+from odocal_ros.data.samples import (
+    ImuSamples,
+    OdometerForm,
+    OdometerSamples,
+    Reading,
+    readings_of,
+)
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import CLOCK_APART
 from odocal_ros.settings.node_configs import ApplyConfig
@@ -75,27 +81,26 @@ class Odometry:
         self._arrivals: dict[str, Arrivals] = {}
         self._path: Reckoning | None = None
 
-    def feed(self, slot: str, block: ImuSamples | OdometerSamples,
+    def feed(self, slot: str, block: ImuSamples | OdometerSamples | list[Reading],
              form: OdometerForm | None = None) -> None:
-        """Add a block of 'imu', 'odometer' or 'odometer_right'; the latter two have a form."""
+        """Add rows of 'imu', 'odometer' or 'odometer_right'; the latter two have a form."""
         if slot not in self._arrivals:
             self._arrivals[slot] = Arrivals()
         arrivals = self._arrivals[slot]
-        usable = arrivals.usable(block.stamp_ns, block.received_ns)
+        rows = block if isinstance(block, list) else readings_of(block)
+        usable = arrivals.usable(rows)
         if arrivals.jumped:
             self.restart(f'the {slot} stamps jump by {arrivals.off_s:+.3g} s')
-            block = take(block, slice(arrivals.jump_row, None))
+            rows = rows[arrivals.jump_row:]
             arrivals = self._arrivals[slot] = Arrivals()
-            usable = arrivals.usable(block.stamp_ns, block.received_ns)
+            usable = arrivals.usable(rows)
         if arrivals.dropped:
             self._notes.append(f'{slot}: {arrivals.dropped} messages dropped: their stamps differ '
                               f'from their arrival times by {arrivals.off_s:+.3g} s')
-        if not usable.all():
-            block = take(block, usable)
-        if isinstance(block, OdometerSamples):
-            self.wheels.feed(slot, block, form or COUNTER)
+        if slot == 'imu':
+            self.imu.feed(usable)
         else:
-            self.imu.feed(block)
+            self.wheels.feed(slot, usable, form or COUNTER)
         self.wheels.zero_ns = self.imu.zero_ns
 
     def lacking_s(self) -> float:

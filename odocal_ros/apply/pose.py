@@ -6,6 +6,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
+import struct
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import SWAY
 
-# definition: number of floats of a pose; indices of the variances of both covariances
-NUMBERS, VARIANCES = 85, np.r_[7:43:7, 49:85:7]
+# format: floats of nav_msgs/Odometry; of them before each covariance
+NUMBERS, PLACE, MOTION = struct.Struct('<85d'), struct.Struct('<7d'), struct.Struct('<6d')
+TWIST = 43 * 8         # format: byte of the twist
 NONE = (0.0,) * 6      # definition
 
 
@@ -25,12 +27,16 @@ class Pose:
     """
     Pose of the vehicle, and mean motion since the previous pose.
 
-    stamp_ns : of the IMU.   numbers : (85,) floats of a nav_msgs/Odometry in order; the last 42
-    are those of the twist.
+    stamp_ns : of the IMU.   raw : 85 floats of a nav_msgs/Odometry in order, as in a message.
     """
 
     stamp_ns: int
-    numbers: Floats
+    raw: bytes
+
+    @property
+    def numbers(self) -> Floats:
+        """Return the floats: (85,)."""
+        return np.frombuffer(self.raw)
 
     @property
     def position(self) -> Floats:
@@ -64,23 +70,21 @@ class Pose:
 
     def is_valid(self) -> bool:
         """Return True if all values are finite and no variance is negative."""
-        return math.isfinite(self.numbers.dot(self.numbers)) and (
-            min(self.numbers[VARIANCES].tolist()) >= 0)
+        values = NUMBERS.unpack(self.raw)
+        return math.isfinite(sum(values)) and min(values[7:43:7] + values[49::7]) >= 0
 
 
-def numbers_of(position: Vector, q: Quaternion, twist: Sequence[float],
-               covariances: Floats) -> Floats:
-    """Return the numbers of a pose: m, x y z w, 6 m/s, rad/s, (2, 36)."""
-    numbers = np.empty(NUMBERS)
-    numbers[:7], numbers[43:49] = (*position, *q), twist
-    numbers[1:].reshape(2, 42)[:, 6:] = covariances
-    return numbers
+def raw_of(position: Vector, q: Quaternion, twist: Sequence[float],
+           covariances: Sequence[bytes]) -> bytes:
+    """Return the floats of a pose as in a message: m, x y z w, 6 m/s, rad/s, two covariances."""
+    of_pose, of_twist = covariances
+    return PLACE.pack(*position, *q) + of_pose + MOTION.pack(*twist) + of_twist
 
 
 def covariances(by_errors: Floats, late: Sequence[float], along_n: Sequence[float],
-                swing: Sequence[float], variances: Sequence[float]) -> Floats:
+                swing: Sequence[float], variances: Sequence[float]) -> list[bytes]:
     """
-    Return the covariances of pose and twist: (2, 36).
+    Return the covariances of pose and twist, (6, 6) each, as in a message.
 
     by_errors : (2, 6, 6), by the error state.   late : (6,) effect of one sigma of the delay on
     the pose.   along_n : (3,) m, one sigma of the travel.   swing : (6,) effect of one sigma of
@@ -89,8 +93,7 @@ def covariances(by_errors: Floats, late: Sequence[float], along_n: Sequence[floa
     x, y, z = map(math.sqrt, variances)
     off = np.array([[late, (*along_n, *NONE[3:]), NONE, NONE],
                     [swing, (x, *NONE[1:]), (0.0, y, *NONE[2:]), (0.0, 0.0, z, *NONE[3:])]])
-    covs: Floats = by_errors + off.swapaxes(1, 2) @ off
-    return covs.reshape(2, 36)
+    return [cov.tobytes() for cov in by_errors + off.swapaxes(1, 2) @ off]
 
 
 def velocity_variances(vehicle: Vehicle, speed: float, T: float, travel: float) -> Vector:

@@ -32,7 +32,7 @@ from odocal_ros.apply.attitude import (
 )
 from odocal_ros.apply.delay import DelaySearch
 from odocal_ros.apply.errors import BA, BG, DRIVING_FORCE, GRAVITY, PHI
-from odocal_ros.apply.pose import covariances, numbers_of, Pose, velocity_variances
+from odocal_ros.apply.pose import covariances, Pose, raw_of, velocity_variances
 from odocal_ros.apply.start import Start
 from odocal_ros.apply.stream import HOLE_INTERVALS, ImuStream, INTERVAL_ROWS
 from odocal_ros.apply.vehicle import Vehicle
@@ -275,14 +275,14 @@ class Reckoning:
             self._T_cov, self._covariances = T, self._uncertainty(T, speed, arm_n, rate_b, swing)
         self._t_pose, self._s_pose = self._t, self._s
         self._turn_b, self._travel_variance = ZERO, 0.0
-        return Pose(self.imu.rows[self.imu.at].stamp_ns, numbers_of(
+        return Pose(self.imu.rows[self.imu.at].stamp_ns, raw_of(
             plus(plus(self.position, arm_n), self._arm0_n, -1.0), product(self.q, self._q_bv),
             (swing[0] + speed, *swing[1:]), self._covariances))
 
     def _uncertainty(self, T: float, speed: float, arm_n: Vector, rate_b: Vector,
-                     swing: Sequence[float]) -> Floats:
+                     swing: Sequence[float]) -> list[bytes]:
         """
-        Return the covariances of pose and twist after T s: (2, 36).
+        Return the covariances of pose and twist after T s, as in a message.
 
         speed : m/s.   arm_n : m.   rate_b : rad/s.   swing : (6,) m/s and rad/s, twist by the turn
         rate.   A delay of the odometer changes the position by delay times the change of velocity

@@ -4,6 +4,7 @@
 """The IMU rows of a stream that dead reckoning still needs."""
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from itertools import pairwise
 
 from odocal_ros.apply.attitude import rotated
@@ -16,7 +17,7 @@ from odocal_ros.apply.spikes import (
     SpikeScreen,
     time_of,
 )
-from odocal_ros.data.samples import ImuSamples
+from odocal_ros.data.samples import Reading
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.settings.node_configs import ApplyConfig
 
@@ -46,11 +47,10 @@ class ImuStream:
         self.usual = 0.0
         self._unmeasured = 0        # rows since ``usual`` was measured
 
-    def feed(self, block: ImuSamples) -> None:
+    def feed(self, readings: Sequence[Reading]) -> None:
         """Add rows with rising stamps; possible spikes are held until the next call."""
         rows, before = self._held, len(self._held)
-        for stamp, w_i, f_i in zip(block.stamp_ns.tolist(), block.w_i.tolist(),
-                                   block.f_i.tolist(), strict=True):
+        for stamp, _, w_i, f_i, *_ in readings:
             w_b, f_b = rotated(self._gyro, w_i), rotated(self._accel, f_i)
             if not any(f_i) or sum(f_b) != sum(f_b):
                 f_b = MISSING
@@ -58,7 +58,7 @@ class ImuStream:
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns
                 rows.append(Row((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
-        self._say_dropped(before + len(block.stamp_ns) - len(rows),
+        self._say_dropped(before + len(readings) - len(rows),
                           'hold NaN or impossible values')
         kept, self._held = self._screen.sift(rows)
         self._say_dropped(len(rows) - len(kept) - len(self._held),

@@ -3,17 +3,18 @@
 
 """Travel of a vehicle by the counter of one wheel or of two."""
 
+from collections.abc import Sequence
 import math
 
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheel import Wheel
-from odocal_ros.data.samples import OdometerForm, OdometerSamples
+from odocal_ros.data.samples import OdometerForm, Reading
 from odocal_ros.nav.standstill import REST_TRAVEL
 from odocal_ros.settings.node_configs import ApplyConfig
 
 STILL_COUNTS = 1.5    # physical: largest number of counts of a wheel at rest
 SIDES = ('odometer', 'odometer_right')
-Rows = tuple[str, OdometerSamples, OdometerForm]
+Rows = tuple[str, Sequence[Reading], OdometerForm]
 
 
 class Wheels:
@@ -33,24 +34,24 @@ class Wheels:
         self.zero_ns = 0
         self.quantum = 0.0                   # m, size of a count of the travel
 
-    def feed(self, slot: str, block: OdometerSamples, form: OdometerForm) -> None:
+    def feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm) -> None:
         """Add rows of a slot."""
-        self._waiting.append((slot, block, form))
+        self._waiting.append((slot, rows, form))
         if not self.zero_ns:
             self._waiting = self._waiting[-100:]
             return
-        for slot, block, form in self._waiting:
-            self._feed(slot, block, form)
+        for slot, rows, form in self._waiting:
+            self._feed(slot, rows, form)
         self._waiting = []
 
-    def _feed(self, slot: str, block: OdometerSamples, form: OdometerForm) -> None:
+    def _feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm) -> None:
         if slot not in self._wheels:
             self._wheels[slot] = Wheel(form, self._vehicle.scale, self._reversed)
             self._scale(form)
         wheel = self._wheels[slot]
         since_ns = self._offset_ns - self.zero_ns
-        wheel.feed([(stamp + since_ns) * 1e-9 for stamp in block.stamp_ns.tolist()],
-                   block.value.tolist())
+        wheel.feed([(stamp + since_ns) * 1e-9 for stamp, *_ in rows],
+                   [value for _, _, value in rows])
         self._notes += wheel.notes
         wheel.notes.clear()
         self.quantum = math.hypot(*(w.quantum for w in self._wheels.values())) / len(self._wheels)

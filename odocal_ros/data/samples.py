@@ -21,6 +21,8 @@ from odocal_ros.data.arrays import Bools, Floats, Ints, Values
 from odocal_ros.errors import BadData
 
 Stamps = Ints
+# a row in plain numbers: stamp and arrival, ns, then the values in the order of the columns
+Reading = tuple[Any, ...]
 FRAME_BYTES = 48     # judgement: of a frame_id in texts
 # format: status of a position in a local frame; that of a NavSatFix is an int8
 LOCAL = 1000
@@ -170,6 +172,11 @@ def join(blocks: Iterable[SomeSamples]) -> SomeSamples:
 def columns_of(samples: Samples) -> list[NDArray[Any]]:
     """Return the columns of samples, in the order of their fields."""
     return list(vars(samples).values())
+
+
+def readings_of(samples: Samples) -> list[Reading]:
+    """Return the rows in plain numbers, each vector as a list."""
+    return list(zip(*(column.tolist() for column in columns_of(samples)), strict=True))
 
 
 def of_columns(kind: type[SomeSamples], *columns: NDArray[Any]) -> SomeSamples:

@@ -7,10 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
 
-import numpy as np
-
-from odocal_ros.data.arrays import Bools
-from odocal_ros.data.samples import FixSamples, Samples
+from odocal_ros.data.arrays import Ints
 from odocal_ros.settings.levels import TIME_ANEW_NS, TIME_ANEW_ROWS
 
 # judgement: time span and number of blocks of a rate; silence of a lost topic
@@ -58,27 +55,25 @@ class Health:
         if numbers:
             self._last_sequence = numbers[-1]
 
-    def decoded(self, block: Samples, max_gap_s: float | None = None) -> Bools:
+    def decoded(self, stamps: list[int], received_ns: Sequence[int] | Ints,
+                max_gap_s: float | None = None) -> list[bool]:
         """
-        Process the stamps of a block; a gap is a step beyond the limit (or 5 intervals).
+        Process the stamps of some rows, ns; a gap is a step beyond the limit (or 5 intervals).
 
         Returns a mask of rows with a plausible stamp: not zero, not far ahead or behind.
         """
-        stamps = block.stamp_ns.tolist()
         self.count += len(stamps)
-        if isinstance(block, FixSamples) and len(block.status):
-            self.fix_status = int(block.status[-1])
         self.stampless = bool(stamps) and max(stamps) <= 0
         sound = self._not_ahead(stamps)
         rows = [row for row, plausible in enumerate(sound) if plausible]
         if rows:
             newest = self.newest_ns
             self._take([stamps[row] for row in rows], max_gap_s)
-            self.delay_s = (int(block.received_ns[rows[-1]]) - stamps[rows[-1]]) * 1e-9
+            self.delay_s = (int(received_ns[rows[-1]]) - stamps[rows[-1]]) * 1e-9
             for row in rows:
                 newest = max(newest, stamps[row])
                 sound[row] = stamps[row] >= newest - TIME_ANEW_NS
-        return np.array(sound, bool)
+        return sound
 
     def _not_ahead(self, stamps: list[int]) -> list[bool]:
         """Return a mask of stamps that exist and are not far ahead of the last one."""

@@ -19,9 +19,8 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from odocal_ros.apply.odometry import Odometry, RESTARTS
-from odocal_ros.apply.pose import Pose
+from odocal_ros.apply.pose import Pose, TWIST
 from odocal_ros.apply.vehicle import vehicle_of
-from odocal_ros.data.arrays import Floats
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
@@ -38,7 +37,6 @@ from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 # judgement, all in s: period of checks for a due pose (its largest delay), of the executor (which
 # costs most CPU), and of computations while odometer data are missing
 LOOK_S, SERVE_S, SILENT_S = 0.02, 0.2, 0.2
-TWIST_NUMBERS = 42              # format: floats of a twist with its covariance
 SAID_AGAIN_NS = 10 * 10**9      # judgement: between two log lines of one kind
 HELP = """\
 usage: odometry --ros-args --params-file CALIBRATION.yaml [-p NAME:=VALUE] [-r FROM:=TO] ...
@@ -71,9 +69,8 @@ class NumbersPublisher:
             type(message), topic, 10,
             event_callbacks=PublisherEventCallbacks(use_default_callbacks=False))
 
-    def send(self, stamp_ns: int, numbers: Floats) -> None:
-        """Publish with a stamp, ns, and all its floats in order: (n,)."""
-        values = numbers.tobytes()
+    def send(self, stamp_ns: int, values: bytes) -> None:
+        """Publish with a stamp, ns, and all its floats in order."""
         stamp = struct.pack('<iI', *divmod(stamp_ns, 10**9))
         self._publisher.publish(self._raw[:4] + stamp + self._raw[12:-len(values)] + values)
 
@@ -182,10 +179,10 @@ class OdometryNode(SettledNode):
         raws, sent_ns = source.take()
         if not raws:
             return
-        for slot, block in source.decode(raws, sent_ns, None):
+        for slot, rows in source.readings(raws, sent_ns):
             if slot == 'imu_other':
                 continue
-            self._odometry.feed(slot, block, source.reader.form if source.reader else None)
+            self._odometry.feed(slot, rows, source.reader.form if source.reader else None)
         if source.health.jumped_back:
             source.health.forget()
 
@@ -217,8 +214,8 @@ class OdometryNode(SettledNode):
             self._silent_ns = now_ns + self._pause_ns
 
     def _publish(self, pose: Pose) -> None:
-        self._twist.send(pose.stamp_ns, pose.numbers[-TWIST_NUMBERS:])
-        self._pose.send(pose.stamp_ns, pose.numbers)
+        self._twist.send(pose.stamp_ns, pose.raw[TWIST:])
+        self._pose.send(pose.stamp_ns, pose.raw)
         if self._tf is not None:
             self._tf(transform_of(pose, self.config.frames))
 

@@ -18,6 +18,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from odocal_ros.data.inputs import INPUTS, OUTSIDE
+from odocal_ros.data.samples import FixSamples, Reading
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.live.health import Health
 from odocal_ros.live.journal_writer import ALWAYS_NS
@@ -30,6 +31,7 @@ from odocal_ros.outside.names import one_line, said_by
 from odocal_ros.settings.config import Config
 
 MOST_TOPICS_MEANT, NAME_SIMILARITY = 2, 0.4      # judgement: suggestions; of difflib, 1: equal
+HEALTH_ROWS = 20       # judgement: readings per update of the health
 STATIC_DEPTH = 100     # judgement: publishers of static transforms
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
 
@@ -82,6 +84,7 @@ class Input:
         self.publishers: list[TopicEndpointInfo] = []
         self.meant: list[str] = []     # suggested topics if this one has no publisher
         self._failed = 0
+        self._unseen: list[Reading] = []     # stamps and arrivals not yet in ``health``
         self._frame_id = ''
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
@@ -97,6 +100,7 @@ class Input:
     def look(self) -> None:
         """Update clock and publishers, and without any the suggested topics."""
         self.waiting.follow_clock()
+        self._see()
         self.publishers = self._node.get_publishers_info_by_topic(self.topic)
         self.meant = [] if self.publishers else self._same()
 
@@ -183,11 +187,39 @@ class Input:
     def decode(self, raws: list[bytes], received_ns: list[int],
                max_gap_s: float | None) -> list[tuple[str, Any]]:
         """Return (slot, block) pairs of messages; unreadable messages are counted."""
+        pairs = self._read('rows', raws, received_ns)
+        for slot, block in pairs:
+            if slot == self.slot:
+                self.sound = np.array(self.health.decoded(
+                    block.stamp_ns.tolist(), block.received_ns, max_gap_s), bool)
+                if isinstance(block, FixSamples) and len(block.status):
+                    self.health.fix_status = int(block.status[-1])
+        return pairs
+
+    def readings(self, raws: list[bytes],
+                 received_ns: list[int]) -> list[tuple[str, list[Reading]]]:
+        """Return (slot, rows in plain numbers) pairs of a few messages, as ``decode``."""
+        pairs = self._read('readings', raws, received_ns)
+        for slot, rows in pairs:
+            self._unseen += [row[:2] for row in rows] if slot == self.slot else []
+        if len(self._unseen) > HEALTH_ROWS:
+            self._see()
+        return pairs
+
+    def _see(self) -> None:
+        """Update the health by the readings since the last time."""
+        if self._unseen:
+            stamps, received = zip(*self._unseen, strict=True)
+            self.health.decoded(list(stamps), received)
+            self._unseen = []
+
+    def _read(self, how: str, raws: list[bytes], received_ns: list[int]) -> list[tuple[str, Any]]:
+        """Return (slot, rows) pairs of messages by a function of the reader."""
         reader, deserialize = self.reader, self._deserialize
         if reader is None or deserialize is None:
             return []
         try:
-            pairs = reader.rows(raws, received_ns, deserialize)
+            pairs: list[tuple[str, Any]] = getattr(reader, how)(raws, received_ns, deserialize)
             if self.slot == 'imu':
                 self.frame = reader.frame or self.frame or deserialize(raws[0]).header.frame_id
         except Exception as error:  # no message may stop the node
@@ -197,9 +229,6 @@ class Input:
         self.health.unusable = self._failed + reader.unreadable
         if not pairs and reader.trouble:
             self.trouble = f'{self.topic}: {reader.trouble}'
-        for slot, block in pairs:
-            if slot == self.slot:
-                self.sound = self.health.decoded(block, max_gap_s)
         return pairs
 
     @property

@@ -8,8 +8,9 @@ Messages whose variable parts (strings, lists) have the same lengths have their 
 same offsets: one message determines the layout for all of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 import re
 import struct
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32': '<i4',
          'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8', 'float32': '<f4', 'float64': '<f8'}
+UNPACKED = {'l': 'q', 'L': 'q'}      # format: of struct, where numpy's differ; uint64 as int64
 INDEXED = re.compile(r'(.+)\[(\d+)\]')
 
 
@@ -76,6 +78,9 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
     'std_msgs/msg/Int64MultiArray': (*_LAYOUT, 'int64[] data'),
 } | {f'std_msgs/msg/{name}': (f'{name.lower()} data',) for name in (
     'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')}
+
+
+Unpacker = Callable[[bytes], tuple[Any, ...]]
 
 
 class Run(NamedTuple):
@@ -150,6 +155,14 @@ class Layout:
             'names': [str(k) for k in range(len(one))], 'itemsize': self.size,
             'formats': [(run.dtype, (run.width,)) for run in one],
             'offsets': [run.place.start for run in one]})
+
+    def unpackers(self, columns: Sequence[Sequence[str] | None]) -> list[Unpacker]:
+        """Return functions for the values at some paths each, as ``record``; [] for its None."""
+        record = self.record(columns)
+        fields = (record.fields or {}).values() if record is not None else ()
+        return [partial(struct.Struct(
+            f'<{kind.shape[0]}{UNPACKED.get(kind.base.char, kind.base.char)}').unpack_from,
+            offset=offset) for kind, offset, *_ in fields]
 
     def fits(self, raw: bytes) -> bool:
         """Return True if a message has this layout."""

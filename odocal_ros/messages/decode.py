@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.inputs import WHEELS
-from odocal_ros.data.samples import OdometerForm, Samples
+from odocal_ros.data.samples import OdometerForm, Reading, readings_of, Samples
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
 from odocal_ros.messages.fields import MessageView, View
@@ -60,6 +60,7 @@ class Reader:
         self._plan = plan
         self._layout: cdr.Layout | None = None      # the last one of a few messages
         self._record: np.dtype[Any] | None = None      # type with which they are read
+        self._unpackers: list[cdr.Unpacker] = []       # the same for plain numbers
 
     @property
     def form(self) -> OdometerForm | None:
@@ -97,6 +98,21 @@ class Reader:
                 received_ns = np.asarray(received_ns, np.int64)[keep]
         found = self._rows(raws, received_ns, deserialize)
         return found if other is None else [*found, ('imu_other', other)]
+
+    def readings(self, raws: Sequence[bytes], received_ns: Sequence[int],
+                 deserialize: Deserialize) -> list[tuple[str, list[Reading]]]:
+        """
+        Decode messages as ``rows``, to plain numbers: a few take a fraction of the time.
+
+        A reading has stamp and arrival, ns, then the first columns of the samples.
+        """
+        fits = self._layout.fits if self._layout and self._unpackers else None
+        if fits and all(map(fits, raws)) and (
+                self.frames is None or all(map(self.frames.is_used, raws))):
+            return self._plan.readings(received_ns, [
+                [unpack(raw) for unpack in self._unpackers] for raw in raws])
+        return [(slot, readings_of(block))
+                for slot, block in self.rows(raws, received_ns, deserialize)]
 
     def _rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
               deserialize: Deserialize) -> Pairs:
@@ -139,7 +155,9 @@ class Reader:
         columns = self._plan.columns
         if layout is not self._layout:
             self._layout = layout
-            self._record = layout.record([column.pick(layout) for column in columns])
+            paths = [column.pick(layout) for column in columns]
+            self._record, self._unpackers = layout.record(paths), (
+                layout.unpackers(paths) if self._plan.plain else [])
         if self._record is None:
             return []
         table = np.frombuffer(b''.join([raw[:layout.size] for raw in raws]), self._record)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.inputs import WHEELS
-from odocal_ros.data.samples import OdometerForm, OdometerSamples, of_columns, Samples
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, of_columns, Reading, Samples
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
 from odocal_ros.messages.fields import Column, MessageView, parts, STAMP, stamp_ns, View
@@ -44,6 +44,8 @@ class OdometerPlan:
     joints are wheels? is a field of an unknown type a whole number?); ``ready`` is called with
     messages in order until it returns True.
     """
+
+    plain = True         # readings can be made
 
     def __init__(self, slot: str, msgtype: str, config: Config) -> None:
         self.slot, self.msgtype, self.odometer = slot, msgtype, config.odometer
@@ -205,6 +207,16 @@ class OdometerPlan:
         wanted = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
         names = f'; names: {", ".join(view.names)}' if view.names else ''
         return f'no {wanted} in a {self.msgtype}{names}'
+
+    def readings(self, received_ns: Sequence[int], values: list[Any]
+                 ) -> list[tuple[str, list[Reading]]]:
+        """Return (slot, rows in plain numbers) from the values of each message."""
+        first = 2 * self.stamped
+        slots = WHEELS[:len(self.keys)] if len(self.keys) > 1 else (self.slot,)
+        return [(slot, [
+            (row[0][0] * 10**9 + row[1][0] if first else received, received, row[wheel][0])
+            for received, row in zip(received_ns, values, strict=True)])
+            for wheel, slot in enumerate(slots, first)]
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:
         """Return (slot, block) pairs."""

@@ -140,6 +140,7 @@ class FrameFilter:
         self.frame = wanted
         self.other = ''         # the last frame that was not used
         self._settled = bool(wanted)
+        self._begin = self._beginning()
         self._msgtype = msgtype
         self._seen: dict[str, int] = {}
 
@@ -169,6 +170,13 @@ class FrameFilter:
         return keep, OtherImuSamples(np.array(stamps), received, np.array(other),
                                      np.full(len(other), self.frame.encode()[:FRAME_BYTES]))
 
+    def is_used(self, raw: bytes) -> bool:
+        """Return True if the frame is determined and that of a message."""
+        return self._settled and self._has_frame(raw)
+
+    def _has_frame(self, raw: bytes) -> bool:
+        return raw[:2] + raw[TEXT_AT:TEXT_AT + len(self._begin) - 2] == self._begin
+
     def _count(self, frame: str | None) -> None:
         """Count the frame of one of the first messages."""
         if frame is None:
@@ -176,16 +184,20 @@ class FrameFilter:
         self._seen[frame] = self._seen.get(frame, 0) + 1
         if self._seen[frame] >= SETTLED:
             self.frame, self._settled = frame, True
+            self._begin = self._beginning()
+
+    def _beginning(self) -> bytes:
+        """Return the first bytes of a message (CDR, little endian), and its frame_id."""
+        text = self.frame.encode() + b'\0'
+        return b'\0\1' + struct.pack('<I', len(text)) + text
 
     def _with_frame(self, raws: Sequence[bytes]) -> Bools:
         """Return a mask of messages with the frame at its place in CDR, little endian."""
-        text = self.frame.encode() + b'\0'
-        pattern = b'\0\1' + struct.pack('<I', len(text)) + text
-        end = TEXT_AT + len(pattern) - 2
         if len(raws) <= FEW_ROWS:
-            return np.array([raw[:2] + raw[TEXT_AT:end] == pattern for raw in raws], bool)
+            return np.array([self._has_frame(raw) for raw in raws], bool)
+        pattern = self._begin
         packed = Raws.of(raws)
-        at = np.concatenate([[0, 1], np.arange(TEXT_AT, end)])
+        at = np.concatenate([[0, 1], np.arange(TEXT_AT, TEXT_AT + len(pattern) - 2)])
         alike: Bools = packed.size > at[-1]
         data, shown = (np.frombuffer(x, np.uint8) for x in (packed.data, pattern))
         alike[alike] = (data[packed.start[alike][:, None] + at] == shown).all(axis=1)

@@ -177,7 +177,9 @@ def received(drive, rows, config):
                 continue
             pairs = reader.rows([d for _, d in part], [t for t, _ in part], _no_other)
             for slot, block in pairs:
-                sound = health[kind].decoded(block) if slot == reader.slot else None
+                sound = np.array(health[kind].decoded(
+                    block.stamp_ns.tolist(), block.received_ns), bool) if (
+                    slot == reader.slot) else None
                 recorder.feed(slot, block)
                 if sound is None:
                     continue

@@ -206,7 +206,8 @@ def test_tf_without_its_message_says_what_to_install():
 
 
 def test_the_transform_is_the_pose():
-    pose = Pose(1_234_567_890_123, np.array([1.0, -2.0, 0.5, 0.1, 0.2, 0.3, 0.9, *[0.0] * 78]))
+    numbers = np.array([1.0, -2.0, 0.5, 0.1, 0.2, 0.3, 0.9, *[0.0] * 78])
+    pose = Pose(1_234_567_890_123, numbers.tobytes())
     out = transform_of(pose, OdomFrames(base='car', odom='map'))
     assert (out.header.stamp.sec, out.header.stamp.nanosec) == (1234, 567_890_123)
     assert (out.header.frame_id, out.child_frame_id) == ('map', 'car')

@@ -14,6 +14,7 @@ import ros_messages as make
 
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.samples import readings_of
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import make_reader
@@ -394,6 +395,53 @@ def test_any_chopping_gives_the_rows_of_single_messages(which, monkeypatch, data
     with monkeypatch.context() as patch:
         patch.setattr(cdr, 'layout_of', lambda msgtype, raw: None)
         assert rows(range(len(raws) + 1)) == blocks
+
+
+@pytest.mark.parametrize('which', [name for name in MESSAGES if name[0] in 'io'])
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_readings_are_the_rows_in_plain_numbers(which, data):
+    messages, changes = MESSAGES[which]
+    stream = data.draw(st.lists(messages, min_size=1, max_size=20))
+    raws = [make.cdr(m, data.draw(st.sampled_from([True, True, True, False]))) for m in stream]
+    slot, msgtype = which.split()[0], stream[0].__msgtype__
+
+    def read(how):
+        reader, found = make_reader(slot, msgtype, with_settings(Config(), changes)), {}
+        for k, raw in enumerate(raws):
+            for own, rows in getattr(reader, how)([raw], [k], make.deserializer(msgtype)):
+                rows = rows if how == 'readings' else readings_of(rows)
+                found.setdefault(own, []).extend(
+                    repr([list(v) if isinstance(v, tuple) else v for v in row[:4]])
+                    for row in rows)
+        return found, reader.unreadable
+
+    assert read('readings') == read('rows')
+
+
+def test_readings_of_an_imu_without_force_have_none():
+    message = make.imu(7, f=(4, 5, 6))
+    message.linear_acceleration_covariance = np.array([-1.0] + [0.0] * 8)
+    reader = make_reader('imu', message.__msgtype__, Config())
+    for _ in range(5):
+        (_, ((*_, f_i),)), = [(slot, [row[:4] for row in rows]) for slot, rows in reader.readings(
+            [make.cdr(message)], [1], None)]
+        assert np.isnan(f_i).all()
+
+
+def test_alike_messages_are_read_without_arrays(monkeypatch):
+    """The property above would hold if readings were always made of rows."""
+    for slot, message, row in (
+            ('imu', make.imu(7, w=(1, 2, 3), f=(4, 5, 6)), (7, 1, (1, 2, 3), (4, 5, 6))),
+            ('odometer', make.whole(3), (1, 1, 3)),
+            ('odometer', make.joints(7, ['l', 'r'], [5, 6]), (7, 1, 5))):
+        raw = make.cdr(message)
+        reader = make_reader(slot, message.__msgtype__, Config())
+        for _ in range(3):      # these determine frame and wheels
+            reader.rows([raw], [0], None)
+        with monkeypatch.context() as patch:
+            patch.setattr(reader, 'rows', None)
+            assert reader.readings([raw], [1], None)[0][1] == [row]
 
 
 def test_a_layout_is_remembered_for_messages_that_have_it():
