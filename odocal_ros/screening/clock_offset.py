@@ -67,6 +67,8 @@ def _offsets(inputs: Inputs, placed: Placed) -> Iterator[tuple[str, float]]:
     if not inputs.has_accelerometer or min(len(t), len(travel.t), len(t_fix)) < 2:
         return
     edges = np.arange(min(t[0], travel.t[0]), max(t[-1], travel.t[-1]), OFFSET_CELL)
+    if len(edges) < 3:      # no change of speed between two cells
+        return
     count, (force,) = bin_means(t, edges, inputs.f_b)
     force[count == 0] = inputs.usual_f_b
     way = np.diff(travel.at(edges))

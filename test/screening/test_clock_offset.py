@@ -9,6 +9,7 @@ from drives import drive, everything_said, settings
 import numpy as np
 import pytest
 
+from odocal_ros.data.samples import take
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening import clock_offset
@@ -56,6 +57,14 @@ def test_clocks_that_are_seconds_apart_are_aligned(made, alone, slot, by, arriva
 
 def test_clocks_that_agree_stay_as_they_are(made, alone):
     assert Code.DELAY_SEEN not in everything_said(alone)
+
+
+@pytest.mark.parametrize('seconds', [0.1, 0.4, 0.6])
+def test_a_leg_shorter_than_a_change_of_speed_is_not_aligned(made, seconds):
+    leg, end_ns = made.leg(), made.leg().imu.stamp_ns[0] + round(seconds * 1e9)
+    short = leg.with_rows(**{slot: take(leg.rows(slot), leg.rows(slot).stamp_ns < end_ns)
+                             for slot in ('imu', 'odometer')})
+    assert Code.DELAY_SEEN not in everything_said(calibrate(short, settings(made)))
 
 
 def test_nothing_is_aligned_without_accelerations():
