@@ -57,17 +57,18 @@ class Odometry:
 
     def apart(self) -> float:
         """Return the lead of the odometer's clock over the IMU's, s, 0 if it may be a delay."""
-        # a bag that is played fast has a coarser time of arrival
-        fast = max((one.rate for one in self._arrivals.values()), default=1.0)
         ahead = self._ahead()
-        return ahead if abs(ahead) > CLOCK_APART * fast else 0.0
+        # a bag that is played fast has a coarser time of arrival
+        return ahead if abs(ahead) > CLOCK_APART and abs(ahead) > CLOCK_APART * max(
+            one.rate for one in self._arrivals.values()) else 0.0
 
     def _ahead(self) -> float:
         """Return the lead of the odometer's stamps over the IMU's, s, 0 if unknown."""
-        lags = {slot: one.lag_ns for slot, one in self._arrivals.items() if one.lag_ns is not None}
-        imu_ns = lags.pop('imu', None)
-        ahead = [imu_ns - lag for lag in lags.values()] if imu_ns is not None else []
-        return max(ahead, key=abs, default=0.0) * 1e-9
+        imu = self._arrivals.get('imu')
+        if imu is None or imu.lag_ns is None:
+            return 0.0
+        return max((imu.lag_ns - one.lag_ns for one in self._arrivals.values()
+                    if one.lag_ns is not None), key=abs) * 1e-9
 
     def restart(self, why: str) -> None:
         """Restart at the origin, with a note of the cause."""
@@ -121,9 +122,9 @@ class Odometry:
         if self._path is None:
             self.imu.forget(ODOMETER_SILENCE)
             return []
-        moved = (max(one.moved_s(rows) for one in self._arrivals.values())
-                 for rows in (MOVED_ROWS, STAYS_ROWS))
-        out = self._path.poses(*moved)
+        moved = max(one.moved_s(MOVED_ROWS) for one in self._arrivals.values())
+        stays = max(one.moved_s(STAYS_ROWS) for one in self._arrivals.values()) if moved else 0.0
+        out = self._path.poses(moved, stays)
         if self._path.failed:
             self.restart(self._path.failed)
         return out
