@@ -195,11 +195,16 @@ def is_single(rows: Sequence[Row]) -> bool:
     """
     if len(rows) < SINGLE_ROWS:
         return False
-    values = [(*row.w_b, *row.f_b) for row in rows[-3:]]
+    before, row, after = rows[-3:]
+    leaves = 1 - EQUAL_NEIGHBOURS / 2      # least step to an outlier, in distances to the mean
+    if not (_largest(before.w_b, row.w_b) > leaves * SINGLE_TURN
+            or _largest(before.f_b, row.f_b) > leaves * SINGLE_FORCE):
+        return False
+    values = [(*one.w_b, *one.f_b) for one in (before, row, after)]
     for k, (a, b, c, least) in enumerate(zip(*values, SINGLES, strict=True)):
         far = abs(b - (a + c) / 2)
         if far > least and abs(c - a) < EQUAL_NEIGHBOURS * far:
-            x = [(*row.w_b, *row.f_b)[k] for row in rows[:-2]]
+            x = [(*one.w_b, *one.f_b)[k] for one in rows[:-2]]
             if all(far > SINGLE_TIMES * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
                    for i in range(1, len(x) - 1)):
                 return True
