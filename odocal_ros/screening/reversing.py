@@ -50,7 +50,8 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     if len(begins) < 2:
         return none
     force = _Forces(t, t_imu, w_b, f_b)
-    push = _second(t, travel.t, travel.s)
+    before, here, after = (travel.at(t + d) for d in (-PUSH_TIME, 0.0, PUSH_TIME))
+    push = (before - 2 * here + after) / PUSH_TIME**2
     ratio, sigma = np.array([_ratio(t, push, force, a, b)
                              for a, b in zip(begins, ends, strict=True)]).T
     driven = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
@@ -124,12 +125,6 @@ def _stretches(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
     begins, ends = moving[moving[:, 0] > 0].T
     long = (ends - begins) * REVERSING_STEP > 2 * PUSH_TIME
     return begins[long], ends[long]
-
-
-def _second(t: Floats, t_in: Floats, s: Floats) -> Floats:
-    """Return the second difference of s over PUSH_TIME each side, per s^2."""
-    before, here, after = (np.interp(t + d, t_in, s) for d in (-PUSH_TIME, 0.0, PUSH_TIME))
-    return (before - 2 * here + after) / PUSH_TIME**2
 
 
 class _Forces:

@@ -28,12 +28,14 @@ def saturated(t_imu: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> tuple[
             ('gyro', w_i, imu.gyro_scale, 'rad/s', LEAST_GYRO),
             ('accelerometer', f_i, imu.accel_scale, 'm/s^2', LEAST_ACCELEROMETER)):
         for axis, x in zip('xyz', columns(x_i), strict=True):
-            for limit, following in ((x.max(initial=0.0), _below), (x.min(initial=0.0), _above)):
+            for peak, inside, none in ((np.max, np.less, -np.inf), (np.min, np.greater, np.inf)):
+                limit = peak(x, initial=0.0)
                 at = x == limit
                 count, size = int(np.count_nonzero(at)), abs(limit * scale)
                 if size < least or count < FEWEST_AT_LIMIT:
                     continue
-                if count > TIMES_NEXT * np.count_nonzero(x == following(x, limit)):
+                following = peak(x, where=inside(x, limit), initial=none)
+                if count > TIMES_NEXT * np.count_nonzero(x == following):
                     found.append((count, float(t_imu[at.argmax()]),
                                   f'{sensor} {axis} stops at {limit * scale:+.4g} {unit}'))
     if not found:
@@ -42,11 +44,3 @@ def saturated(t_imu: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> tuple[
     others = f'; {len(found) - 1} more such limits' if len(found) > 1 else ''
     return (Reason(Code.IMU_SATURATED, f'{words} in {count} of {len(t_imu)} messages, first at '
                    f't = {t:.1f} s{others}'),)
-
-
-def _below(x: Floats, limit: float) -> float:
-    return float(x.max(where=x < limit, initial=-np.inf))
-
-
-def _above(x: Floats, limit: float) -> float:
-    return float(x.min(where=x > limit, initial=np.inf))
