@@ -14,7 +14,6 @@ from typing import Any, TypeAlias
 
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import Path as PathMessage
-import numpy as np
 from rclpy.task import Future
 from std_msgs.msg import Header
 
@@ -24,6 +23,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.live import answers
 from odocal_ros.live.session import LEGS_HELD
+from odocal_ros.output.drawing import evenly
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold, refusal
 from odocal_ros.pipeline.calibrate import calibrate_parts, combine
@@ -109,13 +109,11 @@ def _path(track_n: Floats | None, header: Header) -> PathMessage:
     """Return a track, (m, 3) in n, as a Path of at most MOST_POSES, the last row included."""
     if track_n is None or not len(track_n):
         return PathMessage(header=header)
-    few = min(len(track_n), MOST_POSES)
-    rows = np.linspace(0, len(track_n) - 1, few).round().astype(int)
     upright = Quaternion(w=1.0)
     return PathMessage(header=header, poses=[
         PoseStamped(header=header, pose=Pose(
             position=Point(x=float(x), y=float(y), z=float(z)), orientation=upright))
-        for x, y, z in track_n[rows]])
+        for x, y, z in track_n[evenly(len(track_n), MOST_POSES)]])
 
 
 class Worker:

@@ -49,9 +49,8 @@ def sheet(height: float, rows: int = 1, sharex: bool = True,
     axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False, height_ratios=heights)[:, 0]
     figure.subplots_adjust(left=0.135, right=0.975, top=1 - 0.32 / height,
                            bottom=0.48 / height, hspace=0.16)
-    grid = {'color': '0.90', 'linewidth': 0.6}
     for ax in axes:
-        ax.grid(**grid)
+        ax.grid(color='0.90', linewidth=0.6)
     return figure, axes
 
 

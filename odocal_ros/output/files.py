@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 import json
 import math
 from pathlib import Path
@@ -87,10 +88,7 @@ def _estimate(estimate: Estimate) -> dict[str, Any]:
 
 
 def _check(check: TrackCheck | None) -> dict[str, Any] | None:
-    if check is None:
-        return None
-    return {name: getattr(check, name)
-            for name in ('rms', 'max', 'mean', 'end', 'percent_of_distance')}
+    return None if check is None else asdict(check)
 
 
 def _leg(leg: LegResult) -> dict[str, Any]:

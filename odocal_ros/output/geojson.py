@@ -15,6 +15,7 @@ import numpy as np
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.output.drawing import evenly
 from odocal_ros.output.summary import sentence
 from odocal_ros.settings.config import Config
 
@@ -71,8 +72,7 @@ def _positions(rows_n: Floats | None, leg: LegResult, most: int) -> Floats:
     """Return rows of n, m, as (k, 2 or 3) longitude, latitude, deg, and height, m, if known."""
     if rows_n is None or leg.origin is None or not len(rows_n):
         return np.empty((0, 3))
-    few = np.linspace(0, len(rows_n) - 1, min(len(rows_n), most)).round().astype(int)
-    rows_n = np.array(rows_n, dtype=float)[few]
+    rows_n = np.array(rows_n, dtype=float)[evenly(len(rows_n), most)]
     rows_n = rows_n[np.isfinite(rows_n[:, :2]).all(axis=1)]
     level = np.isnan(rows_n[:, 2]).any()
     geodetic = Origin(*leg.origin).to_geodetic(np.nan_to_num(rows_n))

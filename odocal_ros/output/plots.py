@@ -191,12 +191,9 @@ def _sections(found: Evidence, name: str, scale_sigma: float | None) -> tuple[st
 
 def _motion(found: Evidence, name: str) -> tuple[str, str, str]:
     figure, (upper, lower) = drawing.sheet(3.6, 2)
-    speed, turn = 3.6 * found.speed, np.rad2deg(found.yaw_rate)
-    rows = drawing.thinned(speed)
-    upper.plot(found.t[rows], speed[rows], '-', color=drawing.BLUE, linewidth=1.0)
-    rows = drawing.thinned(turn)
-    lower.plot(found.t[rows], turn[rows], '-', color=drawing.BLUE, linewidth=1.0)
-    for ax in (upper, lower):
+    for ax, x in ((upper, 3.6 * found.speed), (lower, np.rad2deg(found.yaw_rate))):
+        rows = drawing.thinned(x)
+        ax.plot(found.t[rows], x[rows], '-', color=drawing.BLUE, linewidth=1.0)
         ax.axhline(0.0, color=drawing.GREY, linewidth=0.8)
     upper.set_ylabel('speed, km/h')
     lower.set(ylabel='turn rate, deg/s', xlabel='time since the start mark, s')

@@ -46,7 +46,6 @@ BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
 MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the reasons first',
            Verdict.REJECTED: 'do not use these values'}
-ORDER = list(Verdict)
 
 
 def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,

@@ -4,6 +4,7 @@
 """Tracks of a leg, as configured and as calibrated: deviation from the fixes, slips, checks."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -90,9 +91,7 @@ def check_of(ready: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reas
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return {}, found
     fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
-    check = track_check(track_residuals(path, pin, fixes), path_length)
-    return {'check': {name: getattr(check, name) for name in (
-        'rms', 'max', 'mean', 'end', 'percent_of_distance')}}, found
+    return {'check': asdict(track_check(track_residuals(path, pin, fixes), path_length))}, found
 
 
 def _start(ready: PreparedLeg, path: Path) -> MarkFix | None:
