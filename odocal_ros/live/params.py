@@ -6,6 +6,7 @@
 from collections.abc import Callable, Iterable
 import difflib
 import math
+from operator import attrgetter
 from typing import Any
 
 from rcl_interfaces import msg
@@ -144,11 +145,10 @@ def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]
         if p.name in RESULTS and not (p.value == now or str(p.value) == str(now) == 'nan'):
             return (f'{p.name} is set by the node after each leg; to restore a result, start the '
                     'node with --params-file calibration.yaml')
-        if p.name in SETTINGS and SETTINGS[p.name].ro:
-            group, _, key = p.name.rpartition('.')
-            if _plain(p.value) != getattr(getattr(config, group) if group else config, key):
-                return (f'{p.name} is fixed at start-up: restart the node with '
-                        f'"--ros-args -p {p.name}:=VALUE"')
+        if p.name in SETTINGS and SETTINGS[p.name].ro and (
+                _plain(p.value) != attrgetter(p.name)(config)):
+            return (f'{p.name} is fixed at start-up: restart the node with '
+                    f'"--ros-args -p {p.name}:=VALUE"')
     return ''
 
 

@@ -10,6 +10,7 @@ made from these dataclasses. The name of a setting and of its ROS parameter is `
 
 from dataclasses import dataclass, replace
 import math
+from operator import attrgetter
 from typing import Any
 
 from odocal_ros.data.inputs import TOPICS
@@ -273,13 +274,6 @@ class Config:
 SETTINGS = settings_of(Config)
 
 
-def value_of(config: Config, name: str) -> Any:
-    """Return the value of a setting by its dotted name."""
-    for part in name.split('.'):
-        config = getattr(config, part)
-    return config
-
-
 def flat(config: Config) -> dict[str, Any]:
     """Return every setting by its dotted name."""
-    return {name: value_of(config, name) for name in SETTINGS}
+    return {name: attrgetter(name)(config) for name in SETTINGS}

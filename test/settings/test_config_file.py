@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from odocal_ros.errors import BadConfig, BadUsage, OdocalError
-from odocal_ros.settings.config import Config, SETTINGS, value_of, with_settings
+from odocal_ros.settings.config import Config, flat, SETTINGS, with_settings
 from odocal_ros.settings.config_file import parse_set, read_config_file, scalar
 
 pytestmark = pytest.mark.core
@@ -207,4 +207,4 @@ def test_the_shipped_file_holds_every_setting_at_its_default():
     assert list(values) == list(SETTINGS)
     default = Config()
     for name, value in values.items():
-        assert repr(value) == repr(value_of(default, name)), name
+        assert repr(value) == repr(flat(default)[name]), name
