@@ -66,8 +66,6 @@ class Done:
 
     key: str
     status: str
-    reason: str
-    seconds: float
     computed: bool      # in this run
 
 
@@ -80,12 +78,12 @@ def calibrate_bag(job: BagJob) -> Done:
         try:
             seen = seen_as(job.bag.bag, job.settings)
             if found := _known(store, job, seen):
-                return Done(found.key, found.status, found.reason, 0.0, False)
+                return Done(found.key, found.status, False)
             row, computed = _row(job, store, seen, began)
             store.put(row)
             store.remember(seen, row.key)
             store.drop(job.place)
-            return Done(row.key, row.status, row.reason, row.seconds, computed)
+            return Done(row.key, row.status, computed)
         except OdocalError as error:
             why = said_by(error)
         except Exception as error:     # noqa: BLE001 one bag must not stop others
@@ -95,7 +93,7 @@ def calibrate_bag(job: BagJob) -> Done:
     # outside the memory limit: the row needs memory
     row = job.failed(why, seen=seen, seconds=time.monotonic() - began)
     store.put(row)
-    return Done(row.key, FAILED, row.reason, row.seconds, True)
+    return Done(row.key, FAILED, True)
 
 
 @cache

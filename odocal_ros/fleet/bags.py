@@ -6,7 +6,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-import fnmatch
 from pathlib import Path, PurePosixPath
 import re
 import shutil
@@ -18,7 +17,7 @@ from odocal_ros.fleet.rows import key_of
 from odocal_ros.outside.names import said_by
 
 COLUMNS = ('vehicle', 'bag', 'config', 'legs', 'model', 'odometer_km')
-ENDINGS = ('*.mcap', '*.db3', '*.bag')
+ENDINGS = ('.mcap', '.db3', '.bag')
 META = 'metadata.yaml'       # marks a folder as a rosbag2
 
 
@@ -153,8 +152,8 @@ def _in_folder(fs: Any, path: str) -> list[str]:
         return [path]
     files = fs.find(path)
     folders = {str(PurePosixPath(f).parent) for f in files if PurePosixPath(f).name == META}
-    single = [f for f in files if any(fnmatch.fnmatch(f, ending) for ending in ENDINGS)
-              and str(PurePosixPath(f).parent) not in folders]
+    single = [f for f in files
+              if f.endswith(ENDINGS) and str(PurePosixPath(f).parent) not in folders]
     return sorted([*folders, *single])
 
 

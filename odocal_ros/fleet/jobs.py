@@ -64,7 +64,7 @@ def computed_rows(client: Any, jobs: Sequence[BagJob],
             if again:
                 store.drop(job.place)
         else:
-            yield i, Done(key, 'done', '', 0.0, False)
+            yield i, Done(key, 'done', False)
     asked = [jobs[i] for i in open_jobs]
     for k, done, error in results(client, calibrate_bag, asked, 'bag',
                                   [f'{job.place}-{os.urandom(4).hex()}' for job in asked]):
@@ -72,7 +72,7 @@ def computed_rows(client: Any, jobs: Sequence[BagJob],
         if error is not None:      # the worker was ended each time, or could not write
             row = store.get(job.place) or job.failed(_why(error))
             store.put(row)
-            done = Done(row.key, FAILED, row.reason, 0.0, True)
+            done = Done(row.key, FAILED, True)
         yield open_jobs[k], done
 
 
