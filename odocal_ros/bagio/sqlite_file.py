@@ -90,18 +90,15 @@ class Leaves:
                 key, time_ns, skip = _record(data, at)
             except (ValueError, IndexError, struct.error):
                 continue                     # not a row of messages
-            yield row, key, time_ns, partial(self._data, data, at, size, skip)
+            yield row, key, time_ns, partial(self._payload, data, at, size, skip)
 
-    def _data(self, data: bytes, at: int, size: int, skip: int) -> bytes:
-        return self._payload(data, at, size)[skip:]
-
-    def _payload(self, data: bytes, at: int, size: int) -> bytes:
-        """Return the bytes of a row, including its overflow pages."""
+    def _payload(self, data: bytes, at: int, size: int, skip: int) -> bytes:
+        """Return the bytes of a row after ``skip``, including its overflow pages."""
         if size > min(len(self._map), MESSAGE * factor()):
             raise ValueError('larger than the file')
         largest = self._usable - 35
         if size <= largest:
-            return data[at:at + size]
+            return data[at:at + size][skip:]
         least = (self._usable - 12) * 32 // 255 - 23
         local = least + (size - least) % (self._usable - 4)
         local = local if local <= largest else least
@@ -115,7 +112,7 @@ class Leaves:
             page = struct.unpack_from('>I', whole)[0]
             parts.append(whole[4:4 + size - have])
             have += len(parts[-1])
-        return b''.join(parts)
+        return b''.join(parts)[skip:]
 
     def close(self) -> None:
         self._map.close()
