@@ -132,7 +132,8 @@ class Plan:
     def verdict(self) -> Verdict:
         """Return the predicted verdict: of the drive and the best method."""
         order = list(Verdict)
-        best = min((self._verdict_of(name) for name in self.deciding), key=order.index)
+        best = min((verdict_of(self.reasons_of(name)) for name in self.deciding),
+                   key=order.index)
         return Verdict.worst([verdict_of(self.two_point.of_drive), best])
 
     def reasons_of(self, name: str) -> tuple[Reason, ...]:
@@ -140,9 +141,6 @@ class Plan:
         if name != 'two_point':
             return self.methods[name].reasons
         return tuple(r for r in self.two_point.reasons if r not in self.two_point.of_drive)
-
-    def _verdict_of(self, name: str) -> Verdict:
-        return verdict_of(self.reasons_of(name))
 
     @property
     def reasons(self) -> tuple[Reason, ...]:

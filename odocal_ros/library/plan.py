@@ -259,18 +259,13 @@ def plan(*, distance: float | None = None, speed: float | None = None,
         drive = planned_drives.from_gpx(Path(gpx), speed)
     elif bag:
         drive, own = planned_drives.from_bag(Path(bag), settings, dict(topics or {}))
+    elif speed is None:
+        raise BadUsage('--distance needs --speed, m/s')
     else:
         assert distance is not None
-        drive = _of_figures(distance, speed, standstill, turns, acceleration)
+        drive = planned_drives.from_figures(
+            speed, distance, 30.0 if standstill is None else standstill, turns or 0, acceleration)
     if 'fix' in figures:
         own |= {'fix_up': None}
     sigmas = Sigmas(config=settings, **(own | figures))
     return Planned(drive, sigmas, plan_methods(drive, sigmas))
-
-
-def _of_figures(distance: float, speed: float | None, standstill: float | None, turns: int | None,
-                acceleration: float) -> PlannedDrive:
-    if speed is None:
-        raise BadUsage('--distance needs --speed, m/s')
-    return planned_drives.from_figures(speed, distance, 30.0 if standstill is None else standstill,
-                                       turns or 0, acceleration)

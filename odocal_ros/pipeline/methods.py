@@ -140,7 +140,8 @@ def _path_of(t_fix: Floats, geodetic: Floats, least: float) -> float:
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     leg, inputs, asked = prepared.leg, prepared.inputs, prepared.config.method
-    names = _methods_of(prepared)
+    wanted = deciding(asked, shown=True)
+    names = [name for name in METHODS if name in wanted]      # in the order of the output
     runs = run_methods(names, prepared, _progress_reporter(names, progress))
     progress(Stage('tracks', 1.0 - TRACKS / _effort(names)))
     methods = {name: run.result for name, run in runs.items()}
@@ -173,12 +174,6 @@ def _once(found: Sequence[Reason]) -> list[Reason]:
     """Return the reasons of methods and tracks; those on outlier fixes only from the first."""
     far = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
     return [r for k, r in enumerate(found) if k not in far[1:]]
-
-
-def _methods_of(prepared: PreparedLeg) -> list[str]:
-    """Return the methods to run in the order of the output."""
-    wanted = deciding(prepared.config.method, shown=True)
-    return [name for name in METHODS if name in wanted]
 
 
 def _effort(names: Iterable[str]) -> int:
