@@ -5,7 +5,6 @@
 
 from array import array
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from itertools import islice
 from numbers import Integral
 import re
@@ -99,8 +98,8 @@ class Fields:
         self._t_ns = t_ns[keep]
         tried = [_best(name, whole, self._t_ns, value, path, self._every) for name, whole, value
                  in zip(self.paths, self.whole, values[keep].T, strict=True)]
-        self._travel = {one[0].path: one[1] for one in tried if one}
-        found = sorted((asdict(one[0]) for one in tried if one), key=rank)
+        self._travel = {one[0]['path']: one[1] for one in tried if one}
+        found = sorted((one[0] for one in tried if one), key=rank)
         return {'tried': len(self.paths), 'found': [field | {
             'settings': _settings(field, f'odometer.field={field["path"]}')} for field in found]}
 
@@ -125,18 +124,6 @@ class Fields:
                                      for field, side in zip(wheels, named, strict=True)]):
                 return _settings(best, *options)
         return list(best['settings'])
-
-
-@dataclass(frozen=True)
-class Field:
-    """A field that follows the path of the fixes; scale in m per unit, or m/s for a rate."""
-
-    path: str
-    whole: bool
-    quantity: str
-    wrap: int
-    scale: float
-    explained: float
 
 
 def _settings(field: dict[str, Any], *names: str) -> list[str]:
@@ -172,10 +159,14 @@ def _numbers_of(value: object, path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _best(path: str, whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
-          every: int) -> tuple[Field, Floats] | None:
-    """Return the meaning of a field that follows the path best, and its travel; or None."""
+          every: int) -> tuple[dict[str, Any], Floats] | None:
+    """
+    Return the meaning of a field that follows the path best, and its travel; or None.
+
+    The scale is in m per unit, or m/s for a rate.
+    """
     per_message = any(word in path.lower() for word in INCREMENTS)
-    found = []
+    found: list[tuple[dict[str, Any], Floats]] = []
     seconds: Floats = np.multiply(t_ns - t_ns[:1], 1e-9)
     for quantity in ('cumulative', 'increment' if per_message else 'rate'):
         counts = whole and quantity == 'cumulative'
@@ -185,8 +176,9 @@ def _best(path: str, whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
         s = s * every if per_message and quantity != 'cumulative' else s
         match = fixes.match(t_ns, s)
         if match.follows:
-            found.append((Field(path, whole, quantity, wrap, match.scale, match.explained), s))
-    return max(found, key=lambda one: one[0].explained, default=None)
+            found.append(({'path': path, 'whole': whole, 'quantity': quantity, 'wrap': wrap,
+                           'scale': match.scale, 'explained': match.explained}, s))
+    return max(found, key=lambda one: one[0]['explained'], default=None)
 
 
 def _rollover(value: Floats) -> int:

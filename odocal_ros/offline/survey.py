@@ -216,14 +216,13 @@ class Drive:
 
     scale : m per unit of travel, rough; None if the fixes do not determine it.
     stops : (k, 2) s, begin and end of standstills.
-    sigma : m, of a fix, horizontal, as stated.    white : m, white noise of the fixes.
+    sigma : m, of a fix, horizontal, as stated.
     t_fix, fixes_n : (n,), (n, 3) s and m, usable fixes, east-north-up about the first.
     slowest, fastest : m/s.
     """
 
     scale: float | None
     sigma: float
-    white: float
     stops: NDArray[np.float64]
     t_fix: NDArray[np.float64]
     fixes_n: NDArray[np.float64]
@@ -243,8 +242,7 @@ def survey_drive(inputs: Inputs, config: Config) -> Drive:
         if scale and len(t):
             speed = np.abs(inputs.travel.at(t + at_speed) - inputs.travel.at(t)) * scale / at_speed
             slowest, fastest = float(speed.min()), float(speed.max())
-    return Drive(scale, sigma, white_noise(fixes_n), stops, inputs.t_fix, fixes_n, slowest,
-                 fastest)
+    return Drive(scale, sigma, stops, inputs.t_fix, fixes_n, slowest, fastest)
 
 
 def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tuple[float, float]]:
