@@ -201,7 +201,8 @@ class McapFile(Recording):
                 elif op in (SCHEMA, CHANNEL):
                     self._learn(op, body)
             except (Damaged, struct.error, UnicodeDecodeError) as error:
-                self.damage = self.damage or _said(error)
+                self.damage = self.damage or (
+                    str(error) if isinstance(error, Damaged) else 'a damaged record')
 
     # ---- records one by one ----------------------------------------------------------------
 
@@ -265,7 +266,3 @@ class McapFile(Recording):
 
     def close(self) -> None:
         self._file.close()
-
-
-def _said(error: Exception) -> str:
-    return str(error) if isinstance(error, Damaged) else 'a damaged record'

@@ -85,15 +85,12 @@ def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
         for end, count in counts.items() if count]}
 
 
-def _estimate(row: dict[str, Any], name: str) -> Estimate:
-    return Estimate(row[name], row[f'{name}_sigma'], 'rad' if 'angle' in name else '')
-
-
 def _decision(row: dict[str, Any], limits: Limits) -> Decision:
     """Return the decision of the limits on a vehicle or a leg; rejected ones are undecided."""
     if row['verdict'] == Verdict.REJECTED.value:
         return Decision.UNDECIDED
-    return max((hold(name, _estimate(row, name), *ends).decision
+    return max((hold(name, Estimate(row[name], row[f'{name}_sigma'],
+                                    'rad' if 'angle' in name else ''), *ends).decision
                 for name, ends in limits.items()), key=list(Decision).index)
 
 

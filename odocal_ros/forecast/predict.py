@@ -114,7 +114,8 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
                        f'({1 / sigmas.fix_rate:.3g} s); drive longer or raise the fix rate')
     spans = drive.standstills(config.leg.standstill)
     alignment, found = plan_alignment(drive, sigmas.config, sigmas.fix, spans)
-    track = _track(drive, sigmas.quantum)
+    track = dead_reckon(drive.t, quat_from_matrix(drive.C_nb),
+                        Travel(drive.t, drive.travel, sigmas.quantum))
     distance, said = judge_drive(track, drive.duration, 1.0, config.leg)
     track = _from(track, alignment.t)
     start, end = (_mark(t, track, drive, sigmas, spans, asked) for t, asked in (
@@ -165,11 +166,6 @@ def _rest(t: float, spans: Sequence[tuple[float, float]]) -> float:
     """Return the duration of the standstill at a mark, s."""
     begin, end = standing_at(t, spans) or (0.0, 0.0)
     return end - begin
-
-
-def _track(drive: PlannedDrive, quantum: float) -> Track:
-    return dead_reckon(drive.t, quat_from_matrix(drive.C_nb),
-                       Travel(drive.t, drive.travel, quantum))
 
 
 def _from(track: Track, t: float) -> Track:

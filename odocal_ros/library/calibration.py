@@ -20,10 +20,6 @@ from odocal_ros.settings.config import Config
 TABLES = 'pip install pandas pyarrow'
 
 
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec='seconds')
-
-
 def frame_of(columns: dict[str, Any]) -> Any:
     """Return columns as a pandas.DataFrame."""
     try:
@@ -47,7 +43,8 @@ class Calibration:
     config: Config = Config()
     inputs: tuple[dict[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
-    created: str = field(default_factory=_now)
+    created: str = field(
+        default_factory=lambda: datetime.now(UTC).isoformat(timespec='seconds'))
 
     @property
     def verdict(self) -> Verdict:

@@ -81,7 +81,8 @@ def changes(stored: list[Stored]) -> list[Change]:
     Raises BadUsage: the units of a parameter differ: these are different odometers.
     """
     names = sorted({n for s in stored for n, e in s.estimates.items()
-                    if e.value is not None} - NOT_COMPARED, key=_order)
+                    if e.value is not None} - NOT_COMPARED,
+                   key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n))
     if _differently_mounted(stored):
         names = [n for n in names if n not in ANGLES]
     return [c for c in (_change(name, stored) for name in names)
@@ -103,10 +104,6 @@ def notes(stored: list[Stored]) -> list[str]:
     if _differently_mounted(stored):
         out.append('imu.mounting_rpy differs: mounting angles are not compared')
     return out
-
-
-def _order(name: str) -> tuple[int, str]:
-    return (ORDER.index(name) if name in ORDER else len(ORDER), name)
 
 
 def _differently_mounted(stored: list[Stored]) -> bool:

@@ -31,7 +31,8 @@ def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: fl
     """
     def off(square: float) -> Floats:
         if square > 0:
-            return _late(t, place, velocity, at, np.sqrt(square))
+            track, tau = _Track(t, place, velocity), np.sqrt(square)
+            return track.smoothed(at + tau, tau) - track.at(at)
         return _tracked(t, place, velocity, at, np.sqrt(-square / 2))
 
     if abs(square) <= LEAST_LAG2:
@@ -66,12 +67,6 @@ def odometer_error(t: Floats, place: Floats, velocity: Floats, at: Floats, share
     motion = track.at(at) - track.smoothed(at, time)
     longer = track.at(at) - track.smoothed(at, time * np.exp(step))
     return share * motion, motion, share * (longer - motion) / step
-
-
-def _late(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
-    """Return the smoothed positions at ``at + tau`` minus the positions at ``at``, (k, 3)."""
-    track = _Track(t, place, velocity)
-    return track.smoothed(at + tau, tau) - track.at(at)
 
 
 class _Track:

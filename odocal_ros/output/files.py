@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros import __version__
-from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, TrackCheck
+from odocal_ros.calib.result import Calibration, LegResult, MethodResult, TrackCheck
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
 from odocal_ros.output.folder import ResultFolder
@@ -79,12 +79,9 @@ def _method(method: MethodResult) -> dict[str, Any]:
     # arrays among the details are for code, not for readers
     more = {k: v for k, v in method.details.items() if not isinstance(v, np.ndarray)}
     return {'verdict': method.verdict.value, 'reasons': [r.as_dict() for r in method.reasons],
-            'estimates': {n: _estimate(e) for n, e in method.estimates.items()},
+            'estimates': {n: {'value': e.value, 'sigma': e.sigma, 'unit': e.unit}
+                          for n, e in method.estimates.items()},
             'correlation': {}, 'budget': {}} | more
-
-
-def _estimate(estimate: Estimate) -> dict[str, Any]:
-    return {'value': estimate.value, 'sigma': estimate.sigma, 'unit': estimate.unit}
 
 
 def _check(check: TrackCheck | None) -> dict[str, Any] | None:

@@ -79,9 +79,10 @@ def value_rows(calibration: Calibration) -> list[dict[str, Any]]:
         if estimate.value is None:
             continue
         first, other, relative = in_units(name, estimate)
-        method = calibration.methods.get(estimate.method)
+        largest, share = tables.largest_source(calibration.methods.get(estimate.method), name)
         rows.append({'name': label(name), 'value': first, 'other': other, 'relative': relative,
-                     'method': label(estimate.method), 'largest': _largest(method, name)})
+                     'method': label(estimate.method),
+                     'largest': f'{label(largest)} ({100 * share:.0f} %)' if largest else ''})
     return rows
 
 
@@ -111,11 +112,6 @@ def undetermined(calibration: Calibration) -> list[str]:
             one = axis in ('x', 'y', 'z')
             axes.setdefault(label(whole if one else name), []).extend([axis] * one)
     return [f'{word} {", ".join(found)}'.rstrip() for word, found in axes.items()]
-
-
-def _largest(method: MethodResult | None, name: str) -> str:
-    largest, share = tables.largest_source(method, name)
-    return f'{label(largest)} ({100 * share:.0f} %)' if largest else ''
 
 
 def method_table(methods: dict[str, MethodResult],

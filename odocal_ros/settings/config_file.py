@@ -65,7 +65,8 @@ def _settings(path: Path, root: Node) -> dict[str, object]:
     values: dict[str, object] = {}
     for name, node in (pair for block in ours for part in block for pair in _leaves(part, '')):
         if not NOT_OURS.match(name):
-            values[name] = _checked(name, _value(node), f'{path}, line {_line(node)}: ')
+            where = f'{path}, line {node.start_mark.line + 1}: '
+            values[name] = _checked(name, _value(node), where)
     return values
 
 
@@ -101,10 +102,6 @@ def parse_set(text: str) -> tuple[str, object]:
 
 def _is_quoted(node: Node) -> bool:
     return node is not None and getattr(node, 'style', None) in ('"', "'")
-
-
-def _line(node: Node) -> int:
-    return int(node.start_mark.line) + 1
 
 
 def _pairs(node: Node) -> list[tuple[str, Node]]:
