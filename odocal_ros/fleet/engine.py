@@ -19,10 +19,6 @@ LOST = ('the connection to the Dask scheduler is lost; start it again and repeat
         'finished bags are kept')
 
 
-class EngineLost(OdocalError):
-    """The connection to the scheduler was lost during a run."""
-
-
 def check_installed() -> None:
     """Raise BadUsage with the command that installs the missing packages."""
     missing = [name for name in NEEDS if find_spec(name) is None]
@@ -95,7 +91,7 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
 
     The scheduler gets some tasks for each worker at a time, which limits its memory.
 
-    Raises EngineLost: the connection to the scheduler is lost.
+    Raises OdocalError: the connection to the scheduler is lost.
     """
     from distributed import as_completed, CancelledError
     ended, left, fewest = as_completed(), range(len(jobs)), 0
@@ -114,7 +110,7 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
         try:
             found = future.result()
         except CancelledError:
-            raise EngineLost(LOST) from None
+            raise OdocalError(LOST) from None
         except Exception as what:     # noqa: BLE001 of the task, or that its workers were ended
             error = what
         yield number.pop(future.key), found, error
@@ -127,4 +123,4 @@ def _ahead(client: Any) -> int:
         per_worker = 2    # tasks submitted at a time
         return max(FEWEST, per_worker * int(sum(client.nthreads().values())))
     except OSError:
-        raise EngineLost(LOST) from None
+        raise OdocalError(LOST) from None
