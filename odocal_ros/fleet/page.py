@@ -17,6 +17,7 @@ from odocal_ros import __version__
 from odocal_ros.fleet.second_stage import COMPARED, file_name, flagged
 from odocal_ros.fleet.statistics import LEAST, Population, population
 from odocal_ros.fleet.tables import LEGS
+from odocal_ros.output.drawing import BLUE, evenly, GREEN, GREY, look, PINK, RED, sheet, svg
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.summary import DEG
 from odocal_ros.settings.levels import TYRE_SPREAD
@@ -28,7 +29,6 @@ TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting an
 
 def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[str, str, str]]:
     """Return (svg, title, description) of each figure that has data."""
-    from odocal_ros.output.drawing import look
     drawn = []
     with look():
         for name in COMPARED:
@@ -43,7 +43,6 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[
 
 def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
     """Draw each vehicle's value against its model's median, one column a model."""
-    from odocal_ros.output.drawing import BLUE, evenly, RED, sheet, svg
     models = sorted({row['model'] for row in rows})
     figure, (ax,) = sheet(2.8)
     scale, every = name == 'scale_factor', []
@@ -72,7 +71,6 @@ def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
 
 def _within(ax: Any, points: np.ndarray) -> None:
     """Scale the plot to most vehicles; those far beyond are arrows at its edge."""
-    from odocal_ros.output.drawing import RED
     wide = 6.0    # medians of the distance that a picture shows
     usual = wide * float(np.median(np.abs(points[:, 1])))
     beyond = np.abs(points[:, 1]) > 2 * usual
@@ -87,7 +85,6 @@ def _within(ax: Any, points: np.ndarray) -> None:
 
 def _control(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, str] | None:
     """Draw the scale of legs over dates, those that changed or drift highlighted."""
-    from odocal_ros.output.drawing import BLUE, GREEN, GREY, PINK, RED, sheet, svg
     base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
     most_lines = 6    # vehicles that are highlighted
     named = [row['vehicle'] for row in vehicles if row['vehicle'] in base and any(

@@ -14,6 +14,7 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.calib.speed_scale import SpeedScale
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.series import Series
+from odocal_ros.output.drawing import BLUE, GREY, look, new_figure, RED, save_figure
 from odocal_ros.output.geojson import features
 
 POINTS = 400     # judgement: of a line or of the fixes, for a small file
@@ -28,7 +29,6 @@ def draw_map(result: Calibration, path: Path) -> None:
 
     Raises BadUsage: the positions are in a local frame.
     """
-    from odocal_ros.output.drawing import look, save_figure
     shapes = [feature for number, leg in enumerate(result.legs, 1)
               for feature in features(number, leg, POINTS)]
     if not shapes:
@@ -39,7 +39,6 @@ def draw_map(result: Calibration, path: Path) -> None:
 
 def map_figure(shapes: list[dict[str, Any]]) -> Any:
     """Return the figure of features of GeoJSON, with the same scale in both directions."""
-    from odocal_ros.output.drawing import new_figure
     figure = new_figure(6.0, 4.8)
     ax = figure.add_subplot(facecolor='#eef1ea')
     for shape in shapes:
@@ -50,7 +49,6 @@ def map_figure(shapes: list[dict[str, Any]]) -> Any:
 
 def _draw(ax: Any, shape: dict[str, Any]) -> None:
     """Draw one feature; each kind is labelled once."""
-    from odocal_ros.output.drawing import BLUE, GREY, RED
     kind, geometry = shape['properties']['kind'], shape['geometry']
     style: dict[str, Any] = {
         'corrected': {'color': BLUE, 'linewidth': 1.6, 'zorder': 4},
@@ -121,7 +119,6 @@ def scale_by_speed(result: Calibration) -> Series:
 
 def draw_scale_by_speed(result: Calibration, path: Path) -> None:
     """Write the picture of each leg's scale against speed, one above the other."""
-    from odocal_ros.output.drawing import new_figure, save_figure
     from odocal_ros.output.plots_scale import draw_by_speed, fit_text
     most = 8     # legs in one picture, the newest
     found = _found(result)[-most:]

@@ -13,7 +13,7 @@ from typing import Any, TYPE_CHECKING
 
 from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.asked import Listener
+from odocal_ros.library.asked import legs_of, Listener
 from odocal_ros.offline.say import Phase, say, say_json, warn
 from odocal_ros.outside.names import one_line
 
@@ -70,7 +70,6 @@ def add_calibration_arguments(parser: argparse.ArgumentParser, **topics: str) ->
 
 def run(args: argparse.Namespace) -> int:
     """Replay bags; return 0 accepted or caution (with --accept: pass), else 1."""
-    from odocal_ros.library.asked import legs_of
     config = asked_config(args)
     if args.marks:
         config['reference.marks'] = tuple(args.marks)

@@ -12,7 +12,7 @@ from typing import Any
 from odocal_ros.calib.choice import ABOUT, leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.output import report_tables as tables
-from odocal_ros.output.drawing import Drawing
+from odocal_ros.output.drawing import Drawing, look
 from odocal_ros.output.figures import counted, known, length, shared, time_span
 from odocal_ros.output.summary import DEG, MEANING, sentence
 from odocal_ros.output.tables import before_label, check_table
@@ -136,7 +136,6 @@ def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing
 
     If figures exceed MOST_BYTES, only those of the newest legs are shown.
     """
-    from odocal_ros.output.drawing import look
     from odocal_ros.output.plots import leg_figures
     from odocal_ros.output.plots_scale import compared
     numbered, size = list(enumerate(calibration.legs, 1)), 0
