@@ -44,8 +44,7 @@ def geodetic_of(position: Floats, latitude_deg: float) -> tuple[Floats, Floats, 
     # no matrix product: its last bits depend on the number of rows, so replay would differ
     r_e = np.stack([own + a * x + b * y + c * z for own, (a, b, c) in zip(
         own_e, C_en(latitude, FRAME_LONGITUDE), strict=True)])
-    place = geodetic_from_ecef(r_e.T)
-    return place
+    return geodetic_from_ecef(r_e.T)
 
 
 def local_fixes(latitude_deg: float) -> Callable[..., FixSamples]:

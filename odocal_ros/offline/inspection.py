@@ -251,7 +251,7 @@ def _together(taps: dict[str, _Tap], mapping: dict[str, str]) -> LegRecorder:
                 recorder.adopt(more, rows, more)
         if slot == 'odometer_right':
             recorder.form_right = taps[topic].reader.form
-        own = 'odometer' if slot == 'odometer_right' else taps[topic].reader.slot
-        if own == slot or slot == 'odometer_right':
-            recorder.adopt(slot, rows, own)
+            recorder.adopt(slot, rows, 'odometer')
+        elif taps[topic].reader.slot == slot:
+            recorder.adopt(slot, rows, slot)
     return recorder
