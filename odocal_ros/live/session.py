@@ -183,8 +183,7 @@ class Session:
                           'before ~/undo_leg')
         if not self.legs:
             raise Refused('no leg to undo')
-        dropped = self.legs.pop()
-        self.dropped(dropped)
+        self.dropped(self.legs.pop())
         self.lost = ''
         self.state = State.COMPUTING if self.legs else State.IDLE
         self.calibration = None

@@ -28,14 +28,13 @@ class Plane:
     central_meridian: float
     scale: float = 1.0
     ellipsoid: str = 'WGS84'
-    false_easting: float = 500000.0
 
     def forward(self, latitude: Floats, longitude: Floats) -> tuple[Floats, Floats]:
         """Return northing, easting, m (eq. 1-5 of Shi et al. 2015), from rad: (...)."""
         from pyproj import Proj
         a, rf = ELLIPSOIDS[self.ellipsoid]
         proj = Proj(proj='tmerc', lat_0=0, lon_0=self.central_meridian, k_0=self.scale,
-                    x_0=self.false_easting, y_0=0, a=a, rf=rf)
+                    x_0=500000.0, y_0=0, a=a, rf=rf)
         easting, northing = proj(np.rad2deg(longitude), np.rad2deg(latitude))
         return np.asarray(northing), np.asarray(easting)
 
@@ -79,8 +78,7 @@ def geodesic_chord(start: Sequence[float] | Floats,
                    end: Sequence[float] | Floats) -> tuple[float, float]:
     """Return length at the mean height, m, and azimuth, rad, of the WGS 84 geodesic."""
     from pyproj import Geod
-    geod = Geod(ellps='WGS84')
-    azimuth, _, length = geod.inv(np.rad2deg(start[1]), np.rad2deg(start[0]),
-                                  np.rad2deg(end[1]), np.rad2deg(end[0]))
+    azimuth, _, length = Geod(ellps='WGS84').inv(
+        np.rad2deg(start[1]), np.rad2deg(start[0]), np.rad2deg(end[1]), np.rad2deg(end[0]))
     height = (start[2] + end[2]) / 2
     return float(length * (1 + height / 6371008.8)), float(np.deg2rad(azimuth))

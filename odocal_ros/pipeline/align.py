@@ -201,9 +201,8 @@ def _turn_since(inputs: Inputs, level: Level) -> float:
 
 def _imu_orientation(inputs: Inputs, level: Level, latitude: float, grade: Grade,
                      config: Config) -> Found:
-    C_bi = inputs.C_bi
     return _from_quaternions(inputs.t_imu, inputs.q_ni, inputs.yaw_variance, level, config,
-                             lambda C_ni: C_ni @ transpose(C_bi), 0.0)
+                             lambda C_ni: C_ni @ transpose(inputs.C_bi), 0.0)
 
 
 def _heading_topic(inputs: Inputs, level: Level, latitude: float, grade: Grade,
