@@ -162,7 +162,7 @@ class Rhythm:
         if len(self._rows) == 3:
             self._test(quantum)
         at = self._rows[-1][1] if self._in_use() else t
-        self._t = max(at, self._t + APART)
+        self._t = max(at, self._t + APART, math.nextafter(self._t, math.inf))
         return self._t
 
     @property

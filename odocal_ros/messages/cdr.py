@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 
 KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32': '<i4',
          'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8', 'float32': '<f4', 'float64': '<f8'}
-UNPACKED = {'l': 'q', 'L': 'q'}      # format: of struct, where numpy's differ; uint64 as int64
+# format: of struct, by type of numpy; uint64 as int64
+UNPACKED = {'i1': 'b', 'u1': 'B', 'i2': 'h', 'u2': 'H', 'i4': 'i', 'u4': 'I', 'i8': 'q', 'u8': 'q',
+            'f4': 'f', 'f8': 'd'}
 INDEXED = re.compile(r'(.+)\[(\d+)\]')
 
 
@@ -161,7 +163,7 @@ class Layout:
         record = self.record(columns)
         fields = (record.fields or {}).values() if record is not None else ()
         return [partial(struct.Struct(
-            f'<{kind.shape[0]}{UNPACKED.get(kind.base.char, kind.base.char)}').unpack_from,
+            f'<{kind.shape[0]}{UNPACKED[kind.base.str[1:]]}').unpack_from,
             offset=offset) for kind, offset, *_ in fields]
 
     def fits(self, raw: bytes) -> bool:

@@ -168,3 +168,11 @@ def test_the_twist_of_a_late_counter_is_within_its_covariance(late_s):
     # what one count in 50 ms makes, and little more
     assert np.sqrt(np.mean(error**2)) < 0.2
     assert np.median(sigma) < 0.25
+
+
+def test_times_rise_far_from_zero():
+    """A counter stamped at arrival beside an IMU that counts from its start: 1.7e9 s."""
+    rng, rhythm = np.random.default_rng(1), Rhythm()
+    arrival = np.maximum.accumulate(1.7e9 + np.arange(0, 60, 0.02) + rng.exponential(0.02, 3000))
+    placed = [rhythm.place(t, 0.2 * k, 10.0, 0.01) for k, t in enumerate(arrival.tolist())]
+    assert (np.diff(placed) > 0).all()
