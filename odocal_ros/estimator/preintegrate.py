@@ -44,8 +44,9 @@ from odocal_ros.nav.strapdown import prefix_product
 Floats = NDArray[np.float64]
 # judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
 STEPS_AT_A_TIME = 2048
-# definition: signals (1, w, f) of a step that the errors of gyro and accelerometer multiply
-OF_GYRO, OF_ACCEL = slice(6), np.array([0, 4, 5, 6])
+# definition: signals of a step that the errors of gyro and accelerometer multiply, of (1, w, f, f
+# with its bias): the g-sensitivity of the gyro has the latter, so that b_a does not turn
+OF_GYRO, OF_ACCEL = np.array([0, 1, 2, 3, 7, 8]), np.array([0, 4, 5, 6])
 
 
 Some = TypeVar('Some', Intervals, Points)
@@ -106,17 +107,6 @@ def _by(step: Floats, signals: Floats) -> Floats:
     return step[:, :, :, None] * signals[:, None, None, :]
 
 
-def _gyro(x: Floats) -> Floats:
-    """Return the effects of bias and constants of the gyro, from (n, 3, 3, 6): (n, 3, 3 + g)."""
-    out: Floats = x[:, :, [0, 1, 2, *GYRO_AXIS], [0, 0, 0, *np.add(GYRO_SIGNAL, 1)]]
-    return out
-
-
-def _accel(x: Floats) -> tuple[Floats, Floats]:
-    """Return the effects of bias and constants of the accelerometer, from (n, 3, 3, 4)."""
-    return x[:, :, :, 0], x[:, :, ACCEL_AXIS, np.add(ACCEL_SIGNAL, 1)]
-
-
 class _Chunk:
     """Some intervals at once: sums from each interval's begin up to every step."""
 
@@ -128,7 +118,17 @@ class _Chunk:
         self.own = np.repeat(np.arange(len(key) - 1), np.diff(key))     # interval of each step
         self.dt = np.diff(self.t)
         self.longest, dt = imu.longest[rows], self.dt[:, None]
-        gyro, accel = self._errors(imu.signals[rows], gyro_bias, accel_bias, constants)
+        biases = np.concatenate([gyro_bias, accel_bias], axis=1)[self.own] * dt
+        # signals that biases and constants of gyro and accelerometer multiply
+        self.signals = np.concatenate([dt, imu.signals[rows] - biases, imu.signals[rows, 3:5]],
+                                      axis=1)
+        # shares of the signals that are errors, docs/method.md (S3)
+        self.by_gyro, self.by_accel = np.zeros((3, 6)), np.zeros((3, 3))
+        if constants is not None:
+            self.by_gyro[GYRO_AXIS, GYRO_SIGNAL] = constants[GYRO]
+            self.by_accel[ACCEL_AXIS, ACCEL_SIGNAL] = constants[ACCEL]
+        gyro = biases[:, :3] + self.signals[:, OF_GYRO[1:]] @ self.by_gyro[:, :5].T
+        accel = biases[:, 3:] + self.signals[:, OF_ACCEL[1:]] @ self.by_accel.T
         self.turn, self.turn_mean = imu.turn[rows] - gyro, imu.turn_mean[rows] - gyro / 2
         square = skew(self.turn) @ skew(self.turn)
         # integral of the attitude over a step of unit length, and the integral of that
@@ -149,21 +149,18 @@ class _Chunk:
         self.p, self.dp = self._running(self.v * dt + self.step_p)
         # integrals of R over a step, single and double
         self.mean, self.twice = self.R @ self.G, self.R @ self.GG * dt[:, None]
-        # signals that biases and constants of gyro and accelerometer multiply
-        self.signals = np.concatenate([dt, imu.signals[rows]], axis=1)
         self.since = self.t[:-1] - self.t[self.key[:-1]][self.own]      # s, begin of the interval
 
-    def _errors(self, signals: Floats, gyro_bias: Floats, accel_bias: Floats,
-                constants: Floats | None) -> tuple[Floats, Floats]:
-        """Return the sums of the errors in each step: (n, 3) rad, (n, 3) m/s, method (S3)."""
-        gyro, accel = (bias[self.own] * self.dt[:, None] for bias in (gyro_bias, accel_bias))
-        if constants is not None:
-            by_gyro, by_accel = np.zeros((3, 6)), np.zeros((3, 3))
-            by_gyro[GYRO_AXIS, GYRO_SIGNAL] = constants[GYRO]
-            by_accel[ACCEL_AXIS, ACCEL_SIGNAL] = constants[ACCEL]
-            gyro = gyro + signals @ by_gyro.T
-            accel = accel + signals[:, 3:] @ by_accel.T
-        return gyro, accel
+    def _gyro(self, x: Floats) -> Floats:
+        """Return the effects of a gyro's bias and constants, (n, 3, 3 + g), from (n, 3, 3, 6)."""
+        out: Floats = x[:, :, [0, 1, 2, *GYRO_AXIS], [0, 0, 0, *np.add(GYRO_SIGNAL, 1)]]
+        out[:, :, :3] = out[:, :, :3] @ (np.eye(3) - self.by_gyro[:, :3])
+        return out
+
+    def _accel(self, x: Floats) -> tuple[Floats, Floats]:
+        """Return the effects of bias and constants of the accelerometer, from (n, 3, 3, 4)."""
+        return (x[:, :, :, 0] @ (np.eye(3) - self.by_accel),
+                x[:, :, ACCEL_AXIS, np.add(ACCEL_SIGNAL, 1)])
 
     def _running(self, step: Floats) -> tuple[Floats, Floats]:
         """Return the sum before each step since the interval's begin, and each interval's sum."""
@@ -215,11 +212,11 @@ class _Chunk:
         """
         first, last = (np.searchsorted(self.cuts, x) for x in (begin, end))
         turns, once, twice, late = (x[last] - x[first] for x in self.sums)
-        by_turn = _gyro(turns[..., OF_GYRO])
-        once, force = _gyro(once), turns[..., OF_ACCEL]
-        (A, F), (AA, FF) = _accel(force), _accel(force * tau[..., None] + late)
+        by_turn = self._gyro(turns[..., OF_GYRO])
+        once, force = self._gyro(once), turns[..., OF_ACCEL]
+        (A, F), (AA, FF) = self._accel(force), self._accel(force * tau[..., None] + late)
         return (A, AA, F, FF, by_turn, _cross(dv, by_turn) - once,
-                _cross(dp, by_turn) - once * tau - _gyro(twice))
+                _cross(dp, by_turn) - once * tau - self._gyro(twice))
 
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval."""
@@ -233,9 +230,9 @@ class _Chunk:
                              self.signals[:, OF_GYRO]))
         A, AA, F, FF, turned, dv_by, dp_by = self._effects(
             self.key[:-1], self.key[1:], self.dv, self.dp, T[:, None, None])
-        measured = self._sum(self.signals[:, 1:]) / T[:, None]
+        measured = self._sum(self.signals[:, 1:7]) / T[:, None]
         return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, turned, dv_by, dp_by,
-                         self._sum(way), _gyro(S_by), measured[:, :3], measured[:, 3:],
+                         self._sum(way), self._gyro(S_by), measured[:, :3], measured[:, 3:],
                          np.maximum.reduceat(self.longest, self.key[:-1]))
 
     def points(self, t: Floats, j: Ints, interval: Ints, first: int) -> Points:
@@ -253,12 +250,13 @@ class _Chunk:
             self.key[interval], j, dv, dp, tau[:, None, None])
         # errors within the step itself
         share, by = (h / dt)[:, None], self.signals[j]
-        own, moved = _gyro(_by(self.mean[j] * share, by[:, OF_GYRO])), self.step_v[j] * (h / dt)
+        own = self._gyro(_by(self.mean[j] * share, by[:, OF_GYRO]))
+        moved = self.step_v[j] * (h / dt)
         by = by[:, OF_ACCEL]
         (A, F), (AA, FF) = (
-            (x + y for x, y in zip(before, _accel(_by(step, by)), strict=True))
+            (x + y for x, y in zip(before, self._accel(_by(step, by)), strict=True))
             for before, step in (((A, F), self.mean[j] * share),
                                  ((AA, FF), self.twice[j] * share**2)))
         return Points(interval + first, tau, dv, dp, R, A, AA, F, FF, turned + own,
                       dv_by + _cross(moved / 2, own), dp_by + _cross(moved * h / 6, own),
-                      force + rise * h, rate + spin * h, spin, self.signals[j, 1:] / dt)
+                      force + rise * h, rate + spin * h, spin, self.signals[j, 1:7] / dt)

@@ -11,26 +11,26 @@ and mounting angle; a change of this angle is the gyro bias about up. The headin
 rotation from the specific force to the accelerations of the track.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.check import steady
-from odocal_ros.calib.reversal import pieces
-from odocal_ros.data.arrays import Bools, Complexes, Floats
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import by_row
+from odocal_ros.estimator.fitted_track import FittedTrack
 from odocal_ros.estimator.imu_steps import ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.state import LN_K, M, PITCH, Priors, State, YAW
 from odocal_ros.estimator.sums import Intervals
-from odocal_ros.nav.alignment import C_nL, level_frame
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.alignment import level_frame
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.rotations import skew
 
 # s each side, for the mean of a speed: some rows of an odometer. Judgement
 SPEED_WINDOW = 0.4
+START_PART = 600.0      # s, judgement: in which one bias levels a gyro that warms up
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +52,13 @@ def standing(leg: SmootherLeg, t: Floats) -> Bools:
     return by_row(within, t)
 
 
-def rest_bias(leg: SmootherLeg, imu: ImuSteps) -> tuple[Floats, float]:
-    """Return the mean turn rate at standstills, (3,), and their total duration, s."""
-    inside = standing(leg, imu.t)
+def rest_bias(leg: SmootherLeg, imu: ImuSteps) -> Floats | None:
+    """Return the mean turn rate at standstills between the keyframes, (3,); None without any."""
+    first, last = imu.key[[0, -1]]
+    inside = standing(leg, imu.t[first:last + 1])
     still = inside[:-1] & inside[1:]
-    length = float(np.diff(imu.t)[still].sum())
-    if length < 1.0:
-        return np.zeros(3), 0.0
-    return imu.turn[still].sum(axis=0) / length, length
+    length = float(np.diff(imu.t[first:last + 1])[still].sum())
+    return None if length < 1.0 else imu.turn[first:last][still].sum(axis=0) / length
 
 
 def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
@@ -69,9 +68,70 @@ def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
 
     leg : the leg.   imu : its IMU steps with the keyframes.   priors : turn-on bias.   yaw :
     initial yaw mounting, rad, instead of the one estimated from accelerations.
+
     """
-    bias, rest = rest_bias(leg, imu)
-    sigma = np.full(3, 2e-4) if rest else np.maximum(priors.gyro_bias, 1e-3)
+    parts = _parts(leg, imu, priors)
+    K = float(np.average([part.track.K for part in parts],
+                         weights=[np.abs(np.diff(part.track.X)).sum() + 1e-9 for part in parts]))
+    weight = np.array([1 / part.sigma**2 for part in parts])
+    sigma = 1 / np.sqrt(weight.sum()) if weight.any() else np.inf
+    if yaw is None:       # rad: beyond this sigma, the heading is ambiguous
+        turned = [np.exp(1j * (part.psi - part.track.chi)) for part in parts]
+        yaw = float(np.angle(weight @ turned)) if sigma <= 0.2 else 0.0
+    return Start(_joined([_state(leg, part, K, yaw) for part in parts]), float(sigma),
+                 float(np.median([part.track.spread for part in parts])))
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """
+    Part of a leg.
+
+    t : (n,) s, of its keyframes.   C_Lk : (n, 3, 3) attitudes in its level frame.   bias : (3,)
+    rad/s.   psi, sigma : rad, rotation from the level frame to n by accelerations.
+    """
+
+    t: Floats
+    C_Lk: Floats
+    bias: Floats
+    track: FittedTrack
+    psi: float
+    sigma: float
+
+
+def _parts(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Part]:
+    """
+    Return the parts of a leg, of about START_PART each, with biases of their own.
+
+    One bias does not fit a gyro that warms up for an hour, and the level is lost. A part whose
+    heading no fixes determine is joined with the next one, at the end with the one before.
+    """
+    count = max(1, round(float(np.ptp(imu.t[imu.key])) / START_PART))
+    ends = np.linspace(0, len(imu.key) - 1, count + 1).astype(int).tolist()
+    parts, firsts = list[_Part](), [0]
+
+    def between(first: int, last: int) -> _Part:
+        before = parts[-1].bias if parts else np.zeros(3)
+        return _part(leg, replace(imu, key=imu.key[first:last + 1]), priors, before)
+
+    for last in ends[1:]:
+        begin, end = imu.t[imu.key[[firsts[-1], last]]]
+        if np.count_nonzero((leg.t_fix >= begin) & (leg.t_fix <= end)) < 2:
+            continue
+        part = between(firsts[-1], last)
+        if part.track.slope is not None:
+            parts.append(part)
+            firsts.append(last)
+    if firsts[-1] < ends[-1]:
+        parts[-1:] = [between(firsts[-2:][0], ends[-1])]
+    return parts
+
+
+def _part(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _Part:
+    """Return a part; before : (3,) gyro bias of the part before it."""
+    rest = rest_bias(leg, imu)
+    bias = before if rest is None else rest
+    sigma = np.maximum(priors.gyro_bias, 1e-3) if rest is None else np.full(3, 2e-4)
     sums, C_0k = _sums(leg, imu, bias)
     for _ in range(2):
         up, change = _level(leg, sums, C_0k, sigma)
@@ -80,21 +140,14 @@ def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
         sigma = np.minimum(sigma, 5e-4)
     C_Lk = level_frame(up) @ C_0k
     t = imu.t[imu.key]
-    track = _Track(leg, t, C_Lk, sums)
+    track = FittedTrack(leg, t, C_Lk, sums)
     if track.slope is not None:
         up_b = C_Lk[:, 2].mean(axis=0)
         bias = bias - track.slope * up_b / np.linalg.norm(up_b)
         sums, C_0k = _sums(leg, imu, bias)
         C_Lk = level_frame(up) @ C_0k
-        track = _Track(leg, t, C_Lk, sums)
-    psi, yaw_sigma = _heading(leg, t, C_Lk, sums, track)
-    chi = track.chi
-    if yaw is not None:
-        psi = chi + yaw
-    elif yaw_sigma > 0.2:       # rad: the heading is ambiguous
-        psi = chi
-    return Start(_state(leg, t, C_nL(psi) @ C_Lk, bias, track, float(wrap(psi - chi))),
-                 yaw_sigma, track.spread)
+        track = FittedTrack(leg, t, C_Lk, sums)
+    return _Part(t, C_Lk, bias, track, *_heading(leg, t, C_Lk, sums, track))
 
 
 def _sums(leg: SmootherLeg, imu: ImuSteps, bias: Floats) -> tuple[Intervals, Floats]:
@@ -133,92 +186,6 @@ def _level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     return up, change
 
 
-class _Track:
-    """
-    The odometer's track in the level frame, x of b taken as forward, fitted to the fixes.
-
-    X : (N,) travel units, complex.   K : m per unit.   chi : rad, rotation to the fixes at the
-    first keyframe.   slope : rad/s, its change, None without fixes.   place : (N,) m, east + i
-    north.   height : (N,) m.   spread : m, scatter of the fixes about the track.
-    """
-
-    def __init__(self, leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals) -> None:
-        step = (C_Lk[:-1] @ sums.S)[:, :2, 0]
-        self.X = np.concatenate([[0.0], np.cumsum(step[:, 0] + 1j * step[:, 1])])
-        inside = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
-        t_fix, fix = leg.t_fix[inside], leg.fixes_n[inside]
-        sigma = float(np.sqrt(np.median(leg.covariance_n[:, 0, 0])))
-        z = fix[:, 0] + 1j * fix[:, 1]
-        at = np.interp(t_fix, t, self.X)
-        self.K, self.slope = leg.rough_scale, None
-        self.chi = _rotation(np.diff(at), np.diff(z), sigma)
-        for _ in range(2):
-            laid = self.K * np.exp(1j * self.chi) * at
-            apart = np.stack([(laid - z).real, (laid - z).imag], -1)
-            keep, noise = steady(apart, sigma)
-            flat = np.stack([at.real, at.imag], -1) * self.K
-            found = pieces(flat[keep], fix[keep, :2], t_fix[keep], noise)
-            middle, off = found.t, -found.off
-            if not len(middle):
-                break
-            centre = float(np.angle(np.exp(1j * off).sum()))
-            off = np.unwrap(centre + wrap(off - centre)) if len(off) > 1 else off
-            self.chi, slope = _line(middle, off)
-            self.slope = slope
-            at_mid = np.interp(middle, t_fix, np.arange(len(t_fix)))
-            k = np.unique(np.round(at_mid).astype(int))
-            run = np.abs(np.diff(at[k]))
-            way = np.abs(np.diff(z[k]))
-            if (run > 0).any():
-                self.K = float(np.median(way[run > 0] / run[run > 0]))
-        self.bend = 0.0 if self.slope is None else self.slope
-        self.chi_at = self.chi + self.bend * (t - t[0])
-        self.place = self._place(t, t_fix, z)
-        self.height = _smooth(t, t_fix, np.where(np.isnan(fix[:, 2]), 0.0, fix[:, 2]))
-        laid = np.interp(t_fix, t, self.place)
-        self.spread = max(float(np.median(np.abs(laid - z))) / 1.18, 1e-3)
-
-    def _place(self, t: Floats, t_fix: Floats, z: Complexes) -> Complexes:
-        """Return the track plus the smoothed difference from the fixes: (N,) m, east + i north."""
-        steps = np.diff(self.X) * np.exp(1j * (self.chi_at[:-1] + self.chi_at[1:]) / 2) * self.K
-        path = np.concatenate([[0.0], np.cumsum(steps)])
-        off = z - np.interp(t_fix, t, path)
-        return path + _smooth(t, t_fix, off.real) + 1j * _smooth(t, t_fix, off.imag)
-
-
-def _rotation(moved: Complexes, gone: Complexes, sigma: float) -> float:
-    """
-    Return the mean angle from steps of the track to those of the fixes, rad.
-
-    moved, gone : (n,) steps, any unit and m.   sigma : m, of a fix. The weight of a step is its
-    length by the odometer, so that a jump of the fixes does not get a larger weight.
-    """
-    return float(np.angle((moved.conj() * gone / np.maximum(np.abs(gone), sigma)).sum()))
-
-
-def _line(t: Floats, y: Floats) -> tuple[float, float]:
-    """Return value at the first time and slope of a line through points, by medians."""
-    if len(t) < 3:
-        return float(np.median(y)), 0.0
-    i, j = np.triu_indices(min(len(t), 400), 1)
-    pick = np.linspace(0, len(t) - 1, min(len(t), 400)).astype(int)
-    dt = t[pick][j] - t[pick][i]
-    far = dt > (t[-1] - t[0]) / 4
-    slope = float(np.median((y[pick][j] - y[pick][i])[far] / dt[far]))
-    return float(np.median(y - slope * (t - t[0]))), slope
-
-
-def _smooth(t: Floats, t_fix: Floats, y: Floats, window: float = 20.0) -> Floats:
-    """Return medians over windows, interpolated to t, without the effect of outliers."""
-    if not len(y):
-        return np.zeros(len(t))
-    cells = np.floor((t_fix - t_fix[0]) / window).astype(int)
-    at = np.unique(cells)
-    middle = [np.median(t_fix[cells == c]) for c in at]
-    out: Floats = np.interp(t, middle, [np.median(y[cells == c]) for c in at])
-    return out
-
-
 def _speed(leg: SmootherLeg, t: Floats) -> Floats:
     """Return the odometer speed, a mean over 2 SPEED_WINDOW: (N,) units per s."""
     s = leg.travel.at
@@ -226,7 +193,7 @@ def _speed(leg: SmootherLeg, t: Floats) -> Floats:
 
 
 def _heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
-             track: _Track) -> tuple[float, float]:
+             track: FittedTrack) -> tuple[float, float]:
     """
     Return the rotation from the level frame to n from accelerations, rad, and its sigma.
 
@@ -261,19 +228,26 @@ def _heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
     return float(np.angle(x[0])), float(sigma)
 
 
-def _state(leg: SmootherLeg, t: Floats, C_nb: Floats, bias: Floats, track: _Track,
-           yaw: float) -> State:
-    N = len(t)
-    turned = np.exp(1j * (track.chi_at - track.chi))
+def _state(leg: SmootherLeg, part: _Part, K: float, yaw: float) -> State:
+    """Return the state of a part with scale and yaw mounting of the leg."""
+    t, track, N = part.t, part.track, len(part.t)
+    turned = np.exp(1j * (track.chi_at + yaw))
     c, s = turned.real, turned.imag
     spin = np.zeros((N, 3, 3))
     spin[:, 0, 0], spin[:, 0, 1], spin[:, 1, 0], spin[:, 1, 1], spin[:, 2, 2] = c, -s, s, c, 1.0
-    C_nb = spin @ C_nb
+    C_nb = spin @ part.C_Lk
     constants = np.zeros(M)
-    constants[[LN_K, YAW, PITCH]] = np.log(track.K), yaw, 0.0
+    constants[[LN_K, YAW, PITCH]] = np.log(K), yaw, 0.0
     ahead = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
-    v_n = (C_nb @ ahead) * (track.K * _speed(leg, t))[:, None]
+    v_n = (C_nb @ ahead) * (K * _speed(leg, t))[:, None]
     v_n[:, 2] = 0.0
     p_n = np.stack([track.place.real, track.place.imag, track.height], -1)
-    return State(t, p_n, v_n, C_nb, np.tile(bias, (N, 1)), np.zeros((N, 3)), np.zeros(N),
+    return State(t, p_n, v_n, C_nb, np.tile(part.bias, (N, 1)), np.zeros((N, 3)), np.zeros(N),
                  np.zeros((N, 3)), constants)
+
+
+def _joined(states: Sequence[State]) -> State:
+    """Return the states of adjacent parts as one; each begins where the one before ends."""
+    columns = [one.of_keyframes() for one in states]
+    return replace(states[0], **{name: np.concatenate([
+        column[name][min(k, 1):] for k, column in enumerate(columns)]) for name in columns[0]})

@@ -22,7 +22,7 @@ class Intervals:
     A: Floats        # (K, 3, 3) integral of R, s: d dv = -A d ba
     AA: Floats       # (K, 3, 3) its integral: d dp = -AA d ba
     F: Floats        # (K, 3, a) integral of R's columns ACCEL_AXIS times the forces ACCEL_SIGNAL
-    #                  as measured: d dv = -F d constants; A times the mean force may be
+    #                  less their biases: d dv = -F d constants; A times the mean force may be
     #                  millimetres off, which would determine a scale that is not observable
     FF: Floats       # (K, 3, a) its integral: d dp = -FF d constants
     # by the gyro bias (3) and by the constants of GYRO (g)
@@ -31,8 +31,8 @@ class Intervals:
     dp_by: Floats    # (K, 3, 3 + g)
     S: Floats        # (K, 3, 3) sum of R over travel, scale units
     S_by: Floats     # (K, 3, 3 + g) derivative of S @ forward
-    mean_rate: Floats   # (K, 3) mean measured turn rate, with bias, rad/s
-    mean_force: Floats  # (K, 3) mean measured specific force, m/s^2
+    mean_rate: Floats   # (K, 3) mean measured turn rate less its bias, rad/s
+    mean_force: Floats  # (K, 3) mean measured specific force less its bias, m/s^2
     longest_step: Floats   # (K,) longest gap between IMU rows, s
 
     def take(self, rows: slice) -> 'Intervals':
@@ -59,7 +59,7 @@ class Points:
     force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
     rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
     spin: Floats     # (m, 3) rad/s^2, its rate of change
-    measured: Floats    # (m, 6) measured turn rate and specific force, means of the step
+    measured: Floats    # (m, 6) turn rate and specific force less their biases, means of the step
 
     def take(self, index: Ints) -> 'Points':
         """Return the points selected by an index."""

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from odocal_ros.estimator.imu_steps import ImuSteps, STEP
 from odocal_ros.estimator.preintegrate import preintegrate
+from odocal_ros.estimator.state import ACCEL, GYRO, GYRO_AXIS, GYRO_SIGNAL, M
 from odocal_ros.nav.rotations import exp_so3, skew
 
 RATE = np.array([0.05, -0.1, 0.6])      # rad/s
@@ -41,12 +42,12 @@ def integrals(T, terms=12):
     return R, A, AA
 
 
-def summed(leg, t_points=()):
+def summed(leg, t_points=(), constants=None):
     imu = ImuSteps.of(leg, 1.0)
     K = len(imu.key) - 1
     return imu, *preintegrate(imu, np.tile(BIAS, (K, 1)), np.tile(FORCE_BIAS, (K, 1)),
                               lambda t: SPEED * t, np.array([1.0, 0.0, 0.0]),
-                              np.array(t_points))
+                              np.array(t_points), constants)
 
 
 @pytest.mark.parametrize('rate', [10.0, 47.0, 200.0])
@@ -70,6 +71,27 @@ def test_a_constant_turn_has_its_closed_form(rate):
         bent = loose + 4 * SECOND * max(STEP, 1 / rate)**2
         np.testing.assert_allclose(dv, want[1] @ FORCE, atol=bent)
         np.testing.assert_allclose(dp, want[2] @ FORCE, atol=bent)
+
+
+def test_scales_and_axes_multiply_the_signal_and_not_the_bias():
+    """Else a scale error of 1 explains a bias that drifts, and its random walk becomes small."""
+    t, constants = np.arange(0.0, 5.001, 0.01), np.zeros(M)
+    by_rate = np.array(GYRO_SIGNAL) < 3        # not by the force, which has its bias
+    constants[GYRO], constants[ACCEL] = 0.2 * by_rate, 0.1
+    one = np.ones((len(t), 1))
+    _, sums, points = summed(samples(t, one * BIAS, one * FORCE_BIAS), [1.23, 3.91], constants)
+    # of second order in the turn by the bias in a step
+    bent = (np.linalg.norm(BIAS) * STEP)**2 * np.linalg.norm(FORCE_BIAS)
+    for found in (sums, points):
+        np.testing.assert_allclose(found.R - np.eye(3), 0.0, atol=1e-12)
+        for zero in (found.F, found.turned[:, :, 3:][:, :, by_rate]):
+            np.testing.assert_allclose(zero, 0.0, atol=1e-12)
+        for zero in (found.dv, found.dp):
+            np.testing.assert_allclose(zero, 0.0, atol=bent)
+    # an error of the bias is one of the signal, too
+    by_bias = np.eye(3, 6)
+    by_bias[GYRO_AXIS, GYRO_SIGNAL] -= 0.2 * by_rate
+    np.testing.assert_allclose(sums.turned[0, :, :3], by_bias[:, :3], atol=1e-9)
 
 
 # rad: of second order in the turn by the bias in each of ten steps, 0.0027 rad, beside 0.062 rad

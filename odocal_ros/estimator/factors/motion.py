@@ -171,7 +171,7 @@ class Motion:
         self.varied = 1 + self.from_mean @ c[TYRES, None] + self.swung[:, None] * c[BY_PITCHING]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
         # nose down about a point ahead, the odometer goes up; not by turns of a body that rolls
-        self.rate_n = turn(self.C, self.sums.mean_rate - state.gyro_bias[:-1])
+        self.rate_n = turn(self.C, self.sums.mean_rate)
         self.level_left = level_left(self.C @ state.forward)
         nose_down = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
         self.nose_down = np.stack([nose_down, nose_down - slowly(nose_down)], -1)

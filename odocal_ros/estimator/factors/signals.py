@@ -66,7 +66,7 @@ class Signals:
         """
         part, columns = self.motion.take(rows), constants[:, :, GYRO]
         noise = turn(transpose(part.C), part.residual[:, PHI]) / part.T * part.fitted
-        rate = part.sums.mean_rate - self.motion.state.gyro_bias[:-1][rows] + noise
+        rate = part.sums.mean_rate + noise
         bound = LIKELY_NOISE**2 * (gyro[:, PHI]**2).sum(axis=(1, 2))[:, None] / 3 / part.T**2
         noise -= rate * bound / (rate**2 + bound)
         by_bias = by_bias.copy()

@@ -40,7 +40,8 @@ def turned(leg: SmootherLeg, imu: ImuSteps) -> float:
     """Return the total angle of turns faster than TURNING_RATE, without sign, rad."""
     t = imu.t[imu.key]
     T = np.diff(t)
-    turn = imu.over_intervals(imu.turn) - rest_bias(leg, imu)[0] * T[:, None]
+    bias = rest_bias(leg, imu)
+    turn = imu.over_intervals(imu.turn) - (0.0 if bias is None else bias) * T[:, None]
     up = imu.signals[:, 3:].sum(axis=0)
     angle = np.abs(turn @ up) / np.linalg.norm(up)
     way = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
