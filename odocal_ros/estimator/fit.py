@@ -147,6 +147,8 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     while True:
         count += 1
         weighted = Equations(problem, state, priors, spread, fitted).at(levels)
+        if fitted and not was_fitted:      # this step may take back all of the one before
+            taken = np.zeros(M)
         solved = damped(solve(weighted.normal()), taken)
         taken = solved.step_border
         sigma = np.sqrt(np.diag(solved.covariance))
