@@ -87,6 +87,7 @@ class Arrivals:
             if ahead > ODD_NS * self.rate or behind > ODD_NS:
                 self.jump_row = k if not self._odd else self.jump_row
                 self._odd += 1
+                self.dropped += behind != 0
                 self.off_s = (-behind if behind > ODD_NS else ahead) * 1e-9
                 self.jumped |= self._odd >= ODD_ROWS
             elif behind < 0:
@@ -96,7 +97,8 @@ class Arrivals:
                     self.lag_ns = lag
                 else:
                     self.lag_ns -= ahead / LAG_ROWS
-            self.dropped += behind > 0 or behind < 0 and self._odd > 0
+            else:
+                self.dropped += behind > 0      # a row may come twice
             if not self._odd:
                 self._follow(lag)
         self._take_rate(rows[-1][1] if rows else 0)

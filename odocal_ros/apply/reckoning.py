@@ -123,10 +123,7 @@ class Reckoning:
 
     def _next(self) -> int | None:
         """Return the IMU row of the next pose, None until all its samples have arrived."""
-        rows, due = self.imu.rows, self.due()
-        if rows[-1].t < due:
-            return None
-        last = self.imu.from_time(due, self.imu.at + 1)
+        rows, last = self.imu.rows, self.imu.from_time(self.due(), self.imu.at + 1)
         return last if last < len(rows) - 1 and (      # a cubic needs the next sample
             rows[last].t <= self.wheels.newest()
             or rows[-1].t - rows[last].t >= ODOMETER_SILENCE) else None

@@ -13,11 +13,11 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
-import math
 from operator import itemgetter
 from typing import NamedTuple
 
 from odocal_ros.apply.attitude import Vector, ZERO
+from odocal_ros.data.samples import NO_FORCE
 from odocal_ros.screening.glitches import (
     BACK_SHARE,
     EQUAL_NEIGHBOURS,
@@ -40,14 +40,13 @@ STRANGE_TURN_TIME = 1.0        # s; judgement: a longer turn after a step is rea
 ALONE_CHANGE = 2.5        # rad/s^2; judgement: least isolated step; turns start more slowly
 SINGLES = (SINGLE_TURN,) * 3 + (SINGLE_FORCE,) * 3
 SINGLE_ROWS = ROWS_BESIDE + 4      # definition: rows that ``is_single`` uses
-MISSING = (math.nan, math.nan, math.nan)      # definition: m/s^2, no force published
 
 
 class Row(NamedTuple):
     """
     A row of the IMU.
 
-    t : s since the first.   w_b, f_b : rad/s, m/s^2; MISSING: no force published.
+    t : s since the first.   w_b, f_b : rad/s, m/s^2; NO_FORCE: no force published.
     strange : rad/s, implausible part of the turn rate.
     """
 
@@ -63,8 +62,8 @@ Pair = tuple[float, float]
 
 
 def is_possible(w_b: Vector, f_b: Vector) -> bool:
-    """Return True if turn rate, rad/s, and force, m/s^2 or MISSING, are in a sensor's range."""
-    return _within(w_b, MOST_TURN) and (f_b is MISSING or _within(f_b, MOST_FORCE))
+    """Return True if turn rate, rad/s, and force, m/s^2 or NO_FORCE, are in a sensor's range."""
+    return _within(w_b, MOST_TURN) and (f_b is NO_FORCE or _within(f_b, MOST_FORCE))
 
 
 def _within(a: Vector, most: float) -> bool:
@@ -176,13 +175,13 @@ class SpikeScreen:
 
 
 def _largest(a: Vector, b: Vector) -> float:
-    """Return the largest difference between elements of two vectors; NaN for MISSING."""
+    """Return the largest difference between elements of two vectors; NaN for NO_FORCE."""
     (x, y, z), (u, v, w) = a, b
     return max(abs(u - x), abs(v - y), abs(w - z))
 
 
 def _step(last: Row, row: Row) -> Pair:
-    """Return the steps of gyro and force over TURN_STEP and FORCE_STEP; 0 for MISSING."""
+    """Return the steps of gyro and force over TURN_STEP and FORCE_STEP; 0 for NO_FORCE."""
     force = _largest(last.f_b, row.f_b) / FORCE_STEP
     return _largest(last.w_b, row.w_b) / TURN_STEP, force if force == force else 0.0
 

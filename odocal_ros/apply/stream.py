@@ -11,13 +11,12 @@ from odocal_ros.apply.attitude import rotated
 from odocal_ros.apply.spikes import (
     is_possible,
     is_single,
-    MISSING,
     Row,
     SINGLE_ROWS,
     SpikeScreen,
     time_of,
 )
-from odocal_ros.data.samples import Reading
+from odocal_ros.data.samples import NO_FORCE, Reading
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.settings.node_configs import ApplyConfig
 
@@ -53,7 +52,7 @@ class ImuStream:
         for stamp, _, w_i, f_i, *_ in readings:
             w_b, f_b = rotated(self._gyro, w_i), rotated(self._accel, f_i)
             if not any(f_i) or sum(f_b) != sum(f_b):
-                f_b = MISSING
+                f_b = NO_FORCE
             if is_possible(w_b, f_b):
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns

@@ -12,6 +12,7 @@ clocks and never in a result.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, Field, field, fields
+import math
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -23,6 +24,7 @@ from odocal_ros.errors import BadData
 Stamps = Ints
 # a row in plain numbers: stamp and arrival, ns, then the values in the order of the columns
 Reading = tuple[Any, ...]
+NO_FORCE = (math.nan, math.nan, math.nan)      # definition: m/s^2, no force published
 FRAME_BYTES = 48     # judgement: of a frame_id in texts
 # format: status of a position in a local frame; that of a NavSatFix is an int8
 LOCAL = 1000

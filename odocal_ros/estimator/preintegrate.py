@@ -123,11 +123,11 @@ class _Chunk:
         self.signals = np.concatenate([dt, imu.signals[rows] - biases, imu.signals[rows, 3:5]],
                                       axis=1)
         # shares of the signals that are errors, docs/method.md (S3)
-        self.by_gyro, self.by_accel = np.zeros((3, 6)), np.zeros((3, 3))
+        self.by_gyro, self.by_accel = np.zeros((3, 5)), np.zeros((3, 3))
         if constants is not None:
             self.by_gyro[GYRO_AXIS, GYRO_SIGNAL] = constants[GYRO]
             self.by_accel[ACCEL_AXIS, ACCEL_SIGNAL] = constants[ACCEL]
-        gyro = biases[:, :3] + self.signals[:, OF_GYRO[1:]] @ self.by_gyro[:, :5].T
+        gyro = biases[:, :3] + self.signals[:, OF_GYRO[1:]] @ self.by_gyro.T
         accel = biases[:, 3:] + self.signals[:, OF_ACCEL[1:]] @ self.by_accel.T
         self.turn, self.turn_mean = imu.turn[rows] - gyro, imu.turn_mean[rows] - gyro / 2
         square = skew(self.turn) @ skew(self.turn)

@@ -8,7 +8,8 @@ The gyro gives the attitude relative to the first keyframe. The mean specific fo
 is up; its apparent rotation is the gyro bias about the horizontal axes. In the level frame the
 odometer gives the shape of the track. Its fit to the fixes gives the scale and the sum of heading
 and mounting angle; a change of this angle is the gyro bias about up. The heading alone is the
-rotation from the specific force to the accelerations of the track.
+rotation from the specific force to the accelerations of the track. All this is done for each
+part of a long leg, since a gyro warms up.
 """
 
 from collections.abc import Sequence
@@ -68,7 +69,6 @@ def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
 
     leg : the leg.   imu : its IMU steps with the keyframes.   priors : turn-on bias.   yaw :
     initial yaw mounting, rad, instead of the one estimated from accelerations.
-
     """
     parts = _parts(leg, imu, priors)
     K = float(np.average([part.track.K for part in parts],
@@ -123,7 +123,8 @@ def _parts(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Part]:
             parts.append(part)
             firsts.append(last)
     if firsts[-1] < ends[-1]:
-        parts[-1:] = [between(firsts[-2:][0], ends[-1])]
+        first = firsts[-2] if parts else 0
+        parts[-1:] = [between(first, ends[-1])]
     return parts
 
 

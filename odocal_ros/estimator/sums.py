@@ -19,14 +19,14 @@ class Intervals:
     R: Floats        # (K, 3, 3) attitude at the end
     dv: Floats       # (K, 3) m/s
     dp: Floats       # (K, 3) m
-    A: Floats        # (K, 3, 3) integral of R, s: d dv = -A d ba
+    A: Floats        # (K, 3, 3) integral of R (1 - M_a), s: d dv = -A d ba
     AA: Floats       # (K, 3, 3) its integral: d dp = -AA d ba
     F: Floats        # (K, 3, a) integral of R's columns ACCEL_AXIS times the forces ACCEL_SIGNAL
     #                  less their biases: d dv = -F d constants; A times the mean force may be
     #                  millimetres off, which would determine a scale that is not observable
     FF: Floats       # (K, 3, a) its integral: d dp = -FF d constants
     # by the gyro bias (3) and by the constants of GYRO (g)
-    turned: Floats   # (K, 3, 3 + g) rotation of the end: -turned d; the first three are A
+    turned: Floats   # (K, 3, 3 + g) rotation of the end: -turned d
     dv_by: Floats    # (K, 3, 3 + g) derivative of dv
     dp_by: Floats    # (K, 3, 3 + g)
     S: Floats        # (K, 3, 3) sum of R over travel, scale units

@@ -3,7 +3,7 @@
 
 """One topic of the node: waiting raw messages, decoded in blocks by the readers of bags."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import difflib
 from functools import partial
 import time
@@ -33,6 +33,7 @@ from odocal_ros.settings.config import Config
 MOST_TOPICS_MEANT, NAME_SIMILARITY = 2, 0.4      # judgement: suggestions; of difflib, 1: equal
 HEALTH_ROWS = 20       # judgement: readings per update of the health
 STATIC_DEPTH = 100     # judgement: publishers of static transforms
+Read = Callable[[list[bytes], list[int], Callable[[bytes], Any]], Sequence[tuple[str, Any]]]
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
 
 
@@ -187,7 +188,7 @@ class Input:
     def decode(self, raws: list[bytes], received_ns: list[int],
                max_gap_s: float | None) -> list[tuple[str, Any]]:
         """Return (slot, block) pairs of messages; unreadable messages are counted."""
-        pairs = self._read('rows', raws, received_ns)
+        pairs = self._read(self.reader.rows if self.reader else None, raws, received_ns)
         for slot, block in pairs:
             if slot == self.slot:
                 self.sound = np.array(self.health.decoded(
@@ -199,7 +200,7 @@ class Input:
     def readings(self, raws: list[bytes],
                  received_ns: list[int]) -> list[tuple[str, list[Reading]]]:
         """Return (slot, rows in plain numbers) pairs of a few messages, as ``decode``."""
-        pairs = self._read('readings', raws, received_ns)
+        pairs = self._read(self.reader.readings if self.reader else None, raws, received_ns)
         for slot, rows in pairs:
             self._unseen += [row[:2] for row in rows] if slot == self.slot else []
         if len(self._unseen) > HEALTH_ROWS:
@@ -213,13 +214,14 @@ class Input:
             self.health.decoded(list(stamps), received)
             self._unseen = []
 
-    def _read(self, how: str, raws: list[bytes], received_ns: list[int]) -> list[tuple[str, Any]]:
+    def _read(self, read: Read | None, raws: list[bytes],
+              received_ns: list[int]) -> list[tuple[str, Any]]:
         """Return (slot, rows) pairs of messages by a function of the reader."""
         reader, deserialize = self.reader, self._deserialize
-        if reader is None or deserialize is None:
+        if reader is None or deserialize is None or read is None:
             return []
         try:
-            pairs: list[tuple[str, Any]] = getattr(reader, how)(raws, received_ns, deserialize)
+            pairs = list(read(raws, received_ns, deserialize))
             if self.slot == 'imu':
                 self.frame = reader.frame or self.frame or deserialize(raws[0]).header.frame_id
         except Exception as error:  # no message may stop the node

@@ -4,7 +4,6 @@
 """Messages of the IMU, positions and heading: fields and their meaning."""
 
 from collections.abc import Callable, Sequence
-import math
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,6 @@ TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 Pairs = list[tuple[str, samples.Samples]]
 Build = Callable[..., samples.Samples]        # of stamps, arrivals and a slot's columns
 # format: bits of -1 (REP-145), which are compared without a warning of a signalling NaN
-NO_FORCE = (math.nan,) * 3      # definition: m/s^2, no force published
 NONE_SENT = np.float64(-1).view(np.int64)
 # format: block of the position in a 6 x 6 covariance, row by row
 _COVARIANCE = array('pose.covariance', 0, 1, 2, 6, 7, 8, 12, 13, 14)
@@ -67,7 +65,7 @@ class SensorPlan:
     def readings(self, received_ns: Sequence[int], values: list[Any]) -> list[Any]:
         """Return the rows of the IMU in plain numbers, without orientation, from its columns."""
         return [(self.slot, [
-            (sec * 10**9 + nanosec, received, w_i, f_i if of_force != -1 else NO_FORCE)
+            (sec * 10**9 + nanosec, received, w_i, f_i if of_force != -1 else samples.NO_FORCE)
             for received, ((sec,), (nanosec,), *_, w_i, f_i, (of_force,)) in zip(
                 received_ns, values, strict=True)])]
 

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A fit whose sigmas rise and then fall does not end between."""
+"""The iteration of a fit: sigmas that rise and then fall, steps that turn back."""
 
 from drives import configured
 import numpy as np
