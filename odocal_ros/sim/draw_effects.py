@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from odocal_ros.settings.grades import GRADES
-from odocal_ros.sim.zoo import DEG, Drawn, G, KMH, lognormal, plain, Vehicle
+from odocal_ros.sim.zoo import DEG, Drawn, G, KMH, lognormal, MG, plain, Vehicle
 
 
 def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
@@ -243,10 +243,18 @@ def kerbs(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     return {}, lean | {'kerbs': float(rng.uniform(0.04, 0.08)), 'wheelbase': 0.5}
 
 
+def bias_steps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Change the biases at a time in mid-drive: a knock, a strained board, another supply."""
+    accel, gyro = rng.normal(size=(2, 3))
+    return {}, {'accel_step': plain(accel * MG * rng.uniform(1.0, 20.0) / np.linalg.norm(accel)),
+                'gyro_step': plain(gyro * DEG * rng.uniform(0.01, 0.2) / np.linalg.norm(gyro)),
+                'bias_step_at': float(rng.uniform(100.0, 300.0))}
+
+
 EFFECTS = {f.__name__: f for f in (
     triads, g_sensitivity, bias, temperature, vibration, imu_stamps, grade,
     coarse_speed, coarse_pulses, odometer_stamps, speed_law, warming, slip, sideslip, squat,
     lever_arms, receiver_lag, fix_stamps, slow_errors, multipath, covariance, outages)}
 # only with --effect NAME: receivers and buses of some vehicles
 RARE = {f.__name__: f for f in (fused_fixes, tracked_fixes, held_speed, filtered_speed,
-                                late_fixes, tunnels, reflections, kerbs, clocks)}
+                                late_fixes, tunnels, reflections, kerbs, clocks, bias_steps)}

@@ -18,11 +18,11 @@ Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row
 NONE3, NONE9 = (0.0,) * 3, (0.0,) * 9    # definition
 WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
-SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_slope',
-          'accel_slope', 'warm_rise', 'rectification', 'speed_law', 'warming', 'imu_arm_error',
-          'odometer_arm_error', 'antenna_arm_error', 'receiver_odometer', 'sideslip',
-          'squat', 'body_roll', 'crossfall', 'kneeling', 'tunnel_odometer', 'tunnel_heading',
-          'odometer_clock_rate', 'fix_clock_rate')
+SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_step',
+          'accel_step', 'gyro_slope', 'accel_slope', 'warm_rise', 'rectification', 'speed_law',
+          'warming', 'imu_arm_error', 'odometer_arm_error', 'antenna_arm_error',
+          'receiver_odometer', 'sideslip', 'squat', 'body_roll', 'crossfall', 'kneeling',
+          'tunnel_odometer', 'tunnel_heading', 'odometer_clock_rate', 'fix_clock_rate')
 PAIRS = {'slow_errors': 'sigma and correlation time, such as ((1.2,60),(0.9,900))',
          'tunnels': 'begin and length, such as ((200,60),(400,30))'}
 POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_factor',
@@ -43,6 +43,9 @@ class Real:
     g_sensitivity: Matrix = NONE9    # G, rad/s per m/s^2
     gyro_bias: Vector | None = None  # rad/s at the first sample; None: drawn by the grade
     accel_bias: Vector | None = None   # m/s^2
+    gyro_step: Vector = NONE3        # rad/s, change of the bias at bias_step_at
+    accel_step: Vector = NONE3       # m/s^2
+    bias_step_at: float = 0.0        # s after the first sample
     gyro_slope: Vector = NONE3       # rad/s per K
     accel_slope: Vector = NONE3      # m/s^2 per K
     warm_rise: float = 0.0           # K of warming after the first sample

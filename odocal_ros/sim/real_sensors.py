@@ -74,13 +74,15 @@ def crooked(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:
 
 
 def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float]:
-    """Return gyro and accelerometer errors by temperature, drift and vibration: (n, 3) or 0.0."""
+    """Return gyro and accelerometer errors beyond noise and turn-on bias: (n, 3) or 0.0 each."""
     real = options.real
     warmth = real.warm_rise * -np.expm1(-t / real.warm_time)[:, None]
     added = []
     for name, shake in (('gyro', real.gyro_vibration), ('accel', real.vibration)):
         slope, wander = getattr(real, f'{name}_slope'), getattr(real, f'{name}_wander')
         total = warmth * np.array(slope) if real.warm_rise and any(slope) else 0.0
+        if any(step := getattr(real, f'{name}_step')):
+            total = total + (t >= real.bias_step_at)[:, None] * np.array(step)
         if wander:
             total = total + _wander(stream(options.seed, f'real {name} wander'), wander,
                                     real.wander_time, t)

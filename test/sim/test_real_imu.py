@@ -81,6 +81,14 @@ def test_vibration_comes_with_speed_and_moves_the_bias_by_its_square():
     assert (still == 0).all()
 
 
+def test_a_bias_steps_once_by_its_size():
+    t = np.arange(0.0, 20.0, 0.1)
+    gyro, accel = real_sensors.drifts(t, 0 * t, options(accel_step=(0.1, 0.0, -0.2),
+                                                        bias_step_at=7.0))
+    assert gyro == 0.0
+    assert (accel == np.where(t >= 7.0, [[0.1], [0.0], [-0.2]], 0.0).T).all()
+
+
 def test_stamps_are_late_in_order_and_in_batches():
     ns = np.arange(MANY) * 10_000_000
     late = (real_sensors.stamped(ns, stream(3, 'test'), 0.02, 0.003) - ns) * 1e-9

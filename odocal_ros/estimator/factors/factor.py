@@ -27,10 +27,12 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW
 from odocal_ros.estimator.sums import Intervals, Points
 
-# variance factors of an interval: of the odometer forward, sideways and up (slips), of the white
-# noises of the IMU (kerbs, aliased vibration), and of the driving noise of the correlated fix
-# error (jumps of the receiver)
-VARIANCE_FACTORS = ('along', 'side', 'up', 'gyro', 'accel', 'jump')
+# levels of the IMU: white noises, and random walks of its biases
+IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
+# variance factors of an interval: of the odometer forward, sideways and up (slips), of the noises
+# of the IMU (kerbs, aliased vibration; biases that step), and of the driving noise of the
+# correlated fix error (jumps of the receiver)
+VARIANCE_FACTORS = ('along', 'side', 'up', *IMU, 'jump')
 SPREAD, JUMP = len(VARIANCE_FACTORS), VARIANCE_FACTORS.index('jump')
 ACCEL_NOISE = VARIANCE_FACTORS.index('accel')
 IMU_NOISE = slice(VARIANCE_FACTORS.index('gyro'), JUMP)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools
-from odocal_ros.estimator.factors.factor import IMU_NOISE, JUMP, SPREAD
+from odocal_ros.estimator.factors.factor import IMU, IMU_NOISE, JUMP, SPREAD
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer_filter import stamp_of
 from odocal_ros.estimator.leg import SmootherLeg
@@ -28,7 +28,6 @@ from odocal_ros.nav.statistics import gaps_in_rhythm
 
 Floats = NDArray[np.float64]
 # level: variance per second of the white noise or walk; of the road also the axis of the vehicle
-IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
 ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
 INTERVAL = (*IMU, *ROAD)
 # definition: Gauss and Legendre's nodes and weights on 0 to 1
@@ -53,7 +52,7 @@ class IntervalNoise:
 
     motion: Motion
     axes: Floats                       # (K, 3, 3) rows: forward, left, up
-    imu: Floats                        # (K, 2) factors on the unit noises of gyro and accel
+    imu: Floats                        # (K, 4) factors on the unit noises of IMU
     road: Floats                       # (K, 5) effects of the wheels' unit noises along their axes
     extra: Floats                      # (K, 18) variances that are given, not estimated
     given: Floats                      # (K, 18, g) columns of unit noises, the same
@@ -70,18 +69,18 @@ class IntervalNoise:
         out = np.zeros((len(T), ROWS, len(self.component)))
         for point, (x, weight) in enumerate(zip(GAUSS_X, GAUSS_W, strict=True)):
             u = ((1 - x) * T)[:, None, None]
-            root = np.sqrt(weight * T)[:, None, None]
-            of_gyro, of_accel = (root * x[:, None, None] for x in self.imu[rows].T)
             gyro, accel, gyro_walk, accel_walk = (
                 out[:, :, first:first + 3] for first in 12 * point + 3 * np.arange(4))
-            gyro[:, PHI], gyro[:, V] = -one * of_gyro, force * u * of_gyro
-            gyro[:, P], gyro[:, D] = force * (u**2 / 2) * of_gyro, way * u * of_gyro
-            accel[:, V], accel[:, P] = one * of_accel, one * u * of_accel
-            gyro_walk[:, PHI], gyro_walk[:, V] = -C * u * root, force @ C * (u**2 / 2) * root
-            gyro_walk[:, P] = force @ C * (u**3 / 6) * root
-            gyro_walk[:, D], gyro_walk[:, BG] = way @ C * (u**2 / 2) * root, one * root
-            accel_walk[:, V], accel_walk[:, P] = -C * u * root, -C * (u**2 / 2) * root
-            accel_walk[:, BA] = one * root
+            gyro[:, PHI], gyro[:, V] = -one, force * u
+            gyro[:, P], gyro[:, D] = force * (u**2 / 2), way * u
+            accel[:, V], accel[:, P] = one, one * u
+            gyro_walk[:, PHI], gyro_walk[:, V] = -C * u, force @ C * (u**2 / 2)
+            gyro_walk[:, P] = force @ C * (u**3 / 6)
+            gyro_walk[:, D], gyro_walk[:, BG] = way @ C * (u**2 / 2), one
+            accel_walk[:, V], accel_walk[:, P] = -C * u, -C * (u**2 / 2)
+            accel_walk[:, BA] = one
+            root = np.sqrt(weight * T)[:, None] * np.repeat(self.imu[rows], 3, axis=1)
+            out[:, :, 12 * point:12 * (point + 1)] *= root[:, None]
         for column, axis in enumerate(ROAD.values(), 12 * len(GAUSS_X)):
             root = self.road[rows, column - 12 * len(GAUSS_X)]
             out[:, D, column] = self.axes[rows, axis] * root[:, None]
@@ -89,12 +88,12 @@ class IntervalNoise:
 
     def grown(self, by: dict[str, float]) -> Floats:
         """
-        Return the factors of the variances by new levels: (K, 5).
+        Return the factors of the variances by new levels: (K, 7).
 
-        Of the road forward, left, up, of gyro and accelerometer.
+        Of the road forward, left, up, and of IMU.
         """
         out = np.ones((len(self.road), JUMP))
-        out[:, IMU_NOISE] = by['gyro'], by['accel']
+        out[:, IMU_NOISE] = [by[name] for name in IMU]
         for column, (name, axis) in enumerate(ROAD.items()):
             out[:, axis] = np.where(self.road[:, column] > 0, by[name], out[:, axis])
         return out

@@ -11,7 +11,7 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import blocks, room
 from odocal_ros.estimator.chain import JointMarginals, Normal
-from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
+from odocal_ros.estimator.factors.factor import Factor, IMU, LinearisationPoint
 from odocal_ros.estimator.factors.interval_noise import INTERVAL, interval_noise
 from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
@@ -36,7 +36,6 @@ NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyr
          'accel_walk': 'accelerometer_bias_walk', 'along': 'travel_noise',
          'along_hard': 'travel_noise', 'side': 'sideslip', 'side_turn': 'sideslip',
          'up': 'vertical_motion', 'pitching': 'vertical_motion'}
-WHITE_NOISES = ('gyro', 'accel')
 ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up', 'pitching'))
 
 
@@ -237,13 +236,13 @@ class MotionRows(Factor):
 
     def imu_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
         """
-        Return the white noise of gyro and accelerometer in each interval: (K, 2) each.
+        Return the noises of the IMU in each interval: (K, 4) each.
 
         First the norm of the estimates of all unit noises, second the expected variance of the
         one that is observed best.
         """
         estimate, seen = self._noises(marginals)
-        columns = [self.of(name) for name in WHITE_NOISES]
+        columns = [self.of(name) for name in IMU]
         return (np.stack([np.linalg.norm(estimate[:, c], axis=1) for c in columns], -1),
                 np.stack([seen[:, c].max(axis=1) for c in columns], -1))
 
