@@ -86,8 +86,6 @@ setup(
         'tables': [
             'pandas>=2',
             'pyarrow>=14',
-            # LGPL-3.0, read by one test
-            'pymavlink>=2.4',
         ],
         # the site: sphinx-build -W docs site
         'docs': SITE,
@@ -114,6 +112,8 @@ setup(
             'mypy>=1.8',
             'pandas>=2',
             'pyarrow>=14',
+            # LGPL-3.0, read by one test
+            'pymavlink>=2.4',
             'pytest>=7.4',
             'pytest-cov>=4',
             'pytest-xdist>=3.5',

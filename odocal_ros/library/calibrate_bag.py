@@ -39,7 +39,7 @@ class LegDropped(BadUsage):
 def calibrate_bag(path: Path | str | Sequence[Path | str],
                   topics: Mapping[str, str] | None = None, config: Settings = None,
                   legs: Iterable[Leg] | Leg | None = None, *, holdout: bool = False,
-                  hearer: Listener | None = None) -> Calibration:
+                  listener: Listener | None = None) -> Calibration:
     """
     Calibrate from a recorded bag, or from several of one vehicle.
 
@@ -57,7 +57,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
         (A, B); one or several. None: as the node marked them, else found by the standstills.
     holdout : bool
         Keep the last fifth of each leg back from the fit and check the correction on it.
-    hearer : Listener, optional
+    listener : Listener, optional
         Receives notes and progress.
 
     Returns
@@ -73,7 +73,7 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     from odocal_ros.output.ros_files import framed
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
-    received = Notes(hearer or Listener())
+    received = Notes(listener or Listener())
     asked = _Asked(topics_of(topics), config, legs_of(legs), holdout)
     imu = known_imu(config_of(config))
     paths, again = unique_paths(paths_of(path))
@@ -144,7 +144,7 @@ def _each(paths: list[Path], asked: _Asked, received: Notes) -> list[_BagLegs]:
 
 def _one(path: Path, asked: _Asked, unit: str | None, received: Notes) -> _BagLegs:
     """Read a bag and calibrate its legs; ``unit`` is that of the scale in the bags before."""
-    bag = read_bag(path, asked.topics, asked.config, hearer=received)
+    bag = read_bag(path, asked.topics, asked.config, listener=received)
     own = bag.form.scale_unit
     if unit and own != unit:
         raise BadUsage(f'{path}: the scale of its odometer {bag.topics["odometer"]} is in '

@@ -114,20 +114,21 @@ class Recording:
 
 def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
                journal: JournalNotes | None,
-               hearer: asked.Listener | None = None) -> tuple[dict[str, str], dict[str, Reader]]:
+               listener: asked.Listener | None = None) -> tuple[dict[str, str], dict[str, Reader]]:
     """Return slot -> topic, and topic -> reader; ``topics`` take precedence over a journal's."""
     from odocal_ros.library.topics import choose_topics, local_reference
     named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
     chosen = choose_topics(bag.topics, config, named, bool(marks_of(config, bag)))
     said = local_reference(bag.topics, chosen, named)
-    if said and hearer:
-        hearer.note(said)
+    if said and listener:
+        listener.note(said)
     return chosen, {topic: make_reader(slot, bag.topics[topic].msgtype, config)
                     for slot, topic in chosen.items()}
 
 
 def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
-             config: asked.Settings = None, *, hearer: asked.Listener | None = None) -> Recording:
+             config: asked.Settings = None, *,
+             listener: asked.Listener | None = None) -> Recording:
     """
     Read a bag: a rosbag2 folder (sqlite3, mcap), a rosbag1 file, or a file of either.
 
@@ -140,7 +141,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
         found by their type.
     config : Config, mapping of dotted names, or a parameter file, optional
         Settings.
-    hearer : Listener, optional
+    listener : Listener, optional
         Receives notes and progress.
 
     Raises
@@ -149,7 +150,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
         The bag cannot be read, or an input is missing or ambiguous.
 
     """
-    hearer = hearer or asked.Listener()
+    listener = listener or asked.Listener()
     path = Path(path)
     journal = journal_notes(path)
     settings = asked.config_of(config, journal.settings if journal else None)
@@ -160,12 +161,12 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
         if floor_marks:
             settings = with_marks(settings)
         if journal:
-            hearer.note(f'{bag.name} is a journal: settings and topics come from '
+            listener.note(f'{bag.name} is a journal: settings and topics come from '
                           f'{journal.path}; options take precedence')
-        chosen, readers = readers_of(bag, topics or {}, settings, journal, hearer)
+        chosen, readers = readers_of(bag, topics or {}, settings, journal, listener)
         digest = beside.submit(bag_sha256, bag)
         recorder = LegRecorder()
-        with hearer.phase(f'reading {name}') as progress:
+        with listener.phase(f'reading {name}') as progress:
             bag.read(with_static(readers, bag.topics), recorder.feed, progress)
         recorder.form = readers[chosen['odometer']].form or recorder.form
         if 'odometer_right' in chosen:
@@ -177,8 +178,8 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
         marks = marked_legs(bag)
         for note in bag.notes:
             if isinstance(note, str):
-                hearer.note(note)
-        with hearer.phase(f'checksum of {name}'):
+                listener.note(note)
+        with listener.phase(f'checksum of {name}'):
             sha256 = digest.result()
         imu = chosen.get('imu', '')
         frame = readers[imu].frame or bag.frame(imu) if imu else ''

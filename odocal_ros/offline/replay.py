@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.library.calibrate_bag import calibrate_bag
     from odocal_ros.offline.cli import trace_file
     calibration = calibrate_bag(args.bags, asked_topics(args), config, args.leg,
-                                holdout=args.holdout, hearer=_Screen(args))
+                                holdout=args.holdout, listener=_Screen(args))
     for name, trace in traces(calibration.result.legs):
         warn(f'odocal: method {name} failed with an internal error; please report it with '
              f'{trace_file(trace)}')

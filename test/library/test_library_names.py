@@ -14,8 +14,9 @@ from odocal_ros.library.calibration import Calibration
 
 pytestmark = pytest.mark.core
 SIGNATURES = {
-    'calibrate_bag': '(path, topics=None, config=None, legs=None, *, holdout=False, hearer=None)',
-    'read_bag': '(path, topics=None, config=None, *, hearer=None)',
+    'calibrate_bag': '(path, topics=None, config=None, legs=None, *, holdout=False, '
+                     'listener=None)',
+    'read_bag': '(path, topics=None, config=None, *, listener=None)',
     'simulate': "(scenario='town', out=None, *, storage='mcap', compression='none', force=False, "
                 'heading_sigma=None, progress=None, **options)',
     'plan': '(*, distance=None, speed=None, turns=None, standstill=None, acceleration=1.0, '
