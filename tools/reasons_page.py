@@ -200,7 +200,7 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'constant in this leg. The stated value is its mean over the path; `scale_by_speed` and '
         '`scale_by_time` are its slopes.',
         Code.CHANGE_IN_LEG: 'Scale, yaw or pitch before and after this time differ by more than 5 '
-        'sigma, the scale by more than 0.03 %: the IMU or its bracket moved, or tyres, load or '
+        'sigma and 0.03 % or 0.017 deg: the IMU or its bracket moved, or tyres, load or '
         'odometer changed. The sigma of an angle was increased so that it covers both values; the '
         'scale is the mean over the path.',
         Code.FIXES_SMOOTHED: 'Positions follow accelerations like a filter output: later and '

@@ -4,6 +4,7 @@
 """Scale and mounting that change within a leg: the score test, and what is stated."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 from drives import turned
 import numpy as np
@@ -12,11 +13,12 @@ from smoother_legs import leg_of, made
 
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.chain import Normal, solve
-from odocal_ros.estimator.changes import changes
+from odocal_ros.estimator.changes import changes, Step
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import CONVERGENCE
 from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.result.remarks import _changes, LEAST_CHANGE
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import LN_K, PITCH, YAW
 from odocal_ros.reasons import Code
@@ -141,3 +143,10 @@ def test_a_scale_that_changes_is_said_with_size_and_time():
     assert 'the scale factor changes by about -1.' in said[Code.CHANGE_IN_LEG]
     near = float(said[Code.CHANGE_IN_LEG].split('near t = ')[1].split(' s')[0])
     assert abs(near - (AFTER * DRIVE['duration'] - 20.0)) < DRIVE['duration'] / 8
+
+
+@pytest.mark.parametrize('constant', [LN_K, YAW])
+def test_a_change_that_does_not_matter_is_not_reported(constant):
+    for size, count in ((0.9 * LEAST_CHANGE, 0), (1.1 * LEAST_CHANGE, 1)):
+        fit = SimpleNamespace(steps=(Step(constant, 100.0, size, size / 7),))
+        assert len(_changes(fit)) == count

@@ -53,7 +53,8 @@ MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 FALLS_WITH_SPEED = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
                     'wheel at high speed. Tyres grow with speed, which is the opposite. Use wheel '
                     'pulses, or a wheel that is not driven.')
-LEAST_CHANGE = 3e-4     # relative, judgement: smaller changes of the scale are not reported
+# relative, rad, judgement: smaller changes of the scale or of an angle are not reported
+LEAST_CHANGE = 3e-4
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
 OF_POSES = ('Uncertainties were increased to match the residuals. Check the map, and the '
             'covariance that this source of positions states.')
@@ -186,7 +187,7 @@ def _changes(fit: Fit) -> list[Reason]:
     """Return the reason for a scale or mounting that changes in the leg."""
     said = []
     for step in fit.steps:
-        if step.certain and (step.constant != LN_K or abs(step.size) > LEAST_CHANGE):
+        if step.certain and abs(step.size) > LEAST_CHANGE:
             what = CONSTANTS[step.constant].replace('_', ' ')
             size = f'{100 * step.size:+.2f} %' if step.constant == LN_K else \
                 f'{np.rad2deg(step.size):+.2f} deg'
