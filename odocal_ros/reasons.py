@@ -40,8 +40,8 @@ class Code(Enum):
     NO_FIX = REJECT, ('Drive under open sky and wait for a position before the start mark. '
                       'Without GNSS: start the localisation first, and name its topic with '
                       '--fix-topic.')
-    FIXES_UNUSABLE = REJECT, ('Wait for a valid position. If these fixes are good, relax '
-                              'gnss.min_status or gnss.max_sigma.')
+    FIXES_UNUSABLE = REJECT, ('Wait for a valid position. If these fixes are good, lower '
+                              'gnss.min_status or raise gnss.max_sigma.')
     BAD_ROWS_DROPPED = NOTE, ('Check the driver that sends these messages. All other messages '
                               'were used.')
     LOCAL_FRAME = NOTE, 'No action needed: the uncertainties include the unknown Earth rate.'
@@ -61,7 +61,7 @@ class Code(Enum):
     CLOCKS_DRIFT = NOTE, ('Synchronise the clocks (PTP, PPS, chrony), or stamp all sensors with '
                           'one clock. The drift matters to all software that combines them.')
     DELAY_SEEN = NOTE, ('Set the time_offset named above, here and in every other program that '
-                        'combines these sensors. The two-point method improves most.')
+                        'combines these sensors. This improves the two-point method most.')
     ODOMETER_LATE = NOTE, ('Publish the counter with a header stamped at the time of reading, or '
                            'reduce bus or CPU load. The late messages were moved back to their '
                            'estimated times.')
@@ -89,8 +89,8 @@ class Code(Enum):
                          'imu.gyro_scale.')
     IMU_LOOKS_Z_DOWN = CAUTION, ('Set imu.mounting_rpy to [3.141592654, 0, 0] if the '
                                  'axes are forward-right-down.')
-    IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up. If the '
-                        'drive determines the IMU orientation, the values are given.')
+    IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up. '
+                        'odocal inspect prints the values if the drive determines them.')
     IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the other noise '
                                      'settings, to the values of this IMU. A gyro in deg/s also '
                                      'looks like this: then set imu.gyro_scale.')
@@ -135,18 +135,18 @@ class Code(Enum):
     CHECK_WORSE = CAUTION, ('Keep the previous calibration. Find in the report where the track '
                             'deviates from the fixes (slip, gaps, bad fixes), then drive again.')
     WHEEL_SLIP = CAUTION, ('Drive gently on a firm, dry road, or use a wheel that is not driven. '
-                           'The uncertainty was increased by the slip found.')
+                           'The uncertainty includes the detected slip.')
     TRAVEL_MISSING = NOTE, ('Check the odometer at low speed: truncated speeds, a dead band, or a '
                             'sensor that misses pulses. The uncertainty was increased.')
     TRAVEL_EXCESS = NOTE, ('Check the odometer before stops: a speed that is held or late. The '
                            'uncertainty was increased.')
     SCALE_VARIES = NOTE, ('No action needed. For a value that stays valid longer, drive with '
                           'warm tyres at typical speeds, and combine several legs.')
-    CHANGE_IN_LEG = CAUTION, ('Check that the IMU and its bracket are fixed, and tyres, load and '
-                              'odometer. Then drive again, or use the part of the leg before or '
-                              'after this time (--leg). The value is a mean of both parts.')
+    CHANGE_IN_LEG = CAUTION, ('Check the mounting of the IMU, the tyres, the load and the '
+                              'odometer. Then drive again, or use the section before or after '
+                              'this time (--leg). The value is a mean of both sections.')
     FIXES_SMOOTHED = NOTE, ('If possible, switch off smoothing in the receiver (position filter, '
-                            'static hold): accelerations then determine more.')
+                            'static hold): unfiltered fixes contain more information.')
     FIXES_FOLLOW_ODOMETER = CAUTION, ('Use positions that do not contain the wheel odometry. '
                                       'Receiver: the topic before fusion, or dead reckoning '
                                       'switched off. SLAM, AMCL, robot_localization: a source '
@@ -198,8 +198,9 @@ class Code(Enum):
     SEARCH_WIDENED = NOTE, ('If the values are plausible, ignore. Otherwise check '
                             'odometer.nominal_scale and the heading; wheels.radius_range and '
                             'wheels.heading_range set the initial search range.')
-    SEARCH_NOT_SETTLED = CAUTION, ('Widen wheels.radius_range and wheels.heading_range, or set '
-                                   'better start values.')
+    SEARCH_NOT_SETTLED = CAUTION, ('Widen wheels.radius_range and wheels.heading_range, or '
+                                   'correct the start values: odometer.nominal_scale and the '
+                                   'heading.')
     # all the samples at once
     NOT_CONVERGED = REJECT, ('Check units, axes and clocks with odocal inspect, then drive a leg '
                              'with stops and turns. The other methods may still have a result.')
@@ -220,7 +221,7 @@ class Code(Enum):
     LEGS_DISAGREE = CAUTION, ('Find the leg that differs. Likely causes: tyre pressure, load or '
                               'slip (scale), a moved IMU (angles), driver timing (delays), bad '
                               'fixes. The combined uncertainty was increased.')
-    SCALE_CHANGED = CAUTION, ('Check tyre pressure, load and tyres. The scale stated is valid '
+    SCALE_CHANGED = CAUTION, ('Check tyre pressure, load and tyres. The stated scale is valid '
                               'from the change on.')
     LEGS_UNLIKE = REJECT, ('Combine only legs of one vehicle, one mounting, and the same topics '
                            'and settings. Calibrate the other legs separately.')

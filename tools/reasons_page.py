@@ -73,8 +73,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'IMU messages that arrived at the same time. Positions and travel would be combined at '
         'wrong times.',
         Code.CLOCK_SET: 'The stamps of a topic step by 10 ms or more against their arrival times, '
-        'and stay so: its clock was set. Its other stamps, and the marks, were moved by as much, '
-        'so that the clock runs on.',
+        'and stay so: its clock was set. The stamps on one side of the step were shifted by the '
+        'same amount; if the clock is that of the IMU, the marks too.',
         Code.CLOCKS_DRIFT: 'The delay of one sensor changes during the leg by more than three '
         'sigmas and 10 ms: its clock is faster or slower than that of the IMU. Quartz clocks '
         'differ by up to 100 ppm, 0.1 s in 17 minutes. The smoother estimates the rate and '
@@ -130,9 +130,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'accelerometer has the wrong sign, as the accelerations in turns show, or the IMU was '
         'moved in the vehicle by 45 deg or more.',
         Code.IMU_WORSE_THAN_GRADE: 'IMU errors are larger than its grade. The smoother uses the '
-        'noise estimated from the drive instead. Sigmas that only rest on the grade, such as '
+        'noise estimated from the drive instead. Sigmas that only depend on the grade, such as '
         'those of the other methods, are too small. Or errors are far larger for some seconds: '
-        'vibration above half the rate of the IMU (aliasing) becomes slow there.',
+        'vibration above half the rate of the IMU is aliased to low frequencies.',
         Code.IMU_SATURATED: 'The largest value of an axis is repeated: the sensor stops at the '
         'limit of its range, 2 g or 16 g for an accelerometer. Potholes and a hard mount cause '
         'this. Noise levels are estimated with it.',
@@ -209,7 +209,7 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.FIXES_FOLLOW_ODOMETER: 'The scale of the fixes over seconds differs from their '
         'scale over minutes. This happens if the receiver fuses the fixes with a wheel speed of '
         'its own. Limits: 5 sigmas of this difference and 0.05 %. For SLAM and AMCL with wheels '
-        'the scale is known as from so many samples as the leg has time constants.',
+        'the effective sample size is the duration of the leg divided by the time constant.',
         Code.FIXES_DEAD_RECKONED: 'The fixes of some seconds are smooth, as odometer and gyro '
         'predict them, and a jump follows: the receiver had no satellites, as in a tunnel. '
         'These fixes contain errors of its own odometer and are not used.',

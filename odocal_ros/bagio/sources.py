@@ -206,7 +206,7 @@ def kind_of(path: Path) -> str:
     for magic, kind in MAGIC.items():
         if head.startswith(magic):
             return kind
-    what = 'is an empty file' if not head else 'is no bag'
+    what = 'is an empty file' if not head else 'is not a bag'
     raise BadBag(f'{path.name}: {what}; give a folder with metadata.yaml or a .mcap, .db3 or .bag '
                  'file')
 

@@ -76,11 +76,11 @@ def _distance_limit(sigma: float, distance: float) -> float:
 
 def mismatch(check: TrackCheck, fix_sigma: float, drift: float,
              distance: float) -> tuple[Reason, ...]:
-    """Return TRACK_MISMATCH where the corrected track differs from the fixes beyond its sigmas."""
+    """Return TRACK_MISMATCH where the calibrated track is too far from the fixes."""
     allowed = _distance_limit(np.hypot(np.sqrt(2) * fix_sigma, drift), distance)
     if check.rms <= allowed:
         return ()
-    return (Reason(Code.TRACK_MISMATCH, f'the corrected track is {check.rms:.1f} m rms from the '
+    return (Reason(Code.TRACK_MISMATCH, f'the calibrated track is {check.rms:.1f} m rms from the '
                    f'fixes; the limit is {allowed:.1f} m'),)
 
 

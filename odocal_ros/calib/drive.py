@@ -29,9 +29,11 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
     step, yaw = np.abs(np.diff(s)), np.unwrap(yaw_from_quat(track.q_nb[inside]))
     turning = np.abs(rate_over_second(t, yaw)) > leg.max_yaw_rate
     share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
-    if share > 0.1:     # judgement: manoeuvres at the ends are shorter
+    limit = 0.1         # judgement: manoeuvres at the ends are shorter
+    if share > limit:
         found += (Reason(Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven '
-                         f'in turns above {leg.max_yaw_rate:g} rad/s'),)
+                         f'in turns above {leg.max_yaw_rate:g} rad/s; the limit is '
+                         f'{100 * limit:.0f} %'),)
     return distance, found
 
 
@@ -83,7 +85,7 @@ def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
     if not what:
         return ()
     return (Reason(Code.TOPIC_GAP, f'the odometer {" and ".join(what)}: the leg is limited to '
-                   'the odometer data'),)
+                   'the time of the odometer data'),)
 
 
 def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
@@ -97,7 +99,7 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
     t_here, here = t_fix[rows], fixes_n[rows, :2]
     if len(here) < 2:
         return (Reason(Code.NO_FIX, f'{len(here)} usable fix{"es" * (len(here) != 1)} between the '
-                       'marks'),)
+                       'marks; required: 2 or more'),)
     if len(here) > 4:       # a single outlier is no motion: running median of three
         here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
         t_here = t_here[1:-1]

@@ -65,8 +65,8 @@ def check_worse(way: Floats, before: Floats, after: Floats, configured: bool) ->
         if pieces < 3 or now.mean() < 1.1**2 * was.mean() \
                 or more.mean() < REMARK_SIGMAS * more.std() / np.sqrt(pieces):
             continue
-        return [Reason(Code.CHECK_WORSE, f'in {length:g} m of path the calibrated track deviates '
-                       f'{np.sqrt(now.mean()):.2g} m rms from the fixes, '
-                       + ('as configured' if configured else 'uncalibrated')
+        return [Reason(Code.CHECK_WORSE, f'in sections of {length:g} m the calibrated track '
+                       f'deviates {np.sqrt(now.mean()):.2g} m rms from the fixes, the '
+                       + ('track as configured' if configured else 'uncalibrated track')
                        + f' {np.sqrt(was.mean()):.2g} m')]
     return []

@@ -225,7 +225,7 @@ def _judge_angles(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
     if not alignment.heading_separable:
         reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'the only heading is the course over ground, '
                            'which includes the mounting angle: the end points only constrain the '
-                           'sum'),)
+                           'sum of heading and yaw'),)
     elif share > asked:
         reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'heading uncertainty '
                            f'({alignment.heading_source}) is {np.rad2deg(share):.3f} deg, the '
@@ -277,7 +277,9 @@ def _planes_agree(check: dict[str, dict[str, float]], K: float,
                   sigma_relative: float) -> tuple[Reason, ...]:
     worst = max(abs(c['scale_factor'] / K - 1) for c in check.values())
     # relative: a plane about the leg preserves ratios of chords far better
-    if worst > 3e-5 + 0.2 * sigma_relative:
-        return (Reason(Code.PLANES_DISAGREE, 'the scale in the plane or on the geodesic differs '
-                       f'by {worst * 1e6:.0f} ppm from the scale in space'),)
+    limit = 3e-5 + 0.2 * sigma_relative
+    if worst > limit:
+        return (Reason(Code.PLANES_DISAGREE, 'the scale as ratio of chords, in a map plane or on '
+                       f'the ellipsoid, differs by {worst * 1e6:.0f} ppm from the estimated '
+                       f'scale; the limit is {limit * 1e6:.0f} ppm'),)
     return ()

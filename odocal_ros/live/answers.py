@@ -38,7 +38,7 @@ def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: i
     text = sentence(calibration)
     if parts and len(calibration.legs) > 1:
         verdict = Verdict.worst(one.verdict for one in parts)
-        cut = f' in {len(parts)} parts' if len(parts) > 1 else ''
+        cut = f' in {len(parts)} sections' if len(parts) > 1 else ''
         text = (f'leg {leg_id}{cut}, {sum(one.distance for one in parts):.0f} m, '
                 f'{verdict.value}; all legs {text}')
     said = [text, good]
@@ -62,7 +62,7 @@ def provisional(at_stop: SessionView) -> str:
     if any(e.value is not None for e in known.values()):
         estimate = (f'the running estimate is {values_in_words(known)}, computed '
                     f'{at_stop.forecast_age_s:.0f} s before the end')
-    faults = [f'Now it would be rejected: {r.code.name}: {r.text}'
+    faults = [f'The leg would be rejected: {r.code.name}: {r.text}'
               for r in at_stop.faults[:1] if at_stop.lost_cause]
     of_all = ' of all legs' if session.legs else ''
     return _sentences([

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
             ('Python', f'{platform.python_version()}, {sys.executable}'),
             ('system', f'{platform.platform()}, {os.cpu_count()} cores')]
     rows += [(name, _version(name)) for name in NEEDED]
-    rows += [(name, _version(name, f'none: no {use}')) for name, use in OPTIONAL.items()]
+    rows += [(name, _version(name, f'not installed: no {use}')) for name, use in OPTIONAL.items()]
     rows += _ros()
     rows += [(name, os.environ[name]) for name in WORTH if name in os.environ]
     rows += [('results of a node', _room(Path(os.environ.get('ROS_HOME') or '~/.ros') / 'odocal')),

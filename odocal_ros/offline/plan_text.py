@@ -30,7 +30,7 @@ def indoor_screen(runs: list[PlannedRun]) -> str:
     names = [name for name in SHOWN if name in by.estimates
              and not (name == 'yaw_mounting_angle' and by.name == 'planar')]
     drift = f', drift {1000 * robot.drift:.2g} mm' if robot.drift else ''
-    where = ' at rests' if robot.at_rests else f' at {robot.rate:g} Hz'
+    where = ' at standstills' if robot.at_rests else f' at {robot.rate:g} Hz'
     lines = [f'{robot.drive}, {robot.wheels} wheels, {"with" if robot.imu else "without"} an IMU; '
              f'method {by.name}',
              f'positions {1000 * robot.white:.2g} mm{where}{drift}; wheel slip '

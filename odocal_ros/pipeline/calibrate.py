@@ -137,7 +137,8 @@ def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:
             (len(inputs.t_imu), 4, Code.NO_IMU, 'IMU'),
             (len(inputs.travel.t), 2, Code.NO_ODOMETER, 'odometer')):
         if n < least:
-            missing.append(Reason(code, f'{n} usable {what} messages'))
+            missing.append(Reason(code, f'{n} usable {what} message{"s" * (n != 1)}; '
+                                        f'required: {least} or more'))
     if not len(inputs.t_fix) and len(leg.fix.stamp_ns):     # none received: reported already
         missing.append(Reason(Code.FIXES_UNUSABLE, 'no usable fix'))
     return missing

@@ -65,7 +65,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     reasons += unlike_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in good])
     if len(good) < config.verdict.min_legs and good:
         reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(good)} good leg'
-                              f'{"s" * (len(good) > 1)} of {config.verdict.min_legs}'))
+                              f'{"s" * (len(good) > 1)}; required: {config.verdict.min_legs}'))
     if not giving and not any(r.code.gravity is Verdict.REJECTED for r in reasons):
         reasons.append(Reason(Code.NO_METHOD, 'no method could be run'))
     quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)

@@ -54,9 +54,9 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
     if named.any():
         worst, times = int(np.argmax(late)), int((np.diff(named.astype(int)) == 1).sum())
         found.append(Reason(Code.ODOMETER_LATE, f'{int(named.sum())} of {len(t)} {name} messages '
-                            f'arrived late, {max(times, 1)} time{"s" * (times > 1)}, by up to '
-                            f'{late[worst]:.3g} s at t = {t[worst]:.2f} s; moved back between '
-                            'their neighbours'))
+                            f'arrived late, in {max(times, 1)} burst{"s" * (times > 1)}, by up '
+                            f'to {late[worst]:.3g} s at t = {t[worst]:.2f} s; moved back to '
+                            'their estimated times'))
     return true
 
 

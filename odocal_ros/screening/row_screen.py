@@ -132,7 +132,7 @@ def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
     suspect = glitches.about_clumps(wild)
     if suspect.any() or wild.sum() > most:
         found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
-                            'messages hold impossible values or outliers; '
+                            'messages hold impossible values or are outliers; '
                             f'{int((suspect & good & ~wild).sum())} messages next to them were '
                             'dropped too'))
     return suspect

@@ -37,7 +37,7 @@ def saturated(t_imu: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> tuple[
                 following = peak(x, where=inside(x, limit), initial=none)
                 if count > TIMES_NEXT * np.count_nonzero(x == following):
                     found.append((count, float(t_imu[at.argmax()]),
-                                  f'{sensor} {axis} stops at {limit * scale:+.4g} {unit}'))
+                                  f'{sensor} {axis} saturates at {limit * scale:+.4g} {unit}'))
     if not found:
         return ()
     count, t, words = max(found)

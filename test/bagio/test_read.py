@@ -112,7 +112,7 @@ def test_split_bag_is_read_as_one(data_dir):
 @pytest.mark.parametrize(('name', 'says'), [
     ('empty_sqlite3_with_wal', 'the bag is empty, 0 messages on 2 topics'),
     ('unknown_serialization_sqlite3', "'wrong_format', only cdr"),
-    ('README.md', 'is no bag'), ('nothing_here', 'no such file or folder')])
+    ('README.md', 'is not a bag'), ('nothing_here', 'no such file or folder')])
 def test_bags_that_cannot_be_read(data_dir, name, says):
     with pytest.raises(BadBag, match=says), open_bag(data_dir / 'reader_bags' / name):
         pass

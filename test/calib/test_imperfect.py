@@ -170,8 +170,8 @@ def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_o
 
 
 @pytest.mark.parametrize(('set_to', 'found', 'text', 'do'), [
-    ((0.0, 0.0, 1.5), 0.7, 'z: set to +1.50 m, found +2.20 ± 0.05 m', 'Measure .* z again'),
-    ((0.0, 0.0, 0.0), -0.73, 'z: not set, found -0.73 ± 0.05 m', 'Measure .* z and set it'),
+    ((0.0, 0.0, 1.5), 0.7, 'z: set to +1.50 m, estimated +2.20 ± 0.05 m', 'Measure .* z again'),
+    ((0.0, 0.0, 0.0), -0.73, 'z: not set, estimated -0.73 ± 0.05 m', 'Measure .* z and set it'),
     ((0.0, 0.0, 0.0), 9.39, 'z: +9.39 ± 0.05 m is larger than a vehicle, so not plausible',
      'Ignore the estimate')])
 def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, text, do):

@@ -58,7 +58,7 @@ def test_a_correction_that_makes_it_worse_is_a_reason():
     (reason,) = check_worse(WAY, wrong() + noise, wrong(1.02) + noise, configured=True)
     assert reason.code is Code.CHECK_WORSE
     # 2 % of the chord of 100 m and the noise of both ends, each axis
-    assert (f'in 100 m of path the calibrated track deviates {np.hypot(2.0, 1.0):.2g} '
+    assert (f'in sections of 100 m the calibrated track deviates {np.hypot(2.0, 1.0):.2g} '
             'm') in reason.text
     assert 'as configured 1 m' in reason.text
     assert check_worse(WAY, wrong(1.02) + noise, wrong() + noise, configured=True) == []

@@ -60,7 +60,7 @@ def test_it_is_said_at_once_and_what_was_good_enough_stays_so(seen):
 
 def test_its_parts_make_the_result_also_of_a_replay(seen):
     assert seen.stop.success
-    assert seen.stop.message.startswith('leg 1 in 2 parts, ')
+    assert seen.stop.message.startswith('leg 1 in 2 sections, ')
     assert seen.status['legs'] == '1'
     one, other = seen.live['legs']
     assert other['start_ns'] - one['stop_ns'] == pytest.approx(3.02e9, abs=1e6)

@@ -163,4 +163,4 @@ def test_a_leg_that_would_be_rejected_is_no_good_news():
     session.start(1, Config())
     now = SessionView(session, Config(), faults=(
         Reason(Code.IMU_GAP, 'no IMU data for 9 s'),), forecast_age_s=math.nan)
-    assert ('Now it would be rejected: IMU_GAP: no IMU data for 9 s. ' in answers.provisional(now))
+    assert 'The leg would be rejected: IMU_GAP: no IMU data for 9 s. ' in answers.provisional(now)

@@ -115,18 +115,18 @@ def test_force_cut_at_a_limit_is_named(step):
     count = int((f[:, 2] == 19.5).sum())
     first = T[np.argmax(f[:, 2] == 19.5)]
     assert words(NONE, f) == [
-        f'accelerometer z stops at +19.5 m/s^2 in {count} of {N} messages, first at t = '
+        f'accelerometer z saturates at +19.5 m/s^2 in {count} of {N} messages, first at t = '
         f'{first:.1f} s']
 
 
 def test_limits_are_of_the_scaled_unit_and_both_ends_are_counted():
     f = np.clip(shaken(5.0), -2 * G, 2 * G) / G
-    assert 'stops at +19.61 m/s^2' in words(NONE, f, imu=ImuConfig(accel_scale=G))[0]
+    assert 'saturates at +19.61 m/s^2' in words(NONE, f, imu=ImuConfig(accel_scale=G))[0]
     assert not words(NONE, f)       # 2 m/s^2 is no range
     w = np.zeros((N, 3))
     w[:, 1] = np.clip(3.0 * np.sin(T), -2.18, 2.18)
     text, = words(w, NONE)
-    assert text.startswith('gyro y stops at ')
+    assert text.startswith('gyro y saturates at ')
     assert text.endswith('; 1 more such limits')
 
 

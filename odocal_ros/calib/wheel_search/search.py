@@ -176,10 +176,11 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
     found = []
     if held:
         sigma = 100 * free.sigma_difference
-        good = f'to {sigma:.2g} % at best' if sigma < 100 else 'not at all'
-        found.append(Reason(Code.WHEELS_NOT_SEPARABLE, 'positions separate left and right wheel '
-                            f'{good} (condition number {free.condition:.2g}, correlation '
-                            f'{free.correlation[0, 1]:+.6f}): the search moved both together'))
+        how = (f'determine the difference of the wheels only to {sigma:.2g} %' if sigma < 100 else
+               'do not separate left and right wheel')
+        found.append(Reason(Code.WHEELS_NOT_SEPARABLE, f'positions {how} (condition number '
+                            f'{free.condition:.2g}, correlation {free.correlation[0, 1]:+.6f}): '
+                            'the search changed both factors together'))
     if refined.widened:
         grown = [f'{name} ± {_amount(k, a)} to ± {_amount(k, b)}' for k, (name, a, b) in enumerate(
             zip(NAMES, ranges.half, refined.half, strict=True)) if b > a]

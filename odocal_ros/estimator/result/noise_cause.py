@@ -56,7 +56,8 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
     said += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
              f'this is its normal noise, {_setting(name, level)}' for name in own]
     said += [f'The cause of the {NAMES[name]} noise is unknown: ' + (
-        'single samples vary less. ' if rest else 'there is no standstill to compare with. ')
+        'single samples vary less than their means over seconds. ' if rest else
+        'there is no standstill to compare with. ')
         + f'Mount the IMU firmly. If this is its normal noise, {_setting(name, level)}'
         for name in unknown]
     return ' '.join(said)

@@ -227,7 +227,8 @@ def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float,
     reasons, wanted = [], f'; the limit is {np.rad2deg(limit):.2g} deg'
     if sigma[LN_K] > SCALE_LIMIT:
         reasons.append(Reason(Code.SCALE_NOT_DETERMINED, 'scale uncertainty is '
-                              f'{100 * sigma[LN_K]:.0f} %, too large to state a value'))
+                              f'{100 * sigma[LN_K]:.0f} %, too large to state a value; the '
+                              f'limit is {100 * SCALE_LIMIT:g} %'))
     nominal = 0.0 if np.isnan(config.imu.nominal_yaw) else config.imu.nominal_yaw
     off = abs(float(wrap(yaw - nominal)))
     if sigma[YAW] > limit:

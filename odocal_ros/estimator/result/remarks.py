@@ -51,15 +51,16 @@ AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer
 # body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 FALLS_WITH_SPEED = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
-                    'wheel at high speed. Tyres grow with speed, which is the opposite. Use wheel '
-                    'pulses, or a wheel that is not driven.')
+                    'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
+                    'Use wheel pulses, or a wheel that is not driven.')
 # relative, rad, judgement: smaller changes of the scale or of an angle are not reported
 LEAST_CHANGE = 3e-4
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
 OF_POSES = ('Uncertainties were increased to match the residuals. Check the map, and the '
             'covariance that this source of positions states.')
-SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have the same error, it is '
-          'imu.lever_arm. Skid steering and tracks look the same; then keep the setting.')
+SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have the same error, '
+          'check imu.lever_arm. Slip in turns (skid steering, tracks) has the same effect; then '
+          'keep the setting.')
 
 
 def beside(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
@@ -220,10 +221,10 @@ def _arms(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
                 said.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
                 do.append(f'Ignore the estimate of {name} {axis}: another error causes it.')
             elif any(arm):
-                said.append(f'{name} {axis}: set to {value:+.2f} m, found {text}')
+                said.append(f'{name} {axis}: set to {value:+.2f} m, estimated {text}')
                 do.append(f'Measure {name} {axis} again.')
             else:
-                said.append(f'{name} {axis}: not set, found {text}')
+                said.append(f'{name} {axis}: not set, estimated {text}')
                 do.append(f'Measure {name} {axis} and set it.')
     return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(said)}; accounted for', ' '.join(
         [*do, SLIDES] if any('easure' in x for x in do) else do))] if said else []
