@@ -123,7 +123,8 @@ class Code(Enum):
     # the drive
     NO_STANDSTILL = CAUTION, ('Stand still for 10 s or more before the start mark. Level, gyro '
                               'bias and heading are then measured at rest.')
-    LEG_TOO_SHORT = REJECT, 'Drive farther between the marks. The limit is leg.min_distance.'
+    LEG_TOO_SHORT = REJECT, ('Drive farther between the marks. The limit is leg.min_distance, '
+                              'without GNSS reference.min_distance.')
     CHORD_TOO_SHORT = REJECT, ('End the leg far from its start, or mark a straight section with '
                                '--leg. The two-point method only uses the line from start to end.')
     SPEED_TOO_LOW = CAUTION, ('Drive faster than leg.min_speed in part of the leg. For a slow '

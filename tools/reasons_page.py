@@ -157,7 +157,7 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'digits and `_ . / -`, without a leading `/`). The files for TF contain the frame named '
         'in the text.',
         Code.COVARIANCE_UNKNOWN: 'Fixes have no covariance, or zero or NaN in it; '
-        '`gnss.default_sigma` is used.',
+        '`gnss.default_sigma` is used, in a local frame `reference.default_sigma`.',
         Code.FIXES_NOISIER_THAN_SAID: 'The fixes deviate from the track more than their '
         'covariance states. Their sigma was increased to match the residuals.',
         Code.VELOCITY_UNUSABLE: 'Displacements from the GNSS velocity were compared with the '

@@ -13,7 +13,7 @@ contain no information on the scale.
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Complexes, Floats
-from odocal_ros.data.samples import FixSamples
+from odocal_ros.data.samples import FixSamples, LOCAL
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import ecef_from_geodetic, radii
 from odocal_ros.nav.integral import running_integral
@@ -63,9 +63,12 @@ def usable_fixes(fix: FixSamples, sent: int,
     use = ~(no_fix | lost | poor)
     found: tuple[Reason, ...] = ()
     if (unknown & ~no_fix).any():
+        local = bool((fix.status == LOCAL).any())
+        name = 'reference.default_sigma' if local else 'gnss.default_sigma'
         found += (Reason(Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {sent} '
-                         f'fixes have no usable covariance; {gnss.default_sigma:g} m '
-                         '(gnss.default_sigma) is used'),)
+                         f'fixes have no usable covariance; {gnss.default_sigma:g} m ({name}) is '
+                         'used', f'Set {name} to the real horizontal accuracy of the positions.'
+                         if local else ''),)
     bad = [(f'{int(m.sum())} {what}', do) for m, what, do in (
         (no_fix, f'with status below {gnss.min_status}', 'Drive under open sky, or lower '
          'gnss.min_status if these fixes are good.'),

@@ -58,8 +58,10 @@ def test_replay_calibrates_and_says_what_the_reference_is(bag, tmp_path, capsys)
     assert written['inputs'][0]['topics']['fix'] == '/pose'
     scale = written['result']['scale_factor']
     assert abs(scale['value'] - 0.0213) < 3 * scale['sigma'] < 3e-4 * 0.0213
-    codes = {r['code'] for r in written['legs'][0]['reasons']}
-    assert {'LOCAL_FRAME', 'COVARIANCE_UNKNOWN'} <= codes
+    reasons = {r['code']: r for r in written['legs'][0]['reasons']}
+    assert {'LOCAL_FRAME', 'COVARIANCE_UNKNOWN'} <= set(reasons)
+    for part in ('text', 'remedy'):
+        assert 'reference.default_sigma' in reasons['COVARIANCE_UNKNOWN'][part]
 
 
 @pytest.mark.parametrize('name', ['trajectory.csv', 'debug.mcap', 'track.kml'])
