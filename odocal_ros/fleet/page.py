@@ -231,9 +231,9 @@ def remarks(row: dict[str, Any]) -> list[str]:
                    f'{change["after"][:10]} and {change["by"][:10]}'
                    + ', too large for tyres: check the odometer' * odometer)
     if row['outlier']:
-        out.append(f'{" and ".join(row["outlier"].split())} outlier of its model')
+        out.append(f'outlier of its model: {", ".join(row["outlier"].split())}')
     if row['odd_legs']:
-        out.append(f'outlier leg {", ".join(row["odd_legs"].split())}')
+        out.append(f'outlier legs: {", ".join(row["odd_legs"].split())}')
     if row['rejected_for']:
         since = f', all since {row["rejected_since"]:%Y-%m-%d}' if row['rejected_since'] else ''
         out.append(f'{row["legs"] - row["legs_good"]} of {row["legs"]} legs rejected '

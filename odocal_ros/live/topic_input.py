@@ -253,7 +253,8 @@ class Input:
             return f'{self.topic}: all header stamps are zero; check the driver'
         if not self.publishers:
             return (f'no {INPUTS[self.slot].label} on {self.topic}: 0 publishers found'
-                    + (f', silent for {silent:.0f} s' if self.health.received_ns else
+                    + (f', silent for {silent:.0f} s; restart the driver'
+                       if self.health.received_ns else
                        '; start the driver or remap ' + self.name)
                     + (f' (did you mean {" or ".join(self.meant)}?)' if self.meant else ''))
         types = {p.topic_type for p in self.publishers}
@@ -266,4 +267,5 @@ class Input:
         many = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'
         if not self.health.received_ns:
             return f'{self.topic}: {many} found ({offers}) but no message yet; check the driver'
-        return f'no {INPUTS[self.slot].label} on {self.topic} for {silent:.0f} s: {many} found'
+        return (f'no {INPUTS[self.slot].label} on {self.topic} for {silent:.0f} s: {many} found; '
+                'check the driver')

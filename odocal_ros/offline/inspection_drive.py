@@ -221,12 +221,14 @@ def lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> l
                           f'at {found["standstills"][0][0]:.1f} s'))
     short = [leg for leg in legs if leg['way'] < config.leg.min_distance]
     loops = [leg for leg in legs if leg not in short and closed(leg)]
-    for some, code, said in ((short, Code.LEG_TOO_SHORT, 'path length {way:.0f} m'), (
-            loops, Code.CHORD_TOO_SHORT, 'a loop: path length {way:.0f} m, {chord:.0f} m from '
-            'start to end')):
+    limit = f'{config.leg.min_distance:g} m'
+    for some, code, said in ((short, Code.LEG_TOO_SHORT, 'has a path length of {way:.0f} m; the '
+                              f'limit is {limit}'), (
+            loops, Code.CHORD_TOO_SHORT, 'is a loop: {chord:.0f} m from start to end, less than a '
+            'fifth of the path length of {way:.0f} m')):
         if some:
-            many = '' if len(some) == 1 else f'{len(some)} of {len(legs)} legs, as '
-            out.append(Reason(code, many + 'the leg {start:.1f}:{stop:.1f} s is '.format(
+            many = '' if len(some) == 1 else f'{len(some)} of {len(legs)} legs; for example, '
+            out.append(Reason(code, many + 'the leg {start:.1f}:{stop:.1f} s '.format(
                 **some[0]) + said.format(**some[0])))
     if 0 < drive['fastest'] < config.leg.min_speed:
         out.append(Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
@@ -246,7 +248,8 @@ def _heading(found: dict[str, Any], mapping: dict[str, str], config: Config) -> 
         why = 'no heading topic, and the IMU orientation has no covariance'
     elif facts['yaw_sigma'] > config.verdict.max_yaw_sigma:
         why = ('the only heading is the IMU orientation with an uncertainty of '
-               f'{math.degrees(facts["yaw_sigma"]):.1f} deg')
+               f'{math.degrees(facts["yaw_sigma"]):.1f} deg; the limit is '
+               f'{math.degrees(config.verdict.max_yaw_sigma):.2g} deg')
     else:
         return []
     return [Reason(Code.YAW_NOT_SEPARABLE, why)]

@@ -124,8 +124,8 @@ def _lacking(held: Held, reasons: tuple[Reason, ...]) -> tuple[str, str]:
         about = 'scale_factor' if held.name == 'scale_ratio' else held.name
         reason = next((r for r in reasons if ABOUT.get(r.code) == about), None)
         if held.name == 'scale_ratio' and reason is None:
-            return f'{name} not known', 'Set odometer.nominal_scale.'
-        return f'{name} not determined', (reason or DRIVE_MORE[held.name]).remedy
+            return f'{name} is not known', 'Set odometer.nominal_scale.'
+        return f'{name} is not determined', (reason or DRIVE_MORE[held.name]).remedy
     if held.sigma_wanted is None:
         return (f'{name} is beyond its limit, by less than {LIMIT_SIGMAS:g} sigma',
                 DRIVE_MORE[held.name].remedy)
