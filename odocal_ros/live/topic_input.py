@@ -252,11 +252,10 @@ class Input:
         if self.health.stampless:
             return f'{self.topic}: all header stamps are zero; check the driver'
         if not self.publishers:
-            return (f'no {INPUTS[self.slot].label} on {self.topic}: 0 publishers found'
-                    + (f', silent for {silent:.0f} s; restart the driver'
-                       if self.health.received_ns else
-                       '; start the driver or remap ' + self.name)
-                    + (f' (did you mean {" or ".join(self.meant)}?)' if self.meant else ''))
+            meant = f' (did you mean {" or ".join(self.meant)}?)' if self.meant else ''
+            return f'no {INPUTS[self.slot].label} on {self.topic}: 0 publishers found' + (
+                f', silent for {silent:.0f} s; restart the driver' if self.health.received_ns else
+                f'; start the driver or remap {self.name}{meant}')
         types = {p.topic_type for p in self.publishers}
         if self.msgtype and self.msgtype not in types:
             return (f'{self.topic} is published as {", ".join(sorted(types))}; required: '
