@@ -324,7 +324,7 @@ def test_nothing_left(tmp_path, storage):
     data = file.read_bytes()
     for size in (0, 5, 100, 1000):
         file.write_bytes(data[:size])
-        with pytest.raises(BadBag, match=r'empty|no bag|cannot be read'), open_bag(path):
+        with pytest.raises(BadBag, match=r'empty|not a bag|cannot be read'), open_bag(path):
             pass
 
 

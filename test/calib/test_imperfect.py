@@ -190,7 +190,7 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_
                                     'gnss.lever_arm_sigma': 0.1})
     found = smooth(replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0])), config)
     said = {r.code: r.text for r in found.reasons}
-    assert 'gnss.lever_arm x: set to +0.00 m, found +1.' in said[Code.LEVER_ARM_OFF]
+    assert 'gnss.lever_arm x: set to +0.00 m, estimated +1.' in said[Code.LEVER_ARM_OFF]
     # the sigma of this axis is no smaller than its prior; the other two are as configured
     assert found.details['posterior_to_prior']['antenna_lever_arm_x'] > 0.5
     assert 'the antenna lever arm (left, up)' in said[Code.PARAMETER_NOT_DETERMINED]
@@ -213,7 +213,7 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     said = {r.code: r.text for r in found.reasons}
     tau = float(re.search(r'about (.*) s;', said[Code.FIXES_SMOOTHED])[1])
     assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # said to 0.01 s
-    assert 'gnss.lever_arm x: set to +0.00 m, found +0.8' in said[Code.LEVER_ARM_OFF]
+    assert 'gnss.lever_arm x: set to +0.00 m, estimated +0.8' in said[Code.LEVER_ARM_OFF]
     assert ' 2.0 times as large' in said[Code.FIXES_NOISIER_THAN_SAID]
     assert 'from low to high speed' in said[Code.SCALE_VARIES]
     slope = found.details['beside']['scale_by_speed']
