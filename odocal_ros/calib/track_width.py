@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Prior of the track width: of cars, of a measured one, of any vehicle."""
+"""Track width of a vehicle: first value, prior sigmas and limits."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,6 @@ class TrackWidth:
 
     of_a_car: float = 1.6       # first value, if not configured
     least: float = 0.1          # smaller values are not a track width
-    car_sigma: float = 0.8      # of a vehicle that is most likely a car
     any_sigma: float = 10.0     # of any vehicle, if the drive determines it
     first_sigma: float = 3.0    # of any vehicle, if only wheels and gyro are compared
     taped_share: float = 0.02   # 1 sigma of a configured one: by tape, between wide tyres

@@ -90,7 +90,7 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     grade = grade_of(config.imu)
     grade = grade if leg.has_accelerometer else without_accelerometer(grade)
     root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
-    made = Problem(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
+    made = Problem(leg, imu, grade, _priors(config, grade, leg), use, root, still,
                _within(leg, t), _own(leg), turned(leg, imu), config.gnss.correlation_time,
                rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
                drift_time(leg, t), LEAST.fix if not leg.origin.local

@@ -23,8 +23,7 @@ class Problem:
     imu: ImuSteps
     grade: Grade
     priors: Priors
-    within: np.ndarray       # (k,) bool, fixes within the keyframes
-    use: np.ndarray          # (k,) bool, fixes that are used
+    use: np.ndarray          # (k,) bool, fixes within the keyframes
     root: np.ndarray         # (m, 3, 3) inverse roots of the stated covariances
     still: np.ndarray        # (N,) bool
     outside: dict[str, Outside]    # within the keyframes

@@ -124,4 +124,4 @@ def _heading(sent: Heading, state: State, points: Points) -> Rows:
     by_gyro = np.einsum('ki,kij->kj', turns, C @ points.turned)
     J[:, 0, BG], c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]
     c[:, 0, HEADING] = -1.0
-    return Rows(k, raw[:, None], J, c, 1 / sent.noise[:, None])
+    return Rows(raw[:, None], J, c, 1 / sent.noise[:, None])

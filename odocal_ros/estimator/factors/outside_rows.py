@@ -25,9 +25,8 @@ from odocal_ros.settings.config import Config
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows of one kind at one state: (m,), (m, d), (m, d, BARE), (m, d, M), (m, d) 1 / sigma."""
+    """Rows of one kind at one state: (m, d), (m, d, BARE), (m, d, M), (m, d) 1 / sigma."""
 
-    k: np.ndarray
     raw: np.ndarray
     J: np.ndarray
     c: np.ndarray

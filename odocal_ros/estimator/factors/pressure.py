@@ -100,4 +100,4 @@ class PressureRows(OutsideRows):
         by_gyro = -up @ C @ points.dp_by - by_velocity @ C @ points.dv_by
         J[:, :, BG], c[:, :, GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
         c[:, 0, PRESSURE] = -by_constants
-        return Rows(k, raw[:, None], J, c, 1 / sent.sigma[:, None])
+        return Rows(raw[:, None], J, c, 1 / sent.sigma[:, None])

@@ -154,4 +154,4 @@ def _velocity(problem: Problem, point: LinearisationPoint, points: Points) -> Ro
     c[:, :, ACCEL] = C @ signals * t
     J, c = J[:, :2] * times, c[:, :2] * times
     c[:, :, VELOCITY_SCALE] = -v[:, :2]
-    return Rows(k, sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
+    return Rows(sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
