@@ -70,8 +70,8 @@ def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> d
     return {f'gyro_bias_{axis}': bias[:, i:i + 1] for i, axis in enumerate('xyz')} | {
             'gyro_scale': axes[:, scale] * alignment.gyro_scale_sigma,
             'gyro_axes': axes[:, off] * alignment.gyro_axes_sigma,
-            'gyro_noise': alignment.gyro_noise * _root(_spread(r, dt)),
-            'gyro_bias_walk': alignment.gyro_bias_walk * _root(_spread(R, dt))}
+            'gyro_noise': alignment.gyro_noise * root_of(_spread(r, dt)),
+            'gyro_bias_walk': alignment.gyro_bias_walk * root_of(_spread(R, dt))}
 
 
 def _turn(r: Floats, q_nb: Floats) -> Floats:
@@ -97,7 +97,7 @@ def _spread(r: Floats, dt: Floats) -> Floats:
     return spread
 
 
-def _root(covariance: Floats) -> Floats:
+def root_of(covariance: Floats) -> Floats:
     """Return a square root of a covariance that may be singular: A A^T = covariance."""
     value, vector = np.linalg.eigh(covariance)
     root: Floats = vector * np.sqrt(np.maximum(value, 0.0))
@@ -156,8 +156,8 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     at_start = int(np.searchsorted(t, start.t - 1e-9))
     C_first, C_start, C_end = matrix_from_quat(q_nb[[0, at_start, -1]])
     chord = {
-        'fix_start': fix_scale[:, None] * _root(start.covariance_n),
-        'fix_end': fix_scale[:, None] * _root(end.covariance_n),
+        'fix_start': fix_scale[:, None] * root_of(start.covariance_n),
+        'fix_end': fix_scale[:, None] * root_of(end.covariance_n),
         'initial_heading': np.cross([0.0, 0.0, alignment.heading_sigma], D[-1])[:, None],
         # about b's own axes: an accelerometer bias tilts the level of every leg equally
         'initial_level': np.stack([np.cross(axis, D[-1]) for axis in C_first.T[:2]], -1)

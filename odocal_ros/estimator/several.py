@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.border import Border
-from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
+from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root_of
 from odocal_ros.calib.causes import cause_of_change, change_in_words
 from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import Joint, joint
@@ -28,9 +28,8 @@ from odocal_ros.estimator.state import CONSTANTS, IMPERFECT, LN_K, PITCH
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import grade_of
-from odocal_ros.settings.levels import FAULT_SIGMAS
+from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS
 
-DAY = 86400e9        # ns, definition
 # usual scatter of ln K, yaw and pitch between the legs of a vehicle: 20 ppm by tyres, 2 and 5 mdeg
 # by load and the cross slopes of roads. Judgement
 SCATTER = 2e-5, 3.5e-5, 8.7e-5
@@ -58,7 +57,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     order = np.argsort(times_ns, kind='stable')
     legs = [results[i] for i in order]
     names = [(numbers or range(1, len(results) + 1))[i] for i in order]
-    days = np.diff(np.asarray(times_ns)[order]) / DAY
+    days = np.diff(np.asarray(times_ns)[order]) / DAY_NS
     borders = _of_one_vehicle([leg.border for leg in legs])
     steps = config.verdict.scale_drift_per_day * np.sqrt(days)
     changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED]) \
@@ -164,8 +163,7 @@ def _sources(used: Floats, C: Floats) -> tuple[Source, ...]:
     shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
               if alike[i].max() > 1e-9]      # of a correlation: rounding
     apart = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
-    size, V = np.linalg.eigh(C[:WANTED, :WANTED] - apart)
-    return (*shared, Source('legs', V * np.sqrt(np.maximum(size, 0.0))),
+    return (*shared, Source('legs', root_of(C[:WANTED, :WANTED] - apart)),
             Source('model', np.diag(MODEL_FLOOR)))
 
 

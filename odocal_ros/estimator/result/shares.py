@@ -5,8 +5,8 @@
 
 import numpy as np
 
+from odocal_ros.calib.budget import root_of
 from odocal_ros.calib.result import Source
-from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.factors.factor import WANTED
 from odocal_ros.estimator.factors.priors import PriorRows, SIZES
@@ -34,12 +34,5 @@ def shares(fit: Fit, marginals: JointMarginals) -> tuple[Source, ...]:
     for name, effects in (('noise_levels', by_levels[:, :-len(SIZES)]),
                           ('imperfection_sizes', by_levels[:, -len(SIZES):])):
         covariance[name] = effects @ effects.T
-    own = [Source(name, _root(value)) for name, value in covariance.items()]
-    return (*own, *shared, Source('standstill', _root(rest)))
-
-
-def _root(covariance: Floats) -> Floats:
-    """Return a square root of a covariance, rounding below zero taken for zero."""
-    value, vector = np.linalg.eigh(covariance)
-    out: Floats = vector * np.sqrt(np.maximum(value, 0.0))
-    return out
+    own = [Source(name, root_of(value)) for name, value in covariance.items()]
+    return (*own, *shared, Source('standstill', root_of(rest)))
