@@ -11,8 +11,6 @@ wrong sign, the second level axis and the upright axis of the gyro appear to hav
 rates in mirrored axes have these signs.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from odocal_ros.calib.check import ONE_MOTION_RATIO
@@ -22,10 +20,7 @@ from odocal_ros.data.pieces import by_row
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import Facing
 from odocal_ros.screening.gravity_turn import gravity_fit
-from odocal_ros.screening.inputs import Placed
-
-if TYPE_CHECKING:
-    from odocal_ros.screening.inputs import Inputs
+from odocal_ros.screening.inputs import Inputs, Placed
 
 Found = list[tuple[str, str, str]]      # published axis, true axis with its sign, sentence
 SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a correct gyro
@@ -54,7 +49,7 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
     return axes, [_name(axis) for axis in (first, second, np.sign(up[k]) * np.eye(3)[k])]
 
 
-def gyro_axes(inputs: 'Inputs', placed: Placed, faces: Facing | None) -> tuple[Reason, ...]:
+def gyro_axes(inputs: Inputs, placed: Placed, faces: Facing | None) -> tuple[Reason, ...]:
     """
     Return a reason if an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
 
@@ -108,7 +103,7 @@ def _inverted_turns(faces: Facing, found: Found, names: list[str]) -> tuple[Reas
                    'and accelerometer together.'),)
 
 
-def by_course(inputs: 'Inputs', placed: Placed, w_i: Floats, axes: Floats,
+def by_course(inputs: Inputs, placed: Placed, w_i: Floats, axes: Floats,
               names: list[str]) -> Found:
     """Return the level gyro axes that measure the yaw rate instead of the upright one."""
     def ratio(axis: Floats) -> float | None:
@@ -129,7 +124,7 @@ def by_course(inputs: 'Inputs', placed: Placed, w_i: Floats, axes: Floats,
     return found
 
 
-def by_gravity(inputs: 'Inputs', placed: Placed, w_i: Floats, f_i: Floats, axes: Floats,
+def by_gravity(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, axes: Floats,
                names: list[str]) -> Found:
     """Return the gyro axes that measure the turn of gravity about another axis."""
     fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, placed.rough)

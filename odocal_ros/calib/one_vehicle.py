@@ -3,7 +3,7 @@
 
 """Detection of legs of different vehicles or settings, which must not be combined."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
@@ -25,7 +25,8 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
     scales = [scale for scale in _values('scale_factor', estimates) if scale.value]
     units = dict.fromkeys(scale.unit for scale in scales)
     if len(units) > 1:
-        which = '; '.join(f'{unit} in leg {_numbers(s.leg for s in scales if s.unit == unit)}'
+        which = '; '.join(f'{unit} in leg '
+                          + ', '.join(str(s.leg) for s in scales if s.unit == unit)
                           for unit in units)
         return (Reason(Code.LEGS_UNLIKE, 'the odometers have different units, so their scales '
                        f'cannot be combined: {which}'),)
@@ -69,7 +70,3 @@ def _farthest(values: list[_LegValue]) -> tuple[_LegValue, _LegValue] | None:
     low, high = order[0], order[-1]
     noise = (high.sigma**2 + low.sigma**2)**0.5
     return (low, high) if high.value - low.value > FAULT_SIGMAS * noise else None
-
-
-def _numbers(numbers: Iterable[int]) -> str:
-    return ', '.join(map(str, numbers))

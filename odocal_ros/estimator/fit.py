@@ -122,10 +122,6 @@ class Fit(FitSummary):
         return FitSummary(self.state, self.levels, self.priors, self.first, self.spread,
                        self.settled, self.creeping, self.iterations, self.likelihood)
 
-    def marginals(self) -> JointMarginals:
-        """Return the joint marginals of adjacent keyframes; once, since they are large."""
-        return self.solved.marginals()
-
 
 def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, frozen: bool = False,
         about: WarmStart | None = None, trace: Trace | None = None) -> Fit:
@@ -185,7 +181,6 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
             # slips and levels are factors on the same rows: slips are evaluated at the new levels
             if tail:
                 spread = slips(weighted, marginals, spread, before_levels, levels)
-            if tail:
                 priors = relaxed(first, priors, state, solved, marginals)
             del marginals
         del weighted, solved      # the largest memory of a long leg

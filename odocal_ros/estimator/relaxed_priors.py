@@ -9,7 +9,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals, Solved
-from odocal_ros.estimator.state import FIX_TIME, IMPERFECT, Priors, SPEED_OFFSET, State
+from odocal_ros.estimator.state import BA, BG, FIX_TIME, IMPERFECT, Priors, SPEED_OFFSET, State
 
 # sigmas of a prior beyond which it is relaxed. Statistical: one sound prior in 22
 RELAXED_BEYOND = 2.0
@@ -32,8 +32,8 @@ def relaxed(first: Priors, now: Priors, state: State, solved: Solved,
     constants[held] = now.constants[held]
     return replace(
         now,
-        gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[9:12]),
-        accel_bias=_wider(first.accel_bias, now.accel_bias, state.accel_bias[0], P0[12:15]),
+        gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[BG]),
+        accel_bias=_wider(first.accel_bias, now.accel_bias, state.accel_bias[0], P0[BA]),
         constants=constants)
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
+from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, Path, standing_at
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.reversal import level_track
 from odocal_ros.calib.wheels.wheel_slips import WheelSlips
@@ -30,7 +30,6 @@ from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.settings.config import Config
 
 Passed = Callable[[int, float], None]      # called with the number of passes, and Stage.change
-Path = Callable[[Floats], Floats]     # t (n,) s to (n, 3) m, or t () to (3,)
 WHOLE_FROM = 10.0     # judgement: sigmas, larger ones are shown without decimals
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from odocal_ros.calib.marks import Path
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.slip import slip_reasons
 from odocal_ros.calib.wheel_search.planar import planar_leg, PlanarLeg
@@ -20,7 +21,7 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.estimator import smooth, smoother_leg
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
-from odocal_ros.pipeline.prepared import attitude_of, MethodRun, Passed, Path, Paths, PreparedLeg
+from odocal_ros.pipeline.prepared import attitude_of, MethodRun, Passed, Paths, PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured, slip_check
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config

@@ -139,7 +139,7 @@ def test_sigmas_of_the_biases_are_honest_all_along():
     for seed in range(1, 9):
         drive, config, leg, _, fit = fitted(seed=seed, duration=120.0)
         true = truth(drive, config, leg)
-        sigma = bias_sigmas(fit.marginals(), 1.0)
+        sigma = bias_sigmas(fit.solved.marginals(), 1.0)
         off = np.stack([fit.state.gyro_bias - true.gyro_bias,
                         fit.state.accel_bias - true.accel_bias])
         apart.append(off / sigma)

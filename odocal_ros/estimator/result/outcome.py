@@ -4,6 +4,7 @@
 """The smoother's fit as a method's result: estimates, reasons, budget, statistics of the drive."""
 
 from collections.abc import Collection, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,7 @@ SCALES = range(GYRO.start, VELOCITY.start)    # errors of IMU, receiver, tyres, 
 
 def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
     """Return the result of a fit: estimates, reasons, budget, details."""
-    near = fit.marginals()
+    near = fit.solved.marginals()
     widen, reasons = mismatch(problem, fit, config)
     count = leg.travel.quantum * fit.state.scale
     state, c = fit.state, fit.state.constants
@@ -115,7 +116,7 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
         reasons.append(not_observable('this drive', unsaid))
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
-    sources = [*(_widened(s, widen) for s in shares(fit, near)),
+    sources = [*(replace(s, effects=s.effects * widen) for s in shares(fit, near)),
                Source('model', np.diag(MODEL_FLOOR))]
     border = border_of(fit, configured(leg)).widened(widen)
     for i, name, own in beyond:
@@ -215,10 +216,6 @@ def in_words(names: Iterable[str]) -> str:
     said = [f'the {word}' + (f' ({", ".join(axes)})' if 0 < len(axes) < 3 and axes[0] else '')
             for word, axes in words.items()]
     return said[0] if len(said) == 1 else f'{", ".join(said[:-1])} and {said[-1]}'
-
-
-def _widened(source: Source, widen: float) -> Source:
-    return type(source)(source.name, source.effects * widen, source.shared)
 
 
 def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float,
