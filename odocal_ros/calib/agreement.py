@@ -14,16 +14,12 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 # differences are tested as if methods were independent: methods that share data differ less
-NAMES = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
-CAUSES = {
-    'scale_factor': {
-        'two_point': 'slip or bad fixes at one of the marks'},
-    'yaw_mounting_angle': {
-        'two_point': 'an error of the configured heading (alignment.heading_source) of about '
-        'this size'},
-    'pitch_mounting_angle': {
-        'two_point': 'heights at the marks, hills, or an accelerometer bias'},
-}
+# each value as a word, and the likely cause in two_point, the later method of ORDER
+VALUES = {
+    'scale_factor': ('scale', 'slip or bad fixes at one of the marks'),
+    'yaw_mounting_angle': ('yaw', 'an error of the configured heading (alignment.heading_source) '
+                           'of about this size'),
+    'pitch_mounting_angle': ('pitch', 'heights at the marks, hills, or an accelerometer bias')}
 
 
 def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
@@ -41,7 +37,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
     sound = [methods[n] for n in ORDER if n in methods
              and methods[n].verdict is not Verdict.REJECTED]
     found = []
-    for name, word in NAMES.items():
+    for name, (word, cause) in VALUES.items():
         for better, other in combinations(sound, 2):
             a, b = (m.estimates.get(name) for m in (better, other))
             if a is None or b is None or a.value is None or b.value is None \
@@ -55,5 +51,5 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
                 found.append(Reason(
                     Code.METHODS_DISAGREE, f'{word}: {other.name} and {better.name} differ by '
                     f'{off}, {abs(apart) / sigma:.1f} sigma; likely cause: '
-                    f'{CAUSES[name][other.name]}'))
+                    f'{cause}'))
     return found
