@@ -14,7 +14,7 @@ import numpy as np
 
 from odocal_ros.calib.planar.drive import of_sides, rows_of, Wheels
 from odocal_ros.calib.planar.fit import fit_at, LEAST, LEVELS, priors
-from odocal_ros.calib.planar.problem import Known, Run
+from odocal_ros.calib.planar.problem import Run
 from odocal_ros.calib.planar.result import result_of
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Bools, Floats, Ints
@@ -27,6 +27,7 @@ from odocal_ros.forecast.planned_drive import from_rates
 from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.forecast.smoother_forecast import relative
 from odocal_ros.nav.earth import rate_without_north
+from odocal_ros.pipeline.planar_run import known_of
 from odocal_ros.settings.config import (
     Config,
     DIFFERENTIAL,
@@ -36,7 +37,6 @@ from odocal_ros.settings.config import (
     SKID,
     with_settings,
 )
-from odocal_ros.settings.grades import grade_of
 
 # m^2/m, judgement: usual in fits of robots without sideways slip, 0.3 mm in a metre
 NO_SIDE_SLIP = 1e-7
@@ -113,12 +113,7 @@ def _measured(motion: RobotMotion, robot: Robot) -> Ints:
 def predict_planar(motion: RobotMotion, robot: Robot, config: Config) -> MethodResult:
     """Return the prediction of the planar estimator: covariance of its fit at the truth."""
     run, state, constants = planar_run(motion, robot)
-    grade = grade_of(config.imu)
-    known = Known(offset_sigma=max(config.gnss.lever_arm_sigma, 1e-3),
-                  delay_sigma=config.gnss.time_sigma, drift_length=robot.drift_length,
-                  gyro_noise=max(grade.gyro_noise, 1e-3),
-                  gyro_scale_sigma=max(grade.gyro_scale_error, 1e-6),
-                  gyro_bias_sigma=max(grade.gyro_bias, 1e-6))
+    known = replace(known_of(run, config), drift_length=robot.drift_length)
     _, prior = priors(run, known, 1.0, 1.0, robot.width)
     first = np.array([1.0, 1.0, 1 / robot.width])
     found = fit_at(run, known, state, constants, _levels(motion, robot, run), first, prior)

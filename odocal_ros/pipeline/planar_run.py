@@ -4,6 +4,7 @@
 """A leg for the planar estimator: wheels without an IMU, skid steering, mecanum wheels."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -76,7 +77,7 @@ def _guarded(run: Run, inputs: Inputs, config: Config, progress: Callable[[Stage
         return refused([why], unit)
     try:
         with raised_if_wild():
-            found = fit(run, _known(run, config), lambda passes, change: progress(
+            found = fit(run, known_of(run, config), lambda passes, change: progress(
                 Stage(PLANAR, passes=passes, change=change)))
             method = result_of(found, unit, nominal_scale(config, unit), config,
                                shortened_by_slopes(inputs))
@@ -168,23 +169,22 @@ def _gyro(inputs: Inputs, t: Floats) -> Floats:
     return np.diff(integral_at(t, inputs.t_imu, rate))
 
 
-def _known(run: Run, config: Config) -> Known:
+def known_of(run: Run, config: Config) -> Known:
     """Return the priors of the constants by the settings."""
     antenna, odometer = config.gnss.lever_arm, config.odometer.lever_arm
-    known: dict[str, Any] = {
-        'width': config.odometer.track_width * (run.wheels.kind not in HOLONOMIC),
-        'offset_sigma': max(config.gnss.lever_arm_sigma, 1e-3),
-        'delay_sigma': config.gnss.time_sigma,
-        'offset': (antenna[0] - odometer[0], antenna[1] - odometer[1])}
-    if len(run.gyro):
-        grade = grade_of(config.imu)
-        known |= {'gyro_noise': max(grade.gyro_noise, GYRO_LEAST),
-                  'gyro_scale_sigma': max(grade.gyro_scale_error, 1e-6),
-                  'gyro_bias_sigma': max(grade.gyro_bias, 1e-6)}
-    if config.gnss.correlation_time > 0:
-        moved = np.linalg.norm(np.diff(run.position, axis=0), axis=1).sum()
-        known['drift_length'] = config.gnss.correlation_time * moved / (run.t[-1] - run.t[0])
-    return Known(**known)
+    grade = grade_of(config.imu)
+    known = Known(
+        width=config.odometer.track_width * (run.wheels.kind not in HOLONOMIC),
+        offset=(antenna[0] - odometer[0], antenna[1] - odometer[1]),
+        offset_sigma=max(config.gnss.lever_arm_sigma, 1e-3), delay_sigma=config.gnss.time_sigma,
+        gyro_noise=max(grade.gyro_noise, GYRO_LEAST),
+        gyro_scale_sigma=max(grade.gyro_scale_error, 1e-6),
+        gyro_bias_sigma=max(grade.gyro_bias, 1e-6))
+    if not config.gnss.correlation_time > 0:
+        return known
+    moved = np.linalg.norm(np.diff(run.position, axis=0), axis=1).sum()
+    return replace(known, drift_length=config.gnss.correlation_time * moved / (
+        run.t[-1] - run.t[0]))
 
 
 def _tracks(run: Run, found: Fit) -> dict[str, Any]:
