@@ -14,12 +14,14 @@ The Earth rotation, which turns an error of one axis into the others by 4 mrad a
 omitted.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.marks import MarkFix
-from odocal_ros.calib.result import Source
+from odocal_ros.calib.result import Estimate, Source
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row, by_step
 from odocal_ros.nav.alignment import Alignment
@@ -233,6 +235,17 @@ def budget_table(sources: Iterable[Source], parameters: Sequence[str],
     """
     return {s.name: {p: float(np.linalg.norm(s.effects[i]) * scale[i])
                      for i, p in enumerate(parameters)} | {'shared': s.shared} for s in sources}
+
+
+def known_budget(sources: Iterable[Source], parameters: Sequence[str],
+                 estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    """Return ``budget`` and ``correlation`` of the parameters that have a value."""
+    known = [i for i, p in enumerate(parameters) if estimates[p].value is not None]
+    names = [parameters[i] for i in known]
+    rows = [replace(s, effects=s.effects[known]) for s in sources]
+    scale = [estimates[p].value or 0.0 if p.startswith('scale_factor') else 1.0 for p in names]
+    return {'budget': budget_table(rows, names, scale),
+            'correlation': correlations(total_covariance(rows), names)}
 
 
 def correlations(covariance: Floats, names: Sequence[str]) -> dict[str, float]:

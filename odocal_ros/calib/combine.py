@@ -8,12 +8,10 @@ The equations are those of docs/method.md, (T15) and (T16).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.budget import budget_table, correlations, total_covariance
+from odocal_ros.calib.budget import known_budget
 from odocal_ros.calib.joint import deviate, Z95
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.data.arrays import Floats
@@ -60,8 +58,9 @@ def combine_method(name: str, results: Sequence[MethodResult],
             sources.setdefault(source, []).append((i, effect))
     estimates |= _ratio(results, estimates) | newest(results, estimates)
     stacked = _stacked(sources, len(parameters))
+    details = known_budget(stacked, parameters, estimates) if sources else {}
     return MethodResult(name, reasons, estimates, parameters, stacked,
-                        {'legs_used': len(results)} | _details(stacked, parameters, estimates))
+                        {'legs_used': len(results)} | details)
 
 
 def newest(results: Sequence[MethodResult],
@@ -80,19 +79,6 @@ def newest(results: Sequence[MethodResult],
                 name not in found or e.value is not None):
             found[name] = e
     return found
-
-
-def _details(sources: Sequence[Source], parameters: Sequence[str],
-             estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    """Return budget and correlation of a combination, in the format of a leg's result."""
-    known = [i for i, p in enumerate(parameters) if estimates[p].value is not None]
-    if not known:
-        return {}
-    names = [parameters[i] for i in known]
-    rows = [replace(s, effects=s.effects[known]) for s in sources]
-    scale = [estimates[p].value or 0.0 if p.startswith('scale_factor') else 1.0 for p in names]
-    return {'budget': budget_table(rows, names, scale),
-            'correlation': correlations(total_covariance(rows), names)}
 
 
 def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Floats,

@@ -4,12 +4,11 @@
 """The result of a planar fit: estimates with sigmas, and refusals of those not determined."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from odocal_ros.calib.budget import budget_table, correlations, total_covariance
+from odocal_ros.calib.budget import known_budget
 from odocal_ros.calib.choice import PLANAR
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.planar.problem import Fit
@@ -171,17 +170,10 @@ def _gradient(quantity: Quantity, fit: Fit) -> Floats:
 def _details(fit: Fit, estimates: dict[str, Estimate], names: tuple[str, ...],
              sources: list[Source]) -> dict[str, object]:
     """Return budget, correlations, noise levels and nuisance constants, for calibration.json."""
-    known = [i for i, name in enumerate(names) if estimates[name].value is not None]
-    scale = [estimates[names[i]].value or 0.0 if names[i].startswith('scale_factor') else 1.0
-             for i in known]
-    own = [names[i] for i in known]
-    of_known = [replace(s, effects=s.effects[known]) for s in sources]
     sigma = np.sqrt(np.diag(fit.covariance))
     constants = {name: {'value': float(v), 'sigma': float(s)}
                  for name, v, s in zip(fit.names, fit.value, sigma, strict=True)}
-    details: dict[str, object] = {
-        'budget': budget_table(of_known, own, scale),
-        'correlation': correlations(total_covariance(of_known), own),
+    details: dict[str, object] = known_budget(sources, names, estimates) | {
         'noise': fit.levels, 'constants': constants, 'passes': fit.passes}
     if 'gyro_scale' in constants:       # the factor on turn rates is 1 minus this error
         gyro = constants['gyro_scale']
