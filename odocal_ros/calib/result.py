@@ -41,6 +41,13 @@ class Estimate:
         return entry | ({'method': self.method} if self.method else {})
 
 
+def unknown_values(scale_unit: str) -> dict[str, Estimate]:
+    """Return the estimates that every result has, without values."""
+    units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
+             'pitch_mounting_angle': 'rad'}
+    return {name: Estimate(None, None, unit) for name, unit in units.items()}
+
+
 def wheel_factors(estimates: Iterable[str]) -> list[str]:
     """Return the names of the scale factors of single wheels."""
     return [name for name in estimates if name.startswith(FACTOR) and name != AS_SENT]

@@ -28,7 +28,7 @@ from odocal_ros.calib.budget import (
 )
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
-from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_values
 from odocal_ros.calib.slip import slip_source
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
@@ -121,10 +121,8 @@ def refusal(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
 
 def unsolved(reasons: Iterable[Reason], scale_unit: str) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
-    units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
-             'pitch_mounting_angle': 'rad'} | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'}
-    return MethodResult('two_point', tuple(reasons),
-                        {name: Estimate(None, None, unit) for name, unit in units.items()},
+    biases = {f'gyro_bias_{axis}': Estimate(None, None, 'rad/s') for axis in 'xyz'}
+    return MethodResult('two_point', tuple(reasons), unknown_values(scale_unit) | biases,
                         PARAMETERS)
 
 

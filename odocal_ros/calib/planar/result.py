@@ -12,7 +12,7 @@ from odocal_ros.calib.budget import known_budget
 from odocal_ros.calib.choice import PLANAR
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.planar.problem import Fit
-from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_values
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, SIDES
@@ -90,7 +90,7 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config,
     unit, nominal : of the scale factor.   slopes : relative shortening of the path by slopes.
     """
     c = dict(zip(fit.names, fit.value.tolist(), strict=True))
-    estimates, effects, laws, reasons = unknown(unit), {}, {}, _doubts(fit)
+    estimates, effects, laws, reasons = unknown_values(unit), {}, {}, _doubts(fit)
     # a fit that has not converged has twice the sigma
     root = np.linalg.cholesky(fit.covariance) * (1.0 if fit.converged else 2.0)
     quantities = _quantities(fit.names, config)
@@ -130,14 +130,7 @@ def result_of(fit: Fit, unit: str, nominal: float, config: Config,
 
 def refused(reasons: Iterable[Reason], unit: str) -> MethodResult:
     """Return the result of a leg that the method refuses."""
-    return MethodResult(PLANAR, tuple(reasons), unknown(unit))
-
-
-def unknown(unit: str) -> dict[str, Estimate]:
-    """Return the estimates that every result has, without values."""
-    units = {'scale_factor': unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
-             'pitch_mounting_angle': 'rad'}
-    return {name: Estimate(None, None, own) for name, own in units.items()}
+    return MethodResult(PLANAR, tuple(reasons), unknown_values(unit))
 
 
 def _doubts(fit: Fit) -> list[Reason]:

@@ -6,7 +6,7 @@
 from collections.abc import Iterable
 
 from odocal_ros.calib.budget import PARAMETERS
-from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.result import Estimate, MethodResult, unknown_values
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.result.remarks import IMU_SCALES
 from odocal_ros.estimator.result.wheel_result import unknown_wheels
@@ -41,7 +41,7 @@ def no_imu(fit: Fit) -> list[Reason]:
 
 def unknown(scale_unit: str) -> dict[str, Estimate]:
     """Return the estimates of a leg, each without a value."""
-    units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
-             'pitch_mounting_angle': 'rad'} | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'}
-    units |= {CONSTANTS[i]: UNITS[CONSTANTS[i]] for i in OPTIONAL}
-    return {name: Estimate(None, None, unit) for name, unit in units.items()}
+    units = {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
+        CONSTANTS[i]: UNITS[CONSTANTS[i]] for i in OPTIONAL}
+    return unknown_values(scale_unit) | {
+        name: Estimate(None, None, unit) for name, unit in units.items()}
