@@ -37,6 +37,7 @@ from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Orig
 from odocal_ros.nav.projection import geodesic_chord, plane_chord
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.nominal import nominal_yaw
 
 # rad, prior sigma of the pitch without information from heights: physical, by holders and loads
 PITCH_PRIOR = 0.05
@@ -229,8 +230,7 @@ def _judge_angles(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
                            f'({alignment.heading_source}) is {np.rad2deg(share):.3f} deg, the '
                            f'yaw limit is {np.rad2deg(asked):.3f} deg: the end points only '
                            'constrain the sum of heading and yaw'),)
-    nominal = config.imu.nominal_yaw
-    far = abs(float(wrap(yaw - (0.0 if np.isnan(nominal) else nominal))))
+    far = abs(float(wrap(yaw - nominal_yaw(config))))
     if alignment.heading_separable and far > BACKWARDS_YAW:
         reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs opposite to the fixes: '
                            'positive counts mean backwards, or the IMU x axis points backwards '

@@ -43,7 +43,7 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of, imu_as_seen, turn_on_bias
-from odocal_ros.settings.nominal import nominal_scale
+from odocal_ros.settings.nominal import nominal_scale, nominal_yaw
 
 # s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a
 # consumer IMU 6 % larger (docs/decisions/0005)
@@ -189,12 +189,6 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
 def height_sigma(leg: SmootherLeg) -> float:
     """Return the median stated sigma of the heights, m."""
     return float(np.sqrt(np.median(leg.covariance_n[:, 2, 2]))) if len(leg.t_fix) else 0.0
-
-
-def nominal_yaw(config: Config) -> float:
-    """Return the yaw mounting angle as set, 0 where it is not, rad."""
-    yaw = config.imu.nominal_yaw
-    return 0.0 if np.isnan(yaw) else yaw
 
 
 def _offset(coarse: CoarseSpeed | None) -> tuple[float, float]:

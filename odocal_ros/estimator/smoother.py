@@ -15,7 +15,7 @@ from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.estimator.fit import Fit, fit, Trace
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.prepare import nominal_yaw, problem_of, with_imperfect
+from odocal_ros.estimator.prepare import problem_of, with_imperfect
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.outcome import outcome
 from odocal_ros.estimator.result.refusal import no_imu, refused
@@ -25,6 +25,7 @@ from odocal_ros.estimator.state import State, YAW
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.nominal import nominal_yaw
 
 # rad, passes, judgement: a heading from accelerations with a larger sigma may be one of two; both
 # are tried for this number of passes

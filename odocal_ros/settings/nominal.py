@@ -1,9 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The nominal scale, from the settings."""
+"""The nominal scale and yaw mounting angle, from the settings."""
 
-from math import tau
+from math import isnan, tau
 
 from odocal_ros.settings.config import Config
 
@@ -18,3 +18,9 @@ def nominal_scale(config: Config, unit: str) -> float:
     if unit == 'm/rad' and wheels.radius:
         return wheels.radius
     return 1.0 if unit == '1' else 0.0
+
+
+def nominal_yaw(config: Config) -> float:
+    """Return the yaw mounting angle as set, 0 where it is not, rad."""
+    yaw = config.imu.nominal_yaw
+    return 0.0 if isnan(yaw) else yaw

@@ -68,6 +68,7 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import INFORMED_SHARE, SCALE_LIMIT
+from odocal_ros.settings.nominal import nominal_yaw
 
 AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 SCALES = range(GYRO.start, VELOCITY.start)    # errors of IMU, receiver, tyres, body
@@ -226,8 +227,7 @@ def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float,
         reasons.append(Reason(Code.SCALE_NOT_DETERMINED, 'scale uncertainty is '
                               f'{100 * sigma[LN_K]:.0f} %, too large to state a value; the '
                               f'limit is {100 * SCALE_LIMIT:g} %'))
-    nominal = 0.0 if np.isnan(config.imu.nominal_yaw) else config.imu.nominal_yaw
-    off = abs(float(wrap(yaw - nominal)))
+    off = abs(float(wrap(yaw - nominal_yaw(config))))
     if sigma[YAW] > limit:
         cause = 'see CHANGE_IN_LEG' if CONSTANTS[YAW] in moved else (
             'too little acceleration, or too few turns')
