@@ -114,9 +114,9 @@ class LinkedLegs:
                 out -= np.linalg.slogdet(np.eye(len(at)) + own)[1] / 2
         return float(out)
 
-    def _prior_rows(self, columns: int, but: Sequence[int] | Ints = ()) -> tuple[Floats, Floats]:
-        """Return the priors of the constants, except ``but``, as rows and right-hand sides."""
-        held = np.setdiff1d(np.flatnonzero(np.isfinite(self.used)), but)
+    def _prior_rows(self, columns: int) -> tuple[Floats, Floats]:
+        """Return the priors of the constants as rows and right-hand sides."""
+        held = np.flatnonzero(np.isfinite(self.used))
         prior = np.zeros((len(held), columns))
         prior[np.arange(len(held)), self.place(0)[held]] = 1.0     # columns are in its units
         return prior, self.centre[held] / self.used[held]
@@ -156,17 +156,17 @@ class LinkedLegs:
         rest = (b - U[of_legs] @ (U.T @ np.concatenate([b, centre])))
         return float(rest @ rest), len(A) - float((U[of_legs]**2).sum())
 
-    def deviations(self, spread: dict[str, float] | None = None) -> Floats:
+    def deviations(self) -> Floats:
         """
         Return the normalised residual of each leg's constants against the others': (J, m) sigmas.
 
         The gradient of the leg at the joint estimate, over its sigma, for each constant: the test
         of one additional unknown, as if the leg were left out (Baarda 1968), docs/method.md (S37).
         """
-        x, C = self.solve(spread)
+        x, C = self.solve()
         out = np.zeros((len(self.borders), len(self.names)))
         legs = self.determined()
-        for j, (D, pull) in enumerate(zip(*self._scattering(legs, spread), strict=True)):
+        for j, (D, pull) in enumerate(zip(*self._scattering(legs, None), strict=True)):
             where = self.place(j)
             pull = pull - D @ (x[where] - legs[j].value)
             variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
