@@ -19,8 +19,7 @@ from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
 from odocal_ros.estimator.outside import convergence, Outside, thinned
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import BARE, BG, GYRO, HEADING, M, PHI, State
-from odocal_ros.estimator.sums import Points
+from odocal_ros.estimator.state import BARE, BG, GYRO, HEADING, M, PHI
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.angles import arctan2, wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
@@ -85,7 +84,20 @@ class HeadingRows(OutsideRows):
         """Return the rows."""
         sent = problem.outside['heading']
         assert isinstance(sent, Heading)
-        return _heading(sent, point.state, point.points['heading'])
+        state, points = point.state, point.points['heading']
+        k = points.interval
+        C = state.C_nb[k]
+        x = (C @ points.R)[:, :, 0]
+        level2 = np.maximum(x[:, 0]**2 + x[:, 1]**2, 1e-6)
+        raw = wrap(sent.yaw - arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
+        turns = np.stack([-x[:, 2] * x[:, 0] / level2, -x[:, 2] * x[:, 1] / level2,
+                          np.ones(len(k))], -1)
+        J, c = np.zeros((len(k), 1, BARE)), np.zeros((len(k), 1, M))
+        J[:, 0, PHI] = -turns
+        by_gyro = np.einsum('ki,kij->kj', turns, C @ points.turned)
+        J[:, 0, BG], c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]
+        c[:, 0, HEADING] = -1.0
+        return Rows(raw[:, None], J, c, 1 / sent.noise[:, None])
 
     @staticmethod
     def least(sent: Heading) -> dict[str, float]:
@@ -109,19 +121,3 @@ def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float,
     C = matrix_from_quat(q) @ C_ib
     yaw = arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + convergence(inputs, t, origin)
     return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), said_by)
-
-
-def _heading(sent: Heading, state: State, points: Points) -> Rows:
-    k = points.interval
-    C = state.C_nb[k]
-    x = (C @ points.R)[:, :, 0]
-    level2 = np.maximum(x[:, 0]**2 + x[:, 1]**2, 1e-6)
-    raw = wrap(sent.yaw - arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
-    turns = np.stack([-x[:, 2] * x[:, 0] / level2, -x[:, 2] * x[:, 1] / level2,
-                      np.ones(len(k))], -1)
-    J, c = np.zeros((len(k), 1, BARE)), np.zeros((len(k), 1, M))
-    J[:, 0, PHI] = -turns
-    by_gyro = np.einsum('ki,kij->kj', turns, C @ points.turned)
-    J[:, 0, BG], c[:, 0, GYRO] = by_gyro[:, :3], by_gyro[:, 3:]
-    c[:, 0, HEADING] = -1.0
-    return Rows(raw[:, None], J, c, 1 / sent.noise[:, None])

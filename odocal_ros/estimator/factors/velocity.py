@@ -41,7 +41,6 @@ from odocal_ros.estimator.state import (
     VELOCITY_SCALE,
     YAW,
 )
-from odocal_ros.estimator.sums import Points
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.receiver_filter import smoothing
 from odocal_ros.nav.rotations import skew, transpose, turn
@@ -94,7 +93,44 @@ class VelocityRows(OutsideRows):
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
         """Return the rows."""
-        return _velocity(problem, point, point.points['velocity'])
+        leg, state, points = problem.leg, point.state, point.points['velocity']
+        sent, k = problem.outside['velocity'], points.interval
+        assert isinstance(sent, Velocity)
+        C, tau = state.C_nb[k], points.tau[:, None]
+        C_t = C @ points.R
+        arm_v = leg.antenna_arm - leg.imu_arm + state.constants[GNSS_ARM]
+        arm_b = state.C_bv @ arm_v
+        dv, g = turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
+        swing = turn(C_t, np.cross(points.rate, arm_b))
+        _, at_keys = antenna(state, point.intervals.mean_rate, arm_b)
+        faster = (np.diff(at_keys, axis=0) / point.intervals.T[:, None])[k]
+        smoothed, by_lag = smoothing(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
+                                     state.t[k] + points.tau, state.constants[VELOCITY_LAG2])
+        v = state.v_n[k] + dv + g * tau + swing + smoothed
+        # the factor is on the prediction: on the measurement it would also scale its noise, and
+        # small factors would fit best
+        times = 1 + state.constants[VELOCITY_SCALE]
+        m, t, rate = len(k), tau[:, :, None], point.intervals.mean_rate[k]
+        measured = np.concatenate([rate, point.intervals.mean_force[k]], axis=1)[:, None]
+        J, c = np.zeros((m, 3, BARE)), np.zeros((m, 3, M))
+        J[:, :, V] = -np.eye(3)
+        J[:, :, PHI] = skew(dv + swing)
+        J[:, :, BA] = C @ points.A
+        by_gyro, by_rate = -C @ points.dv_by - skew(swing) @ C @ points.turned, -C_t @ skew(arm_b)
+        J[:, :, BG] = by_gyro[:, :, :3] + by_rate
+        c[:, :, GYRO] = by_gyro[:, :, 3:] + by_rate[:, :, GYRO_AXIS] * measured[:, :, GYRO_SIGNAL]
+        by_yaw, by_pitch = state.C_bv_gradient
+        W = C_t @ skew(rate)
+        c[:, :, YAW], c[:, :, PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
+        c[:, :, GNSS_ARM] = -W @ state.C_bv
+        c[:, :, VELOCITY_DELAY], c[:, :, VELOCITY_LAG2] = faster, -by_lag
+        force, signals = turn(transpose(C), faster - g), np.zeros((m, 3, len(ACCEL_AXIS)))
+        # fitted force, (m, 3) m/s^2, by its axes
+        signals[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]
+        c[:, :, ACCEL] = C @ signals * t
+        J, c = J[:, :2] * times, c[:, :2] * times
+        c[:, :, VELOCITY_SCALE] = -v[:, :2]
+        return Rows(sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
@@ -115,43 +151,3 @@ class VelocityRows(OutsideRows):
     def least(sent: Velocity) -> dict[str, float]:
         """Return the least level."""
         return {'velocity': (LEAST.velocity / float(np.median(sent.sigma)))**2}
-
-
-def _velocity(problem: Problem, point: LinearisationPoint, points: Points) -> Rows:
-    leg, state, sent, k = problem.leg, point.state, problem.outside['velocity'], points.interval
-    assert isinstance(sent, Velocity)
-    C, tau = state.C_nb[k], points.tau[:, None]
-    C_t = C @ points.R
-    arm_v = leg.antenna_arm - leg.imu_arm + state.constants[GNSS_ARM]
-    arm_b = state.C_bv @ arm_v
-    dv, g = turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
-    swing = turn(C_t, np.cross(points.rate, arm_b))
-    _, at_keys = antenna(state, point.intervals.mean_rate, arm_b)
-    faster = (np.diff(at_keys, axis=0) / point.intervals.T[:, None])[k]
-    smoothed, by_lag = smoothing(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
-                                 state.t[k] + points.tau, state.constants[VELOCITY_LAG2])
-    v = state.v_n[k] + dv + g * tau + swing + smoothed
-    # the factor is on the prediction: on the measurement it would also scale its noise, and
-    # small factors would fit best
-    times = 1 + state.constants[VELOCITY_SCALE]
-    m, t, rate = len(k), tau[:, :, None], point.intervals.mean_rate[k]
-    measured = np.concatenate([rate, point.intervals.mean_force[k]], axis=1)[:, None]
-    J, c = np.zeros((m, 3, BARE)), np.zeros((m, 3, M))
-    J[:, :, V] = -np.eye(3)
-    J[:, :, PHI] = skew(dv + swing)
-    J[:, :, BA] = C @ points.A
-    by_gyro, by_rate = -C @ points.dv_by - skew(swing) @ C @ points.turned, -C_t @ skew(arm_b)
-    J[:, :, BG] = by_gyro[:, :, :3] + by_rate
-    c[:, :, GYRO] = by_gyro[:, :, 3:] + by_rate[:, :, GYRO_AXIS] * measured[:, :, GYRO_SIGNAL]
-    by_yaw, by_pitch = state.C_bv_gradient
-    W = C_t @ skew(rate)
-    c[:, :, YAW], c[:, :, PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
-    c[:, :, GNSS_ARM] = -W @ state.C_bv
-    c[:, :, VELOCITY_DELAY], c[:, :, VELOCITY_LAG2] = faster, -by_lag
-    force, signals = turn(transpose(C), faster - g), np.zeros((m, 3, len(ACCEL_AXIS)))
-    # fitted force, (m, 3) m/s^2, by its axes
-    signals[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]
-    c[:, :, ACCEL] = C @ signals * t
-    J, c = J[:, :2] * times, c[:, :2] * times
-    c[:, :, VELOCITY_SCALE] = -v[:, :2]
-    return Rows(sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
