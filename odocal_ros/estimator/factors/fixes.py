@@ -47,7 +47,7 @@ class Fixes(PointRows):
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         leg, state, points = problem.leg, point.state, point.points['fixes']
         self.state, self.points, self.root = state, points, problem.root
-        super().__init__(points)
+        super().__init__(problem, points)
         k, tau = self.k, points.tau[:, None]
         self.t_fix = leg.t_fix[problem.use]
         self.C = state.C_nb[k]

@@ -40,9 +40,8 @@ class OutsideRows(PointRows):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self._rows = self.rows(problem, point)
-        super().__init__(point.points[self.name])
+        super().__init__(problem, point.points[self.name])
         self.raw = self._rows.raw
-        self.per_effective = problem.per_effective.get(self.name, 1.0)
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Outside | None:

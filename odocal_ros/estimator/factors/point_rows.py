@@ -38,21 +38,21 @@ class PointRows(Factor):
     """
     Rows of d components each.
 
-    k (m,) are the keyframes before. A subclass sets raw (m, d), the residuals; per_effective, rows
-    per independent row; share (m,), the weight of the correlated fix error of the keyframe after,
-    in rows of three components, or None. It implements ``jacobians`` and ``stated``. Weighted are
-    r (m, d), J (m, d, n + M), and J_end (m, 3, 3) by that correlated error, or None.
+    k (m,) are the keyframes before, per_effective the rows per independent row. A subclass sets
+    raw (m, d), the residuals; share (m,), the weight of the correlated fix error of the keyframe
+    after, in rows of three components, or None. It implements ``jacobians`` and ``stated``.
+    Weighted are r (m, d), J (m, d, n + M), and J_end (m, 3, 3) by that correlated error, or None.
     """
 
     levels_of: ClassVar[dict[str, slice]]     # columns of each level, a factor on variances
     source: ClassVar[str]                     # name in the budget
     k: Ints
     raw: Floats
-    per_effective = 1.0
     share: Floats | None = None
 
-    def __init__(self, points: Points) -> None:
+    def __init__(self, problem: Problem, points: Points) -> None:
         self.k = points.interval
+        self.per_effective = problem.per_effective.get(self.name, 1.0)
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:

@@ -68,10 +68,8 @@ class SpeedSteps(PointRows):
         self.points, self.C, self.C_t, self.dv, self.v_n, self.ahead, g = points.take(own), *(
             x[own] for x in (C, C_t, dv, v_n, ahead, g))
         points = self.points
-        super().__init__(points)
+        super().__init__(problem, points)
         self.sigma = self.instants.sigma * leg.rough_scale
-        # at constant acceleration the errors repeat from step to step
-        self.per_effective = problem.per_effective.get(self.name, 1.0)
         self.v_b = turn(np.swapaxes(self.C_t, 1, 2), self.v_n)
         # the forward axis rotates, and an IMU beside the axle moves relative to the axle
         self.gained = np.einsum('ki,ki->k', self.ahead, turn(self.C, points.force) + g)\
