@@ -53,7 +53,7 @@ def dense(seen, spread, log_levels):
 def test_it_is_least_squares_with_the_whole_covariance():
     seen, spread, levels = uneven()
     V = dense(seen, spread, levels)
-    x, covariance, cost, banded = _solved(levels, seen, spread)
+    x, covariance, cost, banded, root = _solved(levels, seen, spread)
     information = seen.X.T @ np.linalg.solve(V, seen.X) + np.diag(1 / seen.prior**2)
     expected = seen.centre + np.linalg.solve(
         information, seen.X.T @ np.linalg.solve(V, seen.y - seen.X @ seen.centre))
@@ -64,7 +64,8 @@ def test_it_is_least_squares_with_the_whole_covariance():
     assert cost == pytest.approx(np.linalg.slogdet(V)[1] + np.linalg.slogdet(information)[1]
                                  + quadratic, rel=1e-10)
     inverse = np.linalg.inv(V)
-    assert_allclose(_left_out(banded, off), inverse @ off / np.sqrt(np.diag(inverse)), rtol=1e-9)
+    assert_allclose(_left_out(banded, root, off), inverse @ off / np.sqrt(np.diag(inverse)),
+                    rtol=1e-9)
     assert_allclose(banded[1], np.diag(V))
 
 
@@ -81,7 +82,7 @@ def test_of_readings_alone_the_ratio_is_a_line_through_all_of_them():
     """The sigma falls as the power 3/2 of the way: increments alone would give the power 1/2."""
     q = 0.01**2
     seen = increments(reading=q, walk=0.0)
-    x, covariance, _, _ = _solved(np.array([np.log(NO_WALK), 0.0]), seen, np.ones(K))
+    x, covariance, *_ = _solved(np.array([np.log(NO_WALK), 0.0]), seen, np.ones(K))
     readings = np.concatenate([[0.0], np.cumsum(seen.y)])
     at = WAY * np.arange(K + 1)
     # with the walk's share and 1e-16 of roundings left

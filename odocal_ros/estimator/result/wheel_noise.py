@@ -73,29 +73,26 @@ def fit_line(seen: Increments) -> Line:
                          method='Nelder-Mead', options={
                              'xatol': 0.05, 'fatol': 0.02, 'initial_simplex': simplex})
         log_levels = found.x
-        x, covariance, _, banded = _solved(log_levels, seen, spread)
-        off = _left_out(banded, seen.y - seen.X @ x)
+        x, covariance, _, banded, root = _solved(log_levels, seen, spread)
+        off = _left_out(banded, root, seen.y - seen.X @ x)
         before, spread = spread, np.maximum(spread * (off / TAIL_SIGMAS)**2, 1.0)
         if np.allclose(spread, before, rtol=TAIL_SETTLED):
             break
-    root = cholesky_banded(banded, check_finite=False)
     gain = covariance @ cho_solve_banded((root, False), seen.X, check_finite=False).T
     return Line(x, covariance, seen.walk * np.exp(log_levels[:-1]), gain)
 
 
-def _banded(log_levels: Floats, seen: Increments, spread: Floats) -> Floats:
-    """Return the covariance of the increments, upper form: (2, k)."""
+def _solved(log_levels: Floats, seen: Increments,
+            spread: Floats) -> tuple[Floats, Floats, float, Floats, Floats]:
+    """
+    Return x, its covariance, and twice the restricted likelihood negative.
+
+    Then the covariance of the increments and its root, upper form: (2, k) each.
+    """
     reading = seen.reading * np.exp(log_levels[-1])
     walk = (seen.walk * np.exp(log_levels[:-1]))[seen.kind] * seen.share * spread
-    out = np.empty((2, len(seen.y)))
-    out[0], out[1] = -reading, walk + 2 * reading
-    return out
-
-
-def _solved(log_levels: Floats, seen: Increments,
-            spread: Floats) -> tuple[Floats, Floats, float, Floats]:
-    """Return x, its covariance, twice the restricted likelihood negative, and the covariance."""
-    banded = _banded(log_levels, seen, spread)
+    banded = np.empty((2, len(seen.y)))
+    banded[0], banded[1] = -reading, walk + 2 * reading
     root = cholesky_banded(banded, check_finite=False)
     both = np.column_stack([seen.X, seen.y - seen.X @ seen.centre])
     inverse = both.T @ cho_solve_banded((root, False), both, check_finite=False)
@@ -104,7 +101,7 @@ def _solved(log_levels: Floats, seen: Increments,
     step = covariance @ inverse[:-1, -1]
     cost = (2 * np.log(root[1]).sum() + np.linalg.slogdet(information)[1] + inverse[-1, -1]
             - step @ information @ step)
-    return seen.centre + step, covariance, float(cost), banded
+    return seen.centre + step, covariance, float(cost), banded, root
 
 
 def _minus_log_likelihood(log_levels: Floats, seen: Increments, spread: Floats) -> float:
@@ -114,9 +111,8 @@ def _minus_log_likelihood(log_levels: Floats, seen: Increments, spread: Floats) 
     return (_solved(log_levels, seen, spread)[2] + float(held)) / 2
 
 
-def _left_out(banded: Floats, residual: Floats) -> Floats:
+def _left_out(banded: Floats, root: Floats, residual: Floats) -> Floats:
     """Return leave-one-out residuals of the increments, in sigmas: (k,)."""
-    root = cholesky_banded(banded, check_finite=False)
     weighted = cho_solve_banded((root, False), residual, check_finite=False)
     before, after = banded[1].copy(), banded[1].copy()
     square, k = banded[0, -1]**2, len(residual)
