@@ -150,21 +150,20 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
     estimates, _ = choose(methods, asked)
     scale = estimates.get('scale_factor')
     paths = None if scale is None else runs[scale.method].paths
-    if scale is None or paths is None:
-        return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
-                          distance=prepared.distance, deciding=deciding(asked),
-                          path_ratio=prepared.path_ratio)
-    distance_sigma = 0.05    # largest relative sigma of a scale for the distance
-    # more accurate than the approximate scale; the travel is that of the uncorrected speed
-    if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
-        prepared = checked_with_scale(prepared, estimates.get(AS_SENT, scale).value or scale.value)
-    shown, said = tracks(prepared, paths)
-    found += said
-    for name, run in runs.items():
-        if run.paths is not None:
-            check, said = check_of(prepared, run.paths.after)
-            methods[name] = replace(run.result, details=run.result.details | check)
-            found += said
+    shown: dict[str, Any] = {}
+    if scale is not None and paths is not None:
+        distance_sigma = 0.05    # largest relative sigma of a scale for the distance
+        # more accurate than the approximate scale; the travel is that of the uncorrected speed
+        if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
+            prepared = checked_with_scale(
+                prepared, estimates.get(AS_SENT, scale).value or scale.value)
+        shown, said = tracks(prepared, paths)
+        found += said
+        for name, run in runs.items():
+            if run.paths is not None:
+                check, said = check_of(prepared, run.paths.after)
+                methods[name] = replace(run.result, details=run.result.details | check)
+                found += said
     return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
                       distance=prepared.distance, deciding=deciding(asked),
                       path_ratio=prepared.path_ratio, **shown)
