@@ -155,8 +155,6 @@ def _sent(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
 
 def _forward_at(t_new: Floats, t: Floats, track_n: Floats, sign: Floats) -> Complexes:
     """Return the forward direction as complex numbers; at rest the last one: (k,)."""
-    if not len(t):
-        return np.ones(len(t_new), complex)
     z = (rate_over_second(t, track_n[:, 0]) + 1j * rate_over_second(t, track_n[:, 1])) * sign
     # below 0.2 m/s noise of the track (rounding to counts) dominates the direction
     moving = np.flatnonzero(np.abs(z) > 0.2)

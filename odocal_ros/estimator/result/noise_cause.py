@@ -75,9 +75,8 @@ def at_rest_and_moving(problem: Problem) -> tuple[dict[str, float], dict[str, fl
         return np.where(inside, still[np.clip(at, 0, len(keys) - 2)], 2).astype(np.uint8)
 
     parts = by_row(part, leg.t_imu)
-    of = (of_samples(leg, rows) if len(rows) >= FEWEST_ROWS else {} for rows in (
+    moving, rest = (of_samples(leg, rows) if len(rows) >= FEWEST_ROWS else {} for rows in (
         np.flatnonzero(parts == kind)[:MOST_SAMPLES] for kind in (0, 1)))
-    moving, rest = of
     return moving, rest
 
 
