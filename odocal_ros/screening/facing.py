@@ -12,7 +12,6 @@ specific force when the vehicle accelerates; up is the direction of its median.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.data.pieces import bin_means, by_row, chunks, lengths, medians
@@ -36,22 +35,32 @@ MAX_RATE = 8.0                  # rad/s, physical: vehicles on wheels turn more 
 
 
 @dataclass(frozen=True, eq=False)
-class Pushes:
+class Accelerations:
     """
     Accelerations of the IMU in the level plane, in bins of BIN_S seconds, complex: e1 + i e2.
 
-    e1, e2 : (3,) level axes, in the frame of the IMU's data.   force : (m,) m/s^2.
-    onward, inward : (m,) by odometer and gyro, m/s^2: forward; centripetal, positive to the left.
-    near : (m,) True if the bin before it is adjacent.   t : (m,) s, middle of the bin.
+    e1, e2 : (3,) level axes, in the frame of the IMU's data.   t : (m,) s, middle of the bin.
+    force : (m,) m/s^2.   onward, inward : (m,) by odometer and gyro, m/s^2: forward; centripetal,
+    positive to the left.
     """
 
-    e1: NDArray[np.float64]
-    e2: NDArray[np.float64]
-    force: NDArray[np.complex128]
-    onward: NDArray[np.float64]
-    inward: NDArray[np.float64]
-    near: NDArray[np.bool_]
+    e1: Floats
+    e2: Floats
     t: Floats
+    force: Complexes
+    onward: Floats
+    inward: Floats
+
+    def __getitem__(self, rows: slice) -> 'Accelerations':
+        """Return the accelerations of some rows."""
+        return Accelerations(self.e1, self.e2, self.t[rows], self.force[rows], self.onward[rows],
+                             self.inward[rows])
+
+    def changes(self) -> 'Accelerations':
+        """Return the changes from bin to adjacent bin: slopes, which change slowly, cancel."""
+        near = np.diff(self.t) < 1.5 * BIN_S
+        return Accelerations(self.e1, self.e2, self.t[1:][near], np.diff(self.force)[near],
+                             np.diff(self.onward)[near], np.diff(self.inward)[near])
 
 
 @dataclass(frozen=True)
@@ -71,7 +80,7 @@ class Facing:
 
 
 def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
-           metres_per_unit: float) -> Pushes | None:
+           metres_per_unit: float) -> Accelerations | None:
     """
     Return the accelerations of a drive, None if it is too short.
 
@@ -93,34 +102,13 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(up, e1)
     use = np.flatnonzero(count)
-    return Pushes(e1, e2, (f @ e1 + 1j * (f @ e2))[use], onward[use], (speed * turn_rate)[use],
-                  np.diff(use, prepend=-9) == 1, middle[use])
-
-
-@dataclass(frozen=True, eq=False)
-class Accelerations:
-    """
-    Changes of accelerations from bin to bin, in which slopes, which change slowly, cancel.
-
-    e1, e2 : (3,) level axes, frame b.   t : (m,) s.   force, onward, inward : (m,) as in Pushes.
-    """
-
-    e1: Floats
-    e2: Floats
-    t: Floats
-    force: Complexes
-    onward: Floats
-    inward: Floats
-
-    def __getitem__(self, rows: slice) -> 'Accelerations':
-        """Return the accelerations of some rows."""
-        return Accelerations(self.e1, self.e2, self.t[rows], self.force[rows], self.onward[rows],
-                             self.inward[rows])
+    return Accelerations(e1, e2, middle[use], (f @ e1 + 1j * (f @ e2))[use], onward[use],
+                         (speed * turn_rate)[use])
 
 
 def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | None:
     """
-    Return the accelerations of a leg, None if it is too short.
+    Return the changes of the accelerations of a leg, None if it is too short.
 
     inputs : in the configured body frame.   metres_per_unit : as for ``pushes``.
     """
@@ -128,11 +116,7 @@ def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | Non
     size = float(np.linalg.norm(mean))
     found = pushes(inputs.t_imu, inputs.w_b, inputs.f_b, mean / size, inputs.travel,
                    metres_per_unit) if size else None
-    if found is None:
-        return None
-    near = found.near[1:]
-    return Accelerations(found.e1, found.e2, found.t[1:][near], np.diff(found.force)[near],
-                         np.diff(found.onward)[near], np.diff(found.inward)[near])
+    return None if found is None else found.changes()
 
 
 def facing(inputs: Inputs, metres_per_unit: float) -> Facing | None:
