@@ -20,9 +20,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, section_ratio, Track
+from odocal_ros.nav.dead_reckoning import Origin, section_ratio, Track
 from odocal_ros.nav.integral import integral_at
-from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.facing import Facing
@@ -177,10 +176,6 @@ class PreparedLeg(Placed):
             point: tuple[float, ...] = getattr(self.config.reference, name)
             return point
         return ()
-
-    def reckon(self, travel: Travel) -> Track:
-        """Return the track of a travel (mean of the wheels, or one) with attitude ``epochs``."""
-        return dead_reckon(*self.epochs, travel)
 
 
 def attitude_of(inputs: Inputs, origin: Origin, t_begin: float, q_nb: Floats,

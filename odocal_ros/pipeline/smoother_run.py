@@ -134,8 +134,8 @@ def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
         return None
     between = (inputs.t_fix >= begin) & (inputs.t_fix <= end)
     scale = ready.nominal or ready.rough
-    return planar_leg(ready.reckon(left), ready.reckon(right), inputs.t_fix[between],
-                      ready.fixes_n[between], inputs.covariance_n[between],
+    return planar_leg(dead_reckon(*ready.epochs, left), dead_reckon(*ready.epochs, right),
+                      inputs.t_fix[between], ready.fixes_n[between], inputs.covariance_n[between],
                       (start.t, start.position_n), (scale, scale), pitch, ready.lever_b)
 
 

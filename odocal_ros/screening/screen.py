@@ -141,7 +141,8 @@ def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> I
 def _travel(leg: Leg, wheels: Wheels) -> dict[str, Any]:
     """Return the travel of wheels as fields of Inputs."""
     # of two wheels with unknown sides only the mean is defined
-    return {'travel': wheels.mean, 'travels': wheels.several if leg.form.sides else (),
+    several = wheels.each if leg.form.sides and len(wheels.each) > 1 else ()
+    return {'travel': wheels.mean, 'travels': several,
             'doubt_t': wheels.doubt_t, 'doubt_sigma': wheels.doubt_sigma}
 
 

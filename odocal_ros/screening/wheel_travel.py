@@ -159,11 +159,6 @@ class Wheels:
         return mean_travel(fixed) if all(len(one.t) for one in fixed) else fixed[0]
 
     @property
-    def several(self) -> tuple[Travel, ...]:
-        """Return each of several wheels, () for a single one."""
-        return self.each if len(self.each) > 1 else ()
-
-    @property
     def doubt_t(self) -> Floats:
         """Return the times at which the mean is uncertain, s."""
         return np.concatenate([self.doubts[k][0] for k in self._fixed])

@@ -12,7 +12,7 @@ from odocal_ros.apply.odometry import Odometry
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.calib.result import Estimate
 from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.nav.dead_reckoning import forward_b
+from odocal_ros.nav.dead_reckoning import dead_reckon, forward_b
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.prepare import prepare
@@ -61,7 +61,7 @@ def test_of_two_wheels_each_has_its_own_factor(two_wheels):
     row = int(np.searchsorted(made.imu.stamp_ns, made.truth.start_ns)) - 5
     alignment, config = alignment_of(made, row), settings(made)
     run, _ = prepare(made.leg(), screen(made.leg(), config)[0], config, alignment=alignment)
-    left, right = (run.reckon(travel).P * scale for travel, scale in zip(
+    left, right = (dead_reckon(*run.epochs, travel).P * scale for travel, scale in zip(
         (run.inputs.travels[0], run.inputs.travels[1]), made.truth.wheel_scales, strict=True))
     wanted = (left + right) / 2 @ forward_b(made.truth.yaw, made.truth.pitch)
     poses = poses_of(odometry_of(made, **given(alignment, run.origin.latitude)),
