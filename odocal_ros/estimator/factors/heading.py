@@ -81,7 +81,6 @@ class HeadingRows(OutsideRows):
                 'error': float(constants[HEADING]), 'error_sigma': float(sigma[HEADING])}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
-        """Return the rows."""
         sent = problem.outside['heading']
         assert isinstance(sent, Heading)
         state, points = point.state, point.points['heading']
@@ -101,7 +100,6 @@ class HeadingRows(OutsideRows):
 
     @staticmethod
     def least(sent: Heading) -> dict[str, float]:
-        """Return the least level."""
         return {'heading': (LEAST.heading / float(np.median(sent.noise)))**2}
 
 

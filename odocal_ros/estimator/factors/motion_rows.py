@@ -88,7 +88,6 @@ class MotionRows(Factor):
         self.log_R = -2 * logs.sum()
 
     def after(self, step: Floats, constants: Floats, reached: State) -> None:
-        """Apply the step to the residuals."""
         r, n = self.r.copy(), self.n
         for rows in blocks(len(r)):
             J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
@@ -107,7 +106,6 @@ class MotionRows(Factor):
         return begin, end, constants
 
     def add(self, out: Normal) -> None:
-        """Add the rows to normal equations."""
         n = self.n
         for rows in blocks(len(self.r)):
             ends, J = slice(rows.start + 1, rows.stop + 1), self.J[rows]
@@ -126,7 +124,6 @@ class MotionRows(Factor):
             out.g_border += g[:, 2 * n:].sum(axis=0)
 
     def cost(self) -> float:
-        """Return the sum of squares, in sigmas."""
         out: float = (self.r**2).sum()
         return out
 
@@ -143,14 +140,12 @@ class MotionRows(Factor):
         return np.isin(self.noise.component, [INTERVAL.index(name) for name in names])
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        """Return the quadratic sum and its expectation for each level."""
         estimates, seen = self._noises(marginals)
         quadratic, expected = np.einsum('kc,kc->c', estimates, estimates), seen.sum(axis=0)
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
                 for name in INTERVAL}
 
     def add_levels(self, out: LevelSides) -> None:
-        """Add the right-hand sides of its levels."""
         n, columns = self.n, out.at(INTERVAL)
         of = np.eye(len(INTERVAL))[self.noise.component]
         for rows in blocks(len(self.r)):

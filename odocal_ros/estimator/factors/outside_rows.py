@@ -70,7 +70,6 @@ class OutsideRows(PointRows):
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
-        """Return the times of validity, s."""
         return problem.outside[cls.name].t
 
     @classmethod

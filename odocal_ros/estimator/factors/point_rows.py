@@ -121,7 +121,6 @@ class PointRows(Factor):
         return total / self.per_effective
 
     def after(self, step: Floats, constants: Floats, reached: State) -> None:
-        """Apply the step to the residuals."""
         own = np.concatenate([step[self.k], np.broadcast_to(
             constants[:self.m], (len(self.k), self.m))], axis=1)
         self.r = self.r + np.einsum('kij,kj->ki', self.J, own)
@@ -129,7 +128,6 @@ class PointRows(Factor):
             self.r = self.r + np.einsum('kij,kj->ki', self.J_end, step[self.k + 1, SLOW])
 
     def add(self, out: Normal) -> None:
-        """Add the rows to normal equations."""
         n = self.n
         for present, gather in self._intervals():
             J, r = gather(self.J), gather(self.r[:, :, None])
@@ -177,7 +175,6 @@ class PointRows(Factor):
         return np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        """Return the quadratic sum and its expectation for each level."""
         if len(self.k) < FEWEST_JUDGED:
             return {}
         taken = np.concatenate([self._taken(marginals, present, gather)
@@ -189,7 +186,6 @@ class PointRows(Factor):
                 for level, columns in self.levels_of.items()}
 
     def add_levels(self, out: LevelSides) -> None:
-        """Add the right-hand sides of its levels."""
         if len(self.k) < FEWEST_JUDGED:
             return
         columns = out.at(self.levels_of)

@@ -73,11 +73,9 @@ class PressureRows(OutsideRows):
 
     @staticmethod
     def least(sent: Pressure) -> dict[str, float]:
-        """Return the least level."""
         return {'pressure': (LEAST.height / float(np.median(sent.sigma)))**2}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
-        """Return the rows."""
         leg, state, points = problem.leg, point.state, point.points['pressure']
         sent, k, tau = problem.outside['pressure'], points.interval, points.tau
         assert isinstance(sent, Pressure)

@@ -153,7 +153,6 @@ class PriorRows(Factor):
         out.absent = w[m:]
 
     def cost(self) -> float:
-        """Return the sum of squares, in sigmas."""
         total = sum((value**2 / sigma**2).sum() for _, value, sigma in self._biases())
         out: float = total + (self._constants_off()**2 / self.priors.constants**2).sum()
         return out

@@ -38,13 +38,11 @@ class Rests(Factor):
         return out
 
     def add(self, out: Normal) -> None:
-        """Add the rows to normal equations."""
         weight = self.still[:, None] / STILL_SPEED**2
         add_prior(out, slice(None), V, 1.0, self.state.v_n, weight)
         add_process(out, PHI, 1.0, self.pair[:, None] / self.turn_variance, self.turned())
 
     def cost(self) -> float:
-        """Return the sum of squares, in sigmas."""
         total = (self.state.v_n[self.still]**2).sum() / STILL_SPEED**2
         out: float = total + (self.turned()[self.pair]**2 / self.turn_variance[self.pair]).sum()
         return out

@@ -74,18 +74,15 @@ class SlowError(Factor):
         return s[1:] - self.decay * s[:-1]
 
     def add(self, out: Normal) -> None:
-        """Add the rows to normal equations."""
         add_process(out, SLOW, self.decay, 1 / self.drive, self.residual())
         add_prior(out, 0, SLOW, self.power, self.state.slow_n[0])
 
     def cost(self) -> float:
-        """Return the sum of squares, in sigmas."""
         first = (self.state.slow_n[0]**2 / self.power).sum()
         out: float = (self.residual()**2 / self.drive).sum() + first
         return out
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        """Return the quadratic sum and its expectation for each level."""
         i, s = np.arange(SLOW.start, SLOW.stop), self.state.slow_n
         a, q, r = self.decay, self.drive, self.residual()
         before, both, var = self._variances(marginals)

@@ -41,12 +41,10 @@ class TravelError(Factor):
         self.log_R = self.weight.sum() * np.log(self.variance)
 
     def add(self, out: Normal) -> None:
-        """Add the rows to normal equations."""
         add_prior(out, slice(None), slice(E, E + 1), self.variance,
                   self.state.travel_error[:, None], self.weight[:, None])
 
     def cost(self) -> float:
-        """Return the weighted sum of squares."""
         out: float = (self.weight * self.state.travel_error**2).sum() / self.variance
         return out
 
@@ -58,7 +56,6 @@ class TravelError(Factor):
         return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
 
     def add_levels(self, out: LevelSides) -> None:
-        """Add the right-hand side of its level."""
         i, = out.at((self.name,))
         g = self.weight * self.state.travel_error / self.variance
         out.chain[:, E, i] += g

@@ -92,7 +92,6 @@ class VelocityRows(OutsideRows):
                          max(gnss.velocity_scale_sigma, 1e-6)])
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
-        """Return the rows."""
         leg, state, points = problem.leg, point.state, point.points['velocity']
         sent, k = problem.outside['velocity'], points.interval
         assert isinstance(sent, Velocity)
@@ -134,7 +133,6 @@ class VelocityRows(OutsideRows):
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
-        """Return the times of validity, s."""
         out: Floats = super().times(problem, constants) - constants[VELOCITY_DELAY]
         return out
 
@@ -149,5 +147,4 @@ class VelocityRows(OutsideRows):
 
     @staticmethod
     def least(sent: Velocity) -> dict[str, float]:
-        """Return the least level."""
         return {'velocity': (LEAST.velocity / float(np.median(sent.sigma)))**2}
