@@ -87,8 +87,7 @@ def _turn(r: Floats, q_nb: Floats) -> Floats:
 def _turned(q_nb: Floats) -> Floats:
     """Return the rotation of each step about the axes of b: (n, 4) to (n - 1, 3) rad."""
     step = quat_multiply(quat_conjugate(q_nb[:-1]), q_nb[1:])
-    turned: Floats = 2 * step[:, :3] * np.sign(step[:, 3:])
-    return turned
+    return 2 * step[:, :3] * np.sign(step[:, 3:])
 
 
 def _spread(r: Floats, dt: Floats) -> Floats:

@@ -136,9 +136,8 @@ class LinkedLegs:
 
     def evidence(self, name: str, points: int) -> Floats:
         """Return the log likelihood of a constant's scatter by combined legs: (points,)."""
-        out: Floats = sum((b.evidence[name] for b in self.borders if name in b.evidence),
-                          np.zeros(points))
-        return out
+        return sum((b.evidence[name] for b in self.borders if name in b.evidence),
+                   np.zeros(points))
 
     def disagreement(self, spread: dict[str, float] | None = None) -> tuple[float, float]:
         """

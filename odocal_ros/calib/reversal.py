@@ -52,8 +52,7 @@ def level_track(way: Floats, turned: Floats) -> Floats:
     """
     middle = (turned[1:] + turned[:-1]) / 2
     step = np.diff(way)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
-    out: Floats = np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
-    return out
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
 
 
 def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Pieces:

@@ -60,8 +60,7 @@ def _pivots(ends: Floats, angle: Floats) -> Bools:
     """Return a mask of the chords in which a vehicle stops and turns: (n,), angle in rad."""
     lasts, turns = np.diff(ends), np.abs(np.diff(angle))
     # judgement: ratio to the median duration, and rad: the mean over time is not that over path
-    pivots: Bools = (lasts > 3.0 * np.median(lasts)) & (turns > 0.5)
-    return pivots
+    return (lasts > 3.0 * np.median(lasts)) & (turns > 0.5)
 
 
 def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:

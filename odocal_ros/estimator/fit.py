@@ -226,8 +226,7 @@ def slips(weighted: Weighted, marginals: JointMarginals, spread: Floats, levels:
     wanted = np.clip(spread * z2 / TAILS, 1.0, 1e6)
     # half the change in the logarithm: adjacent intervals share a slip and would oscillate
     wanted[:, :JUMP] = np.sqrt(spread * wanted)[:, :JUMP]
-    out: Floats = wanted
-    return out
+    return wanted
 
 
 def per_effective(problem: Problem, weighted: Weighted) -> dict[str, float]:

@@ -95,13 +95,11 @@ class ImuSteps(Steps):
         share = (T / np.repeat(self.over_intervals(T), np.diff(self.key)))[:, None]
         mean = self.over_intervals(turned * share)
         square = self.over_intervals(turned[:, :, None] * (turned * share)[:, None])
-        out: Floats = square - mean[:, :, None] * mean[:, None]
-        return out
+        return square - mean[:, :, None] * mean[:, None]
 
     def over_intervals(self, x: Floats) -> Floats:
         """Return the sums of a quantity of the steps over the keyframe intervals: (K, ...)."""
-        out: Floats = np.add.reduceat(x, self.key[:-1])
-        return out
+        return np.add.reduceat(x, self.key[:-1])
 
 
 def _edges(t: Floats, key: Ints) -> Ints:

@@ -60,5 +60,4 @@ class LevelInformation:
         """
         own = np.diag([precision[name] for name in self.names])
         root = np.linalg.cholesky(np.linalg.inv(self.average + own))
-        effects: Floats = self.moves @ root
-        return effects
+        return self.moves @ root

@@ -156,5 +156,4 @@ def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
 def keyframe_times(leg: SmootherLeg, config: Config) -> Floats:
     """Return the times of the keyframes of a leg, s: (N,)."""
     problem = problem_of(leg, config)
-    out: Floats = problem.imu.t[problem.imu.key]
-    return out
+    return problem.imu.t[problem.imu.key]

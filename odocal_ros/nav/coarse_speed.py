@@ -190,8 +190,7 @@ def _coherence(u: Ints, size: int) -> Floats:
     """Return |mean of exp(2 pi i k u / size)| of cells u, (size / 2 + 1,) by k."""
     there = np.zeros(size)
     there[u] = 1.0
-    phase: Floats = np.abs(np.fft.rfft(there)) / len(u)
-    return phase
+    return np.abs(np.fft.rfft(there)) / len(u)
 
 
 def _may_be_grid(u: Ints) -> bool:

@@ -100,5 +100,4 @@ def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> 
     rest = min(means, key=np.linalg.norm)
     if np.abs(rest).max() > MOST_BIAS:
         return np.zeros_like(quiet)
-    as_at_rest: Bools = across(np.logical_and, np.abs(rate - rest) < REST_TURN)
-    return as_at_rest
+    return across(np.logical_and, np.abs(rate - rest) < REST_TURN)

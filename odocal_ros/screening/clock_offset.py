@@ -95,8 +95,7 @@ def _quick(x: Floats, slow: float) -> Floats:
     """Return columns without their changes slower than some seconds: (n, k)."""
     half = min(round(slow / OFFSET_CELL / 2), (len(x) - 1) // 2)
     total = np.cumsum(np.pad(x, ((half + 1, half), (0, 0)), mode='edge'), axis=0)
-    out: Floats = x - (total[2 * half + 1:] - total[:-2 * half - 1]) / (2 * half + 1)
-    return out
+    return x - (total[2 * half + 1:] - total[:-2 * half - 1]) / (2 * half + 1)
 
 
 def _late(y: Floats, x: Floats, x_late: float = 0.0) -> float:

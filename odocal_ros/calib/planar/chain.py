@@ -46,8 +46,7 @@ class Equations:
         s, m = A.shape[2], C.shape[2]
 
         def product(X: Floats, Y: Floats) -> Floats:
-            out: Floats = np.swapaxes(X * w[:, :, None], 1, 2) @ Y
-            return out
+            return np.swapaxes(X * w[:, :, None], 1, 2) @ Y
         v = rows.value[:, :, None]
         # rows of the last node have zeros ahead, for an extra node, removed below; nodes differ
         self.diagonal, self.off = np.zeros((2, nodes + 1, s, s))

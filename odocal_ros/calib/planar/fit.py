@@ -118,8 +118,7 @@ def _begin(run: Run, known: Known, at_first: First) -> tuple[Floats, Floats, Flo
 def noise_path(run: Run, scale: float) -> Floats:
     """Return the effective wheel path in each interval, by which its noise grows: (n,) m."""
     path: Floats = run.wheels.path * scale
-    out: Floats = path + np.diff(run.t) * np.where(path > 0, WITH_TIME, AT_REST)
-    return out
+    return path + np.diff(run.t) * np.where(path > 0, WITH_TIME, AT_REST)
 
 
 def _solved(parts: dict[str, Equations], theta: dict[str, float], prior: Floats,

@@ -81,14 +81,12 @@ class Ranges:
         """Return x of the rows of an array: equal steps from -half to half."""
         if self.levels == 1:
             return np.zeros(rows.shape)
-        x: Floats = (2 * rows / (self.levels - 1) - 1) * self.half
-        return x
+        return (2 * rows / (self.levels - 1) - 1) * self.half
 
     @property
     def step(self) -> NDArray[np.float64]:
         """Return the step between levels; for one or two levels the half range."""
-        step: Floats = 2 * self.half / max(self.levels - 1, 2)
-        return step
+        return 2 * self.half / max(self.levels - 1, 2)
 
 
 def ranges_of(wheels: WheelsConfig, heading_sigma: float | None = None) -> Ranges:

@@ -63,8 +63,7 @@ class Axle:
         """
         speed, rise = self._ahead(self.v_n), self.v_n[:, 2]
         ahead = speed[1:] + speed[:-1]
-        slope: Floats = (rise[1:] + rise[:-1]) * ahead / np.maximum(ahead**2, (2 * WALK_SPEED)**2)
-        return slope
+        return (rise[1:] + rise[:-1]) * ahead / np.maximum(ahead**2, (2 * WALK_SPEED)**2)
 
     def accelerations(self) -> Floats:
         """

@@ -70,8 +70,7 @@ def gravity_n(position_n: Floats, origin: Origin) -> Floats:
 def slowly(x: Floats) -> Floats:
     """Return moving means over HILL_INTERVALS: (K,)."""
     around = np.ones(HILL_INTERVALS)
-    out: Floats = np.convolve(x, around, 'same') / np.convolve(np.ones(len(x)), around, 'same')
-    return out
+    return np.convolve(x, around, 'same') / np.convolve(np.ones(len(x)), around, 'same')
 
 
 class Motion:
@@ -151,8 +150,7 @@ class Motion:
     @property
     def vertical_shift(self) -> Floats:
         """Return the vertical displacement of the odometer by pitching: (K, 3) m."""
-        out: Floats = self.pitched @ self.state.constants[PITCH_CENTRE]
-        return out
+        return self.pitched @ self.state.constants[PITCH_CENTRE]
 
     def _vary(self) -> Floats:
         """
@@ -175,8 +173,7 @@ class Motion:
         self.level_left = level_left(self.C @ state.forward)
         nose_down = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
         self.nose_down = np.stack([nose_down, nose_down - slowly(nose_down)], -1)
-        out: Floats = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
-        return out
+        return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
     def _inclined(self, straight: Floats) -> Floats:
         """
@@ -197,8 +194,7 @@ class Motion:
         of_body, _ = slope(straight)
         travelled, per_metre = slope(self.travelled)
         self.shorter = travelled * per_metre / (1 + travelled**2)
-        out: Floats = np.sqrt((1 + of_body**2) / (1 + travelled**2))
-        return out
+        return np.sqrt((1 + of_body**2) / (1 + travelled**2))
 
     def _by_slope(self, C: Floats, arm_b: Floats, sign: float) -> Floats:
         """Return derivatives of the path by the position and attitude of an end: (K, 3, 6)."""

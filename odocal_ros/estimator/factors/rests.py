@@ -34,8 +34,7 @@ class Rests(Factor):
     def turned(self) -> Floats:
         """Return the turn within each interval, rad: (K, 3)."""
         C = self.state.C_nb
-        out: Floats = rotvec(C[1:] @ transpose(C[:-1]))
-        return out
+        return rotvec(C[1:] @ transpose(C[:-1]))
 
     def add(self, out: Normal) -> None:
         weight = self.still[:, None] / STILL_SPEED**2

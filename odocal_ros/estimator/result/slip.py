@@ -36,8 +36,7 @@ def along(fit: Fit, marginals: JointMarginals) -> Floats:
     """Return odometer path minus ground path in each interval, m: (K,)."""
     rows = fit.weighted[MotionRows]
     estimate, _ = rows.road_noise(marginals)
-    out: Floats = -estimate[:, 0] * rows.along_size()
-    return out
+    return -estimate[:, 0] * rows.along_size()
 
 
 def find_slips(fit: Fit, turned: Floats, count: float = 0.0) -> tuple[Slip, ...]:
