@@ -43,8 +43,7 @@ class FittedTrack:
                 break
             centre = float(np.angle(np.exp(1j * off).sum()))
             off = np.unwrap(centre + wrap(off - centre)) if len(off) > 1 else off
-            self.chi, slope = _line(middle, off)
-            self.slope = slope
+            self.chi, self.slope = _line(middle, off)
             at_mid = np.interp(middle, t_fix, np.arange(len(t_fix)))
             k = np.unique(np.round(at_mid).astype(int))
             run = np.abs(np.diff(at[k]))

@@ -65,7 +65,10 @@ class SlowError(Factor):
         gain = np.array([levels['slow'], levels['slow'], levels['slow_up']])
         self.power = gain * levels.correlation_time / 2
         self.drive = np.multiply.outer(1 - decay**2, self.power) * self.jump
-        self.decay = decay[:, None]
+        a = self.decay = decay[:, None]
+        # derivatives of decay and of ln drive by ln correlation time
+        self.da = a * self.T[:, None] / levels.correlation_time
+        self.dq = 1 - 2 * a * self.da / (1 - a**2)
         self.log_R = np.log(self.drive).sum() + np.log(self.power).sum()
 
     def residual(self) -> Floats:
@@ -127,9 +130,7 @@ class SlowError(Factor):
         (K, 3) m^2, driving noise times the value before; excess : (K, 3) and begin : (3,) squares
         of the driving noise and of the first value over their variances, less 1: expected values.
         """
-        a, tau = self.decay, self.levels.correlation_time
-        da = a * self.T[:, None] / tau                       # by ln tau
-        dq = 1 - 2 * a * da / (1 - a**2)                      # of ln drive
+        a, tau, da, dq = self.decay, self.levels.correlation_time, self.da, self.dq
         score = float((product * da / self.drive + excess * dq / 2).sum() + begin.sum() / 2
                       - np.log(tau / USUAL_TIME) / TIME_SPREAD**2)
         information = 3 * float((da**2 / (1 - a**2) + dq**2 / 2).sum() + 0.5) + TIME_SPREAD**-2
@@ -139,10 +140,10 @@ class SlowError(Factor):
         """Add the right-hand sides of its levels; for a power, q is the error itself."""
         s = self.state.slow_n
         axes = {'slow': np.array([1.0, 1.0, 0.0]), 'slow_up': np.array([0.0, 0.0, 1.0])}
-        g, q = ([x * one for one in axes.values()] for x in (self._precision(s), s))
+        g, q = ([x * one for one in axes.values()] for x in (self._precision(), s))
         names = list(axes)
         if not self.time_given:
-            by_time = self._by_time(s)
+            by_time = self._by_time()
             g.append(by_time)
             q.append(self._process(by_time))
             names.append('correlation_time')
@@ -151,25 +152,23 @@ class SlowError(Factor):
             out.chain[:, SLOW, i] += own
         out.square[np.ix_(columns, columns)] += [[(a * b).sum() for b in g] for a in q]
 
-    def _precision(self, s: Floats) -> Floats:
-        """Return the inverse covariance of the process times values of it: (N, 3)."""
-        push = (s[1:] - self.decay * s[:-1]) / self.drive
+    def _precision(self) -> Floats:
+        """Return the inverse covariance of the process times the error: (N, 3)."""
+        s, push = self.state.slow_n, self.residual() / self.drive
         out = np.zeros_like(s)
         out[0] = s[0] / self.power
         out[1:] += push
         out[:-1] -= self.decay * push
         return out
 
-    def _by_time(self, s: Floats) -> Floats:
+    def _by_time(self) -> Floats:
         """Return minus the derivative of ``_precision`` by the log correlation time: (N, 3)."""
-        a, r = self.decay, s[1:] - self.decay * s[:-1]
-        da = a * self.T[:, None] / self.levels.correlation_time
-        dq = 1 - 2 * a * da / (1 - a**2)
-        push = (da * s[:-1] + r * dq) / self.drive
+        s, r = self.state.slow_n, self.residual()
+        push = (self.da * s[:-1] + r * self.dq) / self.drive
         out = np.zeros_like(s)
         out[0] = s[0] / self.power
         out[1:] += push
-        out[:-1] += da * r / self.drive - a * push
+        out[:-1] += self.da * r / self.drive - self.decay * push
         return out
 
     def _process(self, g: Floats) -> Floats:
