@@ -99,7 +99,7 @@ def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys,
         said[names] = told.err
         result = json.loads(told.out)
         text, = (r['text'] for r in result['reasons'] if r['code'] == 'MORE_LEGS_NEEDED')
-        assert text.endswith('of 5' if 'other' in names else 'of 3'), names
+        assert text.endswith('required: 5' if 'other' in names else 'required: 3'), names
     assert 'verdict.min_legs: differ between the journals' in said['one other']
     assert 'use those of other' in said['one other']
     assert 'not the same' not in said['one dropped'] + said['one']
