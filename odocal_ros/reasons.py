@@ -96,6 +96,9 @@ class Code(Enum):
                                      'looks like this: then set imu.gyro_scale.')
     IMU_SATURATED = NOTE, ('Set a larger range in the IMU or its driver, or mount it more softly. '
                            'The mean of a saturated axis is wrong.')
+    IMU_BIAS_STEP = NOTE, ('No action needed for this leg. Check that the IMU is firmly mounted '
+                           'and its supply is stable; if the bias steps in each drive, replace '
+                           'the IMU.')
     IMU_AXES_SKEW = NOTE, ('No action needed: the mounting angles refer to the measurement axes '
                            'of the IMU. To silence this, set imu.misalignment_sigma to the value '
                            'of this IMU.')

@@ -136,6 +136,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.IMU_SATURATED: 'The largest value of an axis is repeated: the sensor stops at the '
         'limit of its range, 2 g or 16 g for an accelerometer. Potholes and a hard mount cause '
         'this. Noise levels are estimated with it.',
+        Code.IMU_BIAS_STEP: 'The bias of the gyro or of the accelerometer changes within a second '
+        'or two by more than 10 times its usual change: a knock, a strained board or a change of '
+        'the supply. The bias is estimated before and after; values and sigmas hold.',
         Code.IMU_AXES_SKEW: 'The axes of the IMU deviate more from perpendicular than its grade. '
         'The fit accounts for it; mounting angles measured on the housing differ accordingly.',
         Code.LEVER_ARM_OFF: 'In turns and while leaning, a sensor moves as if it were decimetres '

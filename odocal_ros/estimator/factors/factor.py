@@ -36,6 +36,7 @@ VARIANCE_FACTORS = ('along', 'side', 'up', *IMU, 'jump')
 SPREAD, JUMP = len(VARIANCE_FACTORS), VARIANCE_FACTORS.index('jump')
 ACCEL_NOISE = VARIANCE_FACTORS.index('accel')
 IMU_NOISE = slice(VARIANCE_FACTORS.index('gyro'), JUMP)
+GYRO_STEP, ACCEL_STEP = map(VARIANCE_FACTORS.index, ('gyro_walk', 'accel_walk'))
 WANTED = len(PARAMETERS)    # constants in the error budget: ln K, yaw, pitch
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals
+from odocal_ros.estimator.factors.factor import ACCEL_STEP, GYRO_STEP
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.levels import Levels
@@ -53,6 +54,9 @@ MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 FALLS_WITH_SPEED = ('Possible causes: truncated speed values, a dead band, or slip of a driven '
                     'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
                     'Use wheel pulses, or a wheel that is not driven.')
+# factor on the variance of a second of a bias's walk, judgement: reported steps have 480 and more,
+# drives without steps at most 3 (docs/decisions/0016)
+STEP_VARIANCE = 100.0
 # relative, rad, judgement: smaller changes of the scale or of an angle are not reported
 LEAST_CHANGE = 3e-4
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
@@ -138,7 +142,7 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[R
                               wheels_in_map(problem, c, sigma)),
             *(reason for name, i in CLOCKS.items()
               for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
-            *_varies(fit, sigma), *_changes(fit)]
+            *_varies(fit, sigma), *_changes(fit), *_bias_steps(fit)]
     usual = imperfect_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))
     off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)
@@ -182,6 +186,23 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
     less = said[0].startswith('-') and 'speed' in said[0]
     return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(said)}; the stated '
                    'value is the mean over this leg', FALLS_WITH_SPEED if less else '')]
+
+
+def _bias_steps(fit: Fit) -> list[Reason]:
+    """Return the reason for a bias that steps: the largest step of each sensor."""
+    said = []
+    for name, bias, column, unit, per in (
+            ('gyro', fit.state.gyro_bias, GYRO_STEP, 'deg/s', np.rad2deg(1.0)),
+            ('accelerometer', fit.state.accel_bias, ACCEL_STEP, 'm/s^2', 1.0)):
+        odd = np.r_[False, fit.spread[:, column] > STEP_VARIANCE, False]
+        begin, end = np.flatnonzero(np.diff(odd.astype(int))).reshape(-1, 2).T
+        size = np.linalg.norm(bias[end] - bias[begin], axis=1)
+        if len(size):
+            k = int(np.argmax(size))
+            said.append(f'the {name} bias changes by {per * size[k]:.2g} {unit} near '
+                        f't = {fit.state.t[begin[k]]:.0f} s')
+    return [Reason(Code.IMU_BIAS_STEP, '; '.join(said) + '; estimated before and after')
+            ] if said else []
 
 
 def _changes(fit: Fit) -> list[Reason]:
