@@ -55,7 +55,7 @@ FALLS_WITH_SPEED = ('Possible causes: truncated speed values, a dead band, or sl
                     'wheel at high speed. Tyres have the opposite effect: they grow with speed. '
                     'Use wheel pulses, or a wheel that is not driven.')
 # factor on the variance of a second of a bias's walk, judgement: reported steps have 480 and more,
-# drives without steps at most 3 (docs/decisions/0016)
+# 60 drives without steps at most 7.3 (docs/decisions/0016)
 STEP_VARIANCE = 100.0
 # relative, rad, judgement: smaller changes of the scale or of an angle are not reported
 LEAST_CHANGE = 3e-4
