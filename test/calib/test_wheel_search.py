@@ -302,6 +302,11 @@ def test_a_small_lawn_tells_left_from_right():
         x = np.unique(np.round((found.sets[:, k] - (k < 2)), 12))
         assert_allclose(x, np.linspace(-half, half, 7), atol=1e-11)
     assert set(search(leg, Ranges(RANGES.half, RANGES.why, 1)).sets[:, 0]) == {1.0}
+    # the accuracy asked for is held against the best row
+    reach = found.scores.max[found.best], found.scores.mean[found.best]
+    assert found.meets is None
+    for more, meets in ((1e-9, True), (-1e-9, False)):
+        assert search(leg, RANGES, accuracy=(reach[0] + 1e-9, reach[1] + more)).meets is meets
 
 
 def test_the_range_is_widened_where_the_minimum_lies_on_its_edge():

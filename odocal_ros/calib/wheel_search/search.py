@@ -37,6 +37,7 @@ class SearchResult:
 
     start : scales before, m per unit.   sets, scores : of the array's rows.
     best : the row with the least mean distance (robust: loss), of equal ones the least maximum.
+    meets : its maximum and mean meet the required accuracy, None without one.
     refined : by response surfaces.   direct : by least squares.   free : least squares with left
     and right free; the same unless held.   held : the fixes do not separate left and right, and
     their ratio is that of the start values.   before, after : criteria of the start values and
@@ -49,6 +50,7 @@ class SearchResult:
     sets: NDArray[np.float64]
     scores: Scores
     best: int
+    meets: bool | None
     held: bool
     refined: Refined
     direct: LeastSquares
@@ -73,7 +75,7 @@ class SearchResult:
                       'imbalance': 0.0,
                       'shown': [_set(self.sets[k]) | self.scores.row(k) for k in shown.tolist()]},
             'best_row': _set(self.sets[self.best]) | self.scores.row(self.best),
-            'meets_accuracy': None,
+            'meets_accuracy': self.meets,
             'left_and_right_held_together': self.held,
             'heading_means': HEADING_MEANS,
             'response_surface': _set(self.refined_set) | {
@@ -107,12 +109,14 @@ def _set(parameters: Floats) -> dict[str, float]:
     return {'scale_left': left, 'scale_right': right, 'heading_deg': float(np.rad2deg(heading))}
 
 
-def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult | None:
+def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
+           accuracy: tuple[float, float] | None = None) -> SearchResult | None:
     """
     Search left scale, right scale and heading.
 
     leg : tracks and fixes; its start values are the middle of the ranges.   ranges : search
     ranges.   robust : weight fixes by their sigma and limit the influence of outliers.
+    accuracy : required (maximum, mean) distances, m.
 
     Returns
     -------
@@ -126,6 +130,8 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     sets = sets_of(leg, x)
     scores = score(leg, sets, robust)
     best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
+    meets = None if accuracy is None else bool(
+        scores.max[best] <= accuracy[0] and scores.mean[best] <= accuracy[1])
     free = direct = least_squares(leg, x[best], Space(held=False), robust)
     held = not _separable(free, ranges)
     space = Space(held)
@@ -134,7 +140,7 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult
     refined = _refined(leg, x[best], ranges, space, robust)
     refined_set, direct_set = (_wrapped(sets_of(leg, found.x)[0]) for found in (refined, direct))
     return SearchResult(
-        (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, held,
+        (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, meets, held,
         refined, direct, free, refined_set, direct_set, score(leg, leg.start, robust),
         score(leg, refined_set, robust), _reasons(ranges, refined, direct, free, held))
 
