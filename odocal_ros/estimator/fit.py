@@ -230,7 +230,11 @@ def slips(weighted: Weighted, marginals: JointMarginals, spread: Floats, levels:
 
 
 def per_effective(problem: Problem, weighted: Weighted) -> dict[str, float]:
-    """Return rows per independent row of other sensors, from the residuals."""
+    """
+    Return rows per independent row, from the residuals.
+
+    Of other sensors, and of speed steps: at constant acceleration their errors repeat.
+    """
     # errors of speed steps repeat at constant acceleration
     return {name: alike(part) for name, part in weighted.parts.items()
             if name in (*problem.outside, SpeedSteps.name) and isinstance(part, PointRows)}

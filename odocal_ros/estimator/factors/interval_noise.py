@@ -27,7 +27,7 @@ from odocal_ros.nav.rotations import skew
 from odocal_ros.nav.statistics import gaps_in_rhythm
 
 Floats = NDArray[np.float64]
-# level: variance per second of the white noise or walk; of the road also the axis of the vehicle
+# levels of the road, variance per second as those of IMU, and the axis of the vehicle
 ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
 INTERVAL = (*IMU, *ROAD)
 # definition: Gauss and Legendre's nodes and weights on 0 to 1
