@@ -126,10 +126,15 @@ def _lacking(held: Held, reasons: tuple[Reason, ...]) -> tuple[str, str]:
         if held.name == 'scale_ratio' and reason is None:
             return f'{name} is not known', 'Set odometer.nominal_scale.'
         return f'{name} is not determined', (reason or DRIVE_MORE[held.name]).remedy
+    of, unit = (math.degrees(1.0), ' deg') if found.unit == 'rad' else (1.0, '')
     if held.sigma_wanted is None:
-        return (f'{name} is beyond its limit, by less than {LIMIT_SIGMAS:g} sigma',
-                DRIVE_MORE[held.name].remedy)
+        turn = math.tau if unit else math.inf
+        off, limit = min(((math.remainder(found.value - x, turn), x) for x in (
+            held.low, held.high) if math.isfinite(x)), key=lambda pair: abs(pair[0]))
+        return (f'{name} is {of * (limit + off):.5g}{unit}, beyond its limit of '
+                f'{of * limit:.5g}{unit} by less than {LIMIT_SIGMAS:g} sigma (sigma '
+                f'{of * found.sigma:.2g}{unit})', DRIVE_MORE[held.name].remedy)
     times = (found.sigma / held.sigma_wanted)**2
-    return (f'{name} is within its limits, but its sigma is {found.sigma:.2g}; the limit is '
-            f'{held.sigma_wanted:.2g} (needs about {math.ceil(times)} times as many such '
-            'legs)', DRIVE_MORE[held.name].remedy)
+    return (f'{name} is within its limits, but its sigma is {of * found.sigma:.2g}{unit}; the '
+            f'limit is {of * held.sigma_wanted:.2g}{unit} (needs about {math.ceil(times)} times '
+            'as many such legs)', DRIVE_MORE[held.name].remedy)

@@ -47,7 +47,8 @@ def test_a_value_that_is_not_sure_is_open_and_says_what_sigma_would_do():
     assert found.values[0].sigma_wanted == pytest.approx(0.0005)
     assert 'about 2 times as many' in found.why      # (6 / 5)^2 = 1.44
     assert found.do == Code.SCALE_SIGMA_TOO_LARGE.remedy
-    assert 'beyond its limit' in decided(1.0055, 0.0003).why
+    assert decided(1.0055, 0.0003).why == (
+        'scale ratio is 1.0055, beyond its limit of 1.005 by less than 2 sigma (sigma 0.0003)')
     assert decided(1.0055, 0.0002).decision is Decision.FAIL
 
 
@@ -69,6 +70,11 @@ def test_an_angle_of_an_imu_that_faces_backwards_is_held_across_the_half_turn():
         assert found.decision is Decision.PASS
     found = decided(-pi + 0.05, 0.001, name='yaw_mounting_angle', unit='rad', **limits)
     assert found.decision is Decision.FAIL
+    del limits['accept.yaw_mounting_angle_min']        # texts are in degrees
+    found = decided(-pi + np.deg2rad(3), np.deg2rad(2), name='yaw_mounting_angle', unit='rad',
+                    **limits)
+    assert 'is 183 deg, beyond its limit of 181.15 deg by less than 2 sigma (sigma 2 deg)' in (
+        found.why)
 
 
 def test_nothing_is_decided_by_a_rejected_result_and_strict_lets_no_caution_pass():

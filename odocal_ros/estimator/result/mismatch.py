@@ -48,9 +48,9 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
             sensors.values(), strict=False)
         if np.max(np.abs(now[0]) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE]
     if worse:
-        reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
-                              f'{config.imu.grade} grade; the estimate from this drive is used',
-                              remedy))
+        reasons.append(Reason(
+            Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the {config.imu.grade} grade '
+            f'(limit {WORSE_THAN_GRADE:g}); the estimate from this drive is used', remedy))
     reasons += _outliers(fit)
     odd, move = [], 0.0
     if fit.creeping or not fit.settled:

@@ -151,13 +151,14 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[R
         worst = max((AXIS_XY, AXIS_ZX), key=lambda i: off[i])
         said.append(Reason(Code.IMU_AXES_SKEW, 'accelerometer axes are '
                            f'{np.rad2deg(abs(c[worst])):.2f} deg off perpendicular, '
-                           f'{off[worst]:.0f} times the sigma of the {config.imu.grade} grade; '
-                           'accounted for'))
+                           f'{off[worst]:.0f} times the sigma of the {config.imu.grade} grade '
+                           f'(limit {REMARK_SIGMAS:g}); accounted for'))
     worst = max(IMU_SCALES, key=lambda i: off[i])
-    if off[worst] > 4.0:        # of the sigma of the grade: another IMU
+    most = 4.0      # of the sigma of the grade: another IMU
+    if off[worst] > most:
         said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {CONSTANTS[worst].replace("_", " ")} '
                            f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
-                           f'the {config.imu.grade} grade; accounted for'))
+                           f'the {config.imu.grade} grade (limit {most:g}); accounted for'))
     return said + _arms(c, sigma, config)
 
 
@@ -165,10 +166,11 @@ def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
     """Return the reason for fix errors, white and correlated, above the stated ones."""
     slow = levels['slow'] * levels.correlation_time / 2 if levels.correlation_time else 0.0
     factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
-    if factor <= 1.5:       # worth a word: receivers state their errors no better
+    most = 1.5      # worth a word: receivers state their errors no better
+    if factor <= most:
         return []
     return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'fix errors (white and time-correlated) are '
-                   f'{factor:.1f} times as large as their covariance states',
+                   f'{factor:.1f} times as large as their covariance states (limit {most:g})',
                    OF_POSES if problem.leg.origin.local else '')]
 
 
