@@ -47,6 +47,13 @@ def by_step(function: Callable[..., Array], *columns: Array, steps: int = 1) -> 
     return found
 
 
+def thinned(x: Array, rows: int) -> Array:
+    """Return at least ``rows`` evenly spaced rows, or all if there are fewer: (n, ...)."""
+    step = max(1, len(x) // rows)
+    return np.concatenate([x[some][-some.start % step::step].copy() for some in chunks(len(x))]
+                          or [x])
+
+
 def across(ufunc: np.ufunc, x: Array) -> Array:
     """Return ``ufunc.reduce(x, axis=1)``, (n, k) to (n,); numpy's own takes ten times as long."""
     return reduce(ufunc, x.T)

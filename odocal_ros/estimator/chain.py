@@ -159,13 +159,14 @@ class JointMarginals:
 
     def variances(self) -> Floats:
         """Return the variance of each unknown of each block: (N, n)."""
-        own = [np.einsum('kii->ki', self._own[rows]) for rows in blocks(len(self._own))]
+        # copies: views would be read again after their memory is released
+        own = [np.einsum('kii->ki', self._own[rows]).copy() for rows in blocks(len(self._own))]
         return np.concatenate(own)
 
     def with_next(self) -> Floats:
         """Return the covariance of each unknown with itself in the next block: (N - 1, n)."""
         n = self._own.shape[1]
-        return np.concatenate([np.einsum('kii->ki', self._across[rows, :, :n])
+        return np.concatenate([np.einsum('kii->ki', self._across[rows, :, :n]).copy()
                                for rows in blocks(len(self))])
 
     def variances_of(self, rows: Ints, own: Floats, border: Floats, ahead: Floats | None,

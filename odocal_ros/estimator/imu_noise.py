@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.pieces import by_step
+from odocal_ros.data.pieces import by_step, median
 from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.imu_steps import ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
@@ -71,7 +71,6 @@ def of_samples(leg: SmootherLeg, rows: slice | Ints) -> dict[str, float]:
         out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)
         return out
 
-    usual = float(np.median(np.diff(leg.t_imu[rows]), overwrite_input=True))
-    return {name: float(np.sqrt(np.median(by_step(jumps, x[rows]), overwrite_input=True)
-                                / CHI2_3_MEDIAN / 2 * usual))
+    usual = median(by_step(np.diff, leg.t_imu[rows]))
+    return {name: float(np.sqrt(median(by_step(jumps, x[rows])) / CHI2_3_MEDIAN / 2 * usual))
             for name, x in (('gyro', leg.w_b), ('accel', leg.f_b))}

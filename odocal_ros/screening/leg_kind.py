@@ -20,7 +20,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.pieces import chunks
+from odocal_ros.data.pieces import chunks, thinned
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
@@ -57,7 +57,7 @@ def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
     if not has_accelerometer(imu.f_i):
         return 'publishes turn rates but no acceleration'
     with np.errstate(all='ignore'):
-        some = imu.f_i[::max(1, len(imu.f_i) // GRAVITY_ROWS)]
+        some = thinned(imu.f_i, GRAVITY_ROWS)
         some = some[np.isfinite(some).all(axis=1)]
         if len(some) and np.linalg.norm(np.median(some, axis=0)) * accel_scale < LEAST_GRAVITY:
             return 'publishes accelerations without gravity'

@@ -149,6 +149,7 @@ def test_chunks_of_any_size_give_the_same_sums(monkeypatch):
     leg = samples(t, 0.2 * rng.standard_normal((len(t), 3)), rng.standard_normal((len(t), 3)))
     whole = ImuSteps.of(leg, 1.0)
     monkeypatch.setattr('odocal_ros.estimator.imu_steps.AT_A_TIME', 33)
+    monkeypatch.setattr('odocal_ros.estimator.imu_steps.KEYS_AT_A_TIME', 3)
     parts = ImuSteps.of(leg, 1.0)
     for name in ('turn', 'turn_mean', 'dv', 'dp', 'signals', 'longest', 't', 'key'):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-12)

@@ -15,7 +15,7 @@ import pytest
 from odocal_ros.data import mapped, samples as s, spool
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import across, lengths, median, medians, PIECE_ROWS
+from odocal_ros.data.pieces import across, lengths, median, medians, PIECE_ROWS, thinned
 from odocal_ros.data.samples import ImuSamples, take
 from odocal_ros.errors import BadData
 from odocal_ros.nav.integral import integral_at, integrals_at, twice_integral_at
@@ -114,6 +114,13 @@ def test_a_median_of_many_rows_is_numpys(kind):
         np.testing.assert_array_equal(median(x), np.median(x))
         both = np.stack([x, -x], -1)
         np.testing.assert_array_equal(medians(both), np.median(both, axis=0))
+
+
+@pytest.mark.parametrize('rows', [0, 5, PIECE_ROWS, 2 * PIECE_ROWS + 100])
+def test_evenly_spaced_rows_are_those_of_a_slice(rows):
+    x = np.arange(3 * rows).reshape(-1, 3)
+    for wanted in (4, 1000, PIECE_ROWS):
+        np.testing.assert_array_equal(thinned(x, wanted), x[::max(1, rows // wanted)])
 
 
 def test_an_integral_over_pieces_is_that_at_once_at_each_of_several_times():

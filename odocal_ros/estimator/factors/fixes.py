@@ -130,9 +130,9 @@ class Fixes(PointRows):
         out: Floats = t - constants[GNSS_DELAY] - constants[GNSS_CLOCK] * t
         return out
 
-    def stated(self, rows: Floats) -> Floats:
-        """Return rows divided by the sigmas that the receiver states."""
-        return self.root @ rows
+    def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
+        """Return some rows divided by the sigmas that the receiver states."""
+        return self.root[some] @ rows
 
     def known(self) -> Bools:
         """Return a mask of the components that exist, (m, 3); fixes without height have two."""

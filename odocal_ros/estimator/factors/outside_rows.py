@@ -87,7 +87,7 @@ class OutsideRows(PointRows):
         J = self._rows.J
         return np.pad(J, ((0, 0), (0, 0), (0, n - BARE))), self._rows.c
 
-    def stated(self, rows: Floats) -> Floats:
-        """Return rows (m, d, c) in the sigmas that the sensor states."""
-        out: Floats = rows * self._rows.root[:, :, None]
+    def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
+        """Return some rows, (k, d, c), in the sigmas that the sensor states."""
+        out: Floats = rows * self._rows.root[some, :, None]
         return out

@@ -63,8 +63,8 @@ class PointRows(Factor):
         """Return derivatives by the keyframe before and by constants: (m, d, n), (m, d, M)."""
         raise NotImplementedError
 
-    def stated(self, rows: Floats) -> Floats:
-        """Return rows (m, d, c) divided by the sigmas that the sensor states."""
+    def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
+        """Return some of the rows, (k, d, c), divided by the sigmas that the sensor states."""
         raise NotImplementedError
 
     def known(self) -> Bools | bool:
@@ -93,10 +93,10 @@ class PointRows(Factor):
         """Return the whitened derivatives: (m, d, n + M)."""
         rows, constants = self.jacobians(self.n)
         out = room(*self.raw.shape, self.n + self.m)
-        out[:, :, :self.n] = self.stated(rows)
-        del rows
-        out[:, :, self.n:] = self.stated(constants[:, :, :self.m])
-        out *= self._root
+        for some in blocks(len(out)):
+            out[some, :, :self.n] = self.stated(rows[some], some)
+            out[some, :, self.n:] = self.stated(constants[some, :, :self.m], some)
+            out[some] *= self._root[some]
         return out
 
     def _sizes(self, white: Floats) -> Iterator[tuple[slice, Floats]]:

@@ -108,9 +108,9 @@ class SpeedSteps(PointRows):
         """
         return {'steps': 1.0}, {'steps': 0.25}
 
-    def stated(self, rows: Floats) -> Floats:
-        """Return rows in the sigmas that the grid gives."""
-        return rows / self.sigma[:, None, None]
+    def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
+        """Return some rows in the sigmas that the grid gives."""
+        return rows / self.sigma[some, None, None]
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
         """Return derivatives by the keyframe before and by constants: (m, 1, n), (m, 1, M)."""

@@ -6,7 +6,7 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import Array, by_row
+from odocal_ros.data.pieces import Array, by_row, thinned
 from odocal_ros.estimator.imu_noise import of_samples
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
@@ -31,6 +31,8 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
     level : roots of the white noise levels of 'gyro' and 'accel', SI per sqrt(Hz).
     worse : those of 'gyro' and 'accel' that exceed their grade; empty: no text.
     """
+    if not worse:
+        return ''
     coarse = {name: step for name, step in quantised(problem.leg, level).items() if name in worse}
     vibrating: list[str] = []
     own: list[str] = []
@@ -109,7 +111,7 @@ def quantised(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float]:
 
 def _step(x: Floats) -> float:
     """Return the largest step of the columns of a signal."""
-    rows = x[::max(1, len(x) // SAMPLES)]
+    rows = thinned(x, SAMPLES)
     found = 0.0
     for column in rows.T:
         values = np.unique(np.round(column / FINEST))
