@@ -64,6 +64,12 @@ class CoarseSpeed:
         """Return the speed times signs (n,)."""
         return replace(self, value=self.value * sign)
 
+    def time_in_motion(self, t: Floats) -> Floats:
+        """Return the time in motion between n times, s, negative backwards: (n - 1,)."""
+        sign = np.sign(self.value)
+        total = np.append(0.0, np.cumsum((sign[1:] + sign[:-1]) / 2 * np.diff(self.t)))
+        return np.diff(np.interp(t, self.t, total))
+
     @cached_property
     def most(self) -> float:
         """Return the limit of the deviation of a speed from lines between rows, with curvature."""
@@ -83,7 +89,11 @@ class CoarseSpeed:
         power = self.step**2 / 12 * lasts * (self.value[first] != 0)
         total = np.interp(t, np.append(begin, self.t[-1]),
                           np.append(0.0, np.cumsum(power * lasts)))
-        return np.diff(total)
+        # before and after a motion the speed is within a step of zero, for an unknown time
+        moved, T = np.abs(self.time_in_motion(t)), np.diff(t)
+        hidden = np.where((moved > 0) & (moved < T), self.step * (T - moved), 0.0)
+        out: Floats = np.diff(total) + hidden**2 / 3
+        return out
 
     @cached_property
     def instants(self) -> SpeedInstants:

@@ -120,6 +120,15 @@ def test_a_smooth_speed_has_no_steps():
     assert 'speed_truncation' not in {s.name for s in smoother.sources}
 
 
+@pytest.mark.parametrize('seed', [33, 35])
+def test_fine_truncation_of_a_drive_with_many_stops_is_known(seed):
+    """The first and the last interval of a motion are in motion for a part of them only."""
+    drive, result = calibrated(step=0.1 * KMH, rate=50.0, scenario='yard', duration=400.0,
+                               seed=seed, imu_grade='industrial', fix_noise='rtk', fix_sigma=0.02)
+    off, sigma = error(drive, result.methods['smoother'])
+    assert abs(off) < 3.3 * sigma
+
+
 def test_steps_too_fine_for_crossings_have_an_offset():
     # 0.06 km/h truncated is 0.1 % of the way: 800 ppm at this speed
     drive, result = calibrated(step=0.06 * KMH, rate=50.0)

@@ -36,6 +36,16 @@ def test_the_step_is_found(step, how):
     assert not found.interpolated
 
 
+def test_the_time_in_motion_is_that_of_the_rows_and_not_of_whole_intervals():
+    t = np.arange(0.0, 10.001, 0.02)
+    moves = (t > 1.395) & (t < 6.205)
+    speed = CoarseSpeed(0.1, t, np.where(moves, np.where(t < 3.995, 0.5, -0.5), 0.0))
+    # at a change half of the time between two rows counts, at a reversal none: at most 0.02 s
+    want = [0.0, 0.61, 1.0, 1.0, -1.0, -1.0, -0.21, 0.0, 0.0, 0.0]
+    assert_allclose(speed.time_in_motion(np.arange(11.0)), want, atol=0.0201)
+    assert speed.time_in_motion(np.array([0.0, 10.0])) == pytest.approx(2.6 - 2.21, abs=0.011)
+
+
 def test_the_step_is_found_under_noise_and_of_a_slow_drive():
     t, v = sent(KMH, 'floor')
     noisy = v + 0.01 * np.random.default_rng(1).standard_normal(len(v)) * (v != 0)

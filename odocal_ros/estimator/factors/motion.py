@@ -208,10 +208,9 @@ class Motion:
         """Return the derivative of the path by the offset of a coarse speed: (K, 3), or None."""
         if coarse is None:
             return None
-        said = np.einsum('kij,j->ki', self.sums.S, self.state.forward) @ self.state.forward
-        moves = np.abs(said) > coarse.step * self.T[:, 0]
-        ahead: Floats = (self.f_n + self.f_n_end) / 2 * (np.sign(said) * moves)[:, None]
-        return np.asarray(ahead * self.T)
+        moved_s = coarse.time_in_motion(self.state.t)
+        out: Floats = (self.f_n + self.f_n_end) / 2 * moved_s[:, None]
+        return out
 
     def _by_odometer_filter(self) -> Floats:
         """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
