@@ -31,6 +31,8 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     t_imu, w_up : (n,) s, and turn rate about the upward axis.   t_fix, fixes_n, sigma : (k,), (k,
     2 or more), float s, m, and m horizontally.   least : least significant motion of fixes, m.
     """
+    covered = (t_fix >= t_imu[0]) & (t_fix <= t_imu[-1])      # turns outside are not measured
+    t_fix, fixes_n = t_fix[covered], fixes_n[covered]
     # m: the sigma of a course is then 0.14 rad
     knots = knots_of(fixes_n, max(min(5.0, least), 10 * sigma))
     if len(knots) < 5:

@@ -193,6 +193,16 @@ class TestCheck:
         assert codes(reasons) == ([code] if code else [])
         assert all(text in f'{r.text} {r.remedy}' for r in reasons)
 
+    @pytest.mark.parametrize('sign', [-1.0, 1.0])
+    def test_fixes_before_and_after_the_imu_show_no_turn_of_it(self, sign):
+        t = np.arange(0.0, 300.0, 0.05)
+        course = np.cumsum(np.where(np.sin(t / 20) > 0, 0.12, -0.1)) * 0.05
+        way = np.cumsum(np.exp(1j * course)) * 0.5
+        fixes = np.stack([way.real, way.imag], -1)[::20]
+        rows = slice(600, 4000)       # of the IMU: the course turns by 3 rad outside of them
+        ratio = turn_ratio(t[rows], sign * np.gradient(course, t)[rows], t[::20], fixes, 0.5)
+        assert ratio == pytest.approx(sign, abs=0.03)
+
     def test_outliers_have_no_direction(self):
         rng = np.random.default_rng(4)
         residual = rng.standard_normal((500, 3)) + np.linspace(0, 300, 500)[:, None]
