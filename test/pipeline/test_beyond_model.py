@@ -49,6 +49,17 @@ def test_late_and_early_fixes_are_said(late):
     assert said(made, 'smoother', gnss__time_offset=offset) is None
 
 
+def test_a_value_far_from_its_setting_is_determined_however_sure_the_setting_is():
+    """An antenna 2 m beside its setting of 5 cm: the drive knows it to 3 cm."""
+    made = drive(**ROUTE | {'duration': 300.0}, antenna_lever_arm=(0.0, 2.0, 0.0), fix_sigma=0.5)
+    method = calibrate(made.leg(), settings(
+        made, method='smoother', heading_sigma=None, gnss__lever_arm=(0.0, 0.0, 0.0),
+        gnss__lever_arm_sigma=0.05)).methods['smoother']
+    found = method.estimates['antenna_lever_arm_y']
+    assert abs(found.value - 2.0) < 4 * found.sigma
+    assert found.sigma > 0.05 / 2
+
+
 def test_a_late_odometer_is_said_and_of_no_delay_nothing():
     made = drive(**ROUTE, odometer_delay=0.04, fix_noise='rtk')
     what, size, sigma, name, offset = said(made, 'smoother')
