@@ -124,8 +124,10 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     if coarse is None or coarse.truncation and size < coarse_worth:
         return []
     metres = coarse.step * K
+    near_one = 0.2    # of a factor: the speed is in m/s
+    speed = coarse.step if abs(K - 1) < near_one else metres
     sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \
-        else f'{coarse.step:.3g} m/s ({3.6 * coarse.step:.3g} km/h)'
+        else f'{speed:.3g} m/s ({3.6 * speed:.3g} km/h)'
     if not coarse.truncation:
         return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed is held until it has changed by '
                        f'{sent}; half a step is added in the direction of the last change')]

@@ -112,6 +112,12 @@ def test_truncation_or_rounding_is_found(how, share):
     assert 'resolution is 0.278 m/s (1 km/h)' in text
 
 
+def test_the_step_of_a_topic_in_kmh_is_stated_in_metres_per_second():
+    _, result = calibrated(scale=KMH, nominal_scale=KMH, step=1.0)
+    text = next(r.text for r in result.reasons if r.code is Code.SPEED_COARSE)
+    assert 'resolution is 0.278 m/s (1 km/h)' in text
+
+
 def test_a_smooth_speed_has_no_steps():
     _, result = calibrated(step=0.0)
     smoother = result.methods['smoother']
