@@ -143,7 +143,8 @@ def imperfect_sigmas(grade: Grade) -> Floats:
         'scale_by_pitching': 1.0,                   # of half the square of the angle
         'squat': 3e-3, 'sideslip': 5e-3,            # rad per m/s^2
         'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4,    # rad per m/s^3
-        'pitch_centre': 1.5}                        # m: a car's 1.4, a truck's 2.5
+        # m: a car's 1.4, a truck's 2.5; in turns 0 of a body that rolls on level ground
+        'pitch_centre': 1.5, 'pitch_centre_in_turns': 1.0}
     return np.repeat([usual[kind] for kind in KIND_SIZES], list(KIND_SIZES.values()))
 
 

@@ -56,7 +56,7 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_lag_square',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
              'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
-             'pitch_centre', 'pitch_centre_of_bumps',
+             'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns',
              'fix_motion_time', 'fix_height_drift', 'fix_error_east', 'fix_error_north',
              'fix_error_up', 'speed_offset', 'velocity_delay', 'velocity_lag_square',
              'velocity_scale',
@@ -106,17 +106,18 @@ BY_PITCHING = CONSTANTS.index('scale_by_pitching')
 # of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
 # change, rad per m/s^3: the body reacts with a delay, tyres immediately
 LEAN = constants_from('squat', 'sideslip_by_jerk')
-# m, ahead of the odometer: points about which the body pitches on hills, and in addition on bumps
-PITCH_CENTRE = constants_from('pitch_centre', 'pitch_centre_of_bumps')
+# m, ahead of the odometer: points about which the body pitches on hills, in addition on bumps,
+# and in turns about its own left axis, on banked ground
+PITCH_CENTRE = constants_from('pitch_centre', 'pitch_centre_in_turns')
 # deviations from an ideal vehicle
-IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre_of_bumps')
+IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre_in_turns')
 # kinds of deviations with one common size each, and their numbers of constants
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
               'clock_rate': 2, 'odometer_lag_square': 1,
               'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2,
               'scale_by_pitching': 1, 'squat': 1, 'sideslip': 1, 'squat_by_jerk': 1,
-              'sideslip_by_jerk': 1, 'pitch_centre': 2}
+              'sideslip_by_jerk': 1, 'pitch_centre': 2, 'pitch_centre_in_turns': 1}
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECT
 # scale units per s: offset of a quantised speed, half a step if it is truncated
 SPEED_OFFSET = CONSTANTS.index('speed_offset')

@@ -160,6 +160,18 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
                                part.jacobians(layout.BARE)[2][:, D, layout.LN_K], atol=1e-9)
 
 
+@pytest.mark.parametrize('banking', [0.0, 1.0])
+def test_on_banked_ground_a_turn_pitches_the_vehicle_about_its_own_left_axis(banking):
+    """The road takes all of the lateral force: it leans by its angle to gravity, inwards."""
+    _, problem, state = at_truth(real=Real(banking=banking))
+    motion = Equations(problem, state).parts['motion'].motion
+    rate, speed = motion.rate_n[:, 2], np.linalg.norm(state.v_n, axis=1)[:-1]
+    want = -rate * motion.T[:, 0] * np.sin(np.arctan(banking * speed * rate / G))
+    steady = np.abs(np.gradient(rate)) < 0.01        # the lean is that at the begin
+    assert np.abs(want[steady]).max() >= 0.06 * banking
+    np.testing.assert_allclose(motion.nose_down[steady, 2], want[steady], atol=5e-3)
+
+
 def test_bumps_may_have_another_centre_than_hills():
     _, problem, state = at_truth(slope=0.05)
     motion = Equations(problem, state).parts['motion'].motion
@@ -169,7 +181,7 @@ def test_bumps_may_have_another_centre_than_hills():
     assert slowly(bump)[around] == pytest.approx(0.0, abs=1e-9)
     assert slowly(hill)[around] == pytest.approx(np.sin(np.pi / 8) / (5 * np.sin(np.pi / 40))
                                                  * hill[around])
-    both, fast = motion.nose_down.T
+    both, fast, _ = motion.nose_down.T
     assert fast == pytest.approx(both - slowly(both))
 
 

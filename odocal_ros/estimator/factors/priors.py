@@ -68,7 +68,7 @@ SHARED: dict[str, slice | Ints] = {
     'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz'),
     'receiver_smoothing': np.array([FIX_LAG2, FIX_BY_MOTION, FIX_TIME]),
     'tyre_changes': TYRES,
-    'body_lean': constants_from('scale_by_pitching', 'pitch_centre_of_bumps'),
+    'body_lean': constants_from('scale_by_pitching', 'pitch_centre_in_turns'),
     'speed_truncation': constants_from('speed_offset'),
     'heading': constants_from('heading_offset'), 'velocity': VELOCITY}
 
