@@ -23,7 +23,7 @@ ZOO = [    # kind, grade, verdict, errors of NAMES over their sigmas
     ('yard', 'industrial', 'caution', (-1.11, -1.18, -0.04)),
     ('town', 'tactical', 'caution', (-0.22, -0.21, 1.93)),
     ('straight', 'consumer', 'accepted', (0.96, 1.09, None)),
-    ('out_and_back', 'industrial', 'caution', (-2.11, 1.21, 0.85)),
+    ('out_and_back', 'industrial', 'caution', (-2.1, 1.22, 0.92)),
     ('motorway', 'tactical', 'accepted', (1.31, 0.22, -0.1)),
     ('yard', 'consumer', 'caution', (0.77, 0.76, 0.4)),
     ('town', 'industrial', 'caution', (-0.75, -0.82, 0.14)),
