@@ -235,6 +235,5 @@ def per_effective(problem: Problem, weighted: Weighted) -> dict[str, float]:
 
     Of other sensors, and of speed steps: at constant acceleration their errors repeat.
     """
-    # errors of speed steps repeat at constant acceleration
     return {name: alike(part) for name, part in weighted.parts.items()
             if name in (*problem.outside, SpeedSteps.name) and isinstance(part, PointRows)}

@@ -172,7 +172,8 @@ class Motion:
         self.rate_n = turn(self.C, self.sums.mean_rate)
         self.level_left = level_left(self.C @ state.forward)
         nose_down = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
-        # on banked ground a turn of the vehicle pitches it about its own axis
+        # on banked ground a turn of the vehicle pitches it about its own axis; derivatives by
+        # attitude and gyro bias leave this part out
         left = np.einsum('ki,ki->k', self.rate_n, self.C @ self.left) * T[:, 0]
         self.nose_down = np.stack([nose_down, nose_down - slowly(nose_down), left - nose_down], -1)
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
