@@ -3,7 +3,7 @@
 
 """Information of a leg's data on the constants of the vehicle, without priors."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -57,9 +57,10 @@ class Border:
         The data depend on x + d; d is eliminated, docs/method.md (S34).
         """
         at = [self.names.index(name) for name in sigmas]
-        (D,), (pull,) = loosened(self.information[None], self.pull[None], at,
-                                 np.array(list(sigmas.values())))
-        return replace(self, information=D, pull=pull)
+        taken, DA, A = own_errors(self.information, at, np.array(list(sigmas.values())))
+        left = self.information - taken @ DA.T
+        return replace(self, information=(left + left.T) / 2,
+                       pull=self.pull - taken @ (A.T @ self.pull))
 
     def with_errors(self, effects: Floats) -> 'Border':
         """
@@ -92,42 +93,17 @@ class Border:
         value[i] = about + wrap(value[i] - about)
         return replace(self, value=value)
 
-    def determined(self, unit: Floats) -> 'Border':
-        """
-        Return the part in directions with at least the information of a prior.
 
-        unit : (m,) prior sigmas, in which such information is 1.
-        """
-        (size, V), = directions(self.information[None], unit, 1.0)
-        V, W = V / unit[:, None], V * unit[:, None]
-        return replace(self, information=V * size @ V.T, pull=V @ (W.T @ self.pull))
-
-
-def loosened(D: Floats, pull: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats]:
+def own_errors(D: Floats, at: list[int], sigmas: Floats) -> tuple[Floats, Floats, Floats]:
     """
-    Return information and pull of legs, with the own errors of constants eliminated, (S34).
+    Return T, DA and A: eliminating own errors of constants takes T DA' of D, T A' pull, (S34).
 
-    D, pull : (J, m, m), (J, m).   at, sigmas : (k,) indices of the constants, and sigmas of their
-    errors; inf: unbounded.
+    D : (..., m, m) information of legs.   at, sigmas : (k,) indices of the constants, and sigmas
+    of their errors; inf: unbounded.   The results are (..., m, k).
     """
-    known, own = np.isfinite(sigmas), np.diagonal(D, axis1=1, axis2=2)[:, at]
+    known, own = np.isfinite(sigmas), np.diagonal(D, axis1=-2, axis2=-1)[..., at]
     # the column of an unbounded error may have any length
     size = np.where(known, sigmas, np.where(own > 0, 1 / np.sqrt(np.maximum(own, 1e-300)), 0.0))
-    A = np.eye(D.shape[1])[:, at] * size[:, None]
-    DA, A_t = D @ A, np.swapaxes(A, 1, 2)
-    taken = DA @ np.linalg.pinv(np.diag(known * 1.0) + A_t @ DA)
-    left = D - taken @ np.swapaxes(DA, 1, 2)
-    return ((left + np.swapaxes(left, 1, 2)) / 2,
-            pull - (taken @ (A_t @ pull[:, :, None]))[:, :, 0])
-
-
-def directions(D: Floats, unit: Floats, least: float = 0.0) -> Iterator[tuple[Floats, Floats]]:
-    """
-    Yield size (r,) and direction (m, r) of the information of each leg, in ``unit``.
-
-    D : (J, m, m).   unit : (m,).   least : limit of the size. Rounding errors are left out.
-    """
-    for size, V in zip(*np.linalg.eigh(D * np.multiply.outer(unit, unit)), strict=True):
-        rounding = 1e-12 * size[-1]       # of doubles, times the loss by elimination
-        keep = size > max(rounding, least, 1e-300)
-        yield size[keep], V[:, keep]
+    A = np.eye(D.shape[-1])[:, at] * size[..., None, :]
+    DA = D[..., at] * size[..., None, :]
+    return DA @ np.linalg.pinv(np.diag(known * 1.0) + np.swapaxes(A, -1, -2) @ DA), DA, A

@@ -4,10 +4,12 @@
 """The rows of several legs as one least-squares problem: docs/method.md (S35) to (S37)."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.border import Border, directions, loosened
+from odocal_ros.calib.border import Border, own_errors
+from odocal_ros.calib.linked_equations import LEG_ROUNDING, LinkedEquations
 from odocal_ros.data.arrays import Floats, Ints
 
 # relative, rad: unit of a constant without a prior, ln K and angles. Judgement: a leg's equations
@@ -49,77 +51,79 @@ class LinkedLegs:
     def take(self, borders: list[Border]) -> None:
         """Replace the borders; each must have the names of all."""
         self.borders = borders
-        self._determined: list[Border] | None = None
+        self._clean: dict[float, LegInformation] = {}
 
-    def determined(self) -> list[Border]:
-        """Return the part of each border that is determined at least as well as by the priors."""
-        if self._determined is None:      # requested for each constant
-            self._determined = [b.determined(self.unit) for b in self.borders]
-        return self._determined
-
-    def columns(self, j: int) -> Ints:
-        """Return the indices of the constants of leg j in the unknowns: z, then the drifting."""
-        m = len(self.names)
-        where = np.arange(m)
-        where[self.drifting] = m + j
-        return where
-
-    def system(self, spread: dict[str, float] | None = None,
-               borders: Sequence[Border] | None = None) -> tuple[Floats, Floats]:
-        """Return the rows of all legs and of the random walk, and their right-hand sides."""
-        m, J, borders = len(self.names), len(self.borders), borders or self.borders
-        A, b = [], []
-        D, pull = self._scattering(borders, spread)
-        for j, (size, V) in enumerate(directions(D, self.unit)):
-            root = np.sqrt(size)
-            R = (V * root).T / self.unit
-            A.append(np.zeros((len(R), m + J)))
-            A[-1][:, self.columns(j)] = R
-            b.append(R @ borders[j].value + V.T @ (pull[j] * self.unit) / root)
-        walk = np.zeros((J - 1, m + J))
-        k = np.arange(J - 1)
-        walk[k, m + k], walk[k, m + k + 1] = -1 / self.steps, 1 / self.steps
-        used = [i for i in range(m + J) if i != self.drifting]
-        scale = np.concatenate([self.unit, np.full(J, self.unit[self.drifting])])[used]
-        return np.concatenate([*A, walk])[:, used] * scale, np.concatenate([*b, np.zeros(J - 1)])
+    def information(self, least: float = 0.0) -> 'LegInformation':
+        """Return the information of the legs in directions with more than ``least`` priors."""
+        if least not in self._clean:      # requested for each constant
+            self._clean[least] = information(self.borders, self.unit, least)
+        return self._clean[least]
 
     def place(self, j: int) -> Ints:
-        """Return the indices of the constants of leg j in the columns of ``system``."""
-        where = self.columns(j)
-        return where - (where > self.drifting)
+        """Return the indices of the constants of leg j in the unknowns."""
+        others = len(self.names) - 1
+        return np.insert(np.arange(others), self.drifting, others + j)
+
+    def equations(self, legs: 'LegInformation', spread: dict[str, float] | None = None,
+                  prior: bool = True) -> LinkedEquations:
+        """
+        Return the equations of all legs with a scatter, the random walk, and the priors.
+
+        Unknowns, in their units and less the values of the last leg: the constants but the
+        drifting one; then its steps from leg to leg, last its value in the last leg.
+        """
+        H, g, cost, rank = self._of_legs(legs, spread)
+        others, steps = len(self.names) - 1, len(self.steps)
+        walk = np.arange(others, others + steps)
+        H[walk, walk] += (self.unit[self.drifting] / self.steps)**2
+        weight, off = np.zeros((2, len(g)))
+        if prior:
+            at = self.place(steps)
+            weight[at] = np.isfinite(self.used)
+            off[at] = (self.centre - self.borders[-1].value) / self.unit
+        at_zero = float(weight @ off**2)
+        return LinkedEquations(H + np.diag(weight), g + weight * off, cost + at_zero,
+                               (weight, weight * off, at_zero), others, rank + steps)
+
+    def _of_legs(self, legs: 'LegInformation',
+                 spread: dict[str, float] | None) -> tuple[Floats, Floats, float, int]:
+        """
+        Return the equations of the legs, their cost at zero and the number of their rows.
+
+        The drifting constant of a leg is the sum of its steps from the leg on: rows and columns
+        of the steps are sums over the legs up to each.
+        """
+        J, k, rest = len(legs.D), self.drifting, np.delete(np.arange(len(self.names)),
+                                                           self.drifting)
+        taken, DA, pull, rank = self._scattering(legs, spread)
+        off = np.stack([b.value - self.borders[-1].value for b in self.borders]) / self.unit
+        g_legs = pull + (legs.D @ off[:, :, None]
+                         - taken @ (np.swapaxes(DA, 1, 2) @ off[:, :, None]))[:, :, 0]
+        cost = float((off * (g_legs + pull)).sum() + (legs.nearest * pull).sum())
+        of_drifting = legs.D[:, :, k] - np.einsum('jas,js->ja', taken, DA[:, k])
+        whole = legs.D.sum(axis=0) - np.tensordot(taken, DA, ((0, 2), (0, 2)))
+        across = np.cumsum(of_drifting[:, rest], axis=0)
+        steps = np.cumsum(of_drifting[:, k])[np.minimum.outer(np.arange(J), np.arange(J))]
+        return (np.block([[whole[np.ix_(rest, rest)], across.T], [across, steps]]),
+                np.concatenate([g_legs.sum(axis=0)[rest], np.cumsum(g_legs[:, k])]), cost, rank)
 
     def solve(self, spread: dict[str, float] | None = None) -> tuple[Floats, Floats]:
         """Return the unknowns and their covariance, of leg j at ``place``."""
-        A, b = self.system(spread)
-        prior, centre = self._prior_rows(A.shape[1])
-        Q, R = np.linalg.qr(np.concatenate([A, prior]))
-        inverse = np.linalg.inv(R)
-        x = inverse @ (Q.T @ np.concatenate([b, centre]))
-        scale = np.empty(len(x))
+        x, C = self.equations(self.information(), spread).solved()
+        scale, last = np.empty((2, len(x)))
         for j in range(len(self.borders)):
-            scale[self.place(j)] = self.unit
-        return x * scale, inverse @ inverse.T * np.multiply.outer(scale, scale)
+            scale[self.place(j)], last[self.place(j)] = self.unit, self.borders[-1].value
+        return last + x * scale, C * np.multiply.outer(scale, scale)
 
     def log_likelihood(self, spread: dict[str, float]) -> float:
         """Return the restricted log likelihood of a scatter between legs, up to a constant."""
         at, size = [self.names.index(n) for n in spread], np.array(list(spread.values()))
-        A, b = self.system(spread)
-        prior, centre = self._prior_rows(A.shape[1])
-        Q, R = np.linalg.qr(np.concatenate([A, prior]))
-        b = np.concatenate([b, centre])
-        out = -(b @ b - ((b @ Q)**2).sum()) / 2 - np.log(np.abs(np.diag(R))).sum()
-        for border in self.borders:
-            if not border.evidence:
-                own = border.information[np.ix_(at, at)] * np.multiply.outer(size, size)
-                out -= np.linalg.slogdet(np.eye(len(at)) + own)[1] / 2
-        return float(out)
-
-    def _prior_rows(self, columns: int) -> tuple[Floats, Floats]:
-        """Return the priors of the constants as rows and right-hand sides."""
-        held = np.flatnonzero(np.isfinite(self.used))
-        prior = np.zeros((len(held), columns))
-        prior[np.arange(len(held)), self.place(0)[held]] = 1.0     # columns are in its units
-        return prior, self.centre[held] / self.used[held]
+        size = size / self.unit[at]
+        equations = self.equations(self.information(), spread)
+        out = -(equations.least_cost() + equations.log_determinant) / 2
+        own = self.information().D[:, at][:, :, at][[not b.evidence for b in self.borders]]
+        return float(out - np.linalg.slogdet(
+            np.eye(len(at)) + own * np.multiply.outer(size, size))[1].sum() / 2)
 
     def carried(self, value: Floats, spread: dict[str, float],
                 evidence: dict[str, Floats]) -> Border:
@@ -128,10 +132,10 @@ class LinkedLegs:
 
         evidence : log likelihood of the scatter between legs, by name.
         """
-        A, b = self.system(spread)
-        rows, b = _left(A, b, self.place(len(self.borders) - 1))
-        rows = rows / self.unit
-        return Border(self.names, value, rows.T @ rows, rows.T @ (b - rows @ value),
+        equations = self.equations(self.information(), spread, prior=False)
+        D, pull = equations.of(self.place(len(self.borders) - 1))
+        D, pull = D / np.multiply.outer(self.unit, self.unit), pull / self.unit
+        return Border(self.names, value, D, pull - D @ (value - self.borders[-1].value),
                       self.centre, self.sigma, self.used, evidence)
 
     def evidence(self, name: str, points: int) -> Floats:
@@ -144,16 +148,11 @@ class LinkedLegs:
         Return the chi-square of the legs with common constants, and its degrees of freedom: (S36).
 
         Only of directions determined at least as well as by the priors: the equations of a leg
-        need not be linear over larger changes.
+        need not be linear over larger changes. Priors bound what no leg determines: otherwise two
+        legs that determine half of the constants each, in different directions, would always
+        agree.
         """
-        A, b = self.system(spread, self.determined())
-        # priors bound what no leg determines: otherwise two legs that determine half of the
-        # constants each, in different directions, would always agree
-        prior, centre = self._prior_rows(A.shape[1])
-        U, size, _ = np.linalg.svd(np.concatenate([A, prior]), full_matrices=False)
-        of_legs, U = slice(len(A)), U[:, size > 1e-8 * size[0]]      # below is rounding
-        rest = (b - U[of_legs] @ (U.T @ np.concatenate([b, centre])))
-        return float(rest @ rest), len(A) - float((U[of_legs]**2).sum())
+        return self.equations(self.information(1.0), spread).misfit()
 
     def deviations(self) -> Floats:
         """
@@ -164,38 +163,62 @@ class LinkedLegs:
         """
         x, C = self.solve()
         out = np.zeros((len(self.borders), len(self.names)))
-        legs = self.determined()
-        for j, (D, pull) in enumerate(zip(*self._scattering(legs, None), strict=True)):
+        legs = self.information(1.0)
+        for j, (D, pull) in enumerate(zip(legs.D, legs.pull, strict=True)):
             where = self.place(j)
-            pull = pull - D @ (x[where] - legs[j].value)
-            variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
+            pull = pull - D @ ((x[where] - self.borders[j].value) / self.unit)
+            own = C[np.ix_(where, where)] / np.multiply.outer(self.unit, self.unit)
+            variance = np.diag(D - D @ own @ D)
             # no test if the others have less than a millionth of the leg's information
             news = variance > np.maximum(1e-6 * np.diag(D), 1e-300)
             out[j, news] = pull[news] / np.sqrt(variance[news])
         return out
 
-    def _scattering(self, borders: Sequence[Border],
-                    spread: dict[str, float] | None) -> tuple[Floats, Floats]:
+    def _scattering(self, legs: 'LegInformation', spread: dict[str, float] | None
+                    ) -> tuple[Floats, Floats, Floats, int]:
         """
-        Return information and pull of legs whose constants scatter: (J, m, m), (J, m).
+        Return the loss of information by a scatter, the pull of the legs, and the sum of ranks.
 
-        The information of combined legs already includes their scatter.
+        The loss is T and DA of ``own_errors``. The information of combined legs already
+        includes their scatter.
         """
-        D, pull = (np.stack([getattr(b, what) for b in borders]) for what in (
-            'information', 'pull'))
-        own = [not b.evidence for b in borders]
-        if spread and any(own):
-            D[own], pull[own] = loosened(D[own], pull[own], [self.names.index(n) for n in spread],
-                                         np.array(list(spread.values())))
-        return D, pull
+        at = [self.names.index(n) for n in spread or ()]
+        sigmas = np.array(list((spread or {}).values())) / self.unit[at]
+        taken, DA, A = own_errors(legs.D, at, sigmas)
+        taken[[bool(b.evidence) for b in self.borders]] = 0.0
+        free = (np.isinf(sigmas) & taken.any(axis=1)).sum()
+        pull = legs.pull - (taken @ (np.swapaxes(A, 1, 2) @ legs.pull[:, :, None]))[:, :, 0]
+        return taken, DA, pull, int(legs.rank.sum() - free)
 
 
-def _left(A: Floats, b: Floats, keep: Ints) -> tuple[Floats, Floats]:
-    """Return rows of some unknowns, the others eliminated by QR, and their right-hand sides."""
-    gone = np.setdiff1d(np.arange(A.shape[1]), keep)
-    # only the first rows of R contain the eliminated unknowns
-    R = np.asarray(np.linalg.qr(np.column_stack([A[:, gone], A[:, keep], b]), mode='r'))
-    return R[len(gone):, len(gone):-1], R[len(gone):, -1]
+@dataclass(frozen=True, eq=False)
+class LegInformation:
+    """
+    Information of J legs, in units of their m constants, without what is rounding.
+
+    D, pull : (J, m, m), (J, m), as in ``Border``.   nearest : (J, m) the leg's own estimate, less
+    its value: D nearest = pull, also for a scatter.   rank : (J,) of D.
+    """
+
+    D: Floats
+    pull: Floats
+    nearest: Floats
+    rank: Ints
+
+
+def information(borders: Sequence[Border], unit: Floats, least: float) -> LegInformation:
+    """Return the information of borders in directions of more than ``least``: (m,) unit."""
+    J, m = len(borders), len(unit)
+    out = LegInformation(np.empty((J, m, m)), np.empty((J, m)), np.empty((J, m)), np.empty(J, int))
+    for j, border in enumerate(borders):
+        size, V = np.linalg.eigh(border.information * np.multiply.outer(unit, unit))
+        # of doubles, times the loss by elimination
+        keep = size > max(LEG_ROUNDING * size[-1], least, 1e-300)
+        size, V = size[keep], V[:, keep]
+        along = V.T @ (border.pull * unit)
+        out.D[j], out.pull[j], out.nearest[j] = V * size @ V.T, V @ along, V @ (along / size)
+        out.rank[j] = len(size)
+    return out
 
 
 def _on(border: Border, names: tuple[str, ...]) -> Border:
