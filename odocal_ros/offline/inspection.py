@@ -14,7 +14,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.pieces import medians
-from odocal_ros.data.samples import take
+from odocal_ros.data.samples import OdometerForm, take
 from odocal_ros.errors import OdocalError
 from odocal_ros.library.topics import REFERENCES
 from odocal_ros.messages import cdr
@@ -45,6 +45,12 @@ class _Tap:
         self.reader, self.recorder, self.trouble = reader, LegRecorder(), ''
         listed = reader.msgtype in wheel_survey.FIELDS
         self.values = wheel_survey.Values(reader.msgtype) if listed else None
+        self.meaning: OdometerForm | None = None
+
+    @property
+    def form(self) -> OdometerForm | None:
+        """Return the meaning of odometer values: by the fixes if found, else by the type."""
+        return self.meaning or self.reader.form
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:
@@ -73,6 +79,8 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     fixes = fix_path(taps[mapping['fix']].recorder.rows('fix'), config.gnss) if mapping.get(
         'fix') in taps else None
     lists = {name: tap.values.facts(turn, fixes) for name, tap in taps.items() if tap.values}
+    if fixes and config.odometer.quantity == 'auto':
+        _set_meanings(bag, taps, lists, fixes)
     matches = _matches(taps, lists, fixes) if fixes else {}
     idle = odometer_search.still(matches)
     mapping, config = likely_mapping(bag.topics, config, overrides, idle)
@@ -101,6 +109,8 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         extra = search[best['name']].settings(best['fields']['found'], turn)
     else:
         extra = _wheels(taps, mapping, config, topics, lists)
+        if (tap := taps.get(mapping.get('odometer', ''))) and tap.meaning:
+            extra.append(f'odometer.quantity={tap.meaning.quantity}')
     if extra:
         config = odometer_search.configured(config, extra)
         _read_again(bag, taps, mapping['odometer'], config, topics)
@@ -175,18 +185,29 @@ def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[st
     facts['timing'] = survey.timing(rows, bag.start_ns, headerless)
     facts['rate_hz'] = facts['timing'].pop('rate_hz') or facts['rate_hz']
     if slot == 'odometer':
-        assert tap.reader.form is not None      # an odometer's reader
-        facts['odometer'] = survey.odometer(rows, tap.reader.form)
+        assert tap.form is not None      # an odometer's reader
+        facts['odometer'] = survey.odometer(rows, tap.form) | {
+            'meaning': f'odometer.quantity={tap.meaning.quantity}' if tap.meaning else ''}
     elif slot in ('imu', 'fix'):
         facts[slot] = (survey.imu if slot == 'imu' else survey.fixes)(rows)
     return facts
 
 
+def _set_meanings(bag: Bag, taps: dict[str, _Tap], lists: dict[str, list[dict[str, Any]]],
+                  fixes: FixPath) -> None:
+    """Set the meaning of topics of one number that follow the fixes with another one only."""
+    for name, tap in taps.items():
+        if tap.reader.form and not lists.get(name):
+            found = odometer_search.meaning(bag.topics[name], tap.recorder.rows('odometer'),
+                                            tap.reader.form, fixes)
+            tap.meaning = found if found is not tap.reader.form else None
+
+
 def _matches(taps: dict[str, _Tap], lists: dict[str, list[dict[str, Any]]],
              fixes: FixPath) -> dict[str, Match]:
     """Return the comparison of each odometer topic with the path of the fixes."""
-    found = {name: odometer_search.match_of(tap.recorder.rows('odometer'), tap.reader.form, fixes)
-             for name, tap in taps.items() if tap.reader.form and not lists.get(name)}
+    found = {name: odometer_search.match_of(tap.recorder.rows('odometer'), tap.form, fixes)
+             for name, tap in taps.items() if tap.form and not lists.get(name)}
     grows = {name: any(one['scale'] for one in some) for name, some in lists.items() if some}
     return found | {name: Match(float(some), 0.0, some) for name, some in grows.items()}
 

@@ -125,6 +125,8 @@ def _of_odometer(topic: dict[str, Any]) -> Iterator[str]:
         what = 'one component of a velocity, not the speed along the path of the fixes'
     form = '.5g' if odometer['quantity'] == 'rate' else '.12g'
     yield f'{what}: {odometer["least"]:{form}} to {odometer["most"]:{form}} {unit}'
+    if odometer['meaning']:
+        yield f'follows the fixes as a {what} only: --set {odometer["meaning"]}'
     if odometer['not_finite']:
         yield f'warning: {odometer["not_finite"]} messages hold NaN or Inf'
 

@@ -165,20 +165,25 @@ def _best(path: str, whole: bool, t_ns: Ints, value: Floats, fixes: FixPath,
 
     The scale is in m per unit, or m/s for a rate.
     """
-    per_message = any(word in path.lower() for word in INCREMENTS)
     found: list[tuple[dict[str, Any], Floats]] = []
     seconds: Floats = np.multiply(t_ns - t_ns[:1], 1e-9)
-    for quantity in ('cumulative', 'increment' if per_message else 'rate'):
+    for quantity in _quantities(path):
         counts = whole and quantity == 'cumulative'
         wrap = _rollover(value) if counts else 0
         s = travel(seconds, value.astype(np.int64) if counts else value,
                    OdometerForm(quantity, wrap, ''))[0].s
-        s = s * every if per_message and quantity != 'cumulative' else s
+        s = s * every if quantity == 'increment' else s
         match = fixes.match(t_ns, s)
         if match.follows:
             found.append(({'path': path, 'whole': whole, 'quantity': quantity, 'wrap': wrap,
                            'scale': match.scale, 'explained': match.explained}, s))
     return max(found, key=lambda one: one[0]['explained'], default=None)
+
+
+def _quantities(name: str) -> tuple[str, str]:
+    """Return the possible meanings of a value, by its name."""
+    per_message = any(word in name.lower() for word in INCREMENTS)
+    return 'cumulative', 'increment' if per_message else 'rate'
 
 
 def _rollover(value: Floats) -> int:
@@ -217,6 +222,20 @@ def match_of(rows: OdometerSamples, form: OdometerForm, path: FixPath) -> Match:
     t_ns = t_ns[keep]
     s = travel((t_ns - t_ns[:1]) * 1e-9, rows.value[keep], form)[0].s
     return path.match(t_ns, s)
+
+
+def meaning(info: TopicInfo, rows: OdometerSamples, form: OdometerForm,
+            path: FixPath) -> OdometerForm:
+    """
+    Return the form with which a topic of one plain number follows the path of the fixes.
+
+    The one by its type, if that follows, if no other does, or if the type determines the meaning.
+    """
+    if not info.msgtype.startswith('std_msgs/') or match_of(rows, form, path).follows:
+        return form
+    others = (OdometerForm(quantity, 0, 'm/pulse') for quantity in _quantities(info.name)
+              if quantity != form.quantity)
+    return next((other for other in others if match_of(rows, other, path).follows), form)
 
 
 def still(matches: Mapping[str, Match]) -> set[str]:

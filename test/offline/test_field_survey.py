@@ -256,3 +256,27 @@ def test_a_field_that_explains_much_less_than_the_best_is_removed():
               {'found': [{'path': 'rpm', 'explained': 0.93}, {'path': 'v', 'explained': 0.99}]}]
     only_near_best(fields)
     assert [[one['path'] for one in facts['found']] for facts in fields] == [['speed'], ['v']]
+
+
+def numbers(path, made, values):
+    """Write IMU and fixes of a drive, and one plain number per odometer message."""
+    return write(path, made, [('/distance', stamp, make.real(value)) for stamp, value in zip(
+        made.odometer.stamp_ns.tolist(), values, strict=True)])
+
+
+@pytest.mark.parametrize('kind', ['distance', 'speed'])
+def test_a_float_is_a_distance_or_a_speed_by_the_fixes(tmp_path, capsys, kind):
+    """By its type a std_msgs/Float64 is a speed; a trip meter has the same type."""
+    made = town()
+    trip = (made.odometer.value + made.odometer_right.value) / 2 * made.truth.scale
+    t = (made.odometer.stamp_ns - made.odometer.stamp_ns[0]) * 1e-9
+    path = numbers(tmp_path / 'bag', made, trip if kind == 'distance' else np.gradient(trip, t))
+    found, text = inspected(path, capsys)
+    block = text.partition('\n/distance\n')[2].partition('\n\n')[0]
+    is_distance = kind == 'distance'
+    assert block.strip().startswith('running count: ' if is_distance else 'speed: ')
+    assert ('--set odometer.quantity=cumulative' in block) == is_distance
+    assert ('odometer.quantity=cumulative' in found['command']) == is_distance
+    assert found['drive']['rough_scale'] == pytest.approx(1.0, rel=0.02)
+    content = replayed(found['command'], tmp_path / 'out')
+    assert content['result']['scale_factor']['value'] == pytest.approx(1.0, rel=0.005)
