@@ -290,8 +290,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
     },
     'Several legs': {
         Code.LEGS_DISAGREE: 'The legs differ by more than their uncertainties. The text names '
-        'the parameter and, for the smoother, the leg that differs most. The sigma of the '
-        'combination includes this.',
+        'the parameter and, for the smoother, the leg that differs most. If all deviations '
+        'together are too large, it states the largest one; below 3 sigma no single parameter is '
+        'the cause. The sigma of the combination includes this.',
         Code.SCALE_CHANGED: 'With leg.automatic: the scale of a leg differs from that of the '
         'earlier legs by more than 3 sigma of the difference, including the random walk of '
         'verdict.scale_drift_per_day. A new scale starts at this leg; the other shared '

@@ -28,7 +28,7 @@ from odocal_ros.estimator.state import CONSTANTS, IMPERFECT, LN_K, PITCH
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import grade_of
-from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS
+from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, REMARK_SIGMAS
 
 # usual scatter of ln K, yaw and pitch between the legs of a vehicle: 20 ppm by tyres, 2 and 5 mdeg
 # by load and the cross slopes of roads. Judgement
@@ -151,10 +151,22 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
             Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
             f'times their uncertainties{who}', DELAY_DIFFERS if 'delay' in name else ''))
     if found.factor > 1:
+        of = ' in all parameters but scale, yaw and pitch' * bool(found.between)
         said.append(Reason(
-            Code.LEGS_DISAGREE, f'the scatter of {J} legs in parameters that are not listed is '
-            f'{found.factor:.1f} times their uncertainties'))
+            Code.LEGS_DISAGREE, f'the scatter of {J} legs{of} is {found.factor:.1f} times their '
+            f'uncertainties; {_largest(found, numbers)}'))
     return tuple(said)
+
+
+def _largest(found: Joint, numbers: list[int]) -> str:
+    """Return the largest deviation of a constant without scatter between legs, as text."""
+    own = [i for i, name in enumerate(found.names) if name not in found.between]
+    z = found.deviation[:, own]
+    j, i = np.unravel_index(np.argmax(np.abs(z)), z.shape)
+    # two legs have the same deviation from each other
+    of_leg = f' of {_name(numbers[j])}' * (len(z) > 2)
+    text = f'{found.names[own[i]]}{of_leg} differs most ({abs(z[j, i]):.1f} sigma)'
+    return text if abs(z[j, i]) > REMARK_SIGMAS else f'no parameter alone explains it: {text}'
 
 
 def _sources(used: Floats, C: Floats) -> tuple[Source, ...]:

@@ -4,6 +4,7 @@
 """Legs combined on their border are one fit of all their rows, whatever each is blind to."""
 
 from dataclasses import replace
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -375,6 +376,23 @@ def test_a_dispute_names_leg_and_parameter(legs):
     # and what is not disputed is as sharp as before
     assert whole.estimates[SCALE].sigma == pytest.approx(
         combine_legs(results, [0, 1, 2], config).estimates[SCALE].sigma, rel=0.1)
+
+
+def test_sections_of_a_leg_that_disagree_name_the_largest_deviation(legs):
+    _, config, (one, other, _) = legs
+    at = np.arange(len(other.border.names)) == other.border.names.index('odometer_delay')
+    changed = replace(other.border, value=other.border.value + 0.1 * at)
+    whole = combine_legs([one, replace(other, border=changed)], [0, 0], config)
+    (text,) = [r.text for r in whole.reasons if r.code is Code.LEGS_DISAGREE
+               and r.text.startswith('the scatter of 2 legs is ')]
+    assert re.search('; odometer_delay differs most [(][0-9.]+ sigma[)]$', text)
+
+
+def test_small_deviations_are_no_cause():
+    found = SimpleNamespace(names=('scale_factor', 'odometer_delay', 'gnss_delay'), between={
+        'scale_factor': 1e-5}, deviation=np.array([[9, 1, 0], [0, -2.5, 1], [0, 1, -1.0]]))
+    assert several._largest(found, [4, 7, 9]) == (
+        'no parameter alone explains it: odometer_delay of leg 7 differs most (2.5 sigma)')
 
 
 @pytest.mark.parametrize('off', [1e-3, -3e-3])
