@@ -90,7 +90,7 @@ class Code(Enum):
     IMU_LOOKS_Z_DOWN = CAUTION, ('Set imu.mounting_rpy to [3.141592654, 0, 0] if the '
                                  'axes are forward-right-down.')
     IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up. '
-                        'odocal inspect prints the values if the drive determines them.')
+                        'odocal inspect prints the possible values.')
     IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the other noise '
                                      'settings, to the values of this IMU. A gyro in deg/s also '
                                      'looks like this: then set imu.gyro_scale.')

@@ -15,7 +15,7 @@ from odocal_ros.data.pieces import medians
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.facing import FEWEST_BINS_FACING, pushes
+from odocal_ros.screening.facing import AXES, FEWEST_BINS_FACING, pushes
 from odocal_ros.screening.inputs import Inputs
 
 # rad of yaw from nominal: beyond it a nominal rotation or heading is wrong; beyond it reversed.
@@ -33,12 +33,13 @@ class Mounting:
 
     C_bi : (3, 3) rotation of the IMU frame i to b (forward, left, up), quarter turns only; None
         if not observable.
-    forward_i : (3,) measured forward axis, None if not observable.
+    up_i, forward_i : (3,) measured axes; forward_i is None if not observable.
     forward_sigma : rad.    assumed : forward is assumed to be x, not measured.
     off : rad, angle between the measured axes and the quarter turns.
     """
 
     C_bi: NDArray[np.float64] | None
+    up_i: NDArray[np.float64]
     forward_i: NDArray[np.float64] | None
     forward_sigma: float
     assumed: bool
@@ -47,22 +48,46 @@ class Mounting:
     @property
     def rpy(self) -> list[float] | None:
         """Return imu.mounting_rpy, rad."""
-        if self.C_bi is None:
-            return None
-        return [float(x) for x in np.round(rpy_from_matrix(self.C_bi), 12) + 0.0]
+        return None if self.C_bi is None else _rpy(self.C_bi)
+
+    @property
+    def unclear(self) -> str:
+        """Return the reason why the rotation is not known, '' if it is."""
+        sigma, off, limit = np.rad2deg([self.forward_sigma, self.off, MEANT_AXIS])
+        if self.C_bi is not None:
+            return ''
+        if self.forward_i is not None:
+            return f'the IMU axes are {off:.0f} deg from quarter turns (limit {limit:.0f} deg)'
+        by = f' (1 sigma: {sigma:.0f} deg; limit {limit / 2:.0f} deg)' * bool(sigma < 180)
+        return f'this drive does not determine which IMU axis points forward{by}'
 
 
 def remedy(found: Mounting) -> str:
-    """Return the setting to make, '' if the drive does not determine it."""
-    if found.rpy is None:
-        return ''
-    rpy = ','.join(f'{x:.10g}' for x in found.rpy)
-    return (f"Set imu.mounting_rpy: --set 'imu.mounting_rpy=[{rpy}]'"
-            + ", if the IMU's x axis points forward." * found.assumed + '.' * (not found.assumed))
+    """Return the setting to make; the possible ones if the drive does not determine it."""
+    if found.C_bi is not None:
+        return (f"Set imu.mounting_rpy: --set 'imu.mounting_rpy={_listed(found.C_bi)}'"
+                + ", if the IMU's x axis points forward" * found.assumed + '.')
+    why = found.unclear[0].upper() + found.unclear[1:]
+    if found.forward_i is not None:
+        C = np.stack([found.forward_i, np.cross(found.up_i, found.forward_i), found.up_i])
+        return f'{why}. Set imu.mounting_rpy to its angles, about {_listed(C, 2)} rad.'
+    upright = [C for C in _quarter_turns() if C[2] @ found.up_i > np.abs(found.up_i).max() - 1e-9]
+    each = '; '.join(f'{"-+"[int(C[0].sum() > 0)]}{AXES[int(np.argmax(np.abs(C[0])))]}: '
+                     f'{_listed(C)}' for C in upright)
+    return (f'{why}. Drive with stops, starts and turns, or set imu.mounting_rpy by this axis '
+            f'({each}).')
+
+
+def _rpy(C_bi: Floats) -> list[float]:
+    return [float(x) for x in np.round(rpy_from_matrix(C_bi), 12) + 0.0]
+
+
+def _listed(C_bi: Floats, digits: int = 10) -> str:
+    return f'[{",".join(f"{x:.{digits}g}" for x in _rpy(C_bi))}]'
 
 
 def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
-    """Return reasons, with the setting in IMU_AXES if the screened inputs determine it."""
+    """Return reasons, with the setting in IMU_AXES by the screened inputs."""
     if not any(r.code is Code.IMU_AXES and not r.do for r in reasons):
         return list(reasons)
     found = mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
@@ -83,7 +108,7 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
     mean = medians(f_i)
     size = float(np.linalg.norm(mean))
     if size < 1e-3:
-        return Mounting(None, None, np.pi, True, 0.0)
+        return Mounting(None, np.zeros(3), None, np.pi, True, 0.0)
     up_i = mean / size
     forward_i, sigma = _forward(t, w_i, f_i, up_i, travel, metres_per_unit)
     if forward_i is not None:
@@ -91,11 +116,11 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
         nearest = max(_quarter_turns(), key=lambda q: np.trace(q @ C.T))
         off = float(np.arccos(np.clip((np.trace(nearest @ C.T) - 1) / 2, -1, 1)))
         found = nearest if off < MEANT_AXIS + sigma else None
-        return Mounting(found, forward_i, sigma, False, off)
+        return Mounting(found, up_i, forward_i, sigma, False, off)
     if abs(up_i[2]) > np.cos(MEANT_AXIS):     # upright or upside down: x is forward, most likely
         C_bi = np.diag([1.0, np.sign(up_i[2]), np.sign(up_i[2])])
-        return Mounting(C_bi, None, sigma, True, float(np.arccos(abs(up_i[2]))))
-    return Mounting(None, None, sigma, True, 0.0)
+        return Mounting(C_bi, up_i, None, sigma, True, float(np.arccos(abs(up_i[2]))))
+    return Mounting(None, up_i, None, sigma, True, 0.0)
 
 
 def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,

@@ -221,9 +221,7 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
         return wrapped('axes: an upright IMU is assumed, as there is no accelerometer; if it is '
                         'not upright, set imu.mounting_rpy')
     if mounting['rpy'] is None:
-        text = ('the IMU orientation cannot be estimated from gravity and driving; set '
-                'imu.mounting_rpy manually')
-        return wrapped(f'axes: {text}')
+        return wrapped(f'axes: {mounting["unclear"]}')
     rpy = ', '.join(f'{x:.10g}' for x in mounting['rpy'])
     degrees = ', '.join(f'{math.degrees(x):.0f}' for x in mounting['rpy'])
     if mounting['assumed_forward']:

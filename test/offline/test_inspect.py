@@ -5,6 +5,7 @@
 
 import json
 import math
+import re
 import shlex
 
 import numpy as np
@@ -13,7 +14,7 @@ import ros_bags
 from ros_bags import T0
 import ros_messages as make
 
-from odocal_ros.calib.mounting import mounting
+from odocal_ros.calib.mounting import mounting, remedy
 from odocal_ros.library import legs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -242,6 +243,26 @@ def test_a_forward_axis_that_nothing_shows_is_assumed_or_left_open():
         m = mounting(t, w_i, np.array(up) + rng.normal(0, 0.05, (len(t), 3)), travel, 1.0)
         assert m.assumed
         assert m.rpy == (rpy and pytest.approx(rpy))
+    # the remedy lists the setting for each axis that may point forward
+    possible = re.findall(r'([-+])([xz]): (\[.*?\])', remedy(m))
+    assert len(possible) == 4
+    for sign, axis, rpy in possible:
+        C_bi = matrix_from_rpy(json.loads(rpy))
+        forward = (1 if sign == '+' else -1) * np.eye(3)['xyz'.index(axis)]
+        np.testing.assert_allclose(C_bi @ np.stack([forward, [0, 1, 0]], -1),
+                                   np.eye(3)[:, [0, 2]], atol=1e-8)
+
+
+def test_axes_far_from_quarter_turns_are_stated_as_measured():
+    t, v, w, a = planar()
+    C_bi = matrix_from_rpy([0.0, 0.0, math.radians(45)])
+    f_b = np.stack([a, v * w, np.full(len(t), G)], -1)
+    w_b = np.stack([0 * w, 0 * w, w], -1)
+    m = mounting(t, w_b @ C_bi, f_b @ C_bi, Travel(t, np.cumsum(v) / RATE, 0.0), 1.0)
+    assert m.rpy is None
+    said = remedy(m)
+    assert 'The IMU axes are 45 deg from quarter turns (limit 30 deg)' in said
+    assert json.loads(re.search(r'\[.*\]', said)[0]) == pytest.approx([0, 0, 0.785], abs=0.02)
 
 
 def test_units(tmp_path, capsys):
