@@ -12,10 +12,12 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import SCALE_LIMIT
 
+# definition: m/s of units of speed
+SPEED_UNITS = {1.0: 'm/s', 1 / 3.6: 'km/h', 0.44704: 'mph', 1852 / 3600: 'knots', 0.3048: 'ft/s',
+               0.01: 'cm/s', 1e-3: 'mm/s'}
 # likely cause of a ratio to the nominal scale, by unit of the scale. Physical, definitions
 MISTAKEN = {
-    '1': {1 / 3.6: 'speeds in km/h', 0.44704: 'speeds in mph', 1852 / 3600: 'speeds in knots',
-          0.3048: 'speeds in ft/s', 0.01: 'speeds in cm/s', 1e-3: 'speeds in mm/s'},
+    '1': {factor: f'speeds in {name}' for factor, name in SPEED_UNITS.items() if factor != 1},
     'm/rad': {np.pi / 180: 'angles in degrees', 2 * np.pi: 'whole turns',
               np.pi / 30: 'rates in rpm'},
     'm/pulse': {0.25: 'counting four edges per pulse (x4)',
@@ -32,6 +34,13 @@ def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
                 'odometer driver. Otherwise check the odometer. The limit is '
                 'odometer.max_scale_deviation.')
     return '', ''
+
+
+def speed_unit(scale: float) -> tuple[float, str]:
+    """Return the unit of a speed with this scale: in m/s, and its name; '' if unknown."""
+    near_unit = 0.2    # judgement: relative error of a speedometer and of a rough scale
+    factor = min(SPEED_UNITS, key=lambda one: abs(scale / one - 1))
+    return (factor, SPEED_UNITS[factor]) if abs(scale / factor - 1) < near_unit else (scale, '')
 
 
 def judge(estimates: Mapping[str, Estimate], nominal_scale: float,

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.judge import judge
+from odocal_ros.calib.judge import judge, speed_unit
 from odocal_ros.calib.result import MethodResult, Source, wheel_factors
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.pipeline.prepared import PreparedLeg
@@ -123,17 +123,21 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     coarse_worth = 5e-4    # of the scale: least half step that is reported
     if coarse is None or coarse.truncation and size < coarse_worth:
         return []
-    metres = coarse.step * K
-    near_one = 0.2    # of a factor: the speed is in m/s
-    speed = coarse.step if abs(K - 1) < near_one else metres
-    sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \
-        else f'{speed:.3g} m/s ({3.6 * speed:.3g} km/h)'
+    sent = _in_words(coarse.step, placed.rough, inputs.scale_unit)
     if not coarse.truncation:
         return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed is held until it has changed by '
                        f'{sent}; half a step is added in the direction of the last change')]
     between = ', with interpolated values between' if coarse.interpolated else ''
     return [Reason(Code.SPEED_COARSE, f'odometer resolution is {sent}{between}; if truncated, '
                    f'the distance is {100 * size:.2g} % too short')]
+
+
+def _in_words(step: float, scale: float, scale_unit: str) -> str:
+    """Return a step of speed in the published unit, and in another."""
+    factor, unit = (scale, 'rad/s') if scale_unit == 'm/rad' else speed_unit(scale)
+    speed = f'{factor * step:.3g} m/s'
+    return f'{speed} ({3.6 * factor * step:.3g} km/h)' if unit in ('', 'm/s') else (
+        f'{step:.3g} {unit} ({speed})')
 
 
 def _coarse(inputs: Inputs) -> CoarseSpeed | None:

@@ -112,10 +112,12 @@ def test_truncation_or_rounding_is_found(how, share):
     assert 'resolution is 0.278 m/s (1 km/h)' in text
 
 
-def test_the_step_of_a_topic_in_kmh_is_stated_in_metres_per_second():
-    _, result = calibrated(scale=KMH, nominal_scale=KMH, step=1.0)
+@pytest.mark.parametrize('nominal', [KMH, 1.0])
+def test_the_step_of_a_topic_in_kmh_is_stated_in_its_unit(nominal):
+    """With the default of the nominal scale, 1, the fixes determine the unit."""
+    _, result = calibrated(scale=KMH, nominal_scale=nominal, step=1.0)
     text = next(r.text for r in result.reasons if r.code is Code.SPEED_COARSE)
-    assert 'resolution is 0.278 m/s (1 km/h)' in text
+    assert 'resolution is 1 km/h (0.278 m/s)' in text
 
 
 def test_a_smooth_speed_has_no_steps():
