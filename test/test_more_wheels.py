@@ -159,7 +159,8 @@ def test_without_an_axle_that_is_known_not_to_steer_the_leg_is_rejected(dead):
 def test_a_single_wheel_that_is_dead_is_found():
     one = made(wheels=3)
     _, found = screen(with_dead(one, (2,)), config(one))
-    assert codes(found)[Code.WHEEL_DEAD].startswith('front did not count while others advanced')
+    assert codes(found)[Code.WHEEL_DEAD].startswith(
+        'front did not count: the travel is 0 % of that of the wheel that travels most')
 
 
 def test_a_slip_of_one_of_four_wheels_is_named_and_the_factors_hold():

@@ -13,7 +13,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.integral import running_integral
 from odocal_ros.nav.odometer import mean_travel, Travel
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.wheel_faults import broken_wheels, STILL_SHARE
+from odocal_ros.screening.wheel_faults import broken_wheels, in_per_cent, STILL_SHARE
 from odocal_ros.screening.wheel_pair import Imu, pair, robust_fit
 from odocal_ros.screening.wheel_travel import Wheels
 from odocal_ros.settings.levels import FAULT_SIGMAS
@@ -83,9 +83,11 @@ def _faults(axle: Axle, axles: list[Axle], imu: Imu,
             between: tuple[float, float]) -> tuple[Reason, ...]:
     """Return the faults of an axle; a single wheel is compared with the first axle."""
     most = max(_rolled(wheel) for other in axles for wheel in other)
-    if max(map(_rolled, axle)) <= STILL_SHARE * most:
-        return (Reason(Code.WHEEL_DEAD, f'{_names(axle)} did not count while others advanced by '
-                       f'{most:.6g}'),) if most else ()
+    own = max(map(_rolled, axle))
+    if own <= STILL_SHARE * most:
+        return (Reason(Code.WHEEL_DEAD, f'{_names(axle)} did not count: the travel is '
+                       f'{in_per_cent(own, most)} of that of the wheel that travels most (limit '
+                       f'{100 * STILL_SHARE:g} %)'),) if most else ()
     if len(axle) == 1:
         axle = (*axle, replace(mean_travel(axles[0]), name='mean'))
     return broken_wheels(axle, imu, between)

@@ -43,9 +43,10 @@ def broken_wheels(axle: Sequence[Travel], imu: Imu,
     if rolled.max() <= OTHER_WHEEL_COUNTS * two.quantum or rolled.max() == 0.0:
         return ()                                   # neither moves: the odometer is still
     if rolled[weak] <= STILL_SHARE * rolled.max():
-        return (Reason(Code.WHEEL_DEAD, f'the {two.names[weak]} wheel does not count '
-                       f'({rolled[weak]:.6g} against {rolled.max():.6g} of the '
-                       f'{two.names[1 - weak]} wheel): the mean of both is not the travel'),)
+        return (Reason(Code.WHEEL_DEAD, f'the {two.names[weak]} wheel does not count: its travel '
+                       f'is {in_per_cent(rolled[weak], rolled.max())} of that of the '
+                       f'{two.names[1 - weak]} wheel (limit {100 * STILL_SHARE:g} %). The mean of '
+                       'both is not the travel'),)
     left, right = axle
     if np.array_equal(left.s, right.s) and np.array_equal(left.t, right.t):
         return (Reason(Code.WHEEL_DEAD, 'both wheels have identical counts: one counter is sent '
@@ -134,9 +135,14 @@ def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
         where = f'{len(spans)} time{"s" * (len(spans) > 1)}, first from t = {begin:.1f} s for ' \
                 f'{(spans[0][1] - first) * FAULT_GRID:.1f} s'
         where += f', last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(after and len(spans) > 1)
-    return (Reason(Code.WHEEL_DEAD, f'the {two.names[k]} wheel does not count {where} while the '
-                   f'{two.names[1 - k]} wheel advances by {lost:.6g}: the mean of both is not the '
-                   'travel'),)
+    return (Reason(Code.WHEEL_DEAD, f'the {two.names[k]} wheel does not count {where}, in '
+                   f'{in_per_cent(lost, other.sum())} of the travel of the {two.names[1 - k]} '
+                   'wheel: the mean of both is not the travel'),)
+
+
+def in_per_cent(part: float, whole: float) -> str:
+    """Return a share of a travel as text."""
+    return f'{100 * part / whole:.2g} %'
 
 
 def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance: float,

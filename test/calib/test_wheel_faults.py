@@ -80,7 +80,8 @@ def said(made, **wheels):
 def test_a_wheel_that_never_counts_or_counts_down_is_named(side):
     slot = 'odometer' if side == 'left' else 'odometer_right'
     text = said(drive(**TOWN), **{slot: lambda a: a * 0})[Code.WHEEL_DEAD]
-    assert text.startswith(f'the {side} wheel does not count')
+    assert text.startswith(f'the {side} wheel does not count: its travel is 0 % of that of the ')
+    assert '(limit 2 %)' in text
     text = said(drive(**TOWN), **{slot: lambda a: -a})[Code.WHEEL_REVERSED]
     assert text.startswith(f'the {side} wheel counts down')
 
@@ -98,7 +99,9 @@ def test_a_wheel_that_dies_on_the_way_is_named_with_its_time():
     at = float(text.split('t = ')[1].split()[0])
     # rows of 0.05 s, cells of 0.5 s, and the cell in which it dies holds counts still
     assert abs(at - t[k + moves]) < 1.1
-    assert ' on while the right wheel advances' in text
+    right = np.abs(np.diff(made.odometer_right.value))
+    share = float(text.split(' s on, in ')[1].split(' % of the travel of the right wheel')[0])
+    assert share == pytest.approx(100 * right[k:].sum() / right.sum(), abs=1.5)
 
 
 def test_a_wheel_that_hangs_for_seconds_is_named_with_time_and_length():
