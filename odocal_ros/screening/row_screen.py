@@ -15,9 +15,11 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import by_step, chunks
 from odocal_ros.data.samples import OdometerForm, Samples, take
+from odocal_ros.nav.local_frame import LARGEST_FRAME
 from odocal_ros.nav.statistics import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening import glitches
+from odocal_ros.screening.leg_kind import is_local
 from odocal_ros.settings.config import Config
 
 LABEL = {slot: one.label for slot, one in INPUTS.items()}
@@ -113,8 +115,12 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
         wild[odd] |= np.isfinite(column[odd]).all(axis=tuple(range(1, column.ndim)))
     if slot == 'fix':
         finite |= samples.status < 0       # a receiver without a fix publishes NaN: not a fault
+    bad_value = 'hold NaN, Inf or an impossible value'
+    if slot == 'fix' and is_local(samples):
+        bad_value = ('hold NaN or a position more than '
+                     f'{LARGEST_FRAME / 1000:g} km from the origin of its frame')
     for bad, what in ((~stamped, 'have no stamp (zero or negative)'),
-                      (stamped & ~finite, 'hold NaN, Inf or an impossible value')):
+                      (stamped & ~finite, bad_value)):
         if bad.any():
             first = int(np.argmax(bad))
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '

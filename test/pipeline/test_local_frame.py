@@ -235,6 +235,17 @@ def test_map_coordinates_are_refused_with_what_to_do():
         'Publish positions in a frame with its origin near the site.'
 
 
+def test_positions_far_from_a_local_origin_are_stated_by_their_distance():
+    made = drive(**CAR)
+    fix, position = made.fix, made.positions()
+    position[70:74] += 30_000.0
+    fixes = local_fixes(math.nan)(fix.stamp_ns, fix.received_ns, position)
+    _, found = screen(replace(made.leg(), fix=fixes), settings(made))
+    (reason,) = [r for r in found if r.code is Code.BAD_ROWS_DROPPED]
+    assert reason.text.startswith(f'4 of {len(position)} fix messages hold NaN or a position more '
+                                  'than 20 km from the origin of its frame, first at t = ')
+
+
 def test_the_simulated_frame_starts_at_the_vehicle_and_looks_ahead():
     made = drive(scenario='straight', duration=200.0, fix_noise='rtk', seed=5, heading=0.3)
     position = made.positions()
