@@ -169,15 +169,21 @@ def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_o
     assert imu_as_seen(replace(imu, grade='navigation'), {}).grade == 'navigation'
 
 
-@pytest.mark.parametrize(('set_to', 'found', 'text', 'do'), [
-    ((0.0, 0.0, 1.5), 0.7, 'z: set to +1.50 m, estimated +2.20 ± 0.05 m', 'Measure .* z again'),
-    ((0.0, 0.0, 0.0), -0.73, 'z: not set, estimated -0.73 ± 0.05 m', 'Measure .* z and set it'),
-    ((0.0, 0.0, 0.0), 9.39, 'z: +9.39 ± 0.05 m is larger than a vehicle, so not plausible',
+@pytest.mark.parametrize(('set_to', 'found', 'ratio', 'text', 'do'), [
+    ((0.0, 0.0, 1.5), 0.7, 0.1, 'z: set to +1.50 m, estimated +2.20 ± 0.05 m; accounted',
+     'Measure .* z again'),
+    ((0.0, 0.0, 0.0), -0.73, 0.1, 'z: not set, estimated -0.73 ± 0.05 m; accounted',
+     'Measure .* z and set it'),
+    # the result and the report have no value for it
+    ((0.0, 0.0, 0.0), -0.73, 0.5, 'z: not set, estimated -0.73 ± 0.05 m (too uncertain for a '
+     'result); accounted', 'Measure .* z and set it'),
+    ((0.0, 0.0, 0.0), 9.39, 0.1, 'z: +9.39 ± 0.05 m is larger than a vehicle, so not plausible',
      'Ignore the estimate')])
-def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, text, do):
+def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, ratio, text, do):
     value, sigma = np.zeros(len(CONSTANTS)), np.full(len(CONSTANTS), 0.05)
     value[CONSTANTS.index('antenna_lever_arm_z')] = found
-    reason, = remarks._arms(value, sigma, with_settings(Config(), {'gnss.lever_arm': set_to}))
+    reason, = remarks._arms(value, sigma, np.full(len(CONSTANTS), ratio),
+                            with_settings(Config(), {'gnss.lever_arm': set_to}))
     assert f'gnss.lever_arm {text}' in reason.text
     assert re.search(do, reason.do)
     assert ('easure' in reason.do) != ('larger' in text)

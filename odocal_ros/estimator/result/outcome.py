@@ -88,8 +88,8 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     filtered = filter_reasons(c[ODO_LAG2], sigma[ODO_LAG2])
     slips, slip_said = _slips(leg, fit, near, count, filtered=bool(filtered))
     reasons += [*filtered, *slip_said]
-    reasons += remarks(problem, fit, sigma, config)
     after = np.sqrt(np.diag(fit.covariance)) / fit.priors.constants
+    reasons += remarks(problem, fit, sigma, after, config)
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
     found, undetermined = determined(c + configured(leg), sigma, after, leg.scale_unit,
                                      leg.nominal_scale, config, widen, {

@@ -42,7 +42,7 @@ from odocal_ros.estimator.state import (
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
-from odocal_ros.settings.levels import REMARK_SIGMAS
+from odocal_ros.settings.levels import INFORMED_SHARE, REMARK_SIGMAS
 
 CLOCKS = {'fix': GNSS_CLOCK, 'odometer': ODO_CLOCK}
 IMU_SCALES = tuple(i for i, name in enumerate(CONSTANTS) if name.startswith(
@@ -134,8 +134,13 @@ def beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[tuple[int, str
     return [(LN_K, 'wheels_in_positions', by_map)] * bool(by_map) + moved
 
 
-def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[Reason]:
-    """Return reasons: filtered signals, a varying scale, deviations from configured values."""
+def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
+            config: Config) -> list[Reason]:
+    """
+    Return reasons: filtered signals, a varying scale, deviations from configured values.
+
+    sigma : (M,) of the constants.   ratio : (M,) posterior sigma by that of the prior.
+    """
     c = fit.state.constants
     said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
             *odometer_reasons(c[FIX_BY_MOTION], sigma[FIX_BY_MOTION], c[FIX_TIME],
@@ -159,7 +164,7 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[R
         said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {CONSTANTS[worst].replace("_", " ")} '
                            f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
                            f'the {config.imu.grade} grade (limit {most:g}); accounted for'))
-    return said + _arms(c, sigma, config)
+    return said + _arms(c, sigma, ratio, config)
 
 
 def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
@@ -228,7 +233,7 @@ def arms_off(c: Floats, sigma: Floats) -> set[int]:
     return {i for i in axes if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], worth)}
 
 
-def _arms(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
+def _arms(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reason]:
     """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
     said, do = [], []
     off = arms_off(c, sigma)
@@ -240,14 +245,16 @@ def _arms(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
                 continue
             found = value + c[i]
             text = f'{found:+.2f} ± {sigma[i]:.2f} m'
+            # not among the estimates
+            rough = ' (too uncertain for a result)' * bool(ratio[i] >= INFORMED_SHARE)
             if abs(found) > most:
                 said.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
                 do.append(f'Ignore the estimate of {name} {axis}: another error causes it.')
             elif any(arm):
-                said.append(f'{name} {axis}: set to {value:+.2f} m, estimated {text}')
+                said.append(f'{name} {axis}: set to {value:+.2f} m, estimated {text}{rough}')
                 do.append(f'Measure {name} {axis} again.')
             else:
-                said.append(f'{name} {axis}: not set, estimated {text}')
+                said.append(f'{name} {axis}: not set, estimated {text}{rough}')
                 do.append(f'Measure {name} {axis} and set it.')
     return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(said)}; accounted for', ' '.join(
         [*do, SLIDES] if any('easure' in x for x in do) else do))] if said else []
