@@ -75,7 +75,7 @@ def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
 def sentence(calibration: Calibration) -> str:
     """Return the result as one line: verdict, values with sigma, legs."""
     used = sum(leg.verdict is not Verdict.REJECTED for leg in calibration.legs)
-    legs = f'{used} of {counted(len(calibration.legs), "leg")} good'
+    legs = f'{used} of {counted(len(calibration.legs), "leg")} usable'
     return f'{calibration.verdict.value}: {values_in_words(calibration.estimates)}; {legs}'
 
 

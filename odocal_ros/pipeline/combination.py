@@ -64,7 +64,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
         reasons = list(dict.fromkeys(reasons))
     reasons += unlike_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in good])
     if len(good) < config.verdict.min_legs and good:
-        reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(good)} good leg'
+        reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(good)} usable leg'
                               f'{"s" * (len(good) > 1)}; required: {config.verdict.min_legs}'))
     if not giving and not any(r.code.gravity is Verdict.REJECTED for r in reasons):
         reasons.append(Reason(Code.NO_METHOD, 'no method could be run'))

@@ -206,7 +206,7 @@ def test_values_of_rejected_legs_are_kept_and_no_method_at_all_is_a_reason():
 def test_too_few_legs_are_a_caution_and_the_limits_are_asked_of_the_whole():
     config = with_settings(CONFIG, {'verdict.min_legs': 3})
     whole = combine([leg(method()) for _ in range(2)], config)
-    assert [r.text for r in whole.reasons] == ['2 good legs; required: 3']
+    assert [r.text for r in whole.reasons] == ['2 usable legs; required: 3']
     assert whole.verdict.value == 'caution'
     assert combine([leg(method()) for _ in range(3)], config).reasons == ()
     wide = method(own=1.5e-3, heading=0.0, reasons=[Reason(Code.SCALE_SIGMA_TOO_LARGE, 'leg')])

@@ -256,8 +256,9 @@ def test_an_answer_has_values_quantities_reasons_and_what_to_do_next():
     assert text == (
         'caution: scale factor 1.00000 ± 0.00010, left 1.00000 ± 0.00020, right 1.00000 ± '
         '0.00030, track width 1.000 ± 0.010, yaw mounting +57.30 ± 0.11 deg, pitch mounting '
-        '+57.30 ± 0.17 deg; 0 of 0 legs good. OK: scale; not OK: yaw. YAW_FAR_FROM_NOMINAL: seen. '
-        'Check imu.mounting_rpy, imu.nominal_yaw and the heading source. Next: drive another leg')
+        '+57.30 ± 0.17 deg; 0 of 0 legs usable. OK: scale; not OK: yaw. YAW_FAR_FROM_NOMINAL: '
+        'seen. Check imu.mounting_rpy, imu.nominal_yaw and the heading source. Next: drive '
+        'another leg')
     remedy = Code.YAW_FAR_FROM_NOMINAL.remedy
     again = answers.outcome(result(None, Code.YAW_FAR_FROM_NOMINAL), advice=remedy)[1]
     assert again.count(remedy) == 1

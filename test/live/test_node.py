@@ -238,7 +238,7 @@ def test_start_and_stop_answer(session):
     assert session.again.success
     assert session.again.message.startswith('recording since 2025-06-15T')
     assert session.stop.success
-    for words in ('scale factor', 'yaw mounting', 'deg', '1 of 1 leg good',
+    for words in ('scale factor', 'yaw mounting', 'deg', '1 of 1 leg usable',
                   session.calibrated['verdict']):
         assert words in session.stop.message
     assert session.idle_stop.success

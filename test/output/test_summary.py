@@ -84,7 +84,7 @@ def test_the_sentence_is_one_line_with_the_figures(good, rejected):
     text = sentence(good)
     assert text == (
         'accepted: scale factor 0.0500000 ± 0.0000012 m/pulse (20.00000 ± 0.00048 pulses/m), '
-        'yaw mounting -1.0000 ± 0.0029 deg, pitch mounting not determined; 1 of 1 leg good')
+        'yaw mounting -1.0000 ± 0.0029 deg, pitch mounting not determined; 1 of 1 leg usable')
     assert sentence(rejected).startswith('rejected: scale factor 0.05')
 
 
@@ -125,7 +125,7 @@ def test_nothing_found_is_said_without_nan(nothing, good):
         for text in (screen(calibration), sentence(calibration)):
             assert not re.search(r'\bnan\b|None', text)
     assert 'scale factor not determined' in sentence(nothing)
-    assert '0 of 1 leg good' in sentence(nothing)
+    assert '0 of 1 leg usable' in sentence(nothing)
 
 
 def test_legs_pool_their_checks_over_fixes():
