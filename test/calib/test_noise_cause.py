@@ -65,6 +65,17 @@ def test_noise_in_motion_only_is_vibration_noise_at_rest_the_sensors_else_unknow
     assert 'at rest it is similar' not in text
 
 
+def test_a_cause_of_one_sensor_is_not_stated_for_both():
+    one = noisy(1e-2, 1e-2)
+    sigma = np.where(one.leg.t_imu < 60.0, 0.01, 0.1)[:, None]
+    one.leg.f_b = sigma * np.random.default_rng(5).standard_normal((len(sigma), 3))
+    text = noise_remedy(one, {'gyro': 1e-2, 'accel': 5e-3}, ['gyro', 'accel'])
+    assert text.startswith('The cause of the accelerometer noise is vibration: ')
+    assert 'The gyro noise does not come from vibration: at rest it is similar.' in text
+    text = noise_remedy(one, {'gyro': 1e-2, 'accel': 5e-3}, ['accel'])
+    assert text.startswith('The cause is vibration: ')
+
+
 def test_without_a_standstill_noise_that_does_not_add_up_is_vibration_else_unknown():
     one = noisy(1e-2, 1e-2, rest_s=0.0)
     vibrating = noise_remedy(one, {'gyro': 1e-3, 'accel': 1.0}, ['gyro'])

@@ -18,11 +18,11 @@ from odocal_ros.estimator import bound, smooth
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.result.outcome import outcome
+from odocal_ros.estimator.result.outcome import determined, outcome
 from odocal_ros.estimator.start import first_state
 from odocal_ros.estimator.state import ACCEL, CONSTANTS, GYRO, IMPERFECT, M, YAW
 from odocal_ros.reasons import Code, Verdict
-from odocal_ros.settings.config import with_settings
+from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import GRADES, turn_on_bias
 
 pytestmark = pytest.mark.slow
@@ -123,6 +123,16 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
     assert stated == pytest.approx(sigma[:2], rel=0.03)
     total = np.sqrt(np.diag(total_covariance(method.sources)))
     assert stated == pytest.approx(total[:2], rel=1e-3)
+
+
+def test_a_limit_that_model_errors_lower_is_explained():
+    sigma = np.full(M, np.deg2rad(0.4))
+    sigma[0] = 1e-4
+    for doubt, text in ((1.0, ''), (2.0, '0.4 deg; the limit is 0.25 deg (0.5 deg / 2, by ')):
+        _, reasons = determined(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(), doubt)
+        said = {r.code: r.text for r in reasons}
+        assert text in said.get(Code.YAW_NOT_DETERMINED, '')
+        assert (Code.YAW_NOT_DETERMINED in said) == bool(text)
 
 
 def test_an_even_drive_straight_on_tells_no_yaw():

@@ -3,6 +3,8 @@
 
 """Cause of IMU noise above its grade: quantisation, vibration, or the sensor itself."""
 
+from collections.abc import Collection
+
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
@@ -34,27 +36,32 @@ def noise_remedy(problem: Problem, level: dict[str, float], worse: list[str]) ->
     if not worse:
         return ''
     coarse = {name: step for name, step in quantised(problem.leg, level).items() if name in worse}
-    vibrating: list[str] = []
+    vibrating: dict[str, str] = {}
     own: list[str] = []
     unknown: list[str] = []
     moving, rest = at_rest_and_moving(problem)
     for name in (name for name in worse if name not in coarse):
         still, vary = rest.get(name, 0.0), moving.get(name, 0.0)
         if still and vary > VIBRATION * still:
-            vibrating.append(f'{NAMES[name]} samples vary {vary / still:.0f} times as much '
-                             'in motion as at rest')
+            vibrating[name] = (f'{NAMES[name]} samples vary {vary / still:.0f} times as much '
+                               'in motion as at rest')
         elif not still and vary > VIBRATION * level[name]:
-            vibrating.append(f'{NAMES[name]} samples vary {vary / level[name]:.0f} times as '
-                             'much as their means over seconds')
+            vibrating[name] = (f'{NAMES[name]} samples vary {vary / level[name]:.0f} times as '
+                               'much as their means over seconds')
         else:       # less at rest than its integral
             (own if VIBRATION * still > level[name] else unknown).append(name)
     said = []
+
+    def cause(names: Collection[str]) -> str:
+        """Return the subject of a cause, with the sensors if others have another cause."""
+        of = ' and '.join(NAMES[name] for name in names)
+        return 'The cause' + f' of the {of} noise' * (len(names) < len(worse))
     if coarse:
-        said.append(f'The cause is quantisation: {_steps_in_words(coarse)}. Set a finer '
+        said.append(f'{cause(coarse)} is quantisation: {_steps_in_words(coarse)}. Set a finer '
                     'resolution or a smaller range in the IMU or its driver, if there is one.')
     if vibrating:
-        said.append(f'The cause is vibration: {", ".join(vibrating)}. Mount the IMU firmly and '
-                    'away from the engine.')
+        said.append(f'{cause(vibrating)} is vibration: {", ".join(vibrating.values())}. Mount '
+                    'the IMU firmly and away from the engine.')
     said += [f'The {NAMES[name]} noise does not come from vibration: at rest it is similar. If '
              f'this is its normal noise, {_setting(name, level)}' for name in own]
     said += [f'The cause of the {NAMES[name]} noise is unknown: ' + (

@@ -186,7 +186,7 @@ def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nom
     for i in OPTIONAL:
         if ratio[i] < INFORMED_SHARE:
             found[CONSTANTS[i]] = Estimate(float(value[i]), float(sigma[i]), UNITS[CONSTANTS[i]])
-    return found, _undetermined(sigma, limit / doubt, config, yaw, moved)
+    return found, _undetermined(sigma, limit, doubt, config, yaw, moved)
 
 
 def configured(leg: SmootherLeg) -> Floats:
@@ -219,10 +219,12 @@ def in_words(names: Iterable[str]) -> str:
     return said[0] if len(said) == 1 else f'{", ".join(said[:-1])} and {said[-1]}'
 
 
-def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float,
+def _undetermined(sigma: Floats, usual: float, doubt: float, config: Config, yaw: float,
                   moved: Collection[str]) -> list[Reason]:
-    # with model errors the limit is smaller
+    limit = usual / doubt
     reasons, wanted = [], f'; the limit is {np.rad2deg(limit):.2g} deg'
+    if doubt > 1:
+        wanted += f' ({np.rad2deg(usual):.2g} deg / {doubt:.2g}, by MODEL_MISMATCH)'
     if sigma[LN_K] > SCALE_LIMIT:
         reasons.append(Reason(Code.SCALE_NOT_DETERMINED, 'scale uncertainty is '
                               f'{100 * sigma[LN_K]:.0f} %, too large to state a value; the '
