@@ -71,7 +71,7 @@ class Code(Enum):
     COUNTER_ROLLOVER = NOTE, ('No action needed: the rollover was removed by odometer.wrap or '
                               'the integer type.')
     SPEED_COARSE = NOTE, ('If available, use wheel pulses or a finer speed signal of the same '
-                          'bus. The smoother needs neither: it uses the step transitions.')
+                          'bus. The smoother reduces this error: it uses the step transitions.')
     SPEED_ON_CHANGE = NOTE, ('If available, use wheel pulses or a speed that is published at a '
                              'fixed rate.')
     SPEED_FILTERED = NOTE, ('No action needed. For dead reckoning, wheel pulses or an unfiltered '

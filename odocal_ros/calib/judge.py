@@ -53,7 +53,7 @@ def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
         limit = config.verdict.max_scale_sigma
         if relative > SCALE_LIMIT:
             reasons.append(Reason(Code.SCALE_NOT_DETERMINED, 'scale uncertainty is '
-                                  f'{100 * relative:.0f} %, too large to state a value; the '
+                                  f'{100 * relative:.0f} %, too large for a usable value; the '
                                   f'limit is {100 * SCALE_LIMIT:g} %'))
         elif relative > limit:
             # in the unit of the uncertainty

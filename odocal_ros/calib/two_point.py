@@ -26,6 +26,7 @@ from odocal_ros.calib.budget import (
     PARAMETERS,
     total_covariance,
 )
+from odocal_ros.calib.judge import share
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_values
@@ -278,6 +279,6 @@ def _planes_agree(check: dict[str, dict[str, float]], K: float,
     limit = 3e-5 + 0.2 * sigma_relative
     if worst > limit:
         return (Reason(Code.PLANES_DISAGREE, 'the scale as ratio of chords, in a map plane or on '
-                       f'the ellipsoid, differs by {worst * 1e6:.0f} ppm from the estimated '
-                       f'scale; the limit is {limit * 1e6:.0f} ppm'),)
+                       f'the ellipsoid, differs by {share(worst)} from the estimated '
+                       f'scale; the limit is {share(limit)}'),)
     return ()

@@ -85,10 +85,10 @@ def cut_short(recorder: LegRecorder) -> tuple[Reason, ...]:
             for does, missing, where in (('begins', a - begin, 'after the first topic'),
                                          ('ends', end - b, 'before the last topic'))
             if missing > CUT_SHORT_NS]
-    return (Reason(Code.TOPIC_GAP, f'{", ".join(what)}: the leg is limited to the time that all '
-                   'topics have', 'Drive off when all topics are there, the first fix too, and '
-                   'record to the end of the drive. If a topic failed, check its driver, cable '
-                   'and the recorder.'),) if what else ()
+    return (Reason(Code.TOPIC_GAP, f'{", ".join(what)}: the leg is limited to the time '
+                   'that all topics cover', 'Wait for messages of all topics and the first fix '
+                   'before the drive, and record to its end. If a topic failed, check its driver, '
+                   'cable and the recorder.'),) if what else ()
 
 
 def dropped_legs(bag: Bag) -> bool:

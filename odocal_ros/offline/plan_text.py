@@ -29,7 +29,8 @@ def indoor_screen(runs: list[PlannedRun]) -> str:
     robot, by = runs[0].robot, runs[0].method
     names = [name for name in SHOWN if name in by.estimates
              and not (name == 'yaw_mounting_angle' and by.name == 'planar')]
-    drift = f', drift {1000 * robot.drift:.2g} mm' if robot.drift else ''
+    drift = (f', correlated errors {1000 * robot.drift:.2g} mm over {robot.drift_length:g} m'
+             if robot.drift else '')
     where = ' at standstills' if robot.at_rests else f' at {robot.rate:g} Hz'
     lines = [f'{robot.drive}, {robot.wheels} wheels, {"with" if robot.imu else "without"} an IMU; '
              f'method {by.name}',

@@ -62,6 +62,7 @@ def assumed(problem: Problem, levels: Levels) -> list[Reason]:
         return []
     return [Reason(Code.PARAMETER_NOT_DETERMINED, 'turns faster than '
                    f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to '
-                   f'{np.rad2deg(problem.turned):.0f} deg, too little to estimate sideslip: '
+                   f'{np.rad2deg(problem.turned):.0f} deg, too little to estimate sideslip '
+                   f'(limit {np.rad2deg(2 * NO_TURN):.0f} deg): '
                    f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed, and the uncertainties of the '
                    'mounting angles depend on it')]
