@@ -53,7 +53,7 @@ class Code(Enum):
                        'the gap with --leg. The limit is leg.max_gap.')
     LEG_CUT = NOTE, ('Fix the IMU stream (QoS depth, CPU load, cable). An uninterrupted leg '
                      'gives smaller uncertainties. The limit is leg.max_gap.')
-    TOPIC_GAP = NOTE, ('Check the driver, cable and bus load of this topic. The leg stays valid; '
+    TOPIC_GAP = NOTE, ('Check the sender, cable and bus load of this topic. The leg stays valid; '
                        'missing data increases the uncertainties.')
     CLOCKS_DIFFER = REJECT, ('Set odometer.time_offset, imu.time_offset or gnss.time_offset, or '
                              'stamp all sensors with one clock.')

@@ -129,7 +129,7 @@ def test_a_leg_is_told_whole(good):
     assert 'accepted : ready to use; scale factor 0.0500000 ± 0.0000012 m/pulse' in text
     for part in ('20.00000 ± 0.00048 pulses/m', '24 ppm', '+250000 ± 30 ppm',
                  '-1.0000 ± 0.0029 deg', '-0.017453 ± 0.000050 rad', 'not determined',
-                 'TOPIC_GAP', 'odometer gap of 1.2 s', 'Check the driver',
+                 'TOPIC_GAP', 'odometer gap of 1.2 s', 'Check the sender',
                  '1500 m', '0.10 m', '2018-08-02 08:53:20 UTC', 'ab' * 32, '/imu/data',
                  '1 of 202 fixes status below 0; first at t = 7.0 s', MADE, *FIGURES):
         assert part in text, part
