@@ -8,8 +8,8 @@ A long day of the node: hours of simulated time, a leg every quarter of an hour,
 
 The node runs in simulated time (/clock) and receives out-and-back drives, the same ten again and
 again, with stamps that go on; between the drives its sensors are silent. The node ``odometry``
-runs beside it on the same topics. After each leg are printed: memory, threads and descriptors of
-the process, memory and descriptors of ``odometry`` and how many poses it published, the latency of
+runs beside it on the same topics. After each leg, once its files are written and the vehicle has
+rested, are printed: memory, threads and descriptors of the process, memory and descriptors of ``odometry`` and how many poses it published, the latency of
 a service call in the leg, the time that the answer of ~/stop_leg took, what is in the output
 folder, and how far the scale factor is from the truth. At the end the last
 quarter of the legs is held against the second one; the exit code is 1 if anything grew, or a leg
@@ -160,6 +160,7 @@ def one_leg(day, client, node, odometry, poses, folder, leg, truth) -> Look:
         asked = time.perf_counter()
         client.call('start_leg')                 # answers 'recording since'
         calls.append((time.perf_counter() - asked) * 1e3)
+    saved = client.status['saved']
     asked, begin = client.ask('stop_leg'), time.perf_counter()
     day.play(DRIVE_S - 5, DRIVE_S)
     wait_for(lambda: asked.done() or node.process.poll() is not None,
@@ -168,7 +169,9 @@ def one_leg(day, client, node, odometry, poses, folder, leg, truth) -> Look:
         sys.exit(f'the node has ended with {node.process.poll()}: {node.lines[-5:]}')
     stop_s = time.perf_counter() - begin
     wait_for(lambda: client.status['state'] != 'computing', 'the result', LONGEST_S)
+    wait_for(lambda: client.status['saved'] not in ('', saved), 'its files', LONGEST_S)
     status = client.status
+    day.rest()
     value, sigma = (float(status[k]) for k in ('scale_factor', 'scale_factor_sigma'))
     if odometry.process.poll() is not None:
         sys.exit(f'odometry has ended with {odometry.process.poll()}: {odometry.lines[-15:]}')
@@ -228,7 +231,6 @@ def main() -> int:
                                      drives[0].truth.scale))
                 print(', '.join(f'{k} {v:.4g}' if isinstance(v, float) else f'{k} {v}'
                                 for k, v in asdict(looks[-1]).items()), flush=True)
-                day.rest()
             code = node.end() or odometry.end()
         finally:
             node.end()

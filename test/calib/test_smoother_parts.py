@@ -58,12 +58,11 @@ def moved():
     step = 1e-3 * rng.standard_normal((len(state.t), N))
     step[:, layout.PHI.start:layout.BG.stop] *= 0.1
     c = 1e-3 * np.insert(rng.standard_normal(layout.M - 3), 3 * [layout.BY_SIGMA.start], 1.0)
-    # derivatives by biases take these as constant over HILL_INTERVALS: no centre of bumps, nor
-    # one in turns, whose signal moves with the attitude
+    # derivatives by biases take these as constant over HILL_INTERVALS: no centre of bumps
     # of the size that there is: derivatives leave out how these change what the others do
     c[layout.SPEED_OFFSET], c[layout.FIX_TIME] = 0.0, np.log(5.0)
     c[layout.IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.1, 0.1, 0.0, 0.03, 0.003,
-                            0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0, 0.0]
+                            0.0, 0.0, 1e3, *[0.0] * 4, 1e3, 0.0, 1e3]
     c[layout.FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
     c[layout.VELOCITY_LAG2] = 2.1e-4
     return problem, state.moved(step, c)

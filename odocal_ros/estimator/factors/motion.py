@@ -172,8 +172,7 @@ class Motion:
         self.rate_n = turn(self.C, self.sums.mean_rate)
         self.level_left = level_left(self.C @ state.forward)
         nose_down = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
-        # on banked ground a turn of the vehicle pitches it about its own axis; derivatives by
-        # attitude and gyro bias leave this part out
+        # on banked ground a turn of the vehicle pitches it about its own axis
         left = np.einsum('ki,ki->k', self.rate_n, self.C @ self.left) * T[:, 0]
         self.nose_down = np.stack([nose_down, nose_down - slowly(nose_down), left - nose_down], -1)
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
@@ -233,8 +232,9 @@ class Motion:
         gyro = self._by_gyro()
         a[:, :, BG] = gyro[:, :, :3]
         # biases change little over HILL_INTERVALS: they do not affect the faster part
-        lift = state.constants[PITCH_CENTRE][0] * T * (C @ self.up)[:, :, None]
-        a[:, D, BG] += lift * turn(transpose(C), self.level_left)[:, None]
+        lift, (hills, _, turns) = T * (C @ self.up)[:, :, None], state.constants[PITCH_CENTRE]
+        a[:, D, BG] += lift * ((hills - turns) * turn(transpose(C), self.level_left)
+                               + turns * self.left)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
         a[:, PHI, PHI] = -one
@@ -245,7 +245,7 @@ class Motion:
         a[:, D, PHI] += by_begin[:, :, 3:]
         # on a body with roll, part of the turn about its left axis is not about the level axis
         tilt = self.rate_n[:, 2, None] * level_left(self.level_left)
-        a[:, D, PHI] -= lift * tilt[:, None]
+        a[:, D, PHI] -= (hills - turns) * lift * tilt[:, None]
         a[:, D, E] = -self.f_n
         b[:, P, P] = b[:, V, V] = b[:, PHI, PHI] = b[:, BG, BG] = b[:, BA, BA] = one
         b[:, D, P], b[:, D, PHI], b[:, D, E] = one, -skew(self.C_end @ arm_b), self.f_n_end
