@@ -93,6 +93,17 @@ def test_damaged_counts_are_no_span(made):
     assert not len(doubt_t)
 
 
+@pytest.mark.parametrize(('span', 'found'), [(256, True), (260, False), (2**16, True)])
+@pytest.mark.parametrize('per_row', [0.5, 1.0])
+def test_one_rollover_between_dense_rows_is_undone(made, span, found, per_row):
+    total = span - 100 + np.floor(per_row * np.arange(300)).astype(np.int64)
+    count = changed(take(made.odometer, slice(300)), value=lambda _: total % span)
+    step = np.diff(count.value.astype(float))
+    same, why, *_ = unrolled(count.stamp_ns * 1e-9, count, step, 'odometer')
+    assert [r.code for r in why] == [Code.COUNTER_ROLLOVER] * found
+    assert np.array_equal(np.diff(same.value), np.diff(total)) == found
+
+
 def test_angles_wrapped_at_a_turn_are_unrolled():
     made = drive(**ROUTE | {'odometer': 'angle', 'odometer_rate': 50.0})
     inputs, said = screened(with_right(made, lambda a: np.angle(np.exp(1j * a))), made)

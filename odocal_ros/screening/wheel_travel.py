@@ -65,8 +65,9 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     typical = float(np.median(slack))
     sigma = 0.0
     fewest_jumps = 3    # least number of jumps for a span that is no power of two
-    power_slack = 0.01    # of the span, largest slack for a power of two by one jump
-    if abs(known - middle) <= typical and (len(rows) > 1 or slack[0] < power_slack * known):
+    # judgement, of the span: largest deviation from a power of two of a single jump
+    most_off = np.inf if len(rows) > 1 else 0.01 * known
+    if abs(known - middle) <= min(typical, most_off):
         span = known
     elif len(rows) >= fewest_jumps:
         span, sigma = _measured(value, rows, middle, typical) if whole else (
