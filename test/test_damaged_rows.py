@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.failed import traces
+from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline import methods as leg_methods
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
@@ -105,6 +106,18 @@ def test_what_a_clump_is():
     wild[[405, 410, 414, 419]] = True                # 400 to 419: five apart at most
     assert np.flatnonzero(about_clumps(wild)).tolist() == list(range(390, 430))
     assert not about_clumps(np.zeros(0, bool)).any()
+
+
+@pytest.mark.parametrize('yaw', [0, 2])
+def test_exact_zeros_that_were_rotated_twice_are_no_damage(made, yaw):
+    leg = made.leg()
+    C, C_again = (matrix_from_rpy(np.pi / 2 * np.array(n)) for n in ((1, 1, yaw), (1, 1, 2)))
+
+    def upright(column):
+        column[:] = column * [0.0, 0.0, 1.0] @ C @ C_again
+        assert 0 < np.abs(column[column != 0]).min() < 1e-50
+    said = screen(replace(leg, imu=changed(leg.imu, w_i=upright, f_i=upright)), settings(made))[1]
+    assert not {Code.BAD_ROWS_DROPPED, Code.ROWS_DAMAGED} & {r.code for r in said}
 
 
 def test_a_filtered_speed_that_fades_at_rest_is_zero(made):
