@@ -140,9 +140,12 @@ def test_an_imu_that_ends_early(made, leg):
 def test_an_odometer_that_starts_late_or_ends_early_shortens_the_leg(made, leg):
     t = drives.seconds(leg, leg.odometer)
     for keep, text in ((t > 20, 'begins 20.0 s after the start mark'),
-                       (t < 50, 'ends 90.0 s before the stop mark')):
+                       (t < 50, 'ends 90.0 s before the stop mark'),
+                       (t < 80, 'ends 60.0 s before the stop mark')):
         result, said = run(replace(leg, odometer=take(leg.odometer, keep)), drives.settings(made))
         assert text in said[Code.TOPIC_GAP]
+        assert Code.BAD_ROWS_DROPPED not in said       # nor are later fixes far off the track
+        assert not result.evidence.excluded
         sound(result, made.truth)
 
 

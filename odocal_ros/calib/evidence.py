@@ -62,7 +62,8 @@ class Evidence:
 
 
 def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools, pin: MarkFix,
-             paths: tuple[Path, Path], config: Config, t_fit: float = np.inf) -> Evidence:
+             paths: tuple[Path, Path], config: Config, t_fit: float = np.inf,
+             covered: tuple[float, float] = (0.0, np.inf)) -> Evidence:
     """
     Collect the plot data of a leg.
 
@@ -71,14 +72,14 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
     errors; those within the time span of the track are shown.   pin : mark whose position the
     paths are set to.   paths : (before, after) callables t (n,) to the antenna's path, (n, 3) m
     up to a constant, as configured and as calibrated.   config : settings in force.   t_fit : end
-    of the fitted data, s.
+    of the fitted data, s.   covered : begin and end of the time with an odometer, s.
 
     Returns
     -------
     Evidence, at most 5000 rows of each series.
 
     """
-    inside = (track.t >= 0.0) & (track.t <= inputs.t_stop)
+    inside = (track.t >= covered[0]) & (track.t <= min(inputs.t_stop, covered[1]))
     t = track.t[inside]
     span = (t[0], t[-1]) if len(t) else (0.0, -1.0)
     kept = kept & (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])

@@ -135,6 +135,12 @@ class PreparedLeg(Placed):
         path = level_track(self.track.s, turned)
         return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
 
+    @property
+    def covered(self) -> tuple[float, float]:
+        """Return begin and end of the time with track and odometer, s."""
+        each = self.track.t, self.inputs.travel.t
+        return max(0.0, *(float(t[0]) for t in each)), min(float(t[-1]) for t in each)
+
     @cached_property
     def path_ratio(self) -> float | None:
         """

@@ -77,7 +77,7 @@ def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reas
     kept, far = near(ready, after, start, between)
     found += (*check_worse(path_at, off_before, off_after, bool(ready.nominal)), *far)
     seen = evidence(ready.leg, ready.inputs, ready.track, ready.fixes_n, kept, start, paths,
-                    ready.config, ready.t_fit)
+                    ready.config, ready.t_fit, ready.covered)
     found += counter_change(seen.sections, seen.t_fix, seen.fix_distance)
     return more | {'evidence': seen}, found
 
@@ -95,8 +95,7 @@ def check_of(ready: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reas
 
 
 def _start(ready: PreparedLeg, path: Path) -> MarkFix | None:
-    begin = max(0.0, float(ready.track.t[0]), float(ready.inputs.travel.t[0]))
-    return ready.mark(begin, path, 'start')
+    return ready.mark(ready.covered[0], path, 'start')
 
 
 def _checked(ready: PreparedLeg, path: Path,
@@ -107,6 +106,7 @@ def _checked(ready: PreparedLeg, path: Path,
     found: tuple[Reason, ...] = ()
     if ready.holdout:
         pin, begin, end = ready.mark(ready.t_fit, path), ready.t_fit, ready.inputs.t_stop
+    end = min(end, ready.covered[1])
     between = (ready.inputs.t_fix >= begin) & (ready.inputs.t_fix <= end)
     if pin is not None:
         inside, found = near(ready, path, pin, between)

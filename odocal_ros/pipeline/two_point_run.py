@@ -86,9 +86,8 @@ class TwoPointRun:
 
     def _chord(self) -> Chord | None:
         """Return the chord between the marks; None, with a reason, without fixes."""
-        ready, track, travel = self.ready, self.track, self.inputs.travel
-        ends = (max(0.0, float(track.t[0]), float(travel.t[0])),
-                min(ready.t_fit, float(track.t[-1]), float(travel.t[-1])))
+        ready, track = self.ready, self.track
+        ends = (ready.covered[0], min(ready.t_fit, ready.covered[1]))
         path = ready.path(np.array([ready.rough, 0.0, 0.0]))
         start, end = (ready.mark(t, path, name) for t, name in zip(ends, NAMES, strict=True))
         for mark, name in zip((start, end), NAMES, strict=True):
