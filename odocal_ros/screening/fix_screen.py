@@ -42,6 +42,8 @@ SMOOTH_ROWS, SMOOTH_SHARE = 10, 0.7
 # medians and m: a jump. Judgement: white noise exceeds three medians once in 500 seconds, after a
 # smooth section
 JUMP_SIZE, SHORTEST_JUMP = 3.0, 0.5
+# s, physical: in 0.1 s a change of acceleration by 5 m/s^2 (hard braking) gives SHORTEST_JUMP
+JUMP_DELAY = 0.1
 SPANS_SAID = 3           # judgement: number of spans in a reason
 
 
@@ -249,10 +251,12 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
     before = np.maximum.accumulate(np.where(moving, np.arange(len(way)), -1))[:-1]
     rows = np.flatnonzero(whole[1:] & (before >= 0)) + 1
     before = before[rows - 1]
-    off = np.abs(moved[rows] - moved[before] * way[rows] / way[before])
     driven = moving[rows] & (before == rows - 1)
     if driven.sum() <= SMOOTH_ROWS:
         return []
+    ratio, onward = moved[before] / way[before], np.gradient(way) / np.median(dt)
+    off = _without_delay(moved[rows] - ratio * way[rows],
+                         ratio * (onward[rows] - onward[before] * way[rows] / way[before]))
     usual, at = float(np.median(off[driven])), rows[driven]
     smooth = off[driven] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
     spans: list[tuple[float, float, float]] = []
@@ -269,6 +273,21 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
         if not spans or begin > spans[-1][1]:
             spans.append((begin, float(t[rows[k] + 1]), float(off[k])))
     return spans
+
+
+def _without_delay(off: Complexes, by_second: Complexes) -> Floats:
+    """
+    Return the sizes of deviations, m, without the part by a delay or low-pass filter: (n,).
+
+    off : (n,) m.   by_second : (n,) m, by an odometer that is late by a second.
+    """
+    size = np.maximum(np.abs(by_second), 1e-9)
+    delays = (off * by_second.conj()).real / size**2
+    order = np.argsort(delays)
+    weight = np.cumsum(size[order])
+    delay = delays[order[np.searchsorted(weight, weight[-1] / 2)]]    # weighted median
+    rest: Floats = np.abs(off - delay * by_second * (abs(delay) > JUMP_DELAY))
+    return rest
 
 
 def _begin(smooth: Bools) -> int:

@@ -94,6 +94,28 @@ def test_satellites_that_change_are_no_tunnel(change):
     assert found.any() == (change > 1.4)
 
 
+@pytest.mark.parametrize('lag', ['delay', 'filter'])
+@pytest.mark.parametrize('tunnel', [False, True])
+def test_an_odometer_that_is_late_at_each_braking_is_no_tunnel(lag, tunnel):
+    fine = np.arange(0.0, 400.0, 0.01)
+    phase = fine % 60.0
+    speed = np.interp(phase, [0, 48, 50, 54, 60], [15, 15, 7, 15, 15]) + np.where(
+        phase < 24, np.sin(np.pi / 4 * phase), 0.0)
+    past = np.arange(0.0, 3.0, 0.01)
+    weight = np.exp(-past / 0.3) if lag == 'filter' else np.isclose(past, 0.3)
+    late = np.convolve(np.pad(speed, (len(past), 0), mode='edge'), weight / weight.sum())
+    true, track = (np.interp(at_s, fine, np.cumsum(v * 0.01 * np.exp(1j * turned(fine))))
+                   for v in (speed, late[len(past):][:len(fine)]))
+    noise = 0.003 * stream(3, 'fixes').standard_normal((len(at_s), 2)) @ [1, 1j]
+    inside = tunnel & (at_s >= 210) & (at_s < 226)
+    place = true + np.where(inside, 0.02 * (true - true[210]), noise)
+    found, why = reckoned(at_s, np.stack([place.real, place.imag, 0 * at_s], -1), stated(0.01),
+                          1j * track)
+    assert len(why) == tunnel
+    assert not found[(at_s < 168) | (at_s >= 226)].any()      # smooth from the last braking on
+    assert found[inside].sum() >= 0.8 * inside.sum()
+
+
 @pytest.mark.parametrize(('scenario', 'noise'), [('motorway', 'white'), ('town', 'rtk')])
 def test_fixes_of_a_tunnel_are_not_used_and_said(scenario, noise):
     real = Real(tunnels=((110.0, 70.0),), tunnel_odometer=0.02)
