@@ -22,6 +22,9 @@ SURE_F = 30.0
 # judgement: least explained variance, in variances of a mean of white noise; 8/3 is that of a mean
 # over that of a row. Smooth signals without noise are below it
 LEAST_POWER = 0.1 * 8 / 3
+# judgement: a vibration near half the rate changes its size and phase. Correlation of adjacent
+# residuals, and the slow part of them over the explained part; two IMUs are below one of them
+MOST_CORRELATED, MOST_SLOW = 0.5, 0.05
 
 
 def other_imus(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
@@ -77,9 +80,13 @@ def _share_of_two(x: Floats) -> float:
     free = len(off) - A.shape[1]
     if free < FEWEST_MEANS // 2:
         return 0.0
-    left = ((off - A @ np.linalg.lstsq(A, off, rcond=None)[0])**2).sum(axis=0)
-    total = (off**2).sum(axis=0)
+    rest = off - A @ np.linalg.lstsq(A, off, rcond=None)[0]
+    left, total = (rest**2).sum(axis=0), (off**2).sum(axis=0)
+    slow = (rest[1:] * rest[:-1]).sum(axis=0)
     explained, power = total - left, (parts[good]**2).mean(axis=(0, 1))
     sure = (explained * free > SURE_F * A.shape[1] * left) & (
         explained / len(off) > LEAST_POWER * power / MEAN_ROWS)
+    vibrating = slow > np.maximum(MOST_CORRELATED * left, MOST_SLOW * explained)
+    if vibrating[np.argmax(explained / np.maximum(power, 1e-300))]:
+        return 0.0
     return float((explained[sure] / total[sure]).max(initial=0.0))

@@ -3,7 +3,7 @@
 
 """IMU rows: their rhythm, an axis at the limit of its range, two IMUs that alternate."""
 
-from drives import changed, drive
+from drives import changed, drive, seconds
 import numpy as np
 import pytest
 
@@ -165,6 +165,22 @@ def test_rows_that_alternate_between_two_imus_reject_the_leg(leg, column, by):
 def test_one_imu_is_one_at_any_rate_and_with_rows_that_repeat(grade, rate, repeat):
     imu = drive(scenario='yard', duration=250.0, imu_grade=grade, imu_rate=rate, seed=9).leg().imu
     assert not alternating(*(np.repeat(x[::repeat], repeat, axis=0) for x in (imu.w_i, imu.f_i)))
+
+
+@pytest.mark.parametrize(('off_hz', 'on_s'), [(0.002, 60.0), (0.0, 40.0), (0.001, 40.0)])
+@pytest.mark.parametrize('size', [0.1, 1.0])
+def test_a_vibration_at_half_the_rate_is_no_second_imu(leg, off_hz, on_s, size):
+    t = seconds(leg, leg.imu)
+    shaken = size * np.cos(2 * np.pi * (25.0 - off_hz) * t + 1.0) * (t % 60.0 < on_s)
+    assert not alternating(leg.imu.w_i, leg.imu.f_i + shaken[:, None])
+    assert not alternating(leg.imu.w_i + 0.01 * shaken[:, None], leg.imu.f_i)
+
+
+@pytest.mark.parametrize('drift', [0.0, 0.1])
+def test_biases_that_drift_are_of_two_imus(leg, drift):
+    t = seconds(leg, leg.imu)[:, None]
+    assert alternating(second(leg.imu.w_i, lambda w: w + BIAS * (1 + drift * t / t[-1])),
+                       leg.imu.f_i)
 
 
 def test_a_spike_is_no_second_imu(leg):
