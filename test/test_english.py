@@ -117,8 +117,8 @@ def test_pages_in_html_are_plain():
         assert not unused(text), page.name
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
-def test_docs_are_plain(page):
+@pytest.mark.parametrize('page', [*PAGES, *SETTING_FILES], ids=lambda page: page.name)
+def test_docs_and_files_of_settings_are_plain(page):
     found = [f'{number}: {words}' for number, line in enumerate(
         page.read_text(encoding='utf-8').splitlines(), 1) if (words := unused(line))]
     assert not found, '\n'.join(found)
@@ -129,13 +129,6 @@ def test_the_newest_section_of_the_changelog_is_plain():
                         flags=re.MULTILINE)
     found = [f'{words}: {line}' for line in sections[1].splitlines() if (words := unused(line))]
     assert found == []
-
-
-@pytest.mark.parametrize('path', SETTING_FILES, ids=lambda path: path.name)
-def test_files_of_settings_are_plain(path):
-    found = [f'{number}: {words}' for number, line in enumerate(
-        path.read_text(encoding='utf-8').splitlines(), 1) if (words := unused(line))]
-    assert not found, '\n'.join(found)
 
 
 @pytest.mark.parametrize('code', Code, ids=lambda code: code.name)

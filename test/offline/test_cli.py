@@ -79,16 +79,6 @@ def test_errors_are_one_line_with_their_exit_code(error, code, monkeypatch, caps
         assert 'ZeroDivisionError: oops' in Path(err.split()[-1]).read_text()
 
 
-def test_help_imports_nothing_heavy():
-    probe = ('import sys; from odocal_ros.offline.cli import main\n'
-             'try: main(["--help"])\nexcept SystemExit: pass\n'
-             'print([m for m in ("numpy", "scipy", "rosbags", "pyproj", "yaml", "rclpy") '
-             'if m in sys.modules], file=sys.stderr)')
-    done = subprocess.run([sys.executable, '-c', probe], capture_output=True, text=True,
-                          check=True)
-    assert done.stderr.strip() == '[]'
-
-
 def test_the_package_run_as_a_module_is_the_command():
     result = subprocess.run([sys.executable, '-m', 'odocal_ros', '--version'], text=True,
                             capture_output=True, check=True)
