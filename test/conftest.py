@@ -107,12 +107,10 @@ def made():
 
 @pytest.fixture
 def leg(made):
-    """Return the leg of the drive."""
     return made.leg()
 
 
 @pytest.fixture(scope='session')
 def town():
-    """Return a drive in town."""
     import drives
     return drives.drive(**drives.TOWN)

@@ -97,7 +97,6 @@ def shifted(leg, **marks):
 
 
 def two_point(leg, config, **more):
-    """Return the two-point result of a leg."""
     return calibrate(leg, config, **more).methods['two_point']
 
 

@@ -38,7 +38,6 @@ def commands(page: str) -> list[str]:
 
 
 def yaml_blocks(page: str) -> list[str]:
-    """Return the blocks of YAML."""
     return ['\n'.join(lines) + '\n' for language, lines in fenced(page) if language == 'yaml']
 
 

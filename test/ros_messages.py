@@ -11,17 +11,14 @@ from rosbags.typesys import get_typestore, Stores
 
 @lru_cache
 def store():
-    """Return the Jazzy message types."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def kind(msgtype):
-    """Return the class of a message type."""
     return store().types[msgtype]
 
 
 def cdr(message, little_endian=True):
-    """Return a message serialised."""
     return bytes(store().serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
 
 
@@ -31,18 +28,15 @@ def deserializer(msgtype):
 
 
 def header(stamp_ns=0, frame='imu_link'):
-    """Return a std_msgs/Header."""
     time = kind('builtin_interfaces/msg/Time')(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     return kind('std_msgs/msg/Header')(stamp=time, frame_id=frame)
 
 
 def vector(x=0.0, y=0.0, z=0.0):
-    """Return a geometry_msgs/Vector3."""
     return kind('geometry_msgs/msg/Vector3')(x=float(x), y=float(y), z=float(z))
 
 
 def quaternion(x=0.0, y=0.0, z=0.0, w=1.0):
-    """Return a geometry_msgs/Quaternion."""
     return kind('geometry_msgs/msg/Quaternion')(x=float(x), y=float(y), z=float(z), w=float(w))
 
 
@@ -57,7 +51,6 @@ def imu(stamp_ns, w=(0, 0, 0), f=(0, 0, 9.81), q=(0, 0, 0, 1), covariance=None, 
 
 
 def fix(stamp_ns, latitude, longitude, altitude=0.0, sigma=1.0, status=0, known=2):
-    """Return a sensor_msgs/NavSatFix, angles in degrees."""
     return kind('sensor_msgs/msg/NavSatFix')(
         header=header(stamp_ns, 'gps'),
         status=kind('sensor_msgs/msg/NavSatStatus')(status=status, service=1),
@@ -67,17 +60,14 @@ def fix(stamp_ns, latitude, longitude, altitude=0.0, sigma=1.0, status=0, known=
 
 
 def whole(value, name='Int64'):
-    """Return a std_msgs integer."""
     return kind(f'std_msgs/msg/{name}')(data=value)
 
 
 def real(value, name='Float64'):
-    """Return a std_msgs float."""
     return kind(f'std_msgs/msg/{name}')(data=float(value))
 
 
 def whole_array(values, name='Int32', labels=()):
-    """Return an Int32MultiArray or Int64MultiArray."""
     dims = [kind('std_msgs/msg/MultiArrayDimension')(label=text, size=1, stride=1)
             for text in labels]
     layout = kind('std_msgs/msg/MultiArrayLayout')(dim=dims, data_offset=0)
@@ -86,25 +76,21 @@ def whole_array(values, name='Int32', labels=()):
 
 
 def joints(stamp_ns, names, position=(), velocity=(), effort=(), frame=''):
-    """Return a sensor_msgs/JointState."""
     return kind('sensor_msgs/msg/JointState')(
         header=header(stamp_ns, frame), name=list(names), position=np.array(position, float),
         velocity=np.array(velocity, float), effort=np.array(effort, float))
 
 
 def twist(x, y=0.0, z=0.0):
-    """Return a geometry_msgs/Twist."""
     return kind('geometry_msgs/msg/Twist')(linear=vector(x, y, z), angular=vector(0, 0, 0.5))
 
 
 def twist_stamped(stamp_ns, x, y=0.0, z=0.0, frame='base_link'):
-    """Return a geometry_msgs/TwistStamped."""
     return kind('geometry_msgs/msg/TwistStamped')(header=header(stamp_ns, frame),
                                                   twist=twist(x, y, z))
 
 
 def twist_covariance(stamp_ns, x, y=0.0, z=0.0, variances=(0.0, 0.0, 0.0), frame='base_link'):
-    """Return a geometry_msgs/TwistWithCovarianceStamped."""
     covariance = np.zeros((6, 6))
     covariance[[0, 1, 2], [0, 1, 2]] = variances
     inner = kind('geometry_msgs/msg/TwistWithCovariance')(twist=twist(x, y, z),
@@ -114,13 +100,11 @@ def twist_covariance(stamp_ns, x, y=0.0, z=0.0, variances=(0.0, 0.0, 0.0), frame
 
 
 def pose_at(position):
-    """Return a geometry_msgs/Pose that looks along x."""
     point = kind('geometry_msgs/msg/Point')(**dict(zip('xyz', map(float, position), strict=True)))
     return kind('geometry_msgs/msg/Pose')(position=point, orientation=quaternion())
 
 
 def pose(stamp_ns, position, frame='map'):
-    """Return a geometry_msgs/PoseStamped."""
     return kind('geometry_msgs/msg/PoseStamped')(header=header(stamp_ns, frame),
                                                  pose=pose_at(position))
 
@@ -134,13 +118,11 @@ def pose_covariance(stamp_ns, position, covariance, frame='map'):
 
 
 def point(stamp_ns, position, frame='map'):
-    """Return a geometry_msgs/PointStamped."""
     return kind('geometry_msgs/msg/PointStamped')(header=header(stamp_ns, frame),
                                                   point=pose_at(position).position)
 
 
 def transform(stamp_ns, position, child='robot', frame='world'):
-    """Return a geometry_msgs/TransformStamped."""
     inner = kind('geometry_msgs/msg/Transform')(translation=vector(*position),
                                                 rotation=quaternion())
     return kind('geometry_msgs/msg/TransformStamped')(header=header(stamp_ns, frame),

@@ -16,12 +16,10 @@ KEY = re.compile(r'\.status\[0\]\.values\[:\]\{key=="(\w+)"\}\.value$')
 
 
 def rviz() -> dict:
-    """Return the RViz configuration."""
     return yaml.safe_load((CONFIG / 'odocal.rviz').read_text(encoding='utf-8'))
 
 
 def rviz_displays() -> list[dict]:
-    """Return the displays of RViz."""
     return rviz()['Visualization Manager']['Displays']
 
 
@@ -37,7 +35,6 @@ def foxglove_paths() -> list[str]:
 
 
 def plotjuggler() -> ElementTree.Element:
-    """Return the PlotJuggler layout."""
     return ElementTree.parse(CONFIG / 'odocal_plotjuggler.xml').getroot()
 
 
@@ -88,6 +85,5 @@ def of_inputs() -> set[tuple[str, tuple[str, ...]]]:
 
 
 def services() -> set[str]:
-    """Return the services that Foxglove's buttons call."""
     return {panel['serviceName'] for panel in foxglove()['configById'].values()
             if 'serviceName' in panel}

@@ -53,7 +53,6 @@ def spoilt(slot, **columns):
 
 
 def sideways(a):
-    """Return vectors (x, y, z) as (z, y, -x)."""
     return a[:, [2, 1, 0]] * [1, 1, -1]
 
 

@@ -150,7 +150,6 @@ def config(made):
 
 @pytest.fixture(scope='module')
 def whole(made, config):
-    """Return what the leg says with nothing wrong."""
     return calibrate(made.leg(), config)
 
 

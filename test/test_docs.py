@@ -75,7 +75,6 @@ def undrawn(request, monkeypatch):
 
 @pytest.fixture(scope='module')
 def results(tmp_path_factory):
-    """Return two result folders to compare, of drives that differ by their noise alone."""
     folder = tmp_path_factory.mktemp('results')
     for seed in (1, 2):
         made, bag = drive(**STRAIGHT, seed=seed), folder / f'bag_{seed}'

@@ -18,7 +18,6 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 
 
 def as_ros1(message, kind):
-    """Return a ROS 1 message with the fields of a ROS 2 message."""
     made = {}
     for field in dataclasses.fields(ROS1.types[kind]):
         if not field.init or field.name == '__msgtype__':

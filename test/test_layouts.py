@@ -24,7 +24,6 @@ INPUTS = {'/imu/data', '/odometer', '/fix'}
 
 
 def all_values(tree, key):
-    """Return every value of a key, at any depth."""
     if isinstance(tree, dict):
         return [v for k, v in tree.items() if k == key] + [
             v for sub in tree.values() for v in all_values(sub, key)]

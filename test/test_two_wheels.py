@@ -30,7 +30,6 @@ def screened(leg, made, **more):
 
 @pytest.fixture(scope='module')
 def clean(made):
-    """Return the inputs of the drive with nothing wrong."""
     inputs, said = screened(made.leg(), made)
     assert not said
     return inputs

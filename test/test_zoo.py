@@ -31,7 +31,6 @@ ZOO = [    # kind, grade, verdict, errors of NAMES over their sigmas
 
 
 def error_in_sigmas(estimate, true):
-    """Return the error of an estimate over its sigma, None where nothing is stated."""
     if estimate is None or estimate.value is None:
         return None
     return round((estimate.value - true) / estimate.sigma, 2)

@@ -40,7 +40,6 @@ def calibration(truth, rng):
 
 @cache
 def drive_of(number):
-    """Simulate one of a few drives."""
     return simulate(SimOptions(
         scenario='town', duration=120.0, seed=number + 1, imu_rate=(50.0, 100.0)[number % 2],
         odometer_rate=25.0, imu_grade='consumer', slope=0.03, slip_walk=0.005, sway=0.02,
@@ -81,7 +80,6 @@ def imu_values(rng, topics):
 
 
 def imu_stuck(rng, topics):
-    """Repeat one row."""
     rows = some_rows(rng, topics['imu'], 5.0)
     for name in 'wf':
         topics['imu'][name][rows] = topics['imu'][name][rows.start]
@@ -107,7 +105,6 @@ def stamps(rng, topics):
 
 
 def missing(rng, topics):
-    """Lose rows."""
     name = rng.choice(TOPICS)
     rows = some_rows(rng, topics[name], 15.0)
     topics[name] = {k: np.delete(v, rows, axis=0) for k, v in topics[name].items()}
@@ -148,7 +145,6 @@ def counter(rng, topics):
 
 
 def counter_stuck(rng, topics):
-    """Repeat one value of the odometer."""
     rows = some_rows(rng, topics['odometer'], 5.0)
     topics['odometer']['value'][rows] = topics['odometer']['value'][rows.start]
     return f'counter stuck for {rows.stop - rows.start} rows'
@@ -159,7 +155,6 @@ FAULTS = (imu_values, imu_values, imu_stuck, stamps, stamps, missing, mixed, cou
 
 
 def blocks_of(topics):
-    """Return the topics as samples."""
     imu, odometer = topics['imu'], topics['odometer']
     n = len(imu['stamp'])
     return {'imu': ImuSamples(imu['stamp'], imu['arrival'], imu['w'], imu['f'], np.zeros((n, 4)),

@@ -47,7 +47,6 @@ def chunks_of(data):
 
 @pytest.fixture(scope='module', params=['none', 'storage'])
 def mcap(request, tmp_path_factory):
-    """Return an mcap bag of several chunks."""
     return ros_bags.write(tmp_path_factory.mktemp('mcap') / 'bag', ros_bags.drive(40.0), 'mcap',
                           request.param)
 

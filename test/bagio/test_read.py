@@ -46,18 +46,15 @@ def contents(bag, slots=None):
 
 
 def same(found, wanted):
-    """Tell whether two contents are equal, bit for bit."""
     return found.keys() == wanted.keys() and all(
         found[k].tobytes() == wanted[k].tobytes() for k in wanted)
 
 
 def texts(bag):
-    """Return the notes as text."""
     return [note if isinstance(note, str) else note.text for note in bag.notes]
 
 
 def read(path):
-    """Return contents and notes of a bag."""
     with open_bag(path) as bag:
         return contents(bag), bag.notes
 
@@ -70,7 +67,6 @@ def plain(tmp_path_factory):
 
 @pytest.fixture(scope='session')
 def wanted(plain):
-    """Return its contents."""
     return read(plain)[0]
 
 

@@ -128,7 +128,6 @@ def test_a_level_that_was_drawn_anew_is_no_disagreement():
 
 
 def weekly(scales):
-    """Return legs a week apart."""
     week = 7 * 86_400 * 10**9
     return [replace(leg(method(scale=scale)), start_ns=k * week, stop_ns=k * week + 900)
             for k, scale in enumerate(scales)]

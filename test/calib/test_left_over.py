@@ -24,7 +24,6 @@ SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
 @cached
 def fitted(**options):
-    """Return a drive, its leg, problem and fit."""
     drive, config, leg = made(**(SHORT | options))
     problem = problem_of(leg, config)
     return drive, config, leg, problem, best_fit(problem, config)

@@ -59,7 +59,6 @@ class Toy:
                       free.T @ (b - B @ about), np.zeros(len(NAMES)), PRIOR, PRIOR)
 
     def borders(self):
-        """Return the borders of all legs."""
         return [self.border(j) for j in range(len(self.A))]
 
     def batch(self, steps=STEPS, own=()):
@@ -101,7 +100,6 @@ def of(borders, steps=STEPS, usual=None):
 
 
 def apart(a, b, covariance):
-    """Return by how many sigmas two values differ at most."""
     return np.abs((a - b) / np.sqrt(np.diag(covariance))).max()
 
 

@@ -64,7 +64,6 @@ SIDEWAYS = [(2, 0, 0), (0, 1.5, 0), (0, 0, 2), (-1, 0, 0), (0, -1, 0), (0, 0, -1
 
 
 def value(found, name):
-    """Return value and sigma of a constant."""
     i = found.names.index(name)
     return found.value[i], np.sqrt(found.covariance[i, i])
 

@@ -32,7 +32,6 @@ SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
 @cached
 def result(**options):
-    """Return the smoother's result of a short town drive."""
     drive, config, leg = made(**(SHORT | options))
     return drive, smooth(leg, config)
 

@@ -37,7 +37,6 @@ def calibrated(how='floor', rate=10.0, step=KMH, between=0.0, **options):
 
 
 def error(drive, method):
-    """Return the error of the scale and its sigma, relative."""
     found = method.estimates['scale_factor']
     return found.value / drive.truth.scale - 1, found.sigma / drive.truth.scale
 

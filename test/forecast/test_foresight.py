@@ -282,7 +282,6 @@ def watched(drive, config, worker, log):
 
 
 def finished(worker):
-    """Wait for all the jobs so far."""
     done = []
     worker.submit(lambda: None, lambda *_: done.append(True))
     deadline = time.monotonic() + 20.0

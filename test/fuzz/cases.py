@@ -67,7 +67,6 @@ class Bases:
     options: list
 
     def bag(self, name: str) -> Path:
-        """Return a clean bag."""
         return self.folder / name / ('bag.bag' if name == 'rosbag1' else 'bag')
 
 

@@ -53,7 +53,6 @@ class Outcome:
 
 @cache
 def drive_of(number):
-    """Simulate one of a few short drives."""
     return simulate(SimOptions(
         scenario='town', duration=240.0, seed=number + 1, imu_rate=25.0, odometer_rate=10.0,
         fix_rate=4.0, imu_grade='industrial', slope=0.03, sway=0.02, slip_walk=0.005,
@@ -116,7 +115,6 @@ def burst(rng, rows):
 
 
 def stuck(rng, rows):
-    """Repeat the values of a message, with stamps that go on."""
     kind = rng.choice(list(rows))
     which = some(rng, rows, kind)
     first = rows[kind][which][0][1]
@@ -126,7 +124,6 @@ def stuck(rng, rows):
 
 
 def missing(rng, rows):
-    """Lose messages."""
     kind = rng.choice(list(rows))
     del rows[kind][some(rng, rows, kind)]
     return semantic.SAME
@@ -213,7 +210,6 @@ def _no_other(_raw):
 
 
 def leg(seed, number):
-    """Return the outcome of a leg."""
     rng = random.Random(f'{seed}:{number}')
     drive = drive_of(number % DRIVES)
     rows, config, done, truth = rows_of(drive), settings_of(drive), [], semantic.SAME

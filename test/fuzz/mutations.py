@@ -114,7 +114,6 @@ def records_of(data, at=0):
 
 
 def joined(records):
-    """Return records as they stand in a file."""
     return b''.join(struct.pack('<BQ', op, len(body)) + body for op, body in records)
 
 
@@ -350,7 +349,6 @@ def ros1_records(data, at=0):
 
 
 def ros1_joined(records):
-    """Return records as they stand in a file."""
     return b''.join(struct.pack('<I', len(part)) + part for record in records for part in record)
 
 

@@ -57,7 +57,6 @@ def put_all(rows, kind, fields, change, which=slice(None)):
 
 
 def odometer_of(rows):
-    """Return type and field of the odometer."""
     kind = COUNTER if COUNTER in rows else JOINTS
     return kind, ['data'] if kind == COUNTER else ['position[0]']
 

@@ -41,7 +41,6 @@ def read(path):
 
 
 def both(path, monkeypatch):
-    """Return what it gives by columns, and one by one."""
     by_columns = read(path)
     with monkeypatch.context() as patch:
         patch.setattr(McapFile, 'batches', lambda *_: None)

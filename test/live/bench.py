@@ -46,7 +46,6 @@ class NodeProcess:
 
     @property
     def text(self) -> str:
-        """Return all it has printed."""
         return '\n'.join(self.lines)
 
     def end(self, how: int = signal.SIGINT) -> int:
@@ -185,7 +184,6 @@ class Client:
         return wait_for(begun, 'a leg that starts')
 
     def get(self, *names: str) -> list:
-        """Return values of parameters."""
         from rcl_interfaces.srv import GetParameters
         from rclpy.parameter import parameter_value_to_python
         answer = answer_of(self.send(GetParameters, 'get_parameters',
@@ -204,7 +202,6 @@ class Client:
         return result
 
     def close(self) -> None:
-        """End the client."""
         self.executor.shutdown()
         self._thread.join(PATIENCE)
         self.node.destroy_node()

@@ -84,7 +84,6 @@ class Player:
         return player
 
     def matched(self) -> bool:
-        """Return whether every topic has a subscriber."""
         return all(p.get_subscription_count() for p in self.publishers.values())
 
     @contextlib.contextmanager

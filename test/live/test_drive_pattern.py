@@ -61,12 +61,10 @@ class Robot:
         self._publisher.publish(message)
 
     def bump(self, pressed: bool) -> None:
-        """Press the bumper, or let it go."""
         wait_for(self._bumper.get_subscription_count, 'the node at the bumper')
         self._bumper.publish(Bool(data=pressed))
 
     def close(self) -> None:
-        """End the thread."""
         self._over.set()
         self._thread.join()
 

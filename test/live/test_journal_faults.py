@@ -22,7 +22,6 @@ CHUNKS = 6
 
 
 def journal(root):
-    """Return the journal of a leg, not begun."""
     return LegJournal(Plan(1, root, NAME, 'a: 1\n', 10**9),
                       {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
 

@@ -81,12 +81,10 @@ def test_the_oldest_journals_go_first_and_nothing_else(tmp_path):
 
 
 def chunk(k, size=100_000):
-    """Return a chunk that does not compress."""
     return pack(1, [k * SECOND], [os.urandom(size)])
 
 
 def leg(root, limit, leg_id=1):
-    """Return the journal of a leg, not begun."""
     return LegJournal(Plan(leg_id, root, f'leg_{leg_id}', '', limit),
                       {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
 

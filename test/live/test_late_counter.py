@@ -55,7 +55,6 @@ def messages(drive, begin_ns):
 
 
 def play(player, sent, begin_ns, first_s, last_s):
-    """Publish each message at its time on the wall clock."""
     for one in sent:
         if first_s <= (one.stamp_ns - begin_ns) * 1e-9 < last_s:
             time.sleep(max(0.0, (one.stamp_ns - time.time_ns()) * 1e-9))

@@ -22,7 +22,6 @@ SETTINGS = {'odometer.left': 'left', 'odometer.right': 'right', 'leg.preroll': 2
 
 @pytest.fixture(scope='module', params=[True, False], ids=['imu', 'no imu'])
 def drive(request):
-    """Simulate a robot with and without an IMU that drives a square both ways."""
     return simulate(SimOptions(scenario='square', odometer='angle', imu_rate=50.0,
                                imu=request.param))
 

@@ -34,7 +34,6 @@ RESULTS = ([f'result.{name}{end}' for name in ESTIMATES + OF_TWO_WHEELS for end 
 
 @pytest.fixture(scope='module')
 def drive():
-    """Simulate a straight drive."""
     simulated = straight(heading=HEADING)
     types, sent = messages_of(simulated)
     heading = simulated.truth.heading
@@ -64,7 +63,6 @@ def session(drive, tmp_path_factory):
 
 
 def _early(seen, client):
-    """Call everything before there is anything."""
     seen.waiting = client.until(state='waiting')
     seen.early = {name: client.call(name) for name in
                   ('start_leg', 'stop_leg', 'cancel_leg', 'undo_leg', 'save', 'reset')}

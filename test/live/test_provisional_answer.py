@@ -93,7 +93,6 @@ def _without_estimate(found, client, player, sent, gate):
 
 
 def _answered(client, player=None, sent=(), first_s=0.0, last_s=0.0):
-    """Return the answer of ~/stop_leg and the seconds that it took."""
     begin, asked = time.monotonic(), client.ask('stop_leg')
     if player:
         player.play(part(sent, first_s, last_s), SPEED)

@@ -44,7 +44,6 @@ def leg(driven, clients, between=lambda: None):
 
 
 def true(content):
-    """Return whether a calibration is one of the drive."""
     scale = content['result']['scale_factor']
     return abs(scale['value'] - SCALE) < 5 * scale['sigma']
 

@@ -24,7 +24,6 @@ SLOW = ('import odocal_ros.output.files as f\n'
 
 @pytest.fixture(scope='module')
 def sent():
-    """Return types and messages of a drive."""
     return messages_of(simulate(SimOptions(
         scenario='straight', duration=180.0, imu_rate=25.0, odometer_rate=11.0, fix_noise='rtk',
         odometer='speed', heading=0.7)))

@@ -23,7 +23,6 @@ HALF = 0.5 ** 0.5
 
 
 def transforms(t_ns, place, child, frame):
-    """Return messages of /tf."""
     return [Sent(int(t), 'fix', make.cdr(make.kind(TF)(transforms=[
         make.transform(int(t), p, child, frame)]))) for t, p in zip(t_ns, place, strict=True)]
 
@@ -37,7 +36,6 @@ def fixed(child, frame):
 
 @pytest.fixture(scope='module')
 def drive():
-    """Simulate two minutes of town."""
     return simulate(SimOptions(scenario='town', duration=200.0, imu_rate=50.0, odometer_rate=25.0,
                                odometer='speed', fix_noise='rtk', reference='pose', seed=4))
 

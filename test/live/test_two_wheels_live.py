@@ -20,7 +20,6 @@ REST_S = 30.0            # of the drive played before the mark
 
 @pytest.fixture(scope='module')
 def drive():
-    """Simulate some minutes of town with two wheels that differ by 0.4 %."""
     return simulate(SimOptions(
         scenario='town', duration=240.0, imu_rate=50.0, odometer_rate=25.0, fix_noise='rtk',
         imu_grade='tactical', odometer='angle', two_wheels=True, heading=0.7, seed=4))
@@ -28,7 +27,6 @@ def drive():
 
 @pytest.fixture(scope='module')
 def session(drive, tmp_path_factory):
-    """Drive one leg; keep what the node said."""
     folder = tmp_path_factory.mktemp('two')
     # no setting says which joints are the wheels: their names do
     wheels = {'left_steering': drive.odometer_right, 'right_steering': drive.odometer,

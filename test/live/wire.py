@@ -50,7 +50,6 @@ class Wire:
         wait_for(self._player.matched, 'subscriptions')
 
     def close(self) -> int:
-        """End the node and return its exit code."""
         code = self.node.end()
         self._client.close()
         return code

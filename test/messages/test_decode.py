@@ -39,7 +39,6 @@ def read(slot, messages, settings_=None, received=None):
 
 
 def one(slot, messages, settings_=None):
-    """Return the only block and the form."""
     pairs, reader = read(slot, messages, settings_)
     assert [s for s, _ in pairs] == [slot]
     return pairs[0][1], reader.form

@@ -27,13 +27,11 @@ T_MAP, T_ODOM = np.arange(40) / 5, np.arange(0.003, 7.9, 0.02)
 
 
 def corrections(t):
-    """Return translation and rotation of odom in map."""
     return (np.stack([0.1 * t, np.sin(t), 0 * t], -1),
             Rotation.from_euler('ZY', np.stack([0.5 + 0.1 * (t > 4), 0.01 * t], -1)))
 
 
 def driven(t):
-    """Return translation and rotation of base_link in odom."""
     return (np.stack([2 * np.cos(0.8 * t), 2 * np.sin(0.8 * t), 0.02 * t], -1),
             Rotation.from_euler('ZX', np.stack([0.8 * t + np.pi / 2, 0.05 * np.sin(t)], -1)))
 

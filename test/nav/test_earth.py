@@ -21,7 +21,6 @@ HEIGHTS = [-400, 0, 50, 9000, 100e3]
 
 
 def grid():
-    """Return latitude, longitude (rad), height of all combinations."""
     lat, lon, h = np.meshgrid(LATITUDES_DEG, LONGITUDES_DEG, HEIGHTS)
     return np.deg2rad(lat.ravel()), np.deg2rad(lon.ravel()), h.ravel().astype(float)
 

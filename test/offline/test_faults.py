@@ -20,7 +20,6 @@ from odocal_ros.sim.scenarios import simulate
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
-    """Return a bag of a short drive."""
     made = simulate(SimOptions(scenario='town', duration=140.0, imu_rate=50.0))
     return write_bag(tmp_path_factory.mktemp('bag') / 'bag', drive_topics(made))
 

@@ -32,7 +32,6 @@ STEERING = 'builtin_interfaces/Time stamp\nfloat32 steering_tire_angle\n'
 
 @cache
 def types():
-    """Return a store with the types of a vehicle."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in (('mycar_msgs/msg/Motor', MOTOR), ('mycar_msgs/msg/Encoders', ENCODERS),
                        ('autoware_vehicle_msgs/msg/VelocityReport', VELOCITY),
@@ -91,7 +90,6 @@ def inspected(path, capsys, *options):
 
 
 def replayed(command, folder):
-    """Run a suggested command as pasted; return calibration.json."""
     assert main([*shlex.split(command)[1:], '--output', str(folder), '--set',
                  'verdict.max_yaw_sigma=0.1', '--set', 'output.formats=[params]']) in (0, 1)
     return json.loads((folder / 'calibration.json').read_text())

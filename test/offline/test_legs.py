@@ -93,12 +93,10 @@ def recorded(drive):
 
 @pytest.fixture(scope='module')
 def out_and_back():
-    """Simulate a drive with a stop at the far end, an intermediate one."""
     return simulate(SimOptions(scenario='out_and_back', imu_rate=50.0, odometer_rate=20.0))
 
 
 def moving(drive, stamp):
-    """Tell whether the odometer counts within half a second of a stamp."""
     near = np.abs(drive.odometer.stamp_ns - stamp) < S // 2
     return np.ptp(drive.odometer.value[near]) > 2
 

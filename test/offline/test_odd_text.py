@@ -32,7 +32,6 @@ TEXTS = [
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
-    """Return a bag of ten seconds."""
     return ros_bags.write(tmp_path_factory.mktemp('odd') / 'bag', ros_bags.drive())
 
 

@@ -29,7 +29,6 @@ NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
 
 def asked(capsys, *argv):
-    """Return the JSON of a plan."""
     assert main(['plan', *argv, '--json']) == 0
     out, err = capsys.readouterr()
     assert err == ''
@@ -37,7 +36,6 @@ def asked(capsys, *argv):
 
 
 def refused(capsys, *argv):
-    """Return the one line that refuses a plan."""
     assert main(['plan', *argv]) == 2
     out, err = capsys.readouterr()
     assert out == ''

@@ -118,7 +118,6 @@ def test_bags_of_one_name_are_named_by_their_paths(bags, tmp_path, capsys):
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
-    """Write a short drive."""
     return write_bag(tmp_path_factory.mktemp('force') / 'drive', drive_topics(simulate(SimOptions(
         scenario='straight', duration=180.0, imu_rate=20.0, odometer_rate=10.0))))
 
@@ -127,8 +126,6 @@ CREATED = '2026-01-02T03:04:05+00:00'
 
 
 class Args:
-    """Options of a command line."""
-
     force, json, quiet, holdout = True, False, False, False
 
 

@@ -27,7 +27,6 @@ def load(path):
 
 
 def again(options):
-    """Return the drive that the options in truth.yaml make."""
     return simulate(SimOptions(**{k: tuple(v) if isinstance(v, list) else v
                                   for k, v in options.items()}))
 

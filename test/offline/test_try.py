@@ -49,8 +49,6 @@ def asked(monkeypatch):
 
 
 class Terminal(io.StringIO):
-    """What a person types."""
-
     def isatty(self):
         return True
 

@@ -55,7 +55,6 @@ def as_rcl_reads(path, node, names):
 
 
 def same(a, b):
-    """Return True for equal values of equal types; NaN equals NaN."""
     if isinstance(a, list):
         return type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
     return type(a) is type(b) and (a == b or (a != a and b != b))

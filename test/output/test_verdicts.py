@@ -23,7 +23,6 @@ FAR = Reason(Code.SCALE_FAR_FROM_NOMINAL, 'far off')
 
 
 def later(leg, hours, **changes):
-    """Return a leg driven hours later."""
     shift = hours * 3600 * 10**9
     return replace(leg, start_ns=leg.start_ns + shift, stop_ns=leg.stop_ns + shift, **changes)
 

@@ -33,7 +33,6 @@ PLACE = 1e-6     # rad: fixes of 1.5 m say where north and level of a standstill
 
 
 def settings(**changes):
-    """Return settings; a keyword alignment__heading is alignment.heading."""
     return with_settings(Config(), {k.replace('__', '.'): v for k, v in changes.items()})
 
 

@@ -50,7 +50,6 @@ def without_covariance(made):
 
 
 def estimates(leg, config):
-    """Return the estimates of the smoother."""
     return calibrate(leg, config).methods['smoother'].estimates
 
 

@@ -39,7 +39,6 @@ def result(made):
 
 
 def off(estimate, truth):
-    """Return an error in sigmas."""
     return abs(estimate.value - truth) / estimate.sigma
 
 

@@ -47,7 +47,6 @@ def received(sigma, tunnel, scale=0.02, stop=(0, 0)):
 
 
 def stated(sigma):
-    """Return the stated sigma of each fix, m."""
     return np.full(len(at_s), sigma)
 
 

@@ -103,7 +103,6 @@ def shaken(size, step=0.0):
 
 
 def words(*signals, imu=None):
-    """Return the sentences of what is found."""
     reasons = saturated(T, *signals, imu or ImuConfig())
     assert {reason.code for reason in reasons} <= {Code.IMU_SATURATED}
     return [reason.text for reason in reasons]

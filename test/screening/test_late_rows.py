@@ -34,7 +34,6 @@ def spun(made, samples):
 
 
 def screened(made, odometer, **more):
-    """Return inputs and reasons of the drive with other odometer rows."""
     return screen(replace(made.leg(), odometer=odometer, **more), settings(made))
 
 

@@ -21,7 +21,6 @@ BLOCK = '/**/calibrator:\n  ros__parameters:\n'
 
 @pytest.fixture
 def write(tmp_path):
-    """Return a function that writes a parameter file."""
     def file(text):
         path = tmp_path / 'params.yaml'
         path.write_text(text, encoding='utf-8')
