@@ -16,6 +16,7 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 from odocal_ros.sim.truth import settings as true_settings
 
+ANGLES = ('yaw_mounting_angle', 'pitch_mounting_angle')
 LOW_RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0}
 STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'imu_grade': 'tactical', 'seed': 5}
 TOWN = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'industrial', 'seed': 4}
@@ -112,6 +113,17 @@ def errors_in_sigmas(result, truth):
     true = {'scale_factor': truth.scale, 'yaw_mounting_angle': truth.yaw,
             'pitch_mounting_angle': truth.pitch}
     return {k: (e[k].value - v) / e[k].sigma for k, v in true.items() if e[k].value is not None}
+
+
+def off(found, made, *names):
+    """Return the largest error over sigma of the estimates named, of the scale if none is."""
+    truth, estimates = made.truth, getattr(found, 'estimates', found)
+    true = {'scale_factor': truth.scale, 'yaw_mounting_angle': truth.yaw,
+            'pitch_mounting_angle': truth.pitch, 'track_width': made.options.track_width,
+            **{f'scale_factor_{side}': scale for side, scale in zip(
+                ('left', 'right'), truth.wheel_scales or (), strict=False)}}
+    return np.max([abs(estimates[name].value - true[name]) / estimates[name].sigma
+                   for name in names or ('scale_factor',)])
 
 
 def rejecting(result):

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import cached, drive, everything_said, settings
+from drives import cached, drive, everything_said, off, settings
 import numpy as np
 import pytest
 
@@ -100,10 +100,7 @@ def test_ten_minutes_by_a_gyro_alone_are_solved(seed):
     config = settings(made, heading_sigma=None, method='smoother', imu__grade='consumer')
     method = calibrate(without_force(made), config).methods['smoother']
     assert Code.NOT_CONVERGED not in {r.code for r in method.reasons}
-    for name, true in zip(('scale_factor', 'scale_factor_left', 'scale_factor_right'),
-                          (made.truth.scale, *made.truth.wheel_scales), strict=True):
-        e = method.estimates[name]
-        assert abs(e.value - true) < 3 * e.sigma
+    assert off(method, made, 'scale_factor', 'scale_factor_left', 'scale_factor_right') < 3
 
 
 def test_a_heading_from_outside_gives_the_yaw_all_the_same():
@@ -127,8 +124,7 @@ def test_a_leg_without_force_tells_another_no_angle():
             assert both[name].sigma > 0.5 * alone[name].sigma
     found = combine([first, without], config)
     assert all(found.estimates[name].value is None for name in ANGLES)
-    scale = found.estimates['scale_factor']
-    assert abs(scale.value - one.truth.scale) < 3 * scale.sigma
+    assert off(found, one) < 3
     assert not any('housing' in name for name in found.methods['smoother'].details['beside'])
 
 

@@ -6,7 +6,7 @@
 from dataclasses import replace
 import re
 
-from drives import configured, settings
+from drives import ANGLES, configured, off, settings
 import numpy as np
 import pytest
 from smoother_legs import leg_of, made
@@ -47,8 +47,7 @@ def test_of_slow_fixes_an_error_too_small_to_be_told_is_held_too():
     drive, config, leg = made(scenario='town', duration=200.0, imu_grade='consumer',
                               fix_noise='correlated', accel_scale_error=grade / 4, seed=4)
     result = smooth(leg, with_settings(config, {'imu.accel_scale_sigma': np.nan}))
-    scale = result.estimates['scale_factor']
-    assert abs(scale.value - drive.truth.scale) < 3.0 * scale.sigma
+    assert off(result, drive) < 3.0
     for axis in 'xy':       # by a size that both share, and a third axis that no drive tells
         found = result.details[f'accelerometer_scale_{axis}']
         assert abs(found['value'] - grade / 4) < 3.0 * found['sigma']
@@ -79,11 +78,9 @@ def test_a_body_that_sways_on_a_flat_path_does_not_change_the_scale(hertz):
 def test_the_sigma_of_the_scale_holds_it(noise):
     drive, config, leg = made(**TOWN, fix_noise=noise, accel_scale_error=GRADE, seed=4)
     graded = with_settings(config, {'imu.accel_scale_sigma': np.nan})     # that of its grade
-    scale = smooth(leg, graded).estimates['scale_factor']
-    assert abs(scale.value - drive.truth.scale) < 3.0 * scale.sigma       # 1 in 370
+    assert off(smooth(leg, graded), drive) < 3.0       # 1 in 370
     # of an IMU said to have none, the error is many sigmas: what this is for
-    wrong = smooth(leg, config).estimates['scale_factor']
-    assert abs(wrong.value - drive.truth.scale) > 4.0 * wrong.sigma
+    assert off(smooth(leg, config), drive) > 4.0
 
 
 SKEW = np.deg2rad(0.5)
@@ -107,10 +104,7 @@ def test_angles_are_those_of_the_axes_that_the_imu_measures_in():
         beside = found.details['beside'][f'{name}_mounting_angle_housing_sigma']['value']
         assert abs(e.value - housing) < 3.0 * beside
     # a fit that knows of no such axes is wrong: what this is for
-    blind = smooth(leg, config).estimates
-    assert max(abs(e.value - true) / e.sigma for e, true in (
-        (blind['yaw_mounting_angle'], truth.yaw),
-        (blind['pitch_mounting_angle'], truth.pitch))) > 5.0
+    assert off(smooth(leg, config), drive, *ANGLES) > 5.0
 
 
 @pytest.mark.parametrize('skew', [SKEW, 0.0])
@@ -133,8 +127,7 @@ def test_nose_up_the_yaw_holds_what_y_has_of_z_where_axes_are_off(skew):
     assert 0.15 * usual < held < (0.72 if skew else 0.46) * usual
     assert e.sigma > 0.9 * 0.12 * held
     if skew:    # a fit that knows of no such axes is wrong
-        blind = smooth(leg, config).estimates['yaw_mounting_angle']
-        assert abs(blind.value - drive.truth.yaw) > 3.0 * blind.sigma
+        assert off(smooth(leg, config), drive, 'yaw_mounting_angle') > 3.0
 
 
 def test_a_straight_drive_does_not_pull_the_yaw_to_zero():
@@ -144,8 +137,7 @@ def test_a_straight_drive_does_not_pull_the_yaw_to_zero():
     graded = with_settings(config, {'imu.accel_scale_sigma': np.nan,
                                     'imu.misalignment_sigma': np.nan})
     found = smooth(leg, graded)
-    e = found.estimates['yaw_mounting_angle']
-    assert abs(e.value - drive.truth.yaw) < 3.0 * e.sigma
+    assert off(found, drive, 'yaw_mounting_angle') < 3.0
     assert abs(found.details['accelerometer_scale_y']['value']) < 0.005     # nothing tells it
 
 
@@ -215,9 +207,9 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     real = Real(receiver_lag=0.8, speed_law=0.006, stated_factor=0.5)
     drive, config, leg = made(scenario='town', duration=250.0, imu_grade='industrial', seed=4,
                               fix_noise='rtk', real=real, antenna_lever_arm=(0.8, 0.0, 1.0))
-    off = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0)})
+    moved = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0)})
     leg = replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0]))
-    found = smooth(leg, off)
+    found = smooth(leg, moved)
     said = {r.code: r.text for r in found.reasons}
     tau = float(re.search(r'about (.*) s;', said[Code.FIXES_SMOOTHED])[1])
     assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # said to 0.01 s
@@ -227,8 +219,7 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     slope = found.details['beside']['scale_by_speed']
     true = 2 * real.speed_law / 36.0**2 * FAST_SPEED
     assert abs(slope['slope'] - true) < 3.0 * slope['sigma']
-    e = found.estimates['scale_factor']
-    assert abs(e.value - drive.truth.scale) < 3.0 * e.sigma
+    assert off(found, drive) < 3.0
     assert 'warm tyres' in next(r for r in found.reasons if r.code is Code.SCALE_VARIES).remedy
     # and of a vehicle that has none of it nothing
     clean = {r.code for r in smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config).reasons}
@@ -244,20 +235,13 @@ def test_a_scale_that_falls_with_speed_is_not_blamed_on_tyres():
     assert falls.remedy.startswith('Possible causes: truncated speed values')
 
 
-def scale_off(drive, config, leg):
-    """Return the result and the error of its scale, sigmas."""
-    method = smooth(leg, config)
-    scale = method.estimates['scale_factor']
-    return method, (scale.value - drive.truth.scale) / scale.sigma
-
-
 @pytest.mark.parametrize('driven', [True, False])
 def test_tyres_that_slip_one_way_only_leave_the_mean_right(driven):
     """A wheel that does not drive slips under the brake only: half a slope each way is 90 ppm."""
     drive, config, leg = made(**TOWN | {
         'fix_noise': 'rtk', 'fix_sigma': 0.01, 'real': Real(tyre_slip=0.035, driven=driven)})
-    method, off = scale_off(drive, config, leg)
-    assert abs(off) < 3.3
+    method = smooth(leg, config)
+    assert off(method, drive) < 3.3
     assert method.estimates['scale_factor'].sigma / drive.truth.scale < 60e-6
     assert Code.WHEEL_SLIP not in {r.code for r in method.reasons}
 
@@ -267,5 +251,4 @@ def test_a_slow_drive_settles_on_its_metres():
     options, _ = drawn(70_000_024, 'yard', 'consumer', None)
     drive = simulate(options)
     config = configured(drive)
-    method, off = scale_off(drive, config, leg_of(drive.leg(), config))
-    assert abs(off) < 3.3
+    assert off(smooth(leg_of(drive.leg(), config), config), drive) < 3.3

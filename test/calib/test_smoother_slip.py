@@ -6,7 +6,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-from drives import cached, settings
+from drives import cached, off, settings
 import numpy as np
 import pytest
 from reversing_drives import made as by_hand
@@ -46,11 +46,6 @@ def said(method):
     return ' '.join(r.text for r in method.reasons if r.code is Code.WHEEL_SLIP)
 
 
-def off(drive, method):
-    scale = method.estimates['scale_factor']
-    return abs(scale.value - drive.truth.scale) / scale.sigma
-
-
 @pytest.mark.parametrize(('noise', 'begin', 'length', 'share'), [
     ('white', 100.0, 3.0, 0.1), ('white', 100.0, 10.0, 0.05), ('rtk', 60.0, 10.0, 0.1),
     ('rtk', 100.0, 10.0, 0.3)])
@@ -58,7 +53,7 @@ def test_slip_of_seconds_is_said_with_place_and_size(noise, begin, length, share
     drive, config, leg = made(**SHORT, fix_noise=noise)
     leg, pulses = slipping(leg, begin, length, share)
     method = smooth(leg, config)
-    assert off(drive, method) < 3.3
+    assert off(method, drive) < 3.3
     slips = method.details['slips']
     metres = sum(s['metres'] for s in slips if begin - 2.0 <= s['t'] <= begin + length)
     # intervals of a second that slip in part are not all told: nine tenths, and the accelerometer
@@ -72,7 +67,7 @@ def test_slip_of_seconds_is_said_with_place_and_size(noise, begin, length, share
 def test_slip_at_starts_is_said(noise):
     drive, method = fitted(fix_noise=noise, start_slip=0.005)
     assert 'slip while accelerating or braking' in said(method)
-    assert off(drive, method) < 3.3
+    assert off(method, drive) < 3.3
 
 
 @pytest.mark.parametrize('options', [
@@ -100,9 +95,7 @@ def test_aliased_vibration_is_an_error_of_the_imu_and_no_slip(noise):
     assert not said(method)
     assert 'aliasing' in ' '.join(r.remedy for r in method.reasons
                                   if r.code is Code.IMU_WORSE_THAN_GRADE)
-    assert off(drive, method) < 3.3
-    yaw = method.estimates['yaw_mounting_angle']
-    assert abs(yaw.value - drive.truth.yaw) < 3.3 * yaw.sigma
+    assert off(method, drive, 'scale_factor', 'yaw_mounting_angle') < 3.3
 
 
 @pytest.mark.parametrize(('seconds', 'reported'), [(1, False), (2, False), (3, True)])
@@ -164,8 +157,7 @@ def test_a_speed_that_is_held_before_stops_is_no_slip():
     assert not said(method)
     (extra,) = (r.text for r in method.reasons if r.code is Code.TRAVEL_EXCESS)
     assert 'while it brakes to a stop' in extra
-    assert abs(method.estimates['scale_factor'].value - drive.truth.scale) < (
-        3.3 * method.estimates['scale_factor'].sigma)
+    assert off(method, drive) < 3.3
 
 
 def low_passed(leg, seconds):

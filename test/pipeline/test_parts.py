@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import drive, seconds, settings
+from drives import drive, off, seconds, settings
 import numpy as np
 import pytest
 
@@ -79,14 +79,12 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
     assert whole.verdict is Verdict.ACCEPTED
     assert [r.text for r in whole.reasons if r.code is Code.LEG_CUT][0].startswith(
         'leg 1: this section covers 0.0 to 200.0 s')
-    truth = made.truth
-    for name, true in ((SCALE, truth.scale), (YAW, truth.yaw), (PITCH, truth.pitch)):
-        e = whole.estimates[name]
-        assert abs(e.value - true) < 4 * e.sigma, name
+    assert off(whole, made, SCALE, YAW, PITCH) < 4
+    for name in (SCALE, YAW, PITCH):
         # each part has sizes of imperfections of its own; the joint ones lie between them, so that
         # an angle that they dominate may be a hundredth less certain than by the lucky part
-        assert e.sigma < 1.02 * min(one.methods['smoother'].estimates[name].sigma
-                                    for one in results), name
+        assert whole.estimates[name].sigma < 1.02 * min(
+            one.methods['smoother'].estimates[name].sigma for one in results), name
 
 
 def test_where_no_part_carries_the_leg_is_rejected_as_it_is(made):
@@ -145,8 +143,7 @@ def test_a_leg_is_cut_where_a_ferry_carried_the_vehicle():
         assert Code.NO_STANDSTILL not in {r.code for r in one.reasons}
     found = combine(results, config)
     assert found.verdict is not Verdict.REJECTED
-    scale = found.estimates[SCALE]
-    assert abs(scale.value - made.truth.scale) < 3.3 * scale.sigma
+    assert off(found, made) < 3.3
 
 
 def test_a_counter_that_never_counts_again_rejects_the_leg(made):
