@@ -11,15 +11,10 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.wheels.slips import wheel_faults
-from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
-from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.standstill import standstills
-from odocal_ros.nav.strapdown import attitude
-from odocal_ros.pipeline.align import align
 from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code
-from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.screen import screen
 from odocal_ros.screening.wheel_faults import broken_wheels
 
@@ -33,16 +28,8 @@ def prepared(**options):
     """Return the inputs of a drive, its track, latitude and rough scale."""
     made = drive(**options)
     config = settings(made)
-    inputs, _ = screen(made.leg(), config)
-    origin = origin_amid(inputs.t_fix, inputs.geodetic)
-    fixes_n = origin.to_n(inputs.geodetic)
-    rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, 1.5)
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, rough, 2.0)
-    start, _ = align(inputs, spans, rough, fixes_n, origin, config)
-    t = inputs.t_imu
-    epochs = attitude(t[t >= start.t], inputs.w_b[t >= start.t] - start.gyro_bias, start.q_nb,
-                      earth_rate_n(origin.latitude), 1)
-    return inputs, dead_reckon(*epochs, inputs.travel), origin.latitude, rough
+    found, _ = prepare(made.leg(), screen(made.leg(), config)[0], config)
+    return found.inputs, found.track, found.origin.latitude, found.rough
 
 
 def faults(options, left=lambda s: s, right=lambda s: s, swap=False, prepare=prepared, **more):

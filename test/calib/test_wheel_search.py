@@ -19,12 +19,8 @@ from odocal_ros.calib.wheel_search.search import MOST_ROWS, search
 from odocal_ros.calib.wheel_search.space import Ranges, ranges_of, sets_of, Space
 from odocal_ros.calib.wheel_search.surface import fit_surface, minimum_in_box, refine
 from odocal_ros.nav.dead_reckoning import dead_reckon
-from odocal_ros.nav.earth import earth_rate_n
-from odocal_ros.nav.standstill import standstills
-from odocal_ros.nav.strapdown import attitude
-from odocal_ros.pipeline.align import align
+from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code
-from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, WheelsConfig, with_settings
 
@@ -54,18 +50,12 @@ def simulated(heading_error=0.0, **options):
         'alignment.heading_source': 'fixed',
         'alignment.heading': float(made.truth.heading + heading_error)})
     inputs, _ = screen(made.leg(), config)
-    origin = origin_amid(inputs.t_fix, inputs.geodetic)
-    fixes_n = origin.to_n(inputs.geodetic)
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, 2.0)
-    a, _ = align(inputs, spans, scale, fixes_n, origin, config)
-    pick = inputs.t_imu >= a.t - 1e-9
-    t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - a.gyro_bias, a.q_nb,
-                       earth_rate_n(origin.latitude))
-    left, right = (dead_reckon(t, q_nb, s) for s in (inputs.travels[0], inputs.travels[1]))
-    start = fixes_n[inputs.t_fix < 0.0].mean(axis=0)
+    found, _ = prepare(made.leg(), inputs, config)
+    left, right = (dead_reckon(*found.epochs, s) for s in inputs.travels)
+    start = found.fixes_n[inputs.t_fix < 0.0].mean(axis=0)
     lever_v = np.subtract(made.options.antenna_lever_arm, made.options.odometer_lever_arm)
-    return made, planar_leg(left, right, inputs.t_fix, fixes_n, inputs.covariance_n, (0.0, start),
-                            (scale, scale), pitch, lever_v)
+    return made, planar_leg(left, right, inputs.t_fix, found.fixes_n, inputs.covariance_n,
+                            (0.0, start), (scale, scale), pitch, lever_v)
 
 
 def on_a_plane(lanes=8, sigma=0.02, seed=0, length=15.0, k=600):
