@@ -1,11 +1,13 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""ament's own linters, where they are: what a ROS build farm would say."""
+"""ament's own linters, where they are, and the pages as a site: what others make of them."""
 
 from importlib import import_module
 from pathlib import Path
 import shutil
+import subprocess
+import sys
 
 import pytest
 
@@ -46,3 +48,16 @@ def test_xmllint(capsys):
     if 'failed to load' in said.err and 'package_format3' in said.err:
         pytest.skip('NO NETWORK: the schema of package.xml is at download.ros.org')
     assert code == 0, said
+
+
+def test_the_site_builds_without_a_warning(tmp_path):
+    for name in ('sphinx', 'myst_parser', 'furo'):
+        pytest.importorskip(name, reason='no Sphinx here: pip install odocal_ros[docs]')
+    done = subprocess.run(
+        [sys.executable, '-m', 'sphinx', '-W', '-q', '-d', tmp_path / 'doctrees', ROOT / 'docs',
+         tmp_path / 'site'], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    pages = {p.relative_to(ROOT / 'docs').with_suffix('') for p in (ROOT / 'docs').rglob('*.md')}
+    assert pages == {p.relative_to(tmp_path / 'site').with_suffix('') for p in (
+        tmp_path / 'site').rglob('*.html') if p.stem not in ('search', 'genindex', 'py-modindex')}
+    assert 'calibrate_bag' in (tmp_path / 'site' / 'api.html').read_text()

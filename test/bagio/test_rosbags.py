@@ -1,12 +1,15 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What we touch inside of rosbags, which is 0.x: this fails where another version changes it."""
+"""What is touched inside of rosbags, which is 0.x; without it standard types are read."""
 
 from importlib.metadata import version
 import inspect
 import re
+import subprocess
+import sys
 
+from drives import drive
 import pytest
 import ros_bags
 from rosbags import rosbag1
@@ -15,11 +18,17 @@ from rosbags.rosbag2 import storage_mcap
 from test_damage import chunks_of
 
 from odocal_ros.bagio import rosbag1_file, write
+from odocal_ros.bagio.encode import counter, fix, imu
 from odocal_ros.bagio.parts import Part
+from odocal_ros.bagio.write import write_bag
 from odocal_ros.errors import BadBag
 from odocal_ros.outside.limits import Allowance, LimitReached
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import simulate
+
+PROGRAM = ("import sys; sys.modules['rosbags'] = None\n"
+           'from odocal_ros.offline.cli import main\n'
+           'sys.exit(main(sys.argv[1:]))')
 
 
 def test_the_version_is_one_that_was_looked_at():
@@ -93,3 +102,33 @@ def test_the_mcap_writer_takes_our_checksums(tmp_path, compression):
             int.from_bytes(data[at + 33:at + 37], 'little'))
         assert records
         assert data[at + 33:at + 37] != bytes(4)
+
+
+def odocal(folder, *words):
+    """Run the command in a process that cannot import rosbags."""
+    return subprocess.run([sys.executable, '-c', PROGRAM, *words], capture_output=True, text=True,
+                          cwd=folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
+def test_a_bag_of_standard_types_is_calibrated(tmp_path, storage):
+    made = drive(scenario='straight', duration=200.0, fix_noise='rtk')
+    write_bag(tmp_path / 'drive', [imu('/imu/data', made.imu), fix('/fix', made.fix),
+                                   counter('/odometer', made.odometer)], storage=storage)
+    done = odocal(tmp_path, 'replay', 'drive', '--set', 'method=two_point', '--quiet')
+    assert done.returncode in (0, 1), done.stderr
+    assert (tmp_path / 'odocal_drive' / 'calibration.json').exists()
+
+
+@pytest.mark.slow
+def test_what_needs_it_says_so(tmp_path):
+    made = drive(scenario='straight', duration=200.0, fix_noise='rtk')
+    write_bag(tmp_path / 'drive.bag', [imu('/imu/data', made.imu)], storage='rosbag1')
+    for words in (['inspect', 'drive.bag'], [
+            'simulate', '--scenario', 'straight', '--out', 'new']):
+        done = odocal(tmp_path, *words)
+        assert done.returncode == 2, done.stderr
+        assert 'needs the Python package rosbags, which is not installed: pip install rosbags' in (
+            done.stderr)
+        assert done.stderr.count('\n') == 1

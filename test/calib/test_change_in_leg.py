@@ -1,16 +1,19 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scale and mounting that change within a leg: the score test, and what is stated."""
+"""Scale, mounting, counter or bias that change within a leg: found, and what is stated."""
 
 from dataclasses import replace
+import re
 from types import SimpleNamespace
 
-from drives import turned
+from drives import ANGLES, cached, off, turned
 import numpy as np
 import pytest
 from smoother_legs import leg_of, made
 
+from odocal_ros.calib.counter_change import counter_change
+from odocal_ros.calib.sections import Sections
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.chain import Normal, solve
 from odocal_ros.estimator.changes import changes, Step
@@ -21,11 +24,16 @@ from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.result.remarks import _changes, LEAST_CHANGE
 from odocal_ros.estimator.smoother import best_fit
 from odocal_ros.estimator.state import LN_K, PITCH, YAW
-from odocal_ros.reasons import Code
-from odocal_ros.settings.config import with_settings
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code, Verdict
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.sim.scenarios import SimOptions, simulate
 
 DRIVE = {'imu_grade': 'industrial', 'duration': 240.0, 'fix_sigma': 0.3}
 AFTER = 1 / 3       # of the leg, which ends with a standstill
+SENSORS = {'f_b': 'accelerometer', 'w_b': 'gyro'}
+AT = 70.0       # s
+STEPS = {'f_b': (0.06, 0.06, -0.05), 'w_b': (0.001, -0.001, 0.0014)}     # 10 mg, 0.1 deg/s
 
 
 def changed(turn=(0.0, 0.0, 0.0), scale=0.0, **limits):
@@ -150,3 +158,92 @@ def test_a_change_that_does_not_matter_is_not_reported(constant):
     for size, count in ((0.9 * LEAST_CHANGE, 0), (1.1 * LEAST_CHANGE, 1)):
         fit = SimpleNamespace(steps=(Step(constant, 100.0, size, size / 7),))
         assert len(_changes(fit)) == count
+
+
+def found(ratio, sigma=1e-3):
+    """Return what is said of ten sections of 100 m in 10 s each."""
+    edges = np.linspace(0.0, 1000.0, len(ratio) + 1)
+    parts = Sections(edges[:-1], edges[1:], np.array(ratio), np.full(len(ratio), sigma))
+    return counter_change(parts, np.linspace(0.0, 100.0, 101), np.linspace(0.0, 1000.0, 101))
+
+
+@pytest.mark.core
+def test_it_is_found_where_it_is_and_with_its_factor():
+    (reason,) = found([1.4] * 4 + [0.9] + [0.7] * 5)
+    assert reason.code is Code.TRACK_MISMATCH
+    assert '2.00 times as much per metre after t = 40 to 50 s' in reason.text
+    assert '0.50 times' in found([0.7] * 4 + [0.9] + [1.4] * 5)[0].text
+
+
+@pytest.mark.core
+@pytest.mark.parametrize(('ratio', 'sigma'), [
+    ([1.0] * 10, 1e-3), ([1.01] * 5 + [0.99] * 5, 1e-4), ([1.05] * 5 + [0.95] * 5, 0.05),
+    ([1.0] * 4 + [0.7] + [1.0] * 5, 1e-3), (np.linspace(0.9, 1.1, 10), 1e-3),
+    ([1.0] * 5 + [np.nan] * 5, 1e-3)],
+    ids=['constant', 'tyres', 'uncertain', 'slip', 'drift', 'half'])
+def test_what_else_changes_a_scale_is_none(ratio, sigma):
+    assert found(ratio, sigma) == ()
+
+
+@pytest.fixture(scope='module')
+def town():
+    return simulate(SimOptions(scenario='town', duration=240.0, seed=3, imu_rate=50.0,
+                               odometer_rate=25.0, fix_noise='rtk'))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('factor', [1, 2, 4])
+def test_a_driver_that_decodes_each_edge_from_the_middle_of_the_drive_on(town, factor):
+    leg = town.leg()
+    step = np.diff(leg.odometer.value, prepend=leg.odometer.value[:1])
+    late = leg.odometer.stamp_ns > (leg.start_ns + leg.stop_ns) // 2
+    counts = leg.odometer.value[0] + np.cumsum(step * np.where(late, factor, 1))
+    result = calibrate(replace(leg, odometer=replace(leg.odometer, value=counts)),
+                       with_settings(Config(), {'imu.grade': town.options.imu_grade}))
+    said = [r.text for r in result.reasons if f'{factor:.2f} times as much' in r.text]
+    assert len(said) == (factor > 1)
+    assert (result.verdict is Verdict.REJECTED) == (factor > 1)
+
+
+@pytest.mark.parametrize(('size', 'more'), [
+    (1 / 9.80665, 0.0), (0.0, 0.1), (2.0, 0.0), (1.0, [0.0, 9.8, 0.0])])
+def test_an_accelerometer_changes_its_unit_or_range_but_not_in_a_bend_at_one_g(town, size, more):
+    leg = town.leg()
+    force = leg.imu.f_i.copy()
+    late = leg.imu.stamp_ns > (leg.start_ns + 2 * leg.stop_ns) // 3
+    force[late] = force[late] * size + more
+    result = calibrate(replace(leg, imu=replace(leg.imu, f_i=force)), Config())
+    said = [r.text[:9] for r in result.reasons if r.code is Code.IMU_UNITS]
+    assert said == ['from t = '] * (size != 1.0)
+    assert result.verdict is Verdict.REJECTED or size == 1.0
+
+
+@cached
+def calibrated(stepping=None):
+    """Return a drive and its result, with the bias of one sensor stepping at AT."""
+    drive, config, leg = made(duration=200.0, imu_grade='industrial', fix_noise='rtk')
+    if stepping:
+        step = (leg.t_imu > AT)[:, None] * np.array(STEPS[stepping])
+        leg = replace(leg, **{stepping: getattr(leg, stepping) + step})
+    return drive, smooth(leg, config)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('stepping', STEPS)
+def test_a_step_of_a_bias_is_a_step_and_no_noise(stepping):
+    drive, method = calibrated(stepping)
+    _, plain = calibrated()
+    for name in ('scale_factor', *ANGLES):
+        assert off(method, drive, name) < 3.3
+        # one interval without the continuity of the bias, of 200
+        assert method.estimates[name].sigma < 1.3 * plain.estimates[name].sigma
+    said = {r.code: r.text for r in method.reasons}
+    assert not {Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH, Code.WHEEL_SLIP,
+                Code.CHANGE_IN_LEG} & set(said)
+    assert Code.IMU_BIAS_STEP not in {r.code for r in plain.reasons}
+    found = re.fullmatch(f'the {SENSORS[stepping]} bias changes by ([0-9.]+) (deg/s|m/s\\^2) near '
+                         't = ([0-9]+) s; estimated before and after', said[Code.IMU_BIAS_STEP])
+    unit = {'deg/s': np.deg2rad(1.0), 'm/s^2': 1.0}[found[2]]
+    # two digits; a step within an interval of a second
+    assert float(found[1]) * unit == pytest.approx(np.linalg.norm(STEPS[stepping]), rel=0.1)
+    assert abs(float(found[3]) - AT) <= 3

@@ -1,21 +1,35 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The iteration of a fit: sigmas that rise and then fall, steps that turn back."""
+"""The start and the iteration of a fit: parts of long legs, steps that turn back or are cut."""
+
+from dataclasses import dataclass, replace
 
 from drives import configured
 import numpy as np
+from numpy.testing import assert_allclose
 import pytest
+from smoother_legs import made, truth
 
-from odocal_ros.estimator import fit
+from odocal_ros.estimator import fit, smooth
+from odocal_ros.estimator.fit import damped
+from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.start import first_state
+from odocal_ros.nav.rotations import rotvec, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
+from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.draw import drawn
+from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
-pytestmark = pytest.mark.core
+# of a consumer gyro that warms up by 10 K: 0.35 deg/s in all, half of it in the first 5 min
+WARMS = Real(gyro_slope=(4e-4, -6e-4, 5e-4), warm_rise=10.0, warm_time=400.0)
+DRIVE = {'duration': 1860.0, 'imu_rate': 20.0, 'odometer_rate': 10.0, 'imu_grade': 'consumer',
+         'real': WARMS}
 
 
+@pytest.mark.core
 def test_noise_of_rtk_at_one_hz_is_not_taken_for_correlated_errors():
     made, _ = drawn(109_000_002, 'motorway', 'industrial', ('squat', 'sideslip'), duration=300.0,
                     fix_noise='rtk', fix_sigma=0.02)
@@ -30,6 +44,7 @@ def test_noise_of_rtk_at_one_hz_is_not_taken_for_correlated_errors():
     assert Code.FIXES_NOISIER_THAN_SAID not in {reason.code for reason in result.reasons}
 
 
+@pytest.mark.core
 def test_the_first_step_by_fitted_signals_is_not_shortened(monkeypatch):
     """It takes back what noise in the signals made of the steps before, however much."""
     drive = simulate(SimOptions(scenario='town', duration=140.0, imu_rate=20.0, seed=1))
@@ -50,3 +65,81 @@ def test_the_first_step_by_fitted_signals_is_not_shortened(monkeypatch):
     assert first > 1
     assert all(compared for _, compared in passes[1:first])
     assert all(fitted and compared for fitted, compared in passes[first + 1:])
+
+
+@dataclass(frozen=True)
+class Step:
+    """What ``damped`` reads of a solution."""
+
+    step: np.ndarray
+    step_border: np.ndarray
+    reduced: np.ndarray
+    taken: float = 1.0
+
+
+def walked(slope, passes):
+    """Return how far off an iteration is whose steps are ``slope`` times what is left."""
+    off, taken = np.array([1.0, -0.5]), np.zeros(2)
+    for _ in range(passes):
+        step = -slope * off
+        found = damped(Step(step[None, :], step, np.diag([4.0, 1.0])), taken)
+        assert_allclose(found.step[0], found.step_border)
+        taken = found.step_border
+        off = off + taken
+    return float(np.abs(off).max())
+
+
+def test_steps_that_would_oscillate_are_damped_and_others_taken_as_they_are():
+    # a step twice too long turns back on itself whole: half of it leads to the zero
+    assert walked(2.0, 1) == pytest.approx(1.0)
+    assert walked(2.0, 2) < 1e-12
+    assert walked(0.4, 3) == pytest.approx(0.6**3)
+    back = np.array([-2.0, 1.0])
+    assert damped(Step(back[None, :], back, np.eye(2)), -back).taken == pytest.approx(0.5)
+    step = np.array([3.0, -1.0])
+    found = damped(Step(step[None, :], step, np.eye(2)), np.zeros(2))
+    assert np.array_equal(found.step_border, step)
+
+
+def test_at_the_limit_of_passes_the_best_so_far_is_stated_with_a_wider_sigma():
+    drive, config, leg = made(duration=200.0, imu_grade='consumer', fix_noise='white')
+    whole = smooth(leg, config)
+    few = smooth(leg, with_settings(config, {'leg.compute_limit': 5}))
+    assert few.details['iterations'] == 5
+    said = {r.code: r.text for r in few.reasons}
+    assert 'after 5 iterations the estimates still changed' in said[Code.MODEL_MISMATCH]
+    a, b = (m.estimates['scale_factor'] for m in (whole, few))
+    assert b.sigma > 1.5 * a.sigma
+    assert abs(b.value - drive.truth.scale) < 4 * b.sigma
+
+
+def errors(leg, drive, config):
+    """Return the angles between the first attitudes and the true ones, rad, and the start."""
+    problem = problem_of(leg, config)
+    start = first_state(leg, problem.imu, problem.priors)
+    true = truth(drive, config, leg)
+    assert (start.state.t == true.t).all()
+    C = transpose(true.C_nb) @ start.state.C_nb
+    return np.linalg.norm(rotvec(C), axis=1), start, problem
+
+
+def test_a_gyro_that_warms_up_is_level_in_each_part():
+    drive, config, leg = made(**DRIVE)
+    angle, start, problem = errors(leg, drive, config)
+    # the bias changes by 2 mrad/s in the first part; a level that swings by it over minutes
+    assert np.percentile(angle, 90) < 0.3
+    assert np.log(start.state.scale / drive.truth.scale) == pytest.approx(0.0, abs=0.02)
+    assert len(np.unique(start.state.gyro_bias, axis=0)) == 3
+
+
+@pytest.mark.parametrize('gap', [(-20.0, 605.0), (595.0, 1225.0), (1215.0, 1850.0)])
+def test_a_part_without_fixes_is_joined_with_its_neighbour(gap):
+    drive, config, leg = made(**DRIVE)
+    seen = (leg.t_fix < gap[0]) | (leg.t_fix > gap[1])
+    sparse = replace(leg, t_fix=leg.t_fix[seen], fixes_n=leg.fixes_n[seen],
+                     covariance_n=leg.covariance_n[seen])
+    problem = problem_of(sparse, config)
+    start = first_state(sparse, problem.imu, problem.priors)
+    assert (start.state.t == problem.imu.t[problem.imu.key]).all()
+    assert len(np.unique(start.state.gyro_bias, axis=0)) == 2
+    assert np.log(start.state.scale / drive.truth.scale) == pytest.approx(0.0, abs=0.05)

@@ -1,10 +1,11 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Equations of the smoother: true at the truth."""
+"""Equations of the smoother: true at the truth; a bus that kneels has the result of another."""
 
 from dataclasses import replace
 
+from drives import ANGLES, configured, off
 import numpy as np
 import pytest
 from smoother_legs import made, truth
@@ -13,11 +14,21 @@ from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import Equations, sums as preintegrated
 from odocal_ros.estimator.factors.axle import Axle, WALK_SPEED
 from odocal_ros.estimator.factors.motion import D, HILL_INTERVALS, Motion, slowly
+from odocal_ros.estimator.factors.point_rows import TAIL_SIGMAS
+from odocal_ros.estimator.factors.rests import STILL_TURN
 from odocal_ros.estimator.prepare import problem_of
+from odocal_ros.estimator.state import M, PHI, WITH_SLOW
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose, turn
+from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.reasons import Code
+from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
+from odocal_ros.sim.scenarios import simulate
 from odocal_ros.sim.wheels import G
+
+BUS = SimOptions(scenario='town', duration=250.0, imu_grade='industrial', imu_rate=50.0,
+                 fix_noise='rtk')
 
 
 def at_truth(t_stop=None, **options):
@@ -232,3 +243,37 @@ def test_the_scale_is_that_of_the_path_wherever_the_body_points():
     length, other = (np.einsum('ki,ki->k', x.rolled, ahead)[hard] for x in (level, leaning))
     # with the square of the lean it would be (0.05)^2 / 2 = 1e-3 shorter
     np.testing.assert_allclose(other, length, rtol=1e-5)
+
+
+def result(kneeling):
+    """Return the calibration of a drive, and the drive."""
+    drive = simulate(replace(BUS, real=Real(kneeling=kneeling)))
+    config = configured(drive)
+    return combine([calibrate(drive.leg(), config)], config), drive
+
+
+@pytest.mark.core
+def test_a_bus_that_kneels_has_the_sigmas_of_one_that_does_not():
+    (kneels, bus), (stands, _) = (result(np.radians(x)) for x in (2.0, 0.0))
+    # white noise of the IMU and the standstills that are left without a tilt
+    more = 1.2
+    for name in ('scale_factor', *ANGLES):
+        assert kneels.estimates[name].sigma < more * stands.estimates[name].sigma
+    assert off(kneels, bus) < 4
+    said = {reason.code for reason in kneels.reasons}
+    assert not said & {Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH, Code.LEVER_ARM_OFF}
+
+
+@pytest.mark.core
+def test_a_turn_at_rest_has_the_variance_that_makes_it_an_outlier_of_three_sigmas():
+    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0)
+    problem, state = problem_of(leg, config), truth(drive, config, leg)
+    k = int(np.flatnonzero(problem.still[:-1] & problem.still[1:])[3])
+    step, tilt = np.zeros((len(state.t), WITH_SLOW)), 0.01
+    step[k + 1:, PHI.start] = tilt
+    part = Equations(problem, state.moved(step, np.zeros(M))).parts['rests']
+    T = float(np.diff(state.t)[k])
+    z2 = (tilt / STILL_TURN[0])**2 / T / 3
+    variance = part.turn_variance[k]
+    assert variance == pytest.approx(STILL_TURN**2 * T * z2 / TAIL_SIGMAS**2, rel=1e-3)
+    assert part.turn_variance[k - 1] == pytest.approx(STILL_TURN**2 * np.diff(state.t)[k - 1])

@@ -1,17 +1,22 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The launch files: twins that start the same, with names that the node has."""
+"""Launch files are twins with names that the node has; parameters of its own are refused."""
 
+import math
 from pathlib import Path
 
 from bench import wait_for
 from launch_stand_in import of_python, of_xml
 import pytest
+from rclpy.parameter import Parameter
 import yaml
 
 from odocal_ros.data.inputs import TOPICS
+from odocal_ros.live.params import fixed, refused, RESULTS
 from odocal_ros.messages.sensor_types import FIX, IMU
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.node_configs import ApplyConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON, XML = (ROOT / 'launch' / f'calibrator.launch.{kind}' for kind in ('py', 'xml'))
@@ -92,3 +97,36 @@ def test_it_runs_where_launch_is_installed():
     assert isinstance(scope['generate_launch_description'](), launch.LaunchDescription)
     entity, parser = Parser.load(str(XML))
     assert isinstance(parser.parse_description(entity), launch.LaunchDescription)
+
+
+def values_of(**values):
+    return [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
+
+
+def test_what_is_fixed_at_start_up_is_refused_with_the_way_to_set_it():
+    text = refused(Config(), RESULTS, values_of(odometer__type='std_msgs/msg/Int64'))
+    assert text == ('odometer.type is fixed at start-up: restart the node with '
+                    '"--ros-args -p odometer.type:=VALUE"')
+    assert not refused(Config(), RESULTS, values_of(odometer__type='auto', leg__min_speed=1.0,
+                                             imu__lever_arm=[0.0, 0.0, 0.0]))
+    assert 'imu.lever_arm is fixed' in refused(Config(), RESULTS,
+                                               values_of(imu__lever_arm=[0.0, 0.0, 1.0]))
+
+
+def test_a_result_is_refused_unless_it_is_the_one_in_force():
+    """So ``ros2 param load`` of the file that the node wrote has nothing to refuse."""
+    here = RESULTS | {'result.scale_factor': 0.05}
+    assert not refused(Config(), here, values_of(result__scale_factor=0.05,
+                                          result__yaw_mounting_angle=math.nan))
+    text = refused(Config(), here, values_of(result__scale_factor=0.06))
+    assert 'result.scale_factor is set by the node' in text
+    assert '--params-file calibration.yaml' in text
+
+
+def test_a_node_that_reads_its_settings_at_start_up_refuses_all_of_them():
+    refuse = fixed(ApplyConfig)
+    for values in ({'levelling': False}, {'publish__rate': 5.0}, {'result__valid': True}):
+        answer = refuse(values_of(**values))
+        assert not answer.successful, values
+        assert 'is only read at start-up: restart the node with it' in answer.reason
+    assert refuse(values_of(use_sim_time=True, leg__min_distance=5.0)).successful

@@ -16,7 +16,7 @@ from player import messages_of, part, Player, sent_of, with_clock
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile
-from test_policy import allowed, seen
+from test_shown_names import allowed, seen
 
 from odocal_ros.apply.pose import Pose
 from odocal_ros.bagio import encode

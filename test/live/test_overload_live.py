@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An overloaded machine, a flood of parameters: losses are counted, the node goes on."""
+"""An overloaded machine, a flood of parameters, hostile messages: counted, the node goes on."""
 
 import contextlib
 import os
@@ -12,11 +12,12 @@ import sys
 from types import SimpleNamespace
 
 from bench import given, wait_for
-from kills import NUMBERS, replayed, same_result
+from kills import drive, NUMBERS, replayed, same_result
 from player import ended, messages_of, part, Player, playing_to, recording, stopped, straight
 import pytest
 from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
+from wire import Wire
 
 from odocal_ros.bagio.read import open_bag
 
@@ -25,6 +26,7 @@ SPEED = 15.0
 BEFORE_S, MARK_S, HELD_S, GOES_ON_S, STOP_S, END_S = 45, 60, 80, 90, 115, 117    # of the drive
 FEW = 100      # messages that the queue of the odometer holds
 REQUESTS = 20
+CLEAN, SOME, HALF = 2, 3, 5     # seeds: how much of a round is hostile
 
 
 @contextlib.contextmanager
@@ -121,3 +123,25 @@ def test_a_leg_survives_a_flood_of_parameters_and_a_restart_of_the_sender(start,
     answer = ended(client, player, part(sent, 115, 117), SPEED)
     assert 'scale factor 1.0' in answer.message
     assert node.process.poll() is None
+
+
+@pytest.fixture(scope='module')
+def wire(tmp_path_factory):
+    one = Wire(drive(), tmp_path_factory.mktemp('wire'), 15.0)
+    yield one
+    one.close()
+
+
+def test_a_drive_without_a_hostile_message_is_accepted(wire):
+    """Else the fuzz shows nothing."""
+    seen = wire.round(CLEAN)
+    assert (seen.hostile, seen.wrong) == (0, [])
+    assert seen.accepted
+
+
+@pytest.mark.parametrize('seed', [SOME, HALF])
+def test_the_node_lives_answers_and_accepts_nothing_false(wire, seed):
+    seen = wire.round(seed)
+    assert seen.hostile
+    assert seen.calls >= 2
+    assert seen.wrong == []

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text of any kind in metadata.yaml, journal.yaml, --config, --set and --leg: one sentence."""
+"""Text of any kind in metadata.yaml, journal.yaml and options: one sentence; --export again."""
 
 from contextlib import suppress
 import random
@@ -11,10 +11,12 @@ import pytest
 import ros_bags
 import yaml
 
+from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.library.asked import parse_leg
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config_file import parse_set, read_config_file
+from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 ODD = [None, True, -1, 0, 10**400, 2**63, float('inf'), float('nan'), '', 'text', '\0', [], [[]],
@@ -109,3 +111,14 @@ def test_legs_of_any_text():
 def test_a_sentence_ends_somewhere(capsys):
     _, errors = said(capsys, 'inspect', 'x' * 50_000)
     assert len(errors) < 2200
+
+
+def test_an_option_given_again_adds_its_files(tmp_path):
+    drive = simulate(SimOptions(scenario='straight', duration=200.0, imu_rate=50.0,
+                                odometer_rate=20.0))
+    bag = write_bag(tmp_path / 'drive', drive_topics(drive))
+    main(['replay', str(bag), '--output', str(tmp_path / 'out'), '--quiet', '--set',
+          'output.formats=[params]', '--export',
+          'trajectory.tum,track.kml', '--export', 'trajectory.csv'])
+    for name in ('trajectory.tum', 'track.kml', 'trajectory.csv'):
+        assert (tmp_path / 'out' / name).is_file(), name

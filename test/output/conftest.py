@@ -16,12 +16,22 @@ from odocal_ros.calib.result import (
     Source,
     TrackCheck,
 )
+from odocal_ros.output import ros_files
+from odocal_ros.output.files import as_json
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config, with_settings
 
+CREATED = '2026-01-02T03:04:05+00:00'
 PITCH_LOST = Reason(Code.PITCH_NOT_DETERMINED, 'the heights of the fixes are too inaccurate')
 GAP = Reason(Code.TOPIC_GAP, 'odometer gap of 1.2 s at t = 3.1 s')
 START_NS = 1_533_200_000_500_000_000        # 2018-08-02 08:53:20.5 UTC
 TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])    # Rz(-90 deg)
+
+
+def texts(calibration, **changes):
+    """Return the files for other programs by name; changes of settings as group__name."""
+    config = with_settings(Config(), {k.replace('__', '.'): v for k, v in changes.items()})
+    return ros_files.texts(calibration, config, as_json(calibration, config, [], CREATED))
 
 
 def estimates(unit='m/pulse', scale=0.05, ratio=1.25):

@@ -7,6 +7,7 @@ from dataclasses import replace
 from math import tau
 import re
 
+from conftest import texts
 from drives import drive, settings
 import foreign_keys
 import numpy as np
@@ -14,19 +15,10 @@ import pytest
 import yaml
 
 from odocal_ros.calib.result import Estimate
-from odocal_ros.output import ros_files
-from odocal_ros.output.files import as_json
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.pipeline.combination import combine
-from odocal_ros.settings.config import Config, with_settings
 
-CREATED = '2026-01-02T03:04:05+00:00'
 TWIST, IMU = 'wheel_odometry_covariance.yaml', 'imu_errors.yaml'
-
-
-def texts(calibration, **settings):
-    config = with_settings(Config(), {k.replace('__', '.'): v for k, v in settings.items()})
-    return ros_files.texts(calibration, config, as_json(calibration, config, [], CREATED))
 
 
 def controllers(calibration, **settings):

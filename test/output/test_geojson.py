@@ -8,6 +8,7 @@ from dataclasses import replace
 import io
 import json
 
+from conftest import CREATED
 import numpy as np
 import pytest
 
@@ -16,8 +17,6 @@ from odocal_ros.output.files import as_json
 from odocal_ros.output.geojson import geojson, MOST, TRACK
 from odocal_ros.output.tables import leg_table
 from odocal_ros.settings.config import Config
-
-CREATED = '2026-01-02T03:04:05+00:00'
 
 
 @pytest.fixture

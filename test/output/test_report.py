@@ -12,6 +12,7 @@ import re
 import shutil
 import subprocess
 
+from conftest import CREATED
 import numpy as np
 import pytest
 
@@ -28,7 +29,7 @@ from odocal_ros.output.report import report_html, report_or_why
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.slow
-CREATED, MADE = '2026-01-02T03:04:05+00:00', '2026-01-02 03:04:05 UTC'
+MADE = '2026-01-02 03:04:05 UTC'
 INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
 VOID = {'meta', 'br', 'link', 'img', 'hr', 'input'}
 ALL_ODD = ('fix not used', 'no IMU', 'no odometer', 'fitted to here', 'slip')

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 import re
 
+from conftest import CREATED
 from drives import drive, settings
 import numpy as np
 import pytest
@@ -24,7 +25,6 @@ pytestmark = pytest.mark.core
 ROOT = Path(__file__).resolve().parents[2]
 SCHEMA = json.loads((ROOT / 'config' / 'calibration-1.schema.json').read_text())
 EARLIER = sorted(Path(__file__).parent.glob('calibration_*.json'))
-CREATED = '2026-01-02T03:04:05+00:00'
 INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
 
 

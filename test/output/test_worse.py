@@ -5,14 +5,13 @@
 
 from dataclasses import replace
 
+from conftest import CREATED
 import pytest
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.output.files import write_results
 from odocal_ros.output.stored import is_worse, read_stored, replacing, stored_in
 from odocal_ros.settings.config import Config
-
-CREATED = '2026-01-02T03:04:05+00:00'
 
 
 @pytest.fixture

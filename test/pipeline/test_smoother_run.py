@@ -1,23 +1,30 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The smoother as a member of the pipeline."""
+"""The smoother as a member of the pipeline; limits made for cars do not refuse short runs."""
 
 from dataclasses import replace
 
-from drives import drive, everything_said, seconds, settings, TOWN
+from drives import ANGLES, configured, drive, everything_said, off, seconds, settings, TOWN
 import numpy as np
 import pytest
 
 from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.calib.drive import not_moving
+from odocal_ros.calib.turning import turn_ratio
 from odocal_ros.data.samples import take
 from odocal_ros.estimator.fit import CONVERGENCE
-from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.estimator.leg import drift_time, SmootherLeg
+from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, rough_scale
+from odocal_ros.nav.earth import rate_without_north
+from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.pipeline.smoother_run import _late_path
 from odocal_ros.reasons import Code, Verdict
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 SIGMAS = 4.0     # 1 in 16 000 of a normal error; the seed is fixed
@@ -35,10 +42,7 @@ def held(made):
 
 
 def test_the_result_is_its_own_without_a_heading_and_a_standstill(made, held):
-    found = held.methods['smoother'].estimates
-    for name, true in (('scale_factor', made.truth.scale), ('yaw_mounting_angle', made.truth.yaw),
-                       ('pitch_mounting_angle', made.truth.pitch)):
-        assert abs(found[name].value - true) < SIGMAS * found[name].sigma, name
+    assert off(held.methods['smoother'], made, 'scale_factor', *ANGLES) < SIGMAS
     assert held.methods['two_point'].estimates['yaw_mounting_angle'].value is None
     whole = combine([held], settings(made, **ASKED))
     assert whole.estimates['yaw_mounting_angle'].method == 'smoother'
@@ -50,10 +54,9 @@ def test_fixes_without_altitude_give_all_three(made):
     leg = made.leg()
     flat = replace(leg, fix=replace(leg.fix, height=np.full(len(leg.fix.height), np.nan)))
     found = calibrate(flat, settings(made, **ASKED)).methods['smoother'].estimates
-    for name, true, limit in (('scale_factor', made.truth.scale, 1e-3 * made.truth.scale),
-                              ('yaw_mounting_angle', made.truth.yaw, np.deg2rad(0.25)),
-                              ('pitch_mounting_angle', made.truth.pitch, np.deg2rad(0.25))):
-        assert abs(found[name].value - true) < SIGMAS * found[name].sigma < SIGMAS * limit, name
+    assert off(found, made, 'scale_factor', *ANGLES) < SIGMAS
+    assert found['scale_factor'].sigma < 1e-3 * made.truth.scale
+    assert max(found[name].sigma for name in ANGLES) < np.deg2rad(0.25)
 
 
 def test_heights_stated_far_worse_than_the_level_part_leave_a_result():
@@ -158,3 +161,86 @@ def test_the_path_runs_on_for_the_delay_beyond_the_data():
     path = _late_path(track, np.array([2.0, 0.0, 0.0]), np.zeros(3), -0.3)
     assert path(np.array([0.0, 4.0, 9.9, 10.0]))[:, 0] == pytest.approx([3.0, 43.0, 102.0, 103.0])
     assert path(np.array(12.0))[0] == pytest.approx(103.0), 'no farther than the delay'
+
+
+@pytest.mark.parametrize(('reference', 'limit', 'noise'), [
+    ('mocap', 1e-3, 1e-3), ('total_station', 1e-3, 2e-3), ('slam', 5e-3, None),
+    ('amcl', 1e-2, None)])
+def test_two_minutes_give_radius_ratio_width_and_yaw(reference, limit, noise):
+    """An IMU mounted nose down: with it a wrong derivative made the yaw 5 sigma off."""
+    made = simulate(SimOptions(scenario='indoor', duration=120.0, seed=3, imu_rate=50.0,
+                               reference=reference, pitch=-0.04, roll=0.01))
+    config = with_settings(configured(made), {'odometer.track_width': 0.0,
+                                              'verdict.max_scale_sigma': 0.02})
+    result = calibrate(made.leg(), config)
+    assert not {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW} & {r.code for r in result.reasons}
+    assert all(r.code.gravity is Verdict.ACCEPTED for r in result.reasons), result.reasons
+    smoother = result.methods['smoother']
+    assert smoother.details['iterations'] < 20
+    found = smoother.estimates
+    assert found['scale_factor'].sigma < limit * made.truth.scale
+    if noise:       # of 1200 and more positions, whose level is known to 3 %; none is stated
+        stated = config.in_local_frame().gnss.default_sigma
+        assert smoother.details['noise']['fix'] * stated == pytest.approx(noise, rel=0.1)
+    assert off(found, made, 'scale_factor', 'yaw_mounting_angle', 'track_width',
+               'scale_factor_left', 'scale_factor_right') < 3
+
+
+def test_limits_are_those_of_the_frame_the_smaller_of_both():
+    config = with_settings(Config(), {'leg.min_distance': 50.0, 'reference.min_speed': 5.0})
+    local = config.in_local_frame()
+    assert (local.leg.min_distance, local.leg.min_speed) == (2.0, 2.78)
+    assert local.gnss.default_sigma == 0.05
+    assert config.gnss.default_sigma == 2.5
+
+
+def origin(local):
+    """Return an origin on the equator, of a local frame or not."""
+    return replace(Origin(0.0, 0.0, 0.0), local=rate_without_north(0.7) if local else None)
+
+
+def room(rng):
+    """Return times, fixes and travel of a robot that drives sides of 2 m and turns between."""
+    t = np.arange(0.0, 200.0, 0.1)
+    moves = t % 10.0 < 5.0                      # 0.4 m/s, then 5 s on the spot
+    faces = np.cumsum(np.where(moves, 0.0, 2.0 / 5.0 * (-1.0) ** (t // 30.0))) * 0.1
+    step = 0.04 * moves[:, None] * np.stack([np.cos(faces), np.sin(faces)], -1)
+    fixes = np.cumsum(step, axis=0) + 0.01 * rng.standard_normal((len(t), 2))
+    return t, fixes, np.cumsum(0.04 * moves), faces
+
+
+def test_the_rough_scale_of_a_room_is_that_of_its_straights():
+    t, fixes, way, _ = room(np.random.default_rng(1))
+    travel = Travel(t, way / 1e-4, 1.0)
+    assert rough_scale(travel, t, fixes, 0.01, LOCAL_MOVES) == pytest.approx(1e-4, rel=0.05)
+    assert not not_moving(travel, t, fixes, 0.01, 200.0, LOCAL_MOVES)
+    assert not_moving(travel, t, fixes, 0.01, 200.0, GNSS_MOVES)
+    # a reference that states a metre, and shows a centimetre
+    assert not not_moving(travel, t, fixes, 1.0, 200.0, LOCAL_MOVES)
+
+
+def test_turns_on_the_spot_are_no_turns_of_the_course():
+    t, fixes, _, faces = room(np.random.default_rng(2))
+    rate = np.gradient(faces, t)
+    for unit in (1.0, 57.3):
+        ratio = turn_ratio(t, unit * rate, t, fixes, 0.01, LOCAL_MOVES)
+        assert ratio == pytest.approx(unit, rel=0.1)
+
+
+def test_errors_in_a_local_frame_change_with_the_path_of_the_wheels():
+    t = np.arange(0.0, 11.0)
+    way = np.interp(t, [0.0, 4.0, 6.0, 10.0], [0.0, 0.0, 3.0, 3.0])
+    leg = object.__new__(SmootherLeg)
+    turning = Travel(t, np.interp(t, [0.0, 6.0, 8.0, 10.0], [0.0, 0.0, 1.0, 1.0]), 0.0)
+    for name, value in {'travel': Travel(t, way, 0.0), 'wheels': (Travel(t, way, 0.0), turning),
+                        'origin': origin(True), 'rough_scale': 1.0}.items():
+        object.__setattr__(leg, name, value)
+    # 3 m, then 1 m of one wheel; at rest a hundredth
+    expected = np.where((t[:-1] >= 4) & (t[:-1] < 6), 10 * 1.5 / 4, np.where(
+        (t[:-1] >= 6) & (t[:-1] < 8), 10 * 0.5 / 4, 0.01))
+    assert drift_time(leg, t) == pytest.approx(expected)
+    object.__setattr__(leg, 'rough_scale', 4.0)      # 6 m/s: a car
+    assert (drift_time(leg, t) == 1.0).all()
+    object.__setattr__(leg, 'rough_scale', 1.0)
+    object.__setattr__(leg, 'origin', origin(False))
+    assert (drift_time(leg, t) == 1.0).all()
