@@ -129,7 +129,6 @@ def test_impossible_values_change_no_distance_and_no_standstill(odd, quantity):
     assert found[0][0] == pytest.approx(30.0, abs=0.3)
 
 
-@pytest.mark.core
 def test_with_an_imu_without_accelerometer_only_the_scale_is_observable():
     stamps, rates = np.arange(1, 4) * SECOND, np.zeros((3, 3))
     progress = Progress()

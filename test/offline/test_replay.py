@@ -195,8 +195,6 @@ def test_config_file_then_set_then_default(drive, bag, tmp_path, capsys):
 
 @pytest.mark.parametrize(('argv', 'says'), [
     (['--set', 'leg.min_distanse=3'], 'leg.min_distance'),
-    (['--set', 'leg.min_distance=near'], 'leg.min_distance'),
-    (['--set', 'leg.min_distance=-3'], 'leg.min_distance'),
     (['--config', '/nowhere.yaml'], '/nowhere.yaml'),
     (['--leg', '900000:900001'], 'runs from 0'),
     (['--imu-topic', '/other'], '/other'),

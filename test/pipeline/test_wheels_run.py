@@ -38,10 +38,6 @@ def result(made):
     return calibrate(made.leg(), settings(made))
 
 
-def off(estimate, truth):
-    return abs(estimate.value - truth) / estimate.sigma
-
-
 def test_the_mean_of_both_wheels_is_the_scale_factor(result):
     """Its harmonic one; both sigmas hold the scale's."""
     scale, left, right = (result.methods['smoother'].estimates[name] for name in WHEELS)
@@ -157,7 +153,7 @@ def test_a_slip_of_one_wheel_is_named_once_and_moves_neither_ratio_nor_mean(made
     # of 1300 m half a metre is 380 ppm of the left wheel, 190 of the mean: the sigma is 170 ppm
     # of fixes, and of the ratio some ppm
     scale = after.estimates['scale_factor']
-    assert off(scale, before.estimates['scale_factor'].value) < 0.5
+    assert abs(scale.value - before.estimates['scale_factor'].value) < 0.5 * scale.sigma
     ratio, was = (x.details['wheels']['left']['ratio'] for x in (after, before))
     assert abs(ratio - was) < 4 * after.details['wheels']['left']['ratio_sigma'] < 4e-5
 
@@ -169,8 +165,7 @@ def test_legs_of_two_wheels_combine(made, result):
     for name in WHEELS:
         alone = [leg.methods['smoother'].estimates[name] for leg in legs]
         assert whole.estimates[name].sigma < min(e.sigma for e in alone)
-    for name, true in zip(WHEELS, (made.options.scale, *made.truth.wheel_scales), strict=True):
-        assert off(whole.estimates[name], true) < SIGMAS
+    assert drives.off(whole, made, *WHEELS) < SIGMAS
     alone = [leg.methods['smoother'].estimates['track_width'].value for leg in legs]
     assert min(alone) <= whole.estimates['track_width'].value <= max(alone)
     scale, left, right = (whole.estimates[name].value for name in WHEELS)
