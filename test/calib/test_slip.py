@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 
+from drives import drive, settings
 import numpy as np
 import pytest
 
@@ -13,24 +14,13 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import gravity
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
-LOW = {'imu_rate': 50.0, 'odometer_rate': 20.0}
-
-
-def made(**options):
-    drive = simulate(SimOptions(**LOW | options))
-    return drive, with_settings(Config(), {
-        'method': 'two_point',
-        'odometer.nominal_scale': drive.options.nominal_scale,
-        'imu.grade': drive.options.imu_grade})
 
 
 def result(**options):
-    drive, config = made(**options)
-    return drive, calibrate(drive.leg(), config)
+    made = drive(**options)
+    return made, calibrate(made.leg(), settings(made, None))
 
 
 def slips(leg):
@@ -39,16 +29,16 @@ def slips(leg):
 
 @pytest.mark.parametrize('seed', [1, 2, 5])
 def test_spins_are_named_and_the_sigma_holds_what_they_did(seed):
-    drive, leg = result(scenario='straight', slip_events=30.0, slip_size=1.0, seed=seed)
+    made, leg = result(scenario='straight', slip_events=30.0, slip_size=1.0, seed=seed)
     (reason,) = slips(leg)
     assert 'place' in reason.text
     scale = leg.methods['two_point'].estimates['scale_factor']
-    assert abs(scale.value - drive.truth.scale) < 2 * scale.sigma
+    assert abs(scale.value - made.truth.scale) < 2 * scale.sigma
     slip = next(s for s in leg.methods['two_point'].sources if s.name == 'wheel_slip')
     assert slip.effects.shape[1] == 1       # spins add up rather than average
     assert not slip.shared
     # all spins together: about what they moved the scale by, within the two ends' fix noise
-    off = abs(scale.value / drive.truth.scale - 1)
+    off = abs(scale.value / made.truth.scale - 1)
     assert abs(np.linalg.norm(slip.effects[0]) - off) < 0.5 * off + 1e-4
 
 
@@ -75,8 +65,8 @@ def held_up(leg, seconds, how):
 
 @pytest.mark.parametrize('how', ['late', 'low pass'])
 def test_a_late_or_filtered_odometer_is_named_and_no_slip(how):
-    drive, config = made(scenario='town', odometer='speed', seed=3, duration=300.0)
-    leg = calibrate(held_up(drive.leg(), 0.4, how), config)
+    made = drive(scenario='town', odometer='speed', seed=3, duration=300.0)
+    leg = calibrate(held_up(made.leg(), 0.4, how), settings(made, None))
     assert not slips(leg)
     (text,) = (r.text for r in leg.reasons if r.code is Code.DELAY_SEEN)
     # to the grid of 0.05 s, for a filter to the second order of its time
@@ -86,10 +76,9 @@ def test_a_late_or_filtered_odometer_is_named_and_no_slip(how):
 
 @pytest.mark.parametrize('how', ['late', 'low pass'])
 def test_spins_are_found_of_a_late_or_filtered_odometer(how):
-    drive, config = made(scenario='straight', odometer='speed', slip_events=30.0, slip_size=1.0,
-                         seed=2)
-    (sound,), (reason,) = (slips(calibrate(leg, config)) for leg in (
-        drive.leg(), held_up(drive.leg(), 0.4, how)))
+    made = drive(scenario='straight', odometer='speed', slip_events=30.0, slip_size=1.0, seed=2)
+    (sound,), (reason,) = (slips(calibrate(leg, settings(made, None))) for leg in (
+        made.leg(), held_up(made.leg(), 0.4, how)))
     found, wanted = (r.text.split('in total at ')[1].split(' place')[0] for r in (reason, sound))
     assert found == wanted
 

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import cached, settings
+from drives import cached, everything_said, settings
 import numpy as np
 import pytest
 
@@ -41,11 +41,6 @@ def error(drive, method):
     return found.value / drive.truth.scale - 1, found.sigma / drive.truth.scale
 
 
-def codes(result):
-    return {r.code for r in (*result.reasons, *(
-        r for m in result.methods.values() for r in m.reasons))}
-
-
 @pytest.mark.parametrize(('rate', 'between', 'most'), [
     (10.0, 0.0, 1.7e-3), (1.0, 0.0, 4e-3), (1.0, 10.0, 5e-3)])
 @pytest.mark.parametrize('how', ['floor', 'round'])
@@ -58,7 +53,7 @@ def test_the_scale_of_a_speed_in_whole_kmh_is_held_by_its_sigma(how, rate, betwe
     assert sigma < most
     off, sigma = error(drive, result.methods['two_point'])
     assert abs(off) < 2.0 * sigma
-    seen = codes(result)
+    seen = everything_said(result)
     assert Code.SPEED_COARSE in seen
     assert Code.WHEEL_SLIP not in seen
 
@@ -70,7 +65,7 @@ def test_a_filter_before_the_steps_is_found(tau):
     method = result.methods['smoother']
     off, sigma = error(drive, method)
     assert abs(off) < 3.3 * sigma
-    assert Code.SPEED_FILTERED in codes(result)
+    assert Code.SPEED_FILTERED in everything_said(result)
     found = method.details['odometer_lag_square']
     # 15 % of the time constant: a first-order filter by five speeds
     assert abs(found['value'] - tau**2) < 0.3 * tau**2 + 3.3 * found['sigma']
@@ -122,7 +117,7 @@ def test_the_step_of_a_topic_in_kmh_is_stated_in_its_unit(nominal):
 def test_a_smooth_speed_has_no_steps():
     _, result = calibrated(step=0.0)
     smoother = result.methods['smoother']
-    assert Code.SPEED_COARSE not in codes(result)
+    assert Code.SPEED_COARSE not in everything_said(result)
     assert smoother.details['speed_offset']['value'] == 0.0
     assert 'speed_truncation' not in {s.name for s in smoother.sources}
 
@@ -163,7 +158,7 @@ def test_what_a_robot_at_one_speed_rounds_is_in_its_sigma():
 def test_half_metre_pulses_are_named_and_no_slip():
     drive, result = calibrated(odometer='counts', rate=50.0, step=0.0, scale=0.505,
                                nominal_scale=0.5)
-    seen = codes(result)
+    seen = everything_said(result)
     assert Code.COUNTER_COARSE in seen
     assert Code.WHEEL_SLIP not in seen
     off, sigma = error(drive, result.methods['smoother'])
