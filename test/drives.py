@@ -9,7 +9,8 @@ import inspect
 
 import numpy as np
 
-from odocal_ros.data.samples import OdometerSamples
+from odocal_ros.data.samples import OdometerSamples, take
+from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
@@ -139,6 +140,16 @@ def held_up(samples, every_s=15.0, how_long_s=0.12, drain_s=1e-3):
         free[k] = max(free[k], free[k - 1] + drain_s)
     stamps = samples.stamp_ns[0] + np.round(free * 1e9).astype(np.int64)
     return OdometerSamples(stamps, stamps, samples.value), free - t > drain_s
+
+
+def thinned(leg, stop_s=float('inf'), begin_s=float('-inf'), into=None):
+    """Return the cells of a leg between times after its start mark, s, added to ``into``."""
+    cells = into or ThinnedLeg(leg.form)
+    for slot in ('imu', 'odometer', 'odometer_right', 'fix'):
+        rows = leg.rows(slot)
+        t = (rows.stamp_ns - leg.start_ns) / 10**9
+        cells.feed(slot, take(rows, (t > begin_s) & (t <= stop_s)))
+    return cells
 
 
 def turned(imu, at_ns, turn):

@@ -8,7 +8,7 @@ import math
 import time
 from types import SimpleNamespace
 
-from cells import SECOND, thinned
+from drives import thinned
 import numpy as np
 import pytest
 
@@ -31,6 +31,7 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
+SECOND = 10**9
 HEADING = 0.003         # rad
 
 

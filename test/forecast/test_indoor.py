@@ -5,7 +5,7 @@
 
 import math
 
-from cells import thinned
+from drives import thinned
 import numpy as np
 import pytest
 

@@ -5,8 +5,7 @@
 
 from dataclasses import replace
 
-from cells import thinned
-from drives import changed, drive, held_up, seconds, settings
+from drives import changed, drive, held_up, seconds, settings, thinned
 import numpy as np
 import pytest
 

@@ -8,7 +8,7 @@ import math
 from types import SimpleNamespace
 import warnings
 
-from cells import thinned
+from drives import thinned
 import numpy as np
 import pytest
 
