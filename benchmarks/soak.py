@@ -9,11 +9,11 @@ A long day of the node: hours of simulated time, a leg every quarter of an hour,
 The node runs in simulated time (/clock) and receives out-and-back drives, the same ten again and
 again, with stamps that go on; between the drives its sensors are silent. The node ``odometry``
 runs beside it on the same topics. After each leg, once its files are written and the vehicle has
-rested, are printed: memory, threads and descriptors of the process, memory and descriptors of ``odometry`` and how many poses it published, the latency of
-a service call in the leg, the time that the answer of ~/stop_leg took, what is in the output
-folder, and how far the scale factor is from the truth. At the end the last
-quarter of the legs is held against the second one; the exit code is 1 if anything grew, or a leg
-was wrong.
+rested, are printed: memory, threads and descriptors of the process, memory and descriptors of
+``odometry`` and how many poses it published, the latency of a service call in the leg, the time
+that the answer of ~/stop_leg took, what is in the output folder, and how far the scale factor is
+from the truth. At the end the last quarter of the legs is compared with the second one; the exit
+code is 1 if anything grew, or a leg was wrong.
 """
 
 from contextlib import suppress
