@@ -40,19 +40,21 @@ class PlainLog:
         return getattr(self._logger, name)
 
 
-class LossReport:
-    """Reports counts of lost messages; repeats a topic at LOSS_FACTOR times the reported count."""
+class TopicReport:
+    """Reports mixed and lost messages; a loss again at LOSS_FACTOR times the reported count."""
 
     def __init__(self) -> None:
         self._said: dict[str, int] = {}
+        self._doubled: set[str] = set()      # reported
 
-    def news(self, lost: dict[str, int]) -> list[str]:
+    def news(self, lost: dict[str, int], doubled: list[str]) -> list[str]:
         """
-        Return the sentences on new losses.
+        Return the sentences on new losses, and those of ``doubled`` that are new and not empty.
 
         lost : topic -> messages lost so far; a smaller number than before starts a new count.
         """
-        found = []
+        found = [text for text in dict.fromkeys(doubled) if text and text not in self._doubled]
+        self._doubled.update(found)
         for topic, count in lost.items():
             said = self._said.get(topic, 0)
             if count < said:
@@ -80,8 +82,7 @@ class Console:
     def __init__(self, log: PlainLog) -> None:
         self._log = log
         self._ready = False          # has been logged
-        self._doubled: set[str] = set()      # logged
-        self._losses = LossReport()
+        self._topics = TopicReport()
         self._silence = False        # has been logged
         self._due_ns = 0             # time of the next log of missing inputs
         self._pause_ns = SILENCE_FIRST_NS
@@ -91,12 +92,8 @@ class Console:
         self._withdrawn: set[Code] = set()     # logged as no longer valid
 
     def report(self, now: SessionView, steady_ns: int) -> None:
-        """Log new events."""
         self._faults(now)
-        for text in set(now.doubled) - self._doubled:
-            self._doubled.add(text)
-            self._log.warning(text)
-        for text in self._losses.news(now.lost_messages):
+        for text in self._topics.news(now.lost_messages, now.doubled):
             self._log.warning(text)
         if now.missing:
             self._missing(now, steady_ns)

@@ -84,7 +84,7 @@ class Inputs:
 
     def doubled(self) -> list[str]:
         """Return the warnings on topics with several publishers."""
-        return [text for text in (one.doubled() for one in self.by_slot.values()) if text]
+        return list(filter(None, (one.doubled() for one in self.by_slot.values())))
 
     @property
     def topics(self) -> dict[str, str]:

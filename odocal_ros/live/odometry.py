@@ -24,7 +24,7 @@ from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
-from odocal_ros.live.console import LossReport, SILENCE_FIRST_NS, SILENCE_SELDOM_NS
+from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS, TopicReport
 from odocal_ros.live.inputs import LOOK_AROUND_S
 from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import run, SettledNode
@@ -106,8 +106,7 @@ class OdometryNode(SettledNode):
         self._look_ns = self._silent_ns = 0
         self._begun, self._pause_ns = False, SILENCE_FIRST_NS
         self._said_ns: dict[str, int] = {}      # last log by kind of text
-        self._doubled: set[str] = set()         # logged
-        self._losses = LossReport()
+        self._topics = TopicReport()
         self.add_on_set_parameters_callback(params.fixed(ApplyConfig))
         self._tf = self._transforms() if self.config.publish_tf else None
         self._due_ns = self._reckoned_ns = 0
@@ -188,17 +187,15 @@ class OdometryNode(SettledNode):
 
     def _look_around(self, now_ns: int) -> None:
         """Search for publishers, and log missing inputs at a low rate."""
-        for one in self._inputs.values():
+        inputs = self._inputs.values()
+        for one in inputs:
             one.look()
             if not one.flowing():
                 one.find(self.config)
-            if (text := one.doubled()) and text not in self._doubled:
-                self._doubled.add(text)
-                self.get_logger().warning(text)
-        for text in self._losses.news({one.topic: one.health.lost
-                                       for one in self._inputs.values()}):
+        for text in self._topics.news({one.topic: one.health.lost for one in inputs},
+                                      [one.doubled() for one in inputs]):
             self.get_logger().warning(text)
-        missing = [why for why in (one.why() for one in self._inputs.values()) if why]
+        missing = list(filter(None, (one.why() for one in inputs)))
         apart = self._odometry.apart()
         if not missing and apart:
             missing = [f'odometer stamps differ by {apart:+.3g} s from the IMU stamps. Likely '
@@ -231,7 +228,6 @@ class OdometryNode(SettledNode):
 
 
 def transform_of(pose: Pose, frames: OdomFrames) -> TransformStamped:
-    """Return a pose as a transform."""
     out = TransformStamped(child_frame_id=frames.base, header=Header(frame_id=frames.odom))
     out.header.stamp.sec, out.header.stamp.nanosec = divmod(pose.stamp_ns, 10**9)
     move, turn = out.transform.translation, out.transform.rotation
