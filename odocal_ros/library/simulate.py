@@ -87,12 +87,12 @@ def _check_beside(path: Path, force: bool) -> None:
 def _write_beside(out: Path, drive: Drive, heading_sigma: float | None) -> None:
     truth, known = beside(out)
     with uninterrupted():      # a bag is never without its truth
-        _write_yaml(truth, truth_entries(drive, out.name), f'Truth of {out.name}.')
-        _write_yaml(known, {'/**/calibrator': {'ros__parameters': settings(drive, heading_sigma)}},
-                    f'Settings of the operator of {out.name}.')
+        write_yaml(truth, truth_entries(drive, out.name), f'Truth of {out.name}.')
+        write_yaml(known, {'/**/calibrator': {'ros__parameters': settings(drive, heading_sigma)}},
+                   f'Settings of the operator of {out.name}.')
 
 
-def _write_yaml(path: Path, content: dict[str, Any], title: str) -> None:
+def write_yaml(path: Path, content: dict[str, Any], title: str) -> None:
     """Write a file whole or not at all."""
     import yaml
     try:

@@ -4,8 +4,6 @@
 """odocal simulate --fleet: the bags of many vehicles, their manifest and their truth."""
 
 import argparse
-import csv
-import io
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -29,6 +27,8 @@ def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
 
     options : of each drive, except values that differ between vehicles.
     """
+    from odocal_ros.library.simulate import write_yaml
+    from odocal_ros.output.tables import csv_text
     from odocal_ros.sim.fleet import fleet_of
     out = Path(args.out)
     most = 100_000    # vehicles
@@ -46,7 +46,8 @@ def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
             rows += [row for row, _ in drives]
             truth.append(_truth(vehicle, [made for _, made in drives]))
             phase((number + 1) / len(vehicles), vehicle.name)
-    _write(out, rows, truth)
+    write_yaml(out / 'truth.yaml', {'vehicles': truth}, 'Truth of a fleet; sizes relative or rad.')
+    write_text(out / MANIFEST, csv_text(rows))      # last: it marks a complete fleet
     if not args.quiet:
         say(f'{out}: {len(vehicles)} vehicles, {len(rows)} bags; truth in {out}/truth.yaml; next: '
             f'odocal fleet {out / MANIFEST} --output result')
@@ -57,6 +58,7 @@ def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicl
          options: 'SimOptions') -> 'tuple[dict[str, str], Drive]':
     """Write a bag; return its row of the manifest, and its drive with options and truth."""
     from odocal_ros.bagio.write import drive_topics, write_bag
+    from odocal_ros.library.simulate import write_yaml
     from odocal_ros.sim.fleet import as_driven, drive_options, MODELS
     from odocal_ros.sim.scenarios import simulate
     from odocal_ros.sim.truth import settings
@@ -66,8 +68,8 @@ def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicl
               args.compression, args.force)
     config = f'{vehicle.model.name}.yaml'
     if number < len(MODELS) and not bag:      # one of each model
-        _yaml(out / config, {'/**/calibrator': {'ros__parameters': settings(drive, None)}},
-              f'Settings of the operator of a {vehicle.model.name}.')
+        write_yaml(out / config, {'/**/calibrator': {'ros__parameters': settings(drive, None)}},
+                   f'Settings of the operator of a {vehicle.model.name}.')
     return {'vehicle': vehicle.name, 'bag': name, 'config': config, 'model': vehicle.model.name,
             'odometer_km': f'{vehicle.odometer_km[bag]:.1f}'}, drive
 
@@ -85,18 +87,3 @@ def _truth(vehicle: 'FleetVehicle', drives: 'list[Drive]') -> dict[str, Any]:
                      'size': change.size, 'after': iso(drives[change.bag - 1].truth.start_ns),
                      'by': iso(drives[change.bag].truth.start_ns)}
                     for change in vehicle.changes]}
-
-
-def _write(out: Path, rows: list[dict[str, str]], truth: list[dict[str, Any]]) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator='\n')
-    writer.writeheader()
-    writer.writerows(rows)
-    _yaml(out / 'truth.yaml', {'vehicles': truth}, 'Truth of a fleet; sizes relative or rad.')
-    write_text(out / MANIFEST, text.getvalue())      # last: it marks a complete fleet
-
-
-def _yaml(path: Path, content: dict[str, Any], title: str) -> None:
-    import yaml
-    write_text(path, f'# {title} Made by odocal simulate.\n' + yaml.safe_dump(
-        content, sort_keys=False, default_flow_style=None))

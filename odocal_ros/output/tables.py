@@ -41,12 +41,17 @@ def leg_table(calibration: Calibration, config: Config, content: dict[str, Any])
     """Return file name -> text, empty without legs."""
     if not calibration.legs:
         return {}
-    rows = [_row(n, leg, calibration) for n, leg in enumerate(calibration.legs, 1)]
+    return {LEGS: csv_text([_row(n, leg, calibration) for n, leg in enumerate(
+        calibration.legs, 1)])}
+
+
+def csv_text(rows: list[dict[str, Any]]) -> str:
+    """Return rows with equal keys, one or more, as a table for a spreadsheet."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator='\n')
     writer.writeheader()
     writer.writerows(rows)
-    return {LEGS: text.getvalue()}
+    return text.getvalue()
 
 
 def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any]:
@@ -139,7 +144,6 @@ def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
 
 
 def source_label(name: str) -> str:
-    """Return the printed name of an error source."""
     return LABELS.get(name, name.replace('_', ' '))
 
 
