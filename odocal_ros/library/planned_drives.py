@@ -180,8 +180,7 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
 
 def _smooth(x: Floats, wide: int) -> Floats:
     """Return moving means over ``wide`` rows, odd; the end values are extended."""
-    padded = np.pad(x, wide // 2, mode='edge')
-    total = np.concatenate([[0.0], np.cumsum(padded)])
+    total = np.concatenate([[0.0], np.cumsum(np.pad(x, wide // 2, mode='edge'))])
     mean: Floats = (total[wide:] - total[:-wide]) / wide
     return mean
 
@@ -190,24 +189,18 @@ def from_bag(path: Path, config: Config,
              topics: dict[str, str]) -> tuple[PlannedDrive, dict[str, float]]:
     """Return the drive of a bag's first leg, and ``Sigmas`` arguments by its fixes and counts."""
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.data.leg import LegRecorder
     from odocal_ros.forecast.leg_so_far import count_size, fix_figures, profile_of
     from odocal_ros.library.legs import find_legs, marked_legs
+    from odocal_ros.library.read_bag import recorded
     from odocal_ros.library.topics import choose_topics
     from odocal_ros.messages.decode import make_reader
-    from odocal_ros.messages.transforms import with_static
     from odocal_ros.screening.screen import screen
     with open_bag(path) as bag:
         chosen = choose_topics(bag.topics, config, topics)
         readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)
                    for slot, topic in chosen.items()}
-        recorder = LegRecorder()
-        bag.read(with_static(readers, bag.topics), recorder.feed, None)
-        recorder.form = readers[chosen['odometer']].form or recorder.form
-        if 'odometer_right' in chosen:
-            recorder.form_right = readers[chosen['odometer_right']].form
+        recorder = recorded(bag, chosen, readers)
         start_ns, stop_ns = find_legs(recorder, bag, [], marked_legs(bag), config)[0]
-    leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-    inputs, _ = screen(leg, config)
+    inputs, _ = screen(recorder.close(start_ns, stop_ns, config.leg.preroll), config)
     return profile_of(inputs, config), fix_figures(inputs) | {
         'quantum': count_size(inputs, config)}

@@ -165,12 +165,8 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
                           f'{journal.path}; options take precedence')
         chosen, readers = readers_of(bag, topics or {}, settings, journal, listener)
         digest = beside.submit(bag_sha256, bag)
-        recorder = LegRecorder()
         with listener.phase(f'reading {name}') as progress:
-            bag.read(with_static(readers, bag.topics), recorder.feed, progress)
-        recorder.form = readers[chosen['odometer']].form or recorder.form
-        if 'odometer_right' in chosen:
-            recorder.form_right = readers[chosen['odometer_right']].form
+            recorder = recorded(bag, chosen, readers, progress)
         if settings.reference.marks:        # those of a node were tested when they were set
             check_still(floor_marks, recorder, bag.start_ns)
         if floor_marks:
@@ -187,6 +183,17 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
             name, sha256, chosen, frame, bag.start_ns, bag.end_ns,
             tuple(marks), bool(journal and not marks and dropped_legs(bag)),
             tuple(note for note in bag.notes if not isinstance(note, str)), settings, recorder)
+
+
+def recorded(bag: Bag, chosen: dict[str, str], readers: dict[str, Reader],
+             progress: asked.Progress | None = None) -> LegRecorder:
+    """Return the rows of the chosen topics, slot -> topic, by their readers."""
+    recorder = LegRecorder()
+    bag.read(with_static(readers, bag.topics), recorder.feed, progress)
+    recorder.form = readers[chosen['odometer']].form or recorder.form
+    if 'odometer_right' in chosen:
+        recorder.form_right = readers[chosen['odometer_right']].form
+    return recorder
 
 
 def marks_of(config: Config, bag: Bag) -> list[FloorMark]:
