@@ -133,9 +133,7 @@ def stated_variance(sent: Oriented) -> float:
 def with_heading(config: Config, variances: dict[str, float]) -> Config:
     """Return config with the heading source and sigma that the alignment will find."""
     asked = config.alignment
-    source, sigma = asked.heading_source, max(asked.heading_sigma, EXACT_HEADING)
-    if source == 'auto' and not math.isnan(asked.heading):
-        source = 'fixed'
+    source, sigma = asked.source, max(asked.heading_sigma, EXACT_HEADING)
     if source == 'fixed' and math.isnan(asked.heading):
         source = 'course'
     for name, stated in variances.items():

@@ -117,9 +117,9 @@ def _times(begin: float, end: float, rate: float, spacing: float) -> Floats:
 def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
              ) -> dict[str, Outside]:
     """Return the external heading of the settings; none for a course or a gyrocompass."""
-    asked, sigma = config.alignment.heading_source, config.alignment.heading_sigma
-    if asked == 'fixed' or asked == 'auto' and not np.isnan(config.alignment.heading):
-        t, noise, asked = np.zeros(1), GIVEN_NOISE, 'fixed'
+    asked, sigma = config.alignment.source, config.alignment.heading_sigma
+    if asked == 'fixed':
+        t, noise = np.zeros(1), GIVEN_NOISE
     elif asked in SENT and sigma <= HEADING_LIMIT:
         t = _times(t_begin, drive.duration, OUTSIDE_RATE, spacing)
         noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * OUTSIDE_RATE))
@@ -130,7 +130,6 @@ def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
 
 
 def _state(motion: _Motion, key: Ints) -> State:
-    """Return the true state at the keyframes."""
     N = len(key)
     return State(motion.t[key], motion.p_n[key], motion.v_n[key], motion.C_nb[key],
                  np.zeros((N, 3)), np.zeros((N, 3)), np.zeros(N), np.zeros((N, 3)),

@@ -55,8 +55,7 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
 def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade) -> Level:
     """Return the level of a standstill from the mean of its planned samples."""
     span = (span[0], min(span[1], drive.duration))
-    k = int(np.searchsorted(drive.t, span[0]))
-    C_bn = transpose(drive.C_nb[k])
+    C_bn = transpose(drive.C_nb[int(np.searchsorted(drive.t, span[0]))])
     up_b, earth_b = C_bn[:, 2], C_bn @ earth_rate_n(drive.latitude)
     return level_at_rest(np.array(span), np.tile(earth_b, (2, 1)),
                          np.tile(up_b * gravity(drive.latitude, drive.height), (2, 1)), span,
@@ -81,10 +80,8 @@ def _heading(drive: PlannedDrive, config: AlignmentConfig, fix_sigma: float, lev
              grade: Grade) -> tuple[float, float, str, tuple[Reason, ...]]:
     """Return yaw, sigma and source of the heading, and its reasons."""
     yaw = float(np.interp(level.t, drive.t, drive.yaw))
-    source = config.heading_source
+    source = config.source
     why: tuple[Reason, ...] = ()
-    if source == 'auto' and not np.isnan(config.heading):
-        source = 'fixed'
     if source in ('auto', 'gyrocompass'):
         unable = 'needs a standstill'
         if level.standstill is not None:

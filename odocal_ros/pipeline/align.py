@@ -3,7 +3,7 @@
 
 """Alignment of a leg: choice of the standstill and of the heading source."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TypeVar
 
@@ -157,27 +157,33 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
 def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
              config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
     """Return yaw of the x axis of L, sigma, source, shared, reasons; 0, pi for a course."""
-    asked = config.alignment.heading_source
-    order = [asked] if asked != 'auto' else ['heading_topic', 'imu_orientation', 'gyrocompass']
-    if asked == 'auto' and not np.isnan(config.alignment.heading):
-        order = ['fixed']
-    elif asked == 'auto' and inputs.local:
-        order = ['course']
+    asked = config.alignment.source
+    order = [asked] if asked != 'auto' else [] if inputs.local else [
+        'heading_topic', 'imu_orientation', 'gyrocompass']
     refusals = []
-    for source in order:
-        if source == 'course':
-            break
-        result, why = SOURCES[source](inputs, level, latitude, grade, config)
+    for source in order if asked != 'course' else ():
+        result, why = _from_source(source, inputs, level, latitude, grade, config)
         if result is not None:
-            yaw, sigma = result
-            return yaw, sigma, source, source != 'gyrocompass', ()
+            return *result, source, source != 'gyrocompass', ()
         refusals.append(Reason(Code.GYROCOMPASS_REFUSED if source == 'gyrocompass'
                                else Code.HEADING_UNAVAILABLE, f'heading from {source}: {why}'))
-    reasons = tuple(refusals) if asked not in ('auto', 'course') else ()
-    return 0.0, np.pi, 'course', True, reasons
+    return 0.0, np.pi, 'course', True, tuple(refusals) if asked != 'auto' else ()
 
 
-def _fixed(inputs: Inputs, level: Level, latitude: float, grade: Grade, config: Config) -> Found:
+def _from_source(source: str, inputs: Inputs, level: Level, latitude: float, grade: Grade,
+                 config: Config) -> Found:
+    if source == 'heading_topic':
+        sent, t = inputs.outside['heading']
+        return _from_quaternions(t, sent.q_ni, sent.yaw_variance, np.eye(3), level, config,
+                                 config.alignment.heading_offset)
+    if source == 'imu_orientation':
+        return _from_quaternions(inputs.t_imu, inputs.q_ni, inputs.yaw_variance,
+                                 transpose(inputs.C_bi), level, config)
+    return _fixed(inputs, level, config) if source == 'fixed' else _gyrocompass(
+        inputs, level, latitude, grade, config)
+
+
+def _fixed(inputs: Inputs, level: Level, config: Config) -> Found:
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
     mark_yaw = float(yaw_from_heading(config.alignment.heading))
@@ -199,21 +205,8 @@ def _turn_since(inputs: Inputs, level: Level) -> float:
     return float(np.arctan2(C[1, 0], C[0, 0]))
 
 
-def _imu_orientation(inputs: Inputs, level: Level, latitude: float, grade: Grade,
-                     config: Config) -> Found:
-    return _from_quaternions(inputs.t_imu, inputs.q_ni, inputs.yaw_variance, level, config,
-                             lambda C_ni: C_ni @ transpose(inputs.C_bi), 0.0)
-
-
-def _heading_topic(inputs: Inputs, level: Level, latitude: float, grade: Grade,
-                   config: Config) -> Found:
-    sent, t = inputs.outside['heading']
-    return _from_quaternions(t, sent.q_ni, sent.yaw_variance, level, config, lambda C: C,
-                             config.alignment.heading_offset)
-
-
-def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, config: Config,
-                      to_b: Callable[[Floats], Floats], offset: float) -> Found:
+def _from_quaternions(t: Floats, q: Floats, variance: Floats, C_ib: Floats, level: Level,
+                      config: Config, offset: float = 0.0) -> Found:
     """Return (yaw, sigma) at the level's epoch from published orientations, or None, reason."""
     heading_reach = 0.5    # s, largest distance of a heading sample from a start in motion
     # a leg may have hours of rows: select the used ones first
@@ -226,7 +219,7 @@ def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, conf
         pick = (away <= heading_reach) & (away == away.min(initial=np.inf))
     if not pick.any():
         return None, 'no orientation at the start (covariance[0] = -1, or no message)'
-    C = to_b(matrix_from_quat(q[pick]))
+    C = matrix_from_quat(q[pick]) @ C_ib
     yaw = np.arctan2(C[:, 1, 0].mean(), C[:, 0, 0].mean()) + offset
     stated = float(np.median(variance[pick]))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
@@ -254,10 +247,6 @@ def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
                       f'(limit {no_earth_sigmas:.0f}): the gyro bias exceeds that of the '
                       f'{config.imu.grade} grade')
     return (yaw, sigma), ''
-
-
-SOURCES = {'fixed': _fixed, 'imu_orientation': _imu_orientation, 'heading_topic': _heading_topic,
-           'gyrocompass': _gyrocompass}
 
 
 def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Floats, origin: Origin,

@@ -200,6 +200,12 @@ class AlignmentConfig:
     heading_offset: float = setting(0.0, 'rad', -6.3, 6.3, about='Added to the ENU yaw of the '
                                     'heading topic.')
 
+    @property
+    def source(self) -> str:
+        """Return the heading source; ``auto`` is ``fixed`` if a heading is configured."""
+        return 'fixed' if self.heading_source == 'auto' and not math.isnan(self.heading) else \
+            self.heading_source
+
 
 @dataclass(frozen=True, kw_only=True)
 class WheelsConfig:
