@@ -28,10 +28,9 @@ from odocal_ros.screening.clock_offset import screen_aligned
 from odocal_ros.screening.clocks import TOO_FAR
 from odocal_ros.screening.facing import imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
+from odocal_ros.screening.imu_changes import turned_over, unit_changes
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.leg_kind import settings_by_frame
-from odocal_ros.screening.moved_imu import turned_over
-from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
 from odocal_ros.settings.nominal import nominal_scale

@@ -31,11 +31,10 @@ from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.clock_offset import screen_aligned
 from odocal_ros.screening.facing import imu_sanity, UNUSABLE
+from odocal_ros.screening.imu_changes import turned_over, unit_changes
 from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
-from odocal_ros.screening.moved_imu import turned_over
 from odocal_ros.screening.reversing import BY_FIT, doubled, reversing_reasons
-from odocal_ros.screening.unit_changes import unit_changes
 from odocal_ros.settings.config import Config
 
 __all__ = ['calibrate', 'calibrate_parts', 'combine', 'faults', 'Screened', 'screened']
@@ -114,8 +113,9 @@ def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened
     sanity, z_down = (moved, False) if moved else (sanity or unit_changes(inputs), z_down)
     reasons += tuple(with_axes(sanity, inputs))
     let_go()
-    if z_down:
-        inputs = _turned_over(inputs)
+    if z_down:      # forward-right-down: rotated to forward-left-up
+        C = matrix_from_rpy([np.pi, 0.0, 0.0])
+        inputs = replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)
     return Screened(leg, inputs, reasons, not UNUSABLE & {r.code for r in sanity})
 
 
@@ -144,12 +144,6 @@ def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:
     return missing
 
 
-def _turned_over(inputs: Inputs) -> Inputs:
-    """Return inputs of a forward-right-down IMU, rotated to forward-left-up."""
-    C = matrix_from_rpy([np.pi, 0.0, 0.0])
-    return replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)
-
-
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     """Return the parts of a leg between IMU gaps over ``limit_s``; the leg if none or many."""
     return _beside(leg, _gaps(leg, limit_s))
@@ -161,9 +155,8 @@ def _beside(leg: Leg, gaps: Ints) -> list[Leg]:
     if not 0 < len(gaps) < most_parts:
         return [leg]
     begins = [None, *gaps[:, 1].tolist()]
-    ends = [*gaps[:, 0].tolist(), leg.stop_ns]
     spans = [(max(first or leg.start_ns, leg.start_ns), last, first)
-             for first, last in zip(begins, ends, strict=True)]
+             for first, last in zip(begins, [*gaps[:, 0].tolist(), leg.stop_ns], strict=True)]
     shortest_ns = 10**9    # of a part: shorter ones are dropped
     return [part_of(leg, *span) for span in spans if span[1] - span[0] >= shortest_ns] or [leg]
 

@@ -22,15 +22,10 @@ from odocal_ros.pipeline.align import align, with_observed_walk
 from odocal_ros.pipeline.beyond_model import coarse_reasons
 from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening import facing
 from odocal_ros.screening.axles import axles_of
-from odocal_ros.screening.facing import (
-    accelerations,
-    axes_reasons,
-    Facing,
-    facing_of,
-)
+from odocal_ros.screening.imu_changes import turned_about
 from odocal_ros.screening.inputs import Inputs, place, Placed
-from odocal_ros.screening.moved_imu import turned_about
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config
 
@@ -53,13 +48,13 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     still = _standing(inputs, placed)
     if still is not None:
         return None, (*reasons, *still)
-    pushed = accelerations(inputs, placed.rough) if inputs.has_accelerometer else None
-    faces = None if pushed is None else facing_of(pushed)
+    pushed = facing.accelerations(inputs, placed.rough) if inputs.has_accelerometer else None
+    faces = None if pushed is None else facing.facing_of(pushed)
     reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop))
     turning = turned_about(pushed) or _turning(inputs, config, placed, faces)
     if turning:             # a mirrored axis turns the orientation around
         return None, (*reasons, *turning)
-    axes = axes_reasons(faces, config.imu.nominal_yaw)
+    axes = facing.axes_reasons(faces, config.imu.nominal_yaw)
     reasons = (*reasons, *with_axes(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
         return None, reasons
@@ -67,8 +62,8 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     return prepared, prepared.reasons
 
 
-def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: Facing | None,
-              reasons: Sequence[Reason], alignment: Alignment | None,
+def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed,
+              faces: facing.Facing | None, reasons: Sequence[Reason], alignment: Alignment | None,
               holdout: bool) -> PreparedLeg:
     """Return the leg aligned and dead reckoned, with the reasons of its drive."""
     spans = inputs.standstills(placed.rough, config)
@@ -121,7 +116,7 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
 
 
 def _turning(inputs: Inputs, config: Config, placed: Placed,
-             faces: Facing | None) -> tuple[Reason, ...]:
+             faces: facing.Facing | None) -> tuple[Reason, ...]:
     """Return the reason for a gyro that does not turn with the fixes or the accelerometer."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)

@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Values that are not measurements: beyond any range, or isolated outliers."""
+"""Values that are not measurements: beyond any range, isolated outliers, or at the limit of it."""
 
 from dataclasses import replace
 from functools import reduce
@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import across, by_row, by_step, lengths, median, runs
+from odocal_ros.data.pieces import across, by_row, by_step, columns, lengths, median, runs
 from odocal_ros.data.samples import HeadingSamples, ImuSamples
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
+from odocal_ros.settings.grades import G
 
 # judgement: far beyond any sensor in any unit in use (deg/s, mm/s^2): wrong units are kept
 BEYOND_SENSOR = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
@@ -34,6 +35,10 @@ TURN_STEP, FORCE_STEP, USUAL_STEPS, GLITCH_TIME, BACK_SHARE = 0.8, 50.0, 20.0, 0
 SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES, EQUAL_NEIGHBOURS = 0.03, 2.0, 10.0, 0.3
 GLITCH_SHARE = 0.002      # largest share of glitches; with more, they are normal for the sensor
 ROLLS = 0.1               # of the top speed: least mean speed of a moving vehicle
+# physical: smaller than any range, larger than gravity at rest
+LEAST_GYRO, LEAST_ACCELEROMETER = 1.0, 1.5 * G      # rad/s, m/s^2
+# statistical: coarse steps also repeat the largest value, but less often than the next smaller one
+FEWEST_AT_LIMIT, TIMES_NEXT = 5, 3.0
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
@@ -189,3 +194,32 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
     return (Reason(Code.IMU_GAP, 'the gyro repeats one value for '
                    f'{end[worst] - begin[worst]:.2f} s at t = {begin[worst]:.2f} s while the '
                    'wheels turn: its output is frozen'),)
+
+
+def saturated(t_imu: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> tuple[Reason, ...]:
+    """
+    Return IMU_SATURATED for the axis that is at its limit most often.
+
+    t_imu : (n,) s.   w_i, f_i : (n, 3) raw turn rates and specific forces.
+    """
+    found = []
+    for sensor, x_i, scale, unit, least in (
+            ('gyro', w_i, imu.gyro_scale, 'rad/s', LEAST_GYRO),
+            ('accelerometer', f_i, imu.accel_scale, 'm/s^2', LEAST_ACCELEROMETER)):
+        for axis, x in zip('xyz', columns(x_i), strict=True):
+            for peak, inside, none in ((np.max, np.less, -np.inf), (np.min, np.greater, np.inf)):
+                limit = peak(x, initial=0.0)
+                at = x == limit
+                count, size = int(np.count_nonzero(at)), abs(limit * scale)
+                if size < least or count < FEWEST_AT_LIMIT:
+                    continue
+                following = peak(x, where=inside(x, limit), initial=none)
+                if count > TIMES_NEXT * np.count_nonzero(x == following):
+                    found.append((count, float(t_imu[at.argmax()]),
+                                  f'{sensor} {axis} saturates at {limit * scale:+.4g} {unit}'))
+    if not found:
+        return ()
+    count, t, words = max(found)
+    others = f'; {len(found) - 1} more such limits' if len(found) > 1 else ''
+    return (Reason(Code.IMU_SATURATED, f'{words} in {count} of {len(t_imu)} messages, first at '
+                   f't = {t:.1f} s{others}'),)

@@ -24,13 +24,12 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import usable_axles
 from odocal_ros.screening.clocks import clock_reasons, offsets, without_sets
 from odocal_ros.screening.fix_screen import contradicted, reckoned, usable_fixes
-from odocal_ros.screening.glitches import frozen, oriented
+from odocal_ros.screening.glitches import frozen, oriented, saturated
 from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.inputs import Inputs, place, UsableRows
 from odocal_ros.screening.leg_kind import with_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, reversing_reasons
 from odocal_ros.screening.row_screen import topic_gap, usable_rows
-from odocal_ros.screening.saturation import saturated
 from odocal_ros.screening.several_imus import alternating, other_imus
 from odocal_ros.screening.wheel_travel import Wheels, wheels
 from odocal_ros.settings.config import Config, SIDES
@@ -56,14 +55,19 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     rows = _usable(leg, config, judged, found)
     inputs = _in_base(leg, config, rows, _fixes(leg, config, rows, found))
     inputs = replace(inputs, has_accelerometer=not levelled, local=bool(local))
-    found += _wheel_gaps(leg, rows.wheels)
+    wheels = rows.wheels      # the mean has the rows of the first one
+    for slot, one in zip(leg.wheel_slots, (wheels.mean, *wheels.each[1:]), strict=False):
+        found += topic_gap(slot, one.t)
     if judged:
         found += alternating(rows.imu.w_i, rows.imu.f_i)
         found += saturated(inputs.t_imu, rows.imu.w_i, rows.imu.f_i, config.imu)
         found += frozen(inputs.t_imu, rows.imu.w_i, rows.wheels.mean, config.leg.max_gap)
-        wheels, why = _axles(inputs, rows.wheels)
+        # one axle is only tested with an accelerometer
+        if len(wheels.each) > (1 if inputs.has_accelerometer else len(SIDES)):
+            wheels, why = usable_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b),
+                                       (0.0, inputs.t_stop))
+            found += why
         inputs = replace(inputs, **_travel(leg, wheels))
-        found += why
     let_go()
     if judged and not local:
         inputs = _without_reckoned(inputs, config, found)
@@ -139,25 +143,10 @@ def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> I
 
 
 def _travel(leg: Leg, wheels: Wheels) -> dict[str, Any]:
-    """Return the travel of wheels as fields of Inputs."""
     # of two wheels with unknown sides only the mean is defined
     several = wheels.each if leg.form.sides and len(wheels.each) > 1 else ()
     return {'travel': wheels.mean, 'travels': several,
             'doubt_t': wheels.doubt_t, 'doubt_sigma': wheels.doubt_sigma}
-
-
-def _wheel_gaps(leg: Leg, wheels: Wheels) -> list[Reason]:
-    """Return the gaps of the wheels; the mean has the rows of the first one."""
-    others = zip(leg.wheel_slots[1:], wheels.each[1:], strict=False)
-    return [*topic_gap('odometer', wheels.mean.t),
-            *(reason for slot, one in others for reason in topic_gap(slot, one.t))]
-
-
-def _axles(inputs: Inputs, wheels: Wheels) -> tuple[Wheels, list[Reason]]:
-    """Return the usable wheels, and reasons; one axle is only tested with an accelerometer."""
-    if len(wheels.each) > (1 if inputs.has_accelerometer else len(SIDES)):
-        return usable_axles(wheels, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop))
-    return wheels, []
 
 
 def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
@@ -183,8 +172,7 @@ def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> In
     way = np.diff(inputs.travel.at(t), prepend=0.0) * placed.rough
     track = np.cumsum(heading * way) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
-    lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma,
-                         np.interp(inputs.t_fix, t, track))
+    lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma, np.interp(inputs.t_fix, t, track))
     found += why
     return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],
                    covariance_n=inputs.covariance_n[~lost],

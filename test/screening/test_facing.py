@@ -19,7 +19,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.facing import accelerations, axes_reasons, Facing, facing, toward
-from odocal_ros.screening.moved_imu import turned_about, turned_over
+from odocal_ros.screening.imu_changes import turned_about, turned_over
 from odocal_ros.screening.reversing import doubled, reversed_starts
 from odocal_ros.screening.screen import screen
 

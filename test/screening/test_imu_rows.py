@@ -9,8 +9,8 @@ import pytest
 
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code
+from odocal_ros.screening.glitches import saturated
 from odocal_ros.screening.imu_rhythm import on_rhythm
-from odocal_ros.screening.saturation import saturated
 from odocal_ros.screening.screen import screen
 from odocal_ros.screening.several_imus import alternating
 from odocal_ros.settings.config import Config, ImuConfig

@@ -1,17 +1,17 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""An IMU that is moved in the vehicle during the leg: gravity or forward changes direction."""
+"""An IMU that changes during the leg: gravity or forward turns, or its unit or range changes."""
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import medians
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import Accelerations, facing_of
 from odocal_ros.screening.inputs import Inputs
-from odocal_ros.screening.unit_changes import tenths
+from odocal_ros.settings.grades import G
 
 # judgement, deg: least turn, larger than by slopes, bends and noise; largest scatter on one side
 LEAST_TURN, SIDE = 45.0, 20.0
@@ -20,6 +20,35 @@ SAME_SIZE = 1.15    # judgement: ratio of gravity on both sides; 1.4 in a bend a
 MOST_YAW = 135.0
 YAW_SIGMAS = 5.0    # statistical: of the two sides, beyond LEAST_TURN
 DO = 'Mount the IMU firmly, or mark a leg on one side of this with --leg.'
+TENTHS, TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
+# judgement: limits of measured gravity over the Earth's. Units and ranges differ by a factor of 2
+# at least; in a continuous bend at 1.2 g the force is 1.56 times gravity
+LEAST_RATIO, MOST_RATIO = 0.6, 1.6
+
+
+def tenths(inputs: Inputs) -> Ints:
+    """Return the edges of the tenths of the accelerometer's rows, (11,); (0,) without enough."""
+    edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
+    return edges if inputs.has_accelerometer and edges[1] >= TENTH_ROWS else edges[:0]
+
+
+def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
+    """
+    Return IMU_UNITS if gravity in a tenth of the leg differs from the Earth's.
+
+    The median force over a tenth of a leg differs less from gravity by accelerations.
+    """
+    edges = tenths(inputs)
+    size = [float(np.linalg.norm(medians(inputs.f_b[a:b])))
+            for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    odd = [k for k, one in enumerate(size) if not LEAST_RATIO * G < one < MOST_RATIO * G]
+    if not odd or len(odd) == len(size):      # all tenths: the unit of the whole leg
+        return ()
+    begin, end = inputs.t_imu[edges[odd[0]]], inputs.t_imu[edges[odd[-1] + 1] - 1]
+    return (Reason(Code.IMU_UNITS, f'from t = {begin:.0f} to {end:.0f} s the IMU measures a '
+                   f'gravity of {size[odd[0]]:.3g} m/s^2 instead of 9.8 m/s^2', 'Check the IMU '
+                   'driver for a change of unit or range during the drive, or mark a leg on one '
+                   'side of it with --leg.'),)
 
 
 def turned_over(inputs: Inputs) -> tuple[Reason, ...]:
