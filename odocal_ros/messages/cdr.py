@@ -23,21 +23,20 @@ KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32'
 # format: of struct, by type of numpy; uint64 as int64
 UNPACKED = {'i1': 'b', 'u1': 'B', 'i2': 'h', 'u2': 'H', 'i4': 'i', 'u4': 'I', 'i8': 'q', 'u8': 'q',
             'f4': 'f', 'f8': 'd'}
+NUMBERS = ('Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')
 INDEXED = re.compile(r'(.+)\[(\d+)\]')
 
 
-def _each(kind: str, prefix: str, names: str) -> tuple[str, ...]:
-    return tuple(f'{kind} {prefix}.{name}' for name in names)
+def _each(prefix: str, names: str = 'xyz') -> tuple[str, ...]:
+    return tuple(f'float64 {prefix}.{name}' for name in names)
 
 
 def _twist(prefix: str) -> tuple[str, ...]:
-    return (_each('float64', f'{prefix}.linear', 'xyz')
-            + _each('float64', f'{prefix}.angular', 'xyz'))
+    return _each(f'{prefix}.linear') + _each(f'{prefix}.angular')
 
 
 def _pose(prefix: str) -> tuple[str, ...]:
-    return (_each('float64', f'{prefix}.position', 'xyz')
-            + _each('float64', f'{prefix}.orientation', 'xyzw'))
+    return _each(f'{prefix}.position') + _each(f'{prefix}.orientation', 'xyzw')
 
 
 _HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
@@ -48,28 +47,26 @@ _DIM = ('string label', 'uint32 size', 'uint32 stride')
 # 'kind path', in order; kind[n] is an array, kind[] a list
 SCHEMAS: dict[str, tuple[str, ...]] = {
     'sensor_msgs/msg/Imu': (
-        *_HEADER, *_each('float64', 'orientation', 'xyzw'), 'float64[9] orientation_covariance',
-        *_each('float64', 'angular_velocity', 'xyz'), 'float64[9] angular_velocity_covariance',
-        *_each('float64', 'linear_acceleration', 'xyz'),
-        'float64[9] linear_acceleration_covariance'),
+        *_HEADER, *_each('orientation', 'xyzw'), 'float64[9] orientation_covariance',
+        *_each('angular_velocity'), 'float64[9] angular_velocity_covariance',
+        *_each('linear_acceleration'), 'float64[9] linear_acceleration_covariance'),
     'sensor_msgs/msg/NavSatFix': (
         *_HEADER, 'int8 status.status', 'uint16 status.service', 'float64 latitude',
         'float64 longitude', 'float64 altitude', 'float64[9] position_covariance',
         'uint8 position_covariance_type'),
     'sensor_msgs/msg/JointState': (
         *_HEADER, 'string[] name', 'float64[] position', 'float64[] velocity', 'float64[] effort'),
-    'geometry_msgs/msg/Twist': (
-        *_each('float64', 'linear', 'xyz'), *_each('float64', 'angular', 'xyz')),
+    'geometry_msgs/msg/Twist': _each('linear') + _each('angular'),
     'geometry_msgs/msg/TwistStamped': (*_HEADER, *_twist('twist')),
     'geometry_msgs/msg/TwistWithCovarianceStamped': (
         *_HEADER, *_twist('twist.twist'), 'float64[36] twist.covariance'),
-    'geometry_msgs/msg/PointStamped': (*_HEADER, *_each('float64', 'point', 'xyz')),
+    'geometry_msgs/msg/PointStamped': (*_HEADER, *_each('point')),
     'geometry_msgs/msg/PoseStamped': (*_HEADER, *_pose('pose')),
     'geometry_msgs/msg/PoseWithCovarianceStamped': (
         *_HEADER, *_pose('pose.pose'), 'float64[36] pose.covariance'),
     'geometry_msgs/msg/TransformStamped': (
-        *_HEADER, 'string child_frame_id', *_each('float64', 'transform.translation', 'xyz'),
-        *_each('float64', 'transform.rotation', 'xyzw')),
+        *_HEADER, 'string child_frame_id', *_each('transform.translation'),
+        *_each('transform.rotation', 'xyzw')),
     'nav_msgs/msg/Odometry': (
         *_HEADER, 'string child_frame_id', *_pose('pose.pose'), 'float64[36] pose.covariance',
         *_twist('twist.twist'), 'float64[36] twist.covariance'),
@@ -78,8 +75,7 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
         'float32 heading_rate'),
     'std_msgs/msg/Int32MultiArray': (*_LAYOUT, 'int32[] data'),
     'std_msgs/msg/Int64MultiArray': (*_LAYOUT, 'int64[] data'),
-} | {f'std_msgs/msg/{name}': (f'{name.lower()} data',) for name in (
-    'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')}
+} | {f'std_msgs/msg/{name}': (f'{name.lower()} data',) for name in NUMBERS}
 
 
 Unpacker = Callable[[bytes], tuple[Any, ...]]
@@ -167,7 +163,6 @@ class Layout:
             offset=offset) for kind, offset, *_ in fields]
 
     def fits(self, raw: bytes) -> bool:
-        """Return True if a message has this layout."""
         return self.size <= len(raw) and all(
             raw[a:b] == values for (a, b), values in zip(self.fixed, self.values, strict=True))
 
@@ -231,12 +226,8 @@ class _Walk:
         for line in schema:
             kind, path = line.split()
             base, _, size = kind.partition('[')
-            if not size:
-                self.value(base, prefix + path, 1)
-            elif size == ']':
-                self.value(base, prefix + path, self.length(), listed=True)
-            else:
-                self.value(base, prefix + path, int(size[:-1]), listed=True)
+            count = 1 if not size else self.length() if size == ']' else int(size[:-1])
+            self.value(base, prefix + path, count, listed=bool(size))
 
     def value(self, kind: str, path: str, count: int, listed: bool = False) -> None:
         layout = self.layout

@@ -31,8 +31,7 @@ DEFAULT_FIELD = {
     'autoware_vehicle_msgs/msg/VelocityReport': 'longitudinal_velocity',
     'std_msgs/msg/Int32MultiArray': 'data',
     'std_msgs/msg/Int64MultiArray': 'data',
-} | {f'std_msgs/msg/{name}': 'data' for name in (
-    'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')}
+} | {f'std_msgs/msg/{name}': 'data' for name in cdr.NUMBERS}
 TYPES = tuple(DEFAULT_FIELD)
 
 
@@ -164,7 +163,6 @@ class OdometerPlan:
         return _kinds(self.msgtype)[_base(field)[0]].split('[')[0]
 
     def _meaning(self, field: str, kind: str = '') -> OdometerForm:
-        """Return the meaning of the values of a field."""
         bits = 0
         if self.known:
             kind = self._kind(field)
@@ -219,7 +217,6 @@ class OdometerPlan:
             for wheel, slot in enumerate(slots, first)]
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:
-        """Return (slot, block) pairs."""
         stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
         values = columns[2:] if self.stamped else columns
         slots = WHEELS[:len(values)] if len(values) > 1 else (self.slot,)
