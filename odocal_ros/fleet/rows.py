@@ -21,15 +21,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros import __version__
+from odocal_ros.calib import result
 from odocal_ros.calib.border import Border
-from odocal_ros.calib.result import (
-    Estimate,
-    LegResult,
-    MethodResult,
-    PerDistance,
-    Source,
-    TrackCheck,
-)
 from odocal_ros.errors import BadData
 from odocal_ros.outside.names import said_by
 from odocal_ros.outside.whole import locked, whole_file, write_text
@@ -65,7 +58,6 @@ class Row:
     legs: str = '[]'
 
     def config(self) -> Config:
-        """Return the settings of the computation."""
         return with_settings(Config(), json.loads(self.settings))
 
 
@@ -94,7 +86,6 @@ class RowStore:
         self.folder = Path(folder)
 
     def path(self, key: str) -> Path:
-        """Return the path of the row of a key."""
         return self.folder / 'rows' / key[:2] / f'{key}.parquet'
 
     def put(self, row: Row) -> None:
@@ -171,18 +162,19 @@ def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
 
 
 KINDS = {kind.__name__: kind for kind in (
-    Border, Estimate, LegResult, MethodResult, PerDistance, Reason, Source, TrackCheck)}
+    Border, result.Estimate, result.LegResult, result.MethodResult, result.PerDistance, Reason,
+    result.Source, result.TrackCheck)}
 IS = '~'      # the key of an object's type
 
 
-def leg_text(legs: list[LegResult]) -> str:
+def leg_text(legs: list[result.LegResult]) -> str:
     """Return legs as JSON, without the rows that only a report draws."""
     return json.dumps([_plain(leg.numbers()) for leg in legs], separators=(',', ':'))
 
 
-def legs_from(text: str) -> list[LegResult]:
+def legs_from(text: str) -> list[result.LegResult]:
     """Return the legs of ``leg_text``."""
-    legs: list[LegResult] = json.loads(text, object_hook=_built)
+    legs: list[result.LegResult] = json.loads(text, object_hook=_built)
     return legs
 
 

@@ -14,7 +14,7 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResu
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.drawing import Drawing, look
 from odocal_ros.output.figures import counted, known, length, shared, time_span
-from odocal_ros.output.summary import DEG, MEANING, sentence
+from odocal_ros.output.summary import MEANING, rotation_text, sentence
 from odocal_ros.output.tables import before_label, check_table
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
@@ -80,7 +80,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
         'driven': f'{counted(len(legs), "leg")}, {length(distance)} in {time_span(duration)}',
         'headline': tables.headline(calibration),
         'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),
-        'why': _why(calibration.reasons), 'rotation': _degrees(calibration),
+        'why': _why(calibration.reasons), 'rotation': rotation_text(calibration),
         'reasons': grouped(calibration.reasons), 'check': check_table(legs),
         'methods': tables.method_table(methods, legs), 'budgets': _budgets(methods),
         'inputs': content['inputs'],
@@ -109,12 +109,6 @@ def _leading(methods: dict[str, MethodResult],
     """Return methods in order of the number of values that the result has from them."""
     given = Counter(e.method for e in estimates.values() if e.value is not None)
     return dict(sorted(methods.items(), key=lambda item: -given[item[0]]))
-
-
-def _degrees(calibration: Calibration) -> str:
-    # + 0.0 turns -0.0 into 0.0
-    return ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
-                     for angle in calibration.imu_rotation_rpy or ())
 
 
 def _readable_date(created: str) -> str:
@@ -159,8 +153,7 @@ def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing
     return legs, together, [number for number in had if number not in figures]
 
 
-def _leg(number: int, leg: LegResult, figures: list[Drawing],
-         several: bool) -> dict[str, Any]:
+def _leg(number: int, leg: LegResult, figures: list[Drawing], several: bool) -> dict[str, Any]:
     rows, findings = tables.left_out(leg)
     methods = _leading(leg.methods, leg_estimates(leg))
     return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,

@@ -9,15 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.result import (
-    BESIDE,
-    Calibration,
-    Estimate,
-    FACTOR,
-    LegResult,
-    MethodResult,
-    wheel_factors,
-)
+from odocal_ros.calib import result
 from odocal_ros.output import tables
 from odocal_ros.output.figures import (
     beyond_one,
@@ -33,9 +25,7 @@ from odocal_ros.output.summary import DEG, DEG_PER_HOUR
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 
-LABELS = tables.LABELS | {'scale_factor': 'scale factor', 'scale_ratio': 'ratio to nominal',
-                          'yaw_mounting_angle': 'yaw mounting angle',
-                          'pitch_mounting_angle': 'pitch mounting angle',
+LABELS = tables.LABELS | {'scale_ratio': 'ratio to nominal',
                           'scale_factor_as_sent': 'scale factor of the speed as sent'}
 LOST = 'not determined'
 OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
@@ -46,13 +36,12 @@ OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOP
 
 
 def label(name: str) -> str:
-    """Return the printed name of an estimate or a source."""
-    if name in wheel_factors([name]):
-        return f'scale factor, {name.removeprefix(FACTOR)} wheel'
+    if name in result.wheel_factors([name]):
+        return f'scale factor, {name.removeprefix(result.FACTOR)} wheel'
     return LABELS.get(name, name.replace('_', ' '))
 
 
-def in_units(name: str, estimate: Estimate) -> tuple[str, str, str]:
+def in_units(name: str, estimate: result.Estimate) -> tuple[str, str, str]:
     """Return an estimate in its main unit, in another, and its relative sigma, as text."""
     value, sigma, unit = estimate.value, estimate.sigma, estimate.unit
     if value is None:
@@ -71,7 +60,7 @@ def in_units(name: str, estimate: Estimate) -> tuple[str, str, str]:
     return native, '', ''
 
 
-def value_rows(calibration: Calibration) -> list[dict[str, Any]]:
+def value_rows(calibration: result.Calibration) -> list[dict[str, Any]]:
     """Return the rows of the result: name, value in both units, relative sigma, method, cause."""
     rows = []
     for name in calibration.estimates:
@@ -86,13 +75,12 @@ def value_rows(calibration: Calibration) -> list[dict[str, Any]]:
     return rows
 
 
-def headline(calibration: Calibration) -> list[tuple[str, str, str]]:
+def headline(calibration: result.Calibration) -> list[tuple[str, str, str]]:
     """Return the most important values, up to four: name, value, a second line."""
     found = []
     for name, words in (('scale_factor', 'scale factor'), ('yaw_mounting_angle', 'yaw mounting'),
                         ('pitch_mounting_angle', 'pitch mounting')):
-        estimate = known(calibration.estimates, name)
-        first, other, relative = in_units(name, estimate)
+        first, other, relative = in_units(name, known(calibration.estimates, name))
         found.append((words, first, f'± {relative}' if relative else other))
     pieces = tables.in_pieces(calibration.legs)
     if pieces:
@@ -102,7 +90,7 @@ def headline(calibration: Calibration) -> list[tuple[str, str, str]]:
     return found
 
 
-def undetermined(calibration: Calibration) -> list[str]:
+def undetermined(calibration: result.Calibration) -> list[str]:
     """Return the values that were not determined, axes of one quantity together."""
     axes: dict[str, list[str]] = {}
     for name in calibration.estimates:
@@ -114,8 +102,8 @@ def undetermined(calibration: Calibration) -> list[str]:
     return [f'{word} {", ".join(found)}'.rstrip() for word, found in axes.items()]
 
 
-def method_table(methods: dict[str, MethodResult],
-                 legs: tuple[LegResult, ...]) -> dict[str, Any] | None:
+def method_table(methods: dict[str, result.MethodResult],
+                 legs: tuple[result.LegResult, ...]) -> dict[str, Any] | None:
     """
     Return a table of methods: heads, verdicts, rows of (name, cells), reasons.
 
@@ -137,7 +125,7 @@ def method_table(methods: dict[str, MethodResult],
             'reasons': [(label(n), r) for n, m in methods.items() for r in m.reasons]}
 
 
-def budget_table(method: MethodResult) -> dict[str, Any] | None:
+def budget_table(method: result.MethodResult) -> dict[str, Any] | None:
     """
     Return a method's error budget: heads, rows of (source, shared, cells), small sources.
 
@@ -169,7 +157,7 @@ def _number(row: dict[str, Any], name: str) -> float:
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
 
 
-def _column(name: str, estimate: Estimate) -> tuple[str, float]:
+def _column(name: str, estimate: result.Estimate) -> tuple[str, float]:
     """Return the head of a budget's column, and the factor of its numbers."""
     if name.startswith('scale'):
         return f'{label(name)}, ppm', 1e6 / abs(estimate.value or 1.0)
@@ -180,7 +168,7 @@ def _column(name: str, estimate: Estimate) -> tuple[str, float]:
     return f'{label(name)}, {unit}', factor
 
 
-def left_out(leg: LegResult) -> tuple[list[tuple[str, str]], list[Reason]]:
+def left_out(leg: result.LegResult) -> tuple[list[tuple[str, str]], list[Reason]]:
     """Return the unused fixes, counted by reason, and the findings about the leg's data."""
     rows = []
     if leg.evidence is not None:
@@ -217,7 +205,7 @@ def full_digits(content: dict[str, Any]) -> list[tuple[str, str, str, str, str]]
     """Return each number of the result as in calibration.json: name, value, sigma, ..."""
     rows = []
     for name, entry in content['result'].items():
-        if name in BESIDE:
+        if name in result.BESIDE:
             rows += [(f'{name.replace("_", " ")}, {key.replace("_", " ")}',
                       LOST if x is None else ', '.join(map(repr, np.atleast_1d(x).tolist())),
                       '', '', '') for key, x in entry.items() if key != 'unit']

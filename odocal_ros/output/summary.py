@@ -9,16 +9,8 @@ import textwrap
 
 import numpy as np
 
+from odocal_ros.calib import result
 from odocal_ros.calib.choice import leg_estimates, PLANAR
-from odocal_ros.calib.result import (
-    AS_SENT,
-    Calibration,
-    Estimate,
-    FACTOR,
-    LegResult,
-    MethodResult,
-    wheel_factors,
-)
 from odocal_ros.output import tables
 from odocal_ros.output.figures import (
     bag_lines,
@@ -48,7 +40,7 @@ MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the 
            Verdict.REJECTED: 'do not use these values'}
 
 
-def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
+def screen(calibration: result.Calibration, styled: bool = False, width: int = WIDTH,
            rows: int | None = None) -> str:
     """
     Return the complete summary of a calibration as plain text.
@@ -72,14 +64,14 @@ def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
     return text
 
 
-def sentence(calibration: Calibration) -> str:
+def sentence(calibration: result.Calibration) -> str:
     """Return the result as one line: verdict, values with sigma, legs."""
     used = sum(leg.verdict is not Verdict.REJECTED for leg in calibration.legs)
     legs = f'{used} of {counted(len(calibration.legs), "leg")} usable'
     return f'{calibration.verdict.value}: {values_in_words(calibration.estimates)}; {legs}'
 
 
-def values_in_words(estimates: dict[str, Estimate]) -> str:
+def values_in_words(estimates: dict[str, result.Estimate]) -> str:
     """Return scale, angles and, if known, wheel factors and track width, with sigmas."""
     scale = known(estimates, 'scale_factor')
     parts = []
@@ -88,7 +80,7 @@ def values_in_words(estimates: dict[str, Estimate]) -> str:
     else:
         counts = f' ({inverse(scale)})' if scale.unit in COUNTS else ''
         parts.append(f'scale factor {with_unit(scale)}{counts}')
-    words = {name: name.removeprefix(FACTOR) for name in wheel_factors(estimates)}
+    words = {name: name.removeprefix(result.FACTOR) for name in result.wheel_factors(estimates)}
     for name, word in (words | {'track_width': 'track width'}).items():
         wheel = known(estimates, name)
         if wheel.value is not None:
@@ -101,7 +93,7 @@ def values_in_words(estimates: dict[str, Estimate]) -> str:
     return ', '.join(parts)
 
 
-def _head(calibration: Calibration, styled: bool) -> list[str]:
+def _head(calibration: result.Calibration, styled: bool) -> list[str]:
     legs = calibration.legs
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
     verdict = calibration.verdict.value.upper()
@@ -112,7 +104,7 @@ def _head(calibration: Calibration, styled: bool) -> list[str]:
             f'{counted(len(legs), "leg")}, {length(distance)} in {time_span(duration)}']
 
 
-def _values(calibration: Calibration, width: int) -> list[str]:
+def _values(calibration: result.Calibration, width: int) -> list[str]:
     estimates = calibration.estimates
     scale, ratio = (known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
     lines = [_line('scale factor', _scale_text(scale))]
@@ -121,7 +113,7 @@ def _values(calibration: Calibration, width: int) -> list[str]:
     if ratio.value is not None:
         lines.append(_line('  ratio to nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
                            f'({beyond_one(ratio.value, ratio.sigma)})'))
-    sent = known(estimates, AS_SENT)
+    sent = known(estimates, result.AS_SENT)
     if sent.value is not None:
         lines.append(_line('  of speed as sent', _scale_text(sent)))
     lines.append(_path_ratio(calibration, scale, sent))
@@ -132,7 +124,7 @@ def _values(calibration: Calibration, width: int) -> list[str]:
     lines += wheels.values()
     for name in estimates:
         estimate = known(estimates, name)
-        if name not in ('scale_factor', 'scale_ratio', AS_SENT, *ANGLES, *BIASES, *wheels) \
+        if name not in ('scale_factor', 'scale_ratio', result.AS_SENT, *ANGLES, *BIASES, *wheels) \
                 and name[:-2] not in ARMS and estimate.value is not None:
             text = with_unit(estimate)
             if name == 'heading_error':
@@ -145,24 +137,28 @@ def _values(calibration: Calibration, width: int) -> list[str]:
     if all(bias.value is not None for bias in biases):
         shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
         lines.append(_line('gyro bias x, y, z', f'{shown} deg/h'))
-    if calibration.imu_rotation_rpy is not None:
-        # + 0.0: no minus before a zero
-        rpy = ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
-                        for angle in calibration.imu_rotation_rpy)
+    if rpy := rotation_text(calibration):
         lines.append(_line('IMU on the vehicle', f'roll, pitch, yaw {rpy} deg'))
     return [line for line in lines if line]
 
 
-def _angles_of(estimates: dict[str, Estimate]) -> dict[str, str]:
+def rotation_text(calibration: result.Calibration) -> str:
+    """Return roll, pitch and yaw of the IMU on the vehicle, deg, empty without them."""
+    # + 0.0: no minus before a zero
+    return ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
+                     for angle in calibration.imu_rotation_rpy or ())
+
+
+def _angles_of(estimates: dict[str, result.Estimate]) -> dict[str, str]:
     """Return the mounting angles that the method estimates: the planar one none."""
     return {} if known(estimates, 'scale_factor').method == PLANAR else ANGLES
 
 
-def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
+def _wheels(estimates: dict[str, result.Estimate]) -> dict[str, str]:
     """Return estimate -> line of its wheel, with '' for its position, for more than two wheels."""
     lines: dict[str, str] = {}
-    for name in wheel_factors(estimates):
-        wheel = name.removeprefix(FACTOR)
+    for name in result.wheel_factors(estimates):
+        wheel = name.removeprefix(result.FACTOR)
         places = {f'{axis}_position_{wheel}': words for axis, words in PLACES.items()}
         if any(place in estimates for place in places):
             at = [f'{abs(e.value):.3f} m {words[e.value < 0]}' for place, words in places.items()
@@ -172,7 +168,8 @@ def _wheels(estimates: dict[str, Estimate]) -> dict[str, str]:
     return lines
 
 
-def _path_ratio(calibration: Calibration, scale: Estimate, sent: Estimate) -> str:
+def _path_ratio(calibration: result.Calibration, scale: result.Estimate,
+                sent: result.Estimate) -> str:
     """Return the line that compares the path ratio of the legs with the factor it belongs to."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
     way = sum(distance for _, distance in ratios)
@@ -186,7 +183,7 @@ def _path_ratio(calibration: Calibration, scale: Estimate, sent: Estimate) -> st
                  f'{100 * (ratio / factor.value - 1):+.1f} % from the {word}')
 
 
-def _gyro_scale(calibration: Calibration) -> str:
+def _gyro_scale(calibration: result.Calibration) -> str:
     """Return the factor for the turn rates of the gyro, '' if it is near 1."""
     method = calibration.methods.get(known(calibration.estimates, 'scale_factor').method)
     error = method.details.get('gyro_scale_z') if method else None
@@ -196,7 +193,7 @@ def _gyro_scale(calibration: Calibration) -> str:
     return _line('gyro scale z', with_sigma(1 - error['value'], error['sigma']))
 
 
-def _arm(estimates: dict[str, Estimate], arm: str, word: str) -> str:
+def _arm(estimates: dict[str, result.Estimate], arm: str, word: str) -> str:
     """Return the coordinates of a lever arm that are known, '' without any."""
     found = {axis: known(estimates, f'{arm}_{axis}') for axis in 'xyz'}
     found = {axis: e for axis, e in found.items() if e.value is not None}
@@ -204,7 +201,7 @@ def _arm(estimates: dict[str, Estimate], arm: str, word: str) -> str:
     return _line(f'{word} {", ".join(found)}', f'{shown} m') if found else ''
 
 
-def _largest_errors(calibration: Calibration, width: int) -> list[str]:
+def _largest_errors(calibration: result.Calibration, width: int) -> list[str]:
     """Return the lines with the largest error source of scale, yaw and pitch, none without."""
     found = []
     for name, word in {'scale_factor': 'scale', **ANGLES}.items():
@@ -223,7 +220,7 @@ def _line(label: str, text: str) -> str:
     return f'  {label:<19} {text}'.rstrip()
 
 
-def _scale_text(scale: Estimate) -> str:
+def _scale_text(scale: result.Estimate) -> str:
     if scale.value is None:
         return 'not determined'
     relative = '' if not (scale.sigma and scale.value) else (
@@ -231,14 +228,14 @@ def _scale_text(scale: Estimate) -> str:
     return with_unit(scale) + relative
 
 
-def _angle_text(angle: Estimate, width: int) -> str:
+def _angle_text(angle: result.Estimate, width: int) -> str:
     if angle.value is None:
         return 'not determined'
     rad = f'   ({with_sigma(angle.value, angle.sigma, signed=True)} rad)' if width >= WIDTH else ''
     return f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg{rad}'
 
 
-def _leg_table(legs: tuple[LegResult, ...], width: int) -> list[str]:
+def _leg_table(legs: tuple[result.LegResult, ...], width: int) -> list[str]:
     rows: list[tuple[str, ...]] = [('leg', 'start, UTC', 'distance', 'min:s', 'fixes',
                                     'scale factor', 'yaw, deg', 'verdict')]
     rows += [(str(number), *_leg_row(leg), verdict) for number, (leg, verdict) in enumerate(
@@ -249,7 +246,7 @@ def _leg_table(legs: tuple[LegResult, ...], width: int) -> list[str]:
     return columns(rows) + bag_lines(legs, width) if legs else []
 
 
-def _method_table(calibration: Calibration) -> list[str]:
+def _method_table(calibration: result.Calibration) -> list[str]:
     """Return the table of methods, empty for a single one."""
     methods = calibration.methods
     if len(methods) < 2:
@@ -264,13 +261,13 @@ def _method_table(calibration: Calibration) -> list[str]:
     return columns(rows)
 
 
-def _refused(method: MethodResult) -> str:
+def _refused(method: result.MethodResult) -> str:
     """Return the first code for which a method is rejected, '' if it is not."""
     codes = [r.code.name for r in method.reasons if r.code.gravity is Verdict.REJECTED]
     return f': {codes[0]}' if codes else ''
 
 
-def _leg_row(leg: LegResult) -> tuple[str, ...]:
+def _leg_row(leg: result.LegResult) -> tuple[str, ...]:
     estimates = leg_estimates(leg)
     scale, yaw = (known(estimates, n) for n in ('scale_factor', 'yaw_mounting_angle'))
     started = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
@@ -281,7 +278,7 @@ def _leg_row(leg: LegResult) -> tuple[str, ...]:
             '-' if yaw.value is None else with_sigma(yaw.value, yaw.sigma, DEG, signed=True))
 
 
-def _budget(calibration: Calibration, width: int, small: bool) -> list[str]:
+def _budget(calibration: result.Calibration, width: int, small: bool) -> list[str]:
     estimates = calibration.estimates
     scale = known(estimates, 'scale_factor')
     method = calibration.methods.get(scale.method)

@@ -18,16 +18,10 @@ import math
 
 import numpy as np
 
+from odocal_ros.data import samples
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import chunks, thinned
-from odocal_ros.data.samples import (
-    FixSamples,
-    HeadingSamples,
-    ImuSamples,
-    LOCAL,
-    VelocitySamples,
-)
 from odocal_ros.nav.earth import OMEGA
 from odocal_ros.nav.local_frame import LARGEST_FRAME
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -48,7 +42,7 @@ def has_accelerometer(f_i: Floats) -> bool:
         return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all() for rows in chunks(len(f_i)))
 
 
-def lacking(imu: ImuSamples, accel_scale: float = 1.0) -> str:
+def lacking(imu: samples.ImuSamples, accel_scale: float = 1.0) -> str:
     """
     Return the reason why the accelerations of a leg cannot be used, '' if they can.
 
@@ -88,14 +82,12 @@ def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
         'external heading)'),)
 
 
-def settings_by_frame(fix: FixSamples, config: Config) -> Config:
-    """Return the settings for the frame of the positions."""
+def settings_by_frame(fix: samples.FixSamples, config: Config) -> Config:
     return config.in_local_frame() if is_local(fix) else config
 
 
-def is_local(fix: FixSamples) -> bool:
-    """Return True if positions are in a local frame."""
-    return bool((fix.status == LOCAL).any())
+def is_local(fix: samples.FixSamples) -> bool:
+    return bool((fix.status == samples.LOCAL).any())
 
 
 def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
@@ -107,10 +99,10 @@ def without_north(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     if not is_local(leg.fix):
         return leg, ()
     left_out = ['GNSS velocities'] * bool(len(leg.rows('fix_velocity').stamp_ns))
-    leg = leg.with_rows(fix_velocity=VelocitySamples.none())
+    leg = leg.with_rows(fix_velocity=samples.VelocitySamples.none())
     if config.alignment.heading_source == 'auto' and len(leg.rows('heading').stamp_ns):
         left_out += ['external headings']
-        leg = leg.with_rows(heading=HeadingSamples.none())
+        leg = leg.with_rows(heading=samples.HeadingSamples.none())
     latitude = math.radians(config.reference.latitude_deg)
     unknown = OMEGA if math.isnan(latitude) else OMEGA * math.cos(latitude)
     text = ('positions are in a local frame, so north is unknown: up to '

@@ -14,15 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.earth import (
-    C_en,
-    earth_rate_n,
-    ecef_from_geodetic,
-    geodetic_from_ecef,
-    gravity,
-    radii,
-    transport_rate_n,
-)
+from odocal_ros.nav import earth
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.profile import Hills, Profile
 
@@ -153,7 +145,7 @@ def _running(first: float, steps: Floats) -> Floats:
 def _walk_about(latitude: Floats, height: Floats, east: Floats,
                 north: Floats) -> tuple[Floats, Floats]:
     """Return the change of latitude and longitude of steps about a middle latitude."""
-    meridian, normal = radii(latitude)
+    meridian, normal = earth.radii(latitude)
     return north / (meridian + height), east / ((normal + height) * np.cos(latitude))
 
 
@@ -195,12 +187,12 @@ def inertial_v(state: State,
     a_v = np.concatenate([state.acceleration[:, None], state.sway_acceleration], axis=1)
     a_v = a_v + np.cross(w_nv, _velocity_v(state))
 
-    earth = earth_rate_n(state.latitude)
-    transport = transport_rate_n(state.latitude, state.height, v_n)
-    w_in = _into(C_nv, earth + transport)
+    w_ie_n = earth.earth_rate_n(state.latitude)
+    transport = earth.transport_rate_n(state.latitude, state.height, v_n)
+    w_in = _into(C_nv, w_ie_n + transport)
     w_v = w_in + w_nv
-    gamma = gravity(state.latitude, state.height)
-    coriolis = np.cross(2 * earth + transport, v_n)
+    gamma = earth.gravity(state.latitude, state.height)
+    coriolis = np.cross(2 * w_ie_n + transport, v_n)
     coriolis[:, 2] += gamma
     f_v = a_v + _into(C_nv, coriolis)
 
@@ -208,8 +200,8 @@ def inertial_v(state: State,
     if arm.any():
         a_n = np.einsum('nij,nj->ni', C_nv, a_v)
         dw_v = dw_nv - np.cross(w_nv, w_in) + _into(
-            C_nv, transport_rate_n(state.latitude, state.height, a_n))
-        w_e = _into(C_nv, earth)
+            C_nv, earth.transport_rate_n(state.latitude, state.height, a_n))
+        w_e = _into(C_nv, w_ie_n)
         # the Earth's own centrifugal part is in gravity already
         f_v = f_v + (np.cross(dw_v, arm) + np.cross(w_v, np.cross(w_v, arm))
                      - np.cross(w_e, np.cross(w_e, arm))
@@ -224,9 +216,9 @@ def _into(C_nv: Floats, a_n: Floats) -> Floats:
 
 def _gravity_change(state: State, d_n: Floats, gamma: Floats) -> Floats:
     """Return gravity at d_n (m) from the vehicle minus that at the vehicle, in its ENU."""
-    meridian, normal = radii(state.latitude)
+    meridian, normal = earth.radii(state.latitude)
     tilt_e, tilt_n = d_n[:, 0] / (normal + state.height), d_n[:, 1] / (meridian + state.height)
-    there = gravity(state.latitude + tilt_n, state.height + d_n[:, 2])
+    there = earth.gravity(state.latitude + tilt_n, state.height + d_n[:, 2])
     return np.stack([-there * tilt_e, -there * tilt_n, gamma - there], -1)
 
 
@@ -237,10 +229,10 @@ def point(state: State, lever_arm_v: tuple[float, float, float],
 
     tilt : (n, 3, 3) rotation from the body, to which the point is fixed, to the vehicle.
     """
-    C = C_en(state.latitude, state.longitude) @ attitude(state)
+    C = earth.C_en(state.latitude, state.longitude) @ attitude(state)
     C = C if tilt is None else C @ tilt
-    r_e = ecef_from_geodetic(state.latitude, state.longitude, state.height)
-    return geodetic_from_ecef(r_e + C @ np.asarray(lever_arm_v, dtype=float))
+    r_e = earth.ecef_from_geodetic(state.latitude, state.longitude, state.height)
+    return earth.geodetic_from_ecef(r_e + C @ np.asarray(lever_arm_v, dtype=float))
 
 
 def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float],
@@ -270,6 +262,6 @@ def contact_speed(state: State, lever_arm_v: Floats | tuple[float, float, float]
 def turn_rate(state: State) -> Floats:
     """Return the turn rate about the vehicle's up axis relative to the ground, rad/s: (n,)."""
     east = state.speed * np.cos(state.slope) * np.cos(state.yaw)
-    level_turn = east * np.tan(state.latitude) / (radii(state.latitude)[1] + state.height)
+    level_turn = east * np.tan(state.latitude) / (earth.radii(state.latitude)[1] + state.height)
     turn: Floats = state.yaw_rate * np.cos(state.slope) + level_turn
     return turn

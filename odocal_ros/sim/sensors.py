@@ -14,15 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.data import samples
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.data.samples import (
-    FixSamples,
-    HeadingSamples,
-    ImuSamples,
-    OdometerSamples,
-    ScalarSamples,
-    take,
-)
 from odocal_ros.nav import rotations
 from odocal_ros.nav.earth import radii
 from odocal_ros.settings.config import DIFFERENTIAL, HOLONOMIC
@@ -67,7 +60,7 @@ def imu_errors(options: SimOptions, n: int) -> tuple[Floats, Floats]:
                                      rate, (n, 3)))
 
 
-def imu(motion: Motion, options: SimOptions) -> ImuSamples:
+def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
     """Return the IMU's samples over the whole drive."""
     ns, t = stamps(motion.duration, options.imu_rate)
     state = motion.at(t)
@@ -83,8 +76,9 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
         q_ni = _orientation(state, options, options.orientation_sigma, 'orientation')
         variance = np.full(len(t), options.orientation_sigma**2)
     stamp = options.start_ns + _imu_stamps(ns, options)
-    return ImuSamples(stamp, stamp + round(TRANSPORT['imu'] * 1e9), w_i + gyro + gyro_drift,
-                      f_i + accel + accel_drift, q_ni, variance)
+    return samples.ImuSamples(
+        stamp, stamp + round(TRANSPORT['imu'] * 1e9), w_i + gyro + gyro_drift,
+        f_i + accel + accel_drift, q_ni, variance)
 
 
 def _imu_stamps(ns: Ints, options: SimOptions) -> Ints:
@@ -95,16 +89,16 @@ def _imu_stamps(ns: Ints, options: SimOptions) -> Ints:
                                 real.imu_jitter, real.imu_batch)
 
 
-def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:
+def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.HeadingSamples:
     """Return an external heading of b's x axis, as from a dual-antenna receiver."""
     ns, t = stamps(motion.duration, options.heading_rate, PHASE['heading'])
     q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=NONE3), sigma, 'heading')
     stamp = options.start_ns + ns
-    return HeadingSamples(stamp, stamp + round(TRANSPORT['heading'] * 1e9), q_nb,
-                          np.full(len(t), sigma**2))
+    return samples.HeadingSamples(stamp, stamp + round(TRANSPORT['heading'] * 1e9), q_nb,
+                                  np.full(len(t), sigma**2))
 
 
-def pressure(motion: Motion, options: SimOptions) -> ScalarSamples:
+def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
     """
     Return the air pressure, Pa; none without a sigma.
 
@@ -113,14 +107,14 @@ def pressure(motion: Motion, options: SimOptions) -> ScalarSamples:
     rate, scale_height, ground = 20.0, 8435.0, 101_325.0    # Hz, m, Pa: standard atmosphere
     sigma = options.pressure_sigma
     if sigma is None:
-        return ScalarSamples.none()
+        return samples.ScalarSamples.none()
     ns, t = stamps(motion.duration, rate, PHASE['pressure'])
     state, draw = motion.at(t), stream(options.seed, 'pressure').standard_normal
     weather, by_wind, warmer = draw(3) * [1e-3, 6e-3, 0.03]    # m/s, m per (m/s)^2, relative
     height = (state.height + by_wind * state.speed**2 + weather * t) / (1 + warmer)
     value = ground * np.exp(-(height + sigma * draw(len(t))) / scale_height)
     stamp = options.start_ns + ns
-    return ScalarSamples(stamp, stamp, value, (value * sigma / scale_height)**2)
+    return samples.ScalarSamples(stamp, stamp, value, (value * sigma / scale_height)**2)
 
 
 def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> Floats:
@@ -130,13 +124,13 @@ def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> 
     return rotations.quat_multiply(rotations.quat_from_rotvec([0.0, 0.0, error]), q_ni)
 
 
-def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
+def odometers(motion: Motion, options: SimOptions) -> list[samples.OdometerSamples]:
     """Return the samples of each wheel; pulses are whole counts, rounded down."""
     ns, t = stamps(motion.duration, options.odometer_rate, PHASE['odometer'])
     state = motion.at(t)
     stamp = options.start_ns + _late(ns, options, 'odometer')
     lean = motion.lean(t) if motion.lean else 0.0
-    return [OdometerSamples(stamp, stamp, _reading(state, options, wheel, lean))
+    return [samples.OdometerSamples(stamp, stamp, _reading(state, options, wheel, lean))
             for wheel in wheels.wheels_of(options)]
 
 
@@ -209,7 +203,7 @@ def _travel_after_starts(state: State, moving: Bools, seconds: float) -> Floats:
     return np.cumsum(np.diff(state.travel, prepend=state.travel[:1]) * fresh)
 
 
-def fixes(motion: Motion, options: SimOptions) -> FixSamples:
+def fixes(motion: Motion, options: SimOptions) -> samples.FixSamples:
     """Return GNSS fixes of the antenna, without those in an outage."""
     ns, t = stamps(motion.duration, options.fix_rate, PHASE['fix'])
     real = options.real
@@ -225,14 +219,15 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     error = real_sensors.reckoned(t, error, place, options)
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
+    power = 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
     variance = real_sensors.true_variance(
-        _axes(options) ** 2 * _power(options) + stationary_sigma(options)**2, options)
+        _axes(options) ** 2 * power + stationary_sigma(options)**2, options)
     variance = np.maximum(variance * real.stated_factor**2, SIGMA_FLOOR**2)
     if REFERENCES[options.reference].planar:
         variance[2] = 0.0
     n = len(t)
     stamp = options.start_ns + _late(ns, options, 'fix')
-    samples = FixSamples(
+    sent = samples.FixSamples(
         stamp, stamp + round(TRANSPORT['fix'] * 1e9), latitude, longitude, height + error[:, 2],
         np.tile(np.diag(variance), (n, 1, 1)), np.full(n, 2),
         np.full(n, 2 if options.fix_noise == 'rtk' else 0))
@@ -241,15 +236,11 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
         seen &= (t < begin) | (t >= end)
     if real.drops:
         seen &= stream(options.seed, 'real drops').uniform(size=n) >= real.drops
-    return take(samples, seen)
+    return samples.take(sent, seen)
 
 
 def _axes(options: SimOptions) -> Floats:
     return options.fix_sigma * np.array([1.0, 1.0, 2.0])
-
-
-def _power(options: SimOptions) -> float:
-    return 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
 
 
 def fix_errors(t: Floats, options: SimOptions) -> Floats:
