@@ -23,7 +23,7 @@ from odocal_ros.live import answers
 from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import Worker
 from odocal_ros.output.figures import iso
-from odocal_ros.output.stored import replacing, Stored, stored_in
+from odocal_ros.output.stored import replacing, stored_in
 from odocal_ros.outside.whole import locked, new_folder
 from odocal_ros.settings.config import Config
 
@@ -145,8 +145,7 @@ def _point(link: Path, name: str) -> None:
 
 def output_root(config: Config, node: str) -> Path:
     """Return the folder of results: the setting, else the node's own folder in the ROS home."""
-    home = os.environ.get('ROS_HOME') or '~/.ros'
-    own = Path(home) / 'odocal' / node.lstrip('/')
+    own = Path(os.environ.get('ROS_HOME') or '~/.ros') / 'odocal' / node.lstrip('/')
     return Path(config.output.directory or own).expanduser()
 
 
@@ -267,8 +266,3 @@ class Filing:
             self._show()
 
         self._worker.submit(partial(self._folders.withdraw, marks(left)), then)
-
-
-def latest_of(config: Config, node: str) -> Stored | None:
-    """Return the result at ``latest`` of a node, None without one."""
-    return stored_in(output_root(config, node) / LATEST)

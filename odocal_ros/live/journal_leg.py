@@ -25,7 +25,6 @@ HEADS_BYTES = 2**20            # judgement: for metadata and file heads
 
 
 def journals(root: Path) -> list[Path]:
-    """Return the journals in a folder, the oldest first."""
     found = []
     with suppress(FileNotFoundError):
         for folder in root.iterdir():
@@ -41,13 +40,10 @@ def clear_empty(root: Path) -> None:
         with suppress(OSError):
             named = JOURNAL_NAME.fullmatch(folder.name) and not folder.is_symlink()
             old = named and folder.stat().st_mtime < time.time() - FOLDER_NEW_S
-            if old and all(is_nothing(path) for path in folder.iterdir()) and not _in_use(folder):
+            # files that certainly contain no message
+            if old and all(path.name == JOURNAL or path.name.endswith(PART)
+                           for path in folder.iterdir()) and not _in_use(folder):
                 shutil.rmtree(folder)
-
-
-def is_nothing(path: Path) -> bool:
-    """Return True if a journal file certainly contains no message."""
-    return path.name == JOURNAL or path.name.endswith(PART)
 
 
 def size_of(folder: Path) -> int:

@@ -128,7 +128,6 @@ class LegCompletion:
         self._journal.restart()
 
     def view(self) -> SessionView:
-        """Return the current view of the node."""
         session, recording = self.session, self._recording
         inputs, progress = recording.inputs, recording.progress
         in_leg = session.state is State.RECORDING
@@ -158,8 +157,7 @@ class LegCompletion:
         """Publish the current status and log its changes."""
         now = self.view()
         self._console.report(now, time.monotonic_ns())
-        array = self._publishing.show_status(now)
-        self._journal.receive(self.session, array)
+        self._journal.receive(self.session, self._publishing.show_status(now))
 
     # the processing of a leg
 
@@ -204,7 +202,6 @@ class LegCompletion:
         return text
 
     def end_leg_now(self) -> None:
-        """End the leg at the newest stamp."""
         self._end_leg(self._mark_ns())
 
     def _end_leg(self, mark_ns: int) -> None:

@@ -36,7 +36,9 @@ def message_class(msgtype: str) -> Any:
     """Return the class of 'pkg/msg/Type', or raise BadConfig with the action."""
     match = MESSAGE_TYPE.fullmatch(msgtype)     # untrusted: it may be from the network
     try:
-        if match is None or not _has_messages(match['package']):
+        found = match and PathFinder.find_spec(match['package'])      # does not import it
+        if not (match and found and any(
+                Path(place, 'msg').is_dir() for place in found.submodule_search_locations or ())):
             raise ImportError
         return getattr(importlib.import_module(f'{match["package"]}.msg'), match['name'])
     except (ImportError, AttributeError):
@@ -44,13 +46,6 @@ def message_class(msgtype: str) -> Any:
             f'message type {msgtype!r} cannot be imported here: install its package or source '
             f"its workspace ('ros2 interface show {msgtype}' must work), or correct the type"
         ) from None
-
-
-def _has_messages(package: str) -> bool:
-    """Return True if a package has messages, without importing it."""
-    found = PathFinder.find_spec(package)
-    places = found and found.submodule_search_locations or ()
-    return any(Path(place, 'msg').is_dir() for place in places)
 
 
 def definition_of(kind: type) -> str:

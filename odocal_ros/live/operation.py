@@ -12,11 +12,11 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import Samples
 from odocal_ros.forecast.quantities import words
 from odocal_ros.live import answers, worker
-from odocal_ros.live.filing import latest_of
+from odocal_ros.live.filing import LATEST, output_root
 from odocal_ros.live.leg_completion import LegCompletion
 from odocal_ros.live.session import Refused, State
 from odocal_ros.output.figures import iso
-from odocal_ros.output.stored import Stored
+from odocal_ros.output.stored import Stored, stored_in
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.pipeline.floor_marks import mark_positions, place_of, WITHIN
 from odocal_ros.reasons import Code
@@ -67,7 +67,7 @@ class AutomaticLegs(LegCompletion):
 
     def _load_carried(self) -> None:
         """Continue with the carried result of earlier runs of the node."""
-        found = latest_of(self._config(), self._node_name)
+        found = stored_in(output_root(self._config(), self._node_name) / LATEST)
         if not found or not found.carried:
             return
         why = _not_ours(found, self._config())
@@ -197,7 +197,6 @@ class Operation(AutomaticLegs):
         raise Refused('no leg is running and there is no result yet: call ~/start_leg first')
 
     def cancel_leg(self) -> tuple[bool, str]:
-        """Drop the open leg."""
         text = f'leg {self.session.leg_id} is cancelled'
         self._drop_leg(text)
         self._log.info(text)
@@ -242,7 +241,6 @@ class Operation(AutomaticLegs):
         return True, f'reset: {len(dropped)} leg{"s" * (len(dropped) != 1)} dropped'
 
     def save(self) -> Future:
-        """Write the result files."""
         if self.session.calibration is None:
             raise Refused('nothing to save: no leg has been computed yet; call ~/start_leg, '
                           'drive, ~/stop_leg')

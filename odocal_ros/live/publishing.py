@@ -39,6 +39,7 @@ class Publishing:
         publish = partial(node.create_publisher, event_callbacks=quiet)
         self._node = node
         self._status = publish(DiagnosticArray, '~/status', LATCHED)
+        self.status_topic: str = self._status.topic_name      # resolved
         self._diagnostics = publish(DiagnosticArray, '/diagnostics', 1)
         self._hint = publish(String, '~/hint', LATCHED)
         self._plotted = {name: publish(Float64, f'~/{name}', LATCHED) for name in PLOTTED}
@@ -58,11 +59,11 @@ class Publishing:
 
     def set_results(self, calibration: Calibration | None) -> None:
         """Set all ``result.*`` at once; None: to the restored result, if there is one."""
-        stamp = no_date(iso(self._node.get_clock().now().nanoseconds))
         results = self._before
         if calibration:
-            vehicle = self._node.get_parameter('vehicle').value
-            results = params.as_results(calibration, stamp, vehicle)
+            stamp = no_date(iso(self._node.get_clock().now().nanoseconds))
+            results = params.as_results(calibration, stamp,
+                                        self._node.get_parameter('vehicle').value)
         self.setting_results = True
         try:
             self._node.set_parameters_atomically(
@@ -78,11 +79,6 @@ class Publishing:
         """Publish dead reckoning and reference of a leg."""
         for publisher, message in zip(self._paths, messages, strict=True):
             publisher.publish(message)
-
-    @property
-    def status_topic(self) -> str:
-        """Return the resolved name of ``~/status``."""
-        return self._status.topic_name
 
     def show_status(self, now: SessionView) -> DiagnosticArray:
         """Publish ``~/status`` and return it."""

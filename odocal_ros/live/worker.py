@@ -38,7 +38,6 @@ Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, refere
 JOB_GRACE_S, FILES_GRACE_S = 1.0, 4.0
 Job: TypeAlias = Callable[[], Any]
 Then: TypeAlias = Callable[[Any, Exception | None], None]      # one of them is None
-Outcome: TypeAlias = tuple[Then, Any, Exception | None]
 # By default glibc has an arena for every thread and, once one was freed, takes arrays of up to 32
 # MiB from it: a node kept 100 MiB unused after a leg of an hour at 1 kHz. judgement, of
 # mallopt(3): number of arenas of all threads, bytes from which a block is mapped separately
@@ -127,13 +126,12 @@ class Worker:
 
     def __init__(self) -> None:
         self._jobs: queue.Queue[tuple[Job, Then] | None] = queue.Queue()
-        self._done: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
+        self._done: queue.SimpleQueue[tuple[Then, Any, Exception | None]] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name='odocal_worker', daemon=True)
         self._thread.start()
 
     @property
     def busy(self) -> bool:
-        """Return True if a job is running or waiting."""
         return self._jobs.unfinished_tasks > 0
 
     def submit(self, job: Job, then: Then) -> None:
@@ -154,18 +152,14 @@ class Worker:
 
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:
-            self._done.put(_outcome(*entry))
-            del entry       # release the job's leg now, not at the next job
+            job, then = entry
+            try:
+                self._done.put((then, job(), None))
+            except Exception as error:
+                self._done.put((then, None, error))
+            del entry, job, then      # release the job's leg now, not at the next job
             give_back()
             self._jobs.task_done()
-
-
-def _outcome(job: Job, then: Then) -> Outcome:
-    """Run a job; an exception becomes part of the outcome."""
-    try:
-        return then, job(), None
-    except Exception as error:
-        return then, None, error
 
 
 def hold_little() -> None:
@@ -235,7 +229,6 @@ class Computing:
         return future
 
     def answer(self, success: bool, text: str) -> None:
-        """Answer all waiting callers."""
         waiting, self._waiting = self._waiting, []
         for future, _ in waiting:
             future.set_result((success, text))
