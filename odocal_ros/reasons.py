@@ -257,11 +257,9 @@ class Reason:
 
     @property
     def remedy(self) -> str:
-        """Return the remedy."""
         return self.do or self.code.remedy
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the entry of calibration.json."""
         return {'code': self.code.name, 'text': self.text, 'remedy': self.remedy}
 
 

@@ -117,7 +117,6 @@ class Recording:
 
 
 def possible(time_ns: int) -> bool:
-    """Return True if a bag time is valid."""
     return isinstance(time_ns, int) and 0 <= time_ns < LATEST_NS
 
 

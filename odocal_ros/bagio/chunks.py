@@ -117,7 +117,6 @@ def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chu
 
 
 def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> Written:
-    """Write all records of a file."""
     described = b''.join(
         _record(SCHEMA, struct.pack('<H', key) + _text(c.msgtype)
                 + _text('ros2msg' if c.definition[0] else '') + _text(c.definition[1]))

@@ -73,7 +73,6 @@ class _Layout:
         return self
 
     def header(self, frame: str) -> '_Layout':
-        """Add a std_msgs/Header."""
         return self.add('sec', '<i4').add('nanosec', '<u4').text('frame', frame)
 
     def packer(self, fill: Callable[[NDArray[Any], slice], None],
@@ -101,7 +100,6 @@ class _Layout:
 
 
 def _imu_layout(frame: str) -> _Layout:
-    """Return the layout of a sensor_msgs/Imu."""
     layout = _Layout().header(frame)
     for field, kind in (('q', ('<f8', 4)), ('q_cov', SQUARE), ('w', VECTOR), ('w_cov', SQUARE),
                         ('f', VECTOR), ('f_cov', SQUARE)):
@@ -177,7 +175,6 @@ def joints(name: str, wheels: dict[str, OdometerSamples], frame: str = '',
 
 
 def fix(name: str, samples: FixSamples, frame: str = 'gnss') -> Topic:
-    """Return sensor_msgs/NavSatFix of FixSamples."""
     layout = (_Layout().header(frame).add('status', 'i1').add('service', '<u2')
               .add('place', VECTOR).add('cov', SQUARE).add('cov_type', 'u1'))
 
@@ -205,7 +202,6 @@ def pose(name: str, samples: FixSamples, position: Floats, frame: str = 'map') -
 
 def pose_with_covariance(name: str, samples: FixSamples, position: Floats,
                          frame: str = 'map') -> Topic:
-    """Return geometry_msgs/PoseWithCovarianceStamped of such positions."""
     return _positions(name, 'PoseWithCovarianceStamped', samples, position,
                       _Layout().header(frame).add('place', VECTOR).add('q', ('<f8', 4)).add(
                           'cov', ('<f8', 36)))
@@ -238,7 +234,6 @@ def velocity(name: str, samples: VelocitySamples, frame: str = 'gnss') -> Topic:
 
 
 def pressure(name: str, samples: ScalarSamples, frame: str = 'imu') -> Topic:
-    """Return sensor_msgs/FluidPressure of ScalarSamples."""
     layout = _Layout().header(frame).add('values', ('<f8', 2))
 
     def fill(out: NDArray[Any], rows: slice) -> None:

@@ -250,7 +250,6 @@ class McapFile(Recording):
         return found
 
     def _learn(self, op: int, body: bytes) -> None:
-        """Store a schema or a channel."""
         (key,) = struct.unpack_from('<H', body)
         if op == SCHEMA:
             name, at = text_at(body, 2)

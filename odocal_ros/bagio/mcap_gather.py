@@ -172,7 +172,6 @@ def _walked(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
 
 
 def _joined(*parts: Columns) -> Columns:
-    """Return columns one after the other."""
     if not parts:
         return _walked([])
     packed = [part.raws.packed() for part in parts]
@@ -193,7 +192,6 @@ def _by_time(found: Columns) -> Columns:
 
 
 def _batch(found: Columns, wanted: Mapping[int, Channel]) -> Batch:
-    """Return messages by topic."""
     batch: Batch = {}
     for topic in dict.fromkeys(channel.topic for channel in wanted.values()):
         mine = [found.channel == key for key, channel in wanted.items() if channel.topic == topic]

@@ -111,7 +111,6 @@ class Chunk(NamedTuple):
 
     @property
     def records(self) -> memoryview:
-        """Return the records of the chunk."""
         return memoryview(self.data)[self.at:self.stop]
 
 

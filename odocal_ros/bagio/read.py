@@ -28,8 +28,6 @@ MISSING = 0.5   # s, judgement: shorter losses are not reported
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """A topic of a bag."""
-
     name: str
     msgtype: str
     count: int

@@ -107,7 +107,6 @@ def _reader(path: Path) -> Any:
         """A path that opens a Bounded file."""
 
         def open(self, *_: str) -> io.BufferedReader:
-            """Open the file for reading."""
             return Bounded(io.FileIO(self))
 
     class Counted(Reader):

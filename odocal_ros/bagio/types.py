@@ -112,7 +112,6 @@ class Types:
         return deserialize
 
     def cdr_from_ros1(self, raw: bytes, connection: Any) -> bytes:
-        """Return a ROS 1 message as CDR."""
         cdr: bytes = self._with(connection.msgtype).ros1_to_cdr(raw, connection.msgtype)
         return cdr
 

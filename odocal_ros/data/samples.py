@@ -59,7 +59,6 @@ class Samples:
 
     @classmethod
     def none(cls) -> Self:
-        """Return a block without rows."""
         return cls(*(np.empty((0, *one.metadata['shape']), one.metadata['dtype'])
                      for one in fields(cls)))
 

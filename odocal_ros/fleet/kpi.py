@@ -53,7 +53,6 @@ def _ratio(part: int, whole: int) -> float | None:
 
 
 def limits_of(settings: dict[str, Any]) -> Limits:
-    """Return the limits in settings."""
     return dict(with_settings(Config(), settings).accept.limits)
 
 

@@ -63,7 +63,6 @@ def _bag(row: Mapping[str, Any]) -> Any:
 
 
 def _arguments(options: dict[str, Any]) -> Any:
-    """Return the parsed options of replay."""
     from argparse import ArgumentParser
 
     from odocal_ros.offline.replay import add_calibration_arguments

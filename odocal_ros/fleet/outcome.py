@@ -100,7 +100,6 @@ def draw_report(job: ReportJob) -> str:
 
 
 def said(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
-    """Return the summary of a fleet for people."""
     counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
     failed = sum(row['bags_failed'] for row in vehicles)
     bags = sum(row['bags'] for row in vehicles)

@@ -22,7 +22,6 @@ VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in VALUES)
 
 def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
             leg: LegResult) -> dict[str, Any]:
-    """Return a leg as a row of a table."""
     estimates = leg_estimates(leg)
     reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
     row = {'vehicle': vehicle, 'model': model, 'leg': number, 'bag': one_line(leg.bag),
@@ -45,7 +44,6 @@ def rows_of_legs(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
 
 
 def utc(stamp_ns: int) -> datetime:
-    """Return a time as datetime in UTC."""
     return datetime.fromtimestamp(stamp_ns / 1e9, UTC)
 
 
@@ -57,14 +55,12 @@ def _schema(texts: str, numbers: str, counts: str, times: str, flags: str = '') 
 
 
 def leg_schema() -> Any:
-    """Return the columns of legs.parquet."""
     return _schema('vehicle model bag verdict reasons unit',
                    f'odometer_km duration_s distance_m {VALUE_COLUMNS}',
                    'leg start_ns stop_ns fixes period', 'start', 'odd')
 
 
 def vehicle_schema() -> Any:
-    """Return the columns of vehicles.parquet."""
     return _schema(
         'vehicle model decision verdict unit why remedy reasons changes odd_legs '
         'outlier failures rejected_for',
@@ -74,14 +70,12 @@ def vehicle_schema() -> Any:
 
 
 def in_batches(rows: Sequence[dict[str, Any]]) -> Iterator[Any]:
-    """Yield the rows of vehicles as tables."""
     import pyarrow as pa
     for k in range(0, len(rows), 1000):
         yield pa.Table.from_pylist(rows[k:k + 1000], schema=vehicle_schema())
 
 
 def batches(parts: Sequence[Path]) -> Iterator[Any]:
-    """Yield the tables of files."""
     import pyarrow.parquet as pq
     for part in parts:
         yield pq.ParquetFile(part).read(use_threads=False)

@@ -81,7 +81,6 @@ def pattern(name: str, size: float, rounds: int, drive: str, speed: float = 0.5)
 
 
 def _driven(moves: list[Move], speed: float) -> RobotMotion:
-    """Return the motion of moves, with a rest after each."""
     first, still = round(END_REST / MOTION_STEP), np.zeros((round(REST / MOTION_STEP), 3))
     velocity, rests = [np.zeros((first, 3))], [(first - len(still), first)]
     for forward, left, turn in moves:

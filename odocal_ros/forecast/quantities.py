@@ -46,7 +46,6 @@ QUANTITIES = {
 
 
 def nothing_known() -> dict[str, str]:
-    """Return every quantity as unknown."""
     return dict.fromkeys(QUANTITIES, UNKNOWN)
 
 

@@ -31,8 +31,6 @@ SHOWN = {'scale_factor': 'scale', 'track_width': 'track width', 'rotation_lever'
 
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
-    """A run and its prediction."""
-
     name: str
     motion: RobotMotion
     robot: Robot
@@ -108,7 +106,6 @@ def robot_of(options: SimOptions) -> Robot:
 
 
 def motion_of_drive(options: SimOptions) -> RobotMotion:
-    """Return the motion of resolved options of a simulated run."""
     made = motion_of(options)
     t: Floats = MOTION_STEP * np.arange(int(made.duration / MOTION_STEP) + 1, dtype=float)
     state = made.at(t)

@@ -134,7 +134,6 @@ class Health:
         return (now_ns - self.received_ns) * 1e-9 if self.received_ns else float('inf')
 
     def flowing(self, now_ns: int) -> bool:
-        """Return True if usable messages arrive."""
         allowed_s = max(SILENCE_NS * 1e-9, 5 * self._interval_s)
         return bool(self.newest_ns) and self.silent_s(now_ns) < allowed_s
 

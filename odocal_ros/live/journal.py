@@ -67,7 +67,6 @@ class Journal:
 
     @property
     def folder(self) -> str:
-        """Return the folder of the newest leg."""
         return self._writer.folder if self._limit else ''
 
     def remember(self, source: Input | StaticTransforms, raws: list[bytes],

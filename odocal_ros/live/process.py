@@ -67,7 +67,6 @@ class SettledNode(Node):
                 'and topics conflict; stop one, or rename it with -r __node:=NAME')
 
     def get_logger(self) -> PlainLog:
-        """Return the node's log."""
         return PlainLog(super().get_logger())  # type: ignore[no-untyped-call]
 
 

@@ -69,13 +69,11 @@ class RunningEstimate:
         self._gaps.feed(recorder.rows('imu'))      # leg.automatic sets marks in the past
 
     def end(self) -> None:
-        """Stop watching the leg."""
         self._forget()
         self._thinned = self._gaps = self._earlier = None
 
     @property
     def forecast(self) -> Forecast | None:
-        """Return the forecast of the leg."""
         return better(self._earlier, self._newest)
 
     def _forget(self) -> None:

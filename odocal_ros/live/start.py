@@ -35,7 +35,6 @@ drive_pattern = partial(_run, 'drive_pattern', 'odocal_ros.live.drive_pattern')
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the command-line arguments."""
     parser.add_argument('node', nargs='?', default='/calibrator',
                         help='full name of the node (default: /calibrator)')
     parser.add_argument('--once', action='store_true', help='print the first status and exit')

@@ -239,7 +239,6 @@ class Input:
         return self.health.newest_ns
 
     def flowing(self) -> bool:
-        """Return True if usable messages arrive."""
         return self.health.flowing(time.monotonic_ns())
 
     def why(self) -> str:

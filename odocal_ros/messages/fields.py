@@ -119,12 +119,10 @@ def fixed(dtype: type, *paths: str) -> Column:
 
 
 def xyz(prefix: str, names: str = 'xyz') -> Column:
-    """Return the column of a vector or quaternion."""
     return fixed(np.float64, *(f'{prefix}.{name}' for name in names))
 
 
 def array(path: str, *indices: int) -> Column:
-    """Return the column of some elements of an array."""
     return fixed(np.float64, *(f'{path}[{i}]' for i in indices))
 
 

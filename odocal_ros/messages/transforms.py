@@ -85,7 +85,6 @@ class TransformReader(Reader):
         return self.known()
 
     def add_static(self, raws: Sequence[bytes], deserialize: Deserialize) -> None:
-        """Process messages of the static topic."""
         for raw in raws:
             for child, parent, _, values in self._read(raw, deserialize):
                 self._chain.add_static(child, parent, values)

@@ -58,7 +58,6 @@ def _version(name: str, absent: str = MISSING) -> str:
 
 
 def _ros() -> list[tuple[str, str]]:
-    """Return the state of the ROS installation."""
     if find_spec('rclpy') is None:
         return [('rclpy', 'none: the node cannot run here, bags can be replayed')]
     # in a separate process: a crash does not end this one

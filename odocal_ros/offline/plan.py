@@ -66,7 +66,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Predict and print; return 0."""
     if args.indoor:
         return _indoor(args)
     from odocal_ros.library.plan import plan
@@ -118,7 +117,6 @@ def _config(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _figures(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the requested error parameters."""
     from odocal_ros.library.plan import RTK
     if args.rtk and args.fix_sigma is not None:
         raise BadUsage('--rtk and --fix-sigma exclude each other')

@@ -18,7 +18,6 @@ WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 
 
 def screen(planned: Planned) -> str:
-    """Return the prediction as one screen of plain text."""
     before, sigmas, found = planned.plan, planned.sigmas, planned.helps
     return '\n'.join([*_head(before, sigmas), '', *_methods(before), '', *_budgets(before),
                       *_helps(before, found), *_reasons(before)])

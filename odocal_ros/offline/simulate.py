@@ -143,7 +143,6 @@ def _span(text: str) -> tuple[float, float]:
 
 
 def options_of(args: argparse.Namespace) -> 'SimOptions':
-    """Return the SimOptions of parsed arguments."""
     from odocal_ros.sim.options import SimOptions
     plain = ['scenario', 'seed', 'imu', 'imu_grade', 'odometer', 'drive', 'two_wheels', 'wheels',
              'front_steers', 'reference', 'fix_noise', 'slip_walk', *NUMBERS]

@@ -102,7 +102,6 @@ def odometer(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
 
 
 def fixes(samples: FixSamples) -> dict[str, Any]:
-    """Return status and quality of fixes."""
     covariance = np.diagonal(samples.covariance_n, axis1=1, axis2=2)
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
         & ~beyond('covariance_n', covariance)
@@ -231,7 +230,6 @@ class Drive:
 
 
 def survey_drive(inputs: Inputs, config: Config) -> Drive:
-    """Return the drive of screened inputs."""
     placed = place(inputs, config)
     fixes_n, sigma, scale = placed.fixes_n, placed.fix_sigma, placed.rough or None
     stops, slowest, fastest = np.empty((0, 2)), 0.0, 0.0

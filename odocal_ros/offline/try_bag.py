@@ -63,7 +63,6 @@ class _Choice:
     why: str
 
     def words(self) -> str:
-        """Return the choice as a printed line."""
         return (f'{INPUTS[self.slot].label}: {self.topic}, because {self.why}; other candidates: '
                 f'{", ".join(self.others)} ({topic_option(self.slot)})')
 

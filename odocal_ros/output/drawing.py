@@ -55,7 +55,6 @@ def sheet(height: float, rows: int = 1, sharex: bool = True,
 
 
 def key(figure: Any, axes: Any) -> None:
-    """Place the legend above the axes."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         figure.legend(handles, labels, loc='upper center', ncols=3, borderpad=0.1,

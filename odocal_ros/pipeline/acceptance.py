@@ -47,7 +47,6 @@ class Held:
     sigma_wanted: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the entry of calibration.json; a limit that is not set is None."""
         return {'decision': self.decision.value, **self.estimate.as_dict(),
                 'low': self.low if math.isfinite(self.low) else None,
                 'high': self.high if math.isfinite(self.high) else None,
@@ -64,7 +63,6 @@ class Acceptance:
     do: str = ''
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the entry of calibration.json."""
         return {'decision': self.decision.value, 'why': self.why, 'remedy': self.do,
                 'values': {held.name: held.as_dict() for held in self.values}}
 
@@ -105,7 +103,6 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
 
 
 def hold(name: str, found: Estimate, low: float, high: float) -> Held:
-    """Return a value with its decision."""
     value, sigma = found.value, found.sigma
     if value is None or sigma is None:
         return Held(name, found, low, high, Decision.UNDECIDED)

@@ -77,7 +77,6 @@ class Stage:
     change: float = nan
 
     def words(self) -> str:
-        """Return the stage as text."""
         if not self.passes:
             return self.name
         change = f'{self.change:.0f}' if self.change >= WHOLE_FROM else f'{self.change:.2f}'

@@ -52,7 +52,6 @@ class Accelerations:
     inward: Floats
 
     def __getitem__(self, rows: slice) -> 'Accelerations':
-        """Return the accelerations of some rows."""
         return Accelerations(self.e1, self.e2, self.t[rows], self.force[rows], self.onward[rows],
                              self.inward[rows])
 

@@ -45,7 +45,6 @@ def read_config_file(path: Path) -> dict[str, object]:
 
 
 def _root(path: Path) -> Node:
-    """Return the root node of a parameter file."""
     try:
         return composed(read_text(path), str(path))
     except OSError as error:

@@ -118,7 +118,6 @@ def _settings(owner: Settings, prefix: str = '') -> Iterator[Setting]:
 
 @cache
 def settings_of(kind: type) -> dict[str, Setting]:
-    """Return the settings of a dataclass of settings by dotted name."""
     return {s.name: s for s in _settings(kind())}
 
 

@@ -26,7 +26,6 @@ def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def g_sensitivity(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Draw the g-sensitivity of the gyro."""
     return {}, {'g_sensitivity': plain(rng.normal(0.0, vehicle.size('g sensitivity'), 9))}
 
 

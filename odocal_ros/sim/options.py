@@ -106,7 +106,6 @@ class SimOptions:
 
     @property
     def wheel_count(self) -> int:
-        """Return the number of published wheels."""
         return max(self.wheels, 1 + self.two_wheels)
 
 
