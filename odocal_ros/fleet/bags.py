@@ -142,7 +142,8 @@ def _bags_in(name: str) -> list[str]:
     fs, path = file_system(name)
     try:
         paths = fs.glob(path) if any(c in path for c in '*?[') else [path]
-        return [_url(name, fs, bag) for found in sorted(paths) for bag in _in_folder(fs, found)]
+        bags = [bag for found in sorted(paths) for bag in _in_folder(fs, found)]
+        return [str(fs.unstrip_protocol(bag)) for bag in bags] if '://' in name else bags
     except OSError as error:
         raise BadUsage(f'{name}: cannot be read ({said_by(error)})') from None
 
@@ -155,10 +156,6 @@ def _in_folder(fs: Any, path: str) -> list[str]:
     single = [f for f in files
               if f.endswith(ENDINGS) and str(PurePosixPath(f).parent) not in folders]
     return sorted([*folders, *single])
-
-
-def _url(name: str, fs: Any, path: str) -> str:
-    return str(fs.unstrip_protocol(path)) if '://' in name else path
 
 
 def is_local(url: str) -> bool:

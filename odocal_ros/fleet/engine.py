@@ -28,8 +28,7 @@ def check_installed() -> None:
 
 
 @contextmanager
-def engine(scheduler: str | None, workers: int | None, memory: int,
-           tries: int) -> Iterator[Any]:
+def engine(scheduler: str | None, workers: int | None, memory: int, tries: int) -> Iterator[Any]:
     """
     Yield a Dask client: of the scheduler at an address, or of temporary local processes.
 

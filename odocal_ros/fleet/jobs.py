@@ -41,16 +41,11 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
         legs = bag.legs or tuple(args.leg)
         legs_of(legs)
         settings = settings_key(config_of(settled), topics, legs)
-        jobs.append(BagJob(_from_anywhere(bag), topics, settled, legs, settings,
+        if is_local(bag.bag):      # valid for workers in any folder
+            bag = replace(bag, bag=os.path.abspath(file_system(bag.bag)[1]))
+        jobs.append(BagJob(bag, topics, settled, legs, settings,
                            str(folder.resolve()), seconds, memory))
     return jobs
-
-
-def _from_anywhere(bag: FleetBag) -> FleetBag:
-    """Return the bag with an absolute path, valid for workers in any folder."""
-    if not is_local(bag.bag):
-        return bag
-    return replace(bag, bag=os.path.abspath(file_system(bag.bag)[1]))
 
 
 def computed_rows(client: Any, jobs: Sequence[BagJob],

@@ -106,12 +106,6 @@ def rejecting(leg: LegResult) -> list[Reason]:
             if r.code.gravity is Verdict.REJECTED and leg.verdict is Verdict.REJECTED]
 
 
-def rejected_from(driven: Sequence[Driven]) -> int:
-    """Return the first leg from which all are rejected; the number of legs if there is none."""
-    return 1 + max((k for k, one in enumerate(driven)
-                    if one.leg.verdict is not Verdict.REJECTED), default=-1)
-
-
 def all_rejected(lost: Sequence[Driven]) -> Reason:
     """Return the reason why the current state of a vehicle is unknown."""
     last = rejecting(lost[-1].leg)[0]
@@ -157,10 +151,13 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     config = with_settings(done[-1].config(), job.settings)
     histories = {name: history_of(name, driven, config) for name in (
         'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')}
-    starts = _periods(histories)
+    # first legs of the periods without changes
+    starts = sorted({0} | {number[change.leg] for number, found, _ in histories.values()
+                           for change in found.changes})
     now = driven[starts[-1]:]
     calibration = combine([one.leg for one in now], config, imu=known_imu(config))
-    lost = driven[rejected_from(driven):]
+    lost = driven[1 + max((k for k, one in enumerate(driven)
+                           if one.leg.verdict is not Verdict.REJECTED), default=-1):]
     if len(lost) >= FEWEST_REJECTED and calibration.verdict is not Verdict.REJECTED:
         calibration = replace(calibration, reasons=(all_rejected(lost), *calibration.reasons))
     row |= _current(calibration, config, driven, starts) | _changes(histories, driven) \
@@ -188,12 +185,6 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
             {'vehicle': row['vehicle'], 'decision': decision,
              'why': row['failures'], 'remedy': LOOK_AT_BAGS, 'values': {},
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
-
-
-def _periods(histories: dict[str, Any]) -> list[int]:
-    """Return the first leg of each period without changes; the first period starts at 0."""
-    return sorted({0} | {number[change.leg] for number, found, _ in histories.values()
-                         for change in found.changes})
 
 
 def _current(calibration: Calibration, config: Config, driven: Sequence[Driven],

@@ -34,7 +34,6 @@ class Listener:
         """Receive a note for the user."""
 
     def phase(self, title: str) -> AbstractContextManager[Progress]:
-        """Return a context for a phase of the work; its value receives the fraction done."""
         return nullcontext(lambda share, stage='': None)
 
 
@@ -51,7 +50,6 @@ class Notes(Listener):
         self._onward.note(text)
 
     def phase(self, title: str) -> AbstractContextManager[Progress]:
-        """Return the phase of the next listener."""
         return self._onward.phase(title)
 
 
@@ -153,8 +151,7 @@ def parse_leg(text: str) -> LegSpan:
 
     Raises BadUsage: not of that form, or B not after A.
     """
-    separator = '/' if '/' in text else ':'
-    parts = text.split(separator)
+    parts = text.split('/' if '/' in text else ':')
     if len(parts) != 2:
         raise BadUsage(f'--leg {text}: required: A:B in seconds, or A/B for ISO 8601 dates')
     (start, rel_a), (stop, rel_b) = (_edge(p.strip(), text) for p in parts)

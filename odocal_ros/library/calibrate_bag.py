@@ -83,7 +83,10 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
         look_at_all(paths, lambda one: _look(one, asked))
     done = _each(paths, asked, received)
     settings = done[-1].config
-    if unlike := unlike_settings([one.config for one in done]):
+    first, *others = [flat(one.config) for one in done]      # journals have their own
+    # as text: an unset one is NaN, which is not equal to itself
+    if unlike := [name for name, value in first.items()
+                  if any(repr(other[name]) != repr(value) for other in others)]:
         received.note(f'{", ".join(unlike)}: differ between the journals; each leg uses its own '
                       f'settings, limits and files use those of {done[-1].path.name}')
     results, inputs = unique_names([one.path for one in done], [one.legs for one in done],
@@ -155,7 +158,6 @@ def _one(path: Path, asked: _Asked, unit: str | None, received: Notes) -> _BagLe
 
 
 def _legs_of(bag: Recording, asked: _Asked, received: Notes) -> list[LegResult]:
-    """Return the results of a bag's legs."""
     if bag.dropped and not asked.legs:
         raise LegDropped(f'{bag.name}: its leg was cancelled or undone and is not replayed; use '
                          '--leg : to replay it anyway')
@@ -236,14 +238,6 @@ def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
     if troubles:
         raise BadUsage(f'{len(troubles)} of {len(paths)} bags cannot be used; nothing was '
                        f'calibrated: {"; ".join(troubles)}')
-
-
-def unlike_settings(configs: list[Config]) -> list[str]:
-    """Return the names of the settings that differ between bags; journals have their own."""
-    first, *others = [flat(config) for config in configs]
-    # as text: an unset one is NaN, which is not equal to itself
-    return [name for name, value in first.items()
-            if any(repr(other[name]) != repr(value) for other in others)]
 
 
 def unique_names(paths: list[Path], legs: list[list[LegResult]],

@@ -43,8 +43,7 @@ class Calibration:
     config: Config = Config()
     inputs: tuple[dict[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
-    created: str = field(
-        default_factory=lambda: datetime.now(UTC).isoformat(timespec='seconds'))
+    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec='seconds'))
 
     @property
     def verdict(self) -> Verdict:

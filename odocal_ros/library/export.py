@@ -106,7 +106,6 @@ def kml(columns: Series) -> str:
 
 
 def parquet(columns: Series, path: Path) -> None:
-    """Write a series as a Parquet file."""
     import pyarrow
     from pyarrow import parquet as files
     held = pyarrow.BufferOutputStream()
@@ -124,8 +123,7 @@ def mcap(result: Calibration, path: Path) -> None:
     /odocal/residuals/SENSOR JointState: each component and its sigma, units in the names.
     """
     with tempfile.TemporaryDirectory(prefix='.odocal_', dir=path.parent) as work:
-        bag = write_bag(Path(work) / 'debug', _topics(result))
-        next(bag.glob('*.mcap')).replace(path)
+        next(write_bag(Path(work) / 'debug', _topics(result)).glob('*.mcap')).replace(path)
 
 
 def _topics(result: Calibration) -> list[encode.Topic]:

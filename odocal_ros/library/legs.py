@@ -4,7 +4,7 @@
 """Legs of a recording: as requested, as marked by the node, or from its standstills."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -22,6 +22,10 @@ from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
+if TYPE_CHECKING:
+    from odocal_ros.library.read_bag import Recording
+
+Recorded: TypeAlias = 'Bag | Recording'     # open, or read
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
 Stops = tuple[Ints, tuple[Floats, float] | None]     # result of ``stops_of``
 OPENING = 0.2                 # judgement: of the distance; a later first stop does not start a leg
@@ -31,22 +35,6 @@ DROPPED = ('cancelled', 'undone')
 OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: it ends at the '
             'last sample that all topics have')
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
-
-
-class Recorded(Protocol):
-    """A bag that is open or was read."""
-
-    @property
-    def name(self) -> str:
-        """Return its name."""
-
-    @property
-    def start_ns(self) -> int:
-        """Return the bag time of its first message."""
-
-    @property
-    def end_ns(self) -> int:
-        """Return the bag time of its last message."""
 
 
 def marked_legs(bag: Bag) -> list[tuple[int, int]]:
@@ -136,7 +124,8 @@ def find_legs(recorder: LegRecorder, bag: Recorded, asked: Sequence[LegSpan | st
     Raises BadUsage: a requested leg is outside the bag; BadData: the stamps of the topics have no
     common time, and a leg must be searched or is open-ended.
     """
-    first, last = _common(recorder)
+    firsts, lasts = zip(*_ends(recorder).values() or [(0, 1)], strict=True)
+    first, last = max(firsts), min(lasts)     # last before first: no common time
     closed = marks or any(isinstance(a, LegSpan) and None not in (a.start_ns, a.stop_ns)
                           for a in asked)
     if first - last > OFFSET_REACH * 1e9 and not closed:
@@ -165,12 +154,6 @@ def _marked(marks: Sequence[tuple[int, int]], last: int, bag: Recorded) -> Spans
         raise BadData(f'{bag.name}: the recording ended at the start mark or right after it, so '
                       'the leg is empty; drive it again (--leg : uses the data before the mark)')
     return legs
-
-
-def _common(recorder: LegRecorder) -> tuple[int, int]:
-    """Return the first and last common stamp of IMU, odometer and fix; last before first: none."""
-    firsts, lasts = zip(*_ends(recorder).values() or [(0, 1)], strict=True)
-    return max(firsts), min(lasts)
 
 
 def _ends(recorder: LegRecorder) -> dict[str, tuple[int, int]]:

@@ -52,7 +52,6 @@ class Change:
         return math.inf if then is None else then / now
 
     def sigma(self, parameter: str) -> float | None:
-        """Return the sigma of a parameter."""
         return self.scale if parameter == SCALE else self.yaw
 
 
@@ -108,8 +107,7 @@ def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
 def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
     """Return the drive up to where it is farthest from the start, None if that is the end."""
     inside = drive.t >= 0
-    ds = np.gradient(drive.travel[inside])
-    place = np.cumsum(ds * np.exp(1j * drive.yaw[inside]))
+    place = np.cumsum(np.gradient(drive.travel[inside]) * np.exp(1j * drive.yaw[inside]))
     k = int(np.argmax(np.abs(place - place[0])))
     if abs(place[-1] - place[0]) > 0.9 * abs(place[k] - place[0]):
         return None
@@ -175,7 +173,6 @@ class Planned:
         return self.plan.reasons
 
     def sigma(self, parameter: str) -> float | None:
-        """Return the sigma of scale_factor (relative) or of a mounting angle (rad)."""
         return self.plan.sigma(parameter)
 
     @cached_property

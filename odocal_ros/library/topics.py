@@ -129,8 +129,7 @@ def _optional(slot: str, config: Config, found: list[str]) -> bool:
 
 def _of_receiver(name: str) -> bool:
     """Return True if the name of a topic has a receiver word and no word of another source."""
-    words = re.split('[/_]', name.lower())
-    return (any(word.startswith(GNSS) for word in words)
+    return (any(word.startswith(GNSS) for word in re.split('[/_]', name.lower()))
             and not _has(name, (*COMMANDS, 'filtered', 'fused', 'ekf', 'odom', 'wheel', 'speed')))
 
 

@@ -127,16 +127,12 @@ def main(argv: list[str] | None = None) -> int:
              '(--leg A:B)')
         return WRONG_USE
     except Exception as error:     # noqa: BLE001 users get a line and a file, no trace
-        return _internal(error)
-
-
-def _internal(error: Exception) -> int:
-    import traceback
-    path = trace_file(''.join(traceback.format_exception(error)))
-    first = (str(error).splitlines() or [''])[0][:200]
-    warn(f'odocal: internal error ({type(error).__name__}: {first}); '
-         f'please report it with {path}')
-    return INTERNAL
+        import traceback
+        path = trace_file(''.join(traceback.format_exception(error)))
+        first = (str(error).splitlines() or [''])[0][:200]
+        warn(f'odocal: internal error ({type(error).__name__}: {first}); '
+             f'please report it with {path}')
+        return INTERNAL
 
 
 def trace_file(text: str) -> str:

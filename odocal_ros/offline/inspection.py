@@ -30,7 +30,8 @@ from odocal_ros.output.files import plain
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond
 from odocal_ros.screening.leg_kind import settings_by_frame
-from odocal_ros.settings.config import Config, SIDES
+from odocal_ros.settings.config import Config, SIDES, with_settings
+from odocal_ros.settings.config_file import parse_set
 
 # they affect only methods with an initial alignment, or with the end points alone
 ENDS = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARABLE, Code.LEG_NOT_STRAIGHT}
@@ -112,7 +113,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         if (tap := taps.get(mapping.get('odometer', ''))) and tap.meaning:
             extra.append(f'odometer.quantity={tap.meaning.quantity}')
     if extra:
-        config = odometer_search.configured(config, extra)
+        config = with_settings(config, dict(map(parse_set, extra)))
         _read_again(bag, taps, mapping['odometer'], config, topics)
     if {'imu', 'odometer'} <= mapping.keys():
         extra += look(bag, _together(taps, mapping), config, found, findings)
@@ -165,7 +166,6 @@ def _static(taps: dict[str, _Tap], bag: Bag) -> dict[str, _Tap]:
 
 
 def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[str, Any]:
-    """Return the findings on one topic."""
     seconds = (bag.end_ns - bag.start_ns) * 1e-9
     facts: dict[str, Any] = {'name': info.name, 'type': info.msgtype, 'count': info.count,
                    'rate_hz': info.count / seconds if seconds > 0 else None}
@@ -260,7 +260,6 @@ def _turn(imu: _Tap) -> tuple[Ints, Floats] | None:
 
 
 def _together(taps: dict[str, _Tap], mapping: dict[str, str]) -> LegRecorder:
-    """Return one recorder with the inputs of a mapping."""
     recorder = LegRecorder()
     for slot, topic in mapping.items():
         if topic not in taps:

@@ -25,8 +25,6 @@ from odocal_ros.messages.sensor_types import IMU, Pairs
 from odocal_ros.nav.odometer import travel
 from odocal_ros.offline.survey import FixPath, Match
 from odocal_ros.offline.wheel_survey import sides, suggested
-from odocal_ros.settings.config import Config, with_settings
-from odocal_ros.settings.config_file import parse_set
 
 # judgement: limits of the search in one topic; 0.4 million values take 1 s and 4 MB
 MOST_MESSAGES, MOST_FIELDS, MOST_VALUES = 10_000, 128, 400_000
@@ -87,8 +85,7 @@ class Fields:
             raise BadData('no numeric field')
         self.paths = [path for path, _ in found]
         self.whole = [isinstance(value, Integral) for _, value in found]
-        most = min(MOST_MESSAGES, MOST_VALUES // len(found))
-        self._every = max(1, -(-self.count // most))
+        self._every = max(1, -(-self.count // min(MOST_MESSAGES, MOST_VALUES // len(found))))
 
     def facts(self, path: FixPath) -> dict[str, Any]:
         """Return the number of fields and those that follow the path of the fixes."""
@@ -207,11 +204,10 @@ def searched(topics: Mapping[str, TopicInfo], known: Collection[str],
 def _possible(info: TopicInfo) -> bool:
     """Return True for types without a fixed meaning, except GNSS and commands."""
     package = info.msgtype.partition('/')[0]
-    words = re.split(r'[/_]', f'{info.name}/{info.msgtype}'.lower())
     return (info.msgtype not in (*ODOMETERS, IMU) and info.name not in NEVER
             and package not in STANDARD and '/calibrator/' not in info.name
             and not any(word.startswith((*RECEIVER, *COMMANDS)) or word in FUSED
-                        for word in words))
+                        for word in re.split(r'[/_]', f'{info.name}/{info.msgtype}'.lower())))
 
 
 def match_of(rows: OdometerSamples, form: OdometerForm, path: FixPath) -> Match:
@@ -260,8 +256,3 @@ def best_topic(topics: Sequence[dict[str, Any]], asked: str) -> dict[str, Any] |
     found = [facts for facts in topics if facts.get('fields', {}).get('found') and (
         not asked or facts['name'].strip('/') == asked.strip('/'))]
     return min(found, default=None, key=lambda facts: rank(facts['fields']['found'][0]))
-
-
-def configured(config: Config, settings: Collection[str]) -> Config:
-    """Return a configuration with settings as for --set."""
-    return with_settings(config, dict(parse_set(setting) for setting in settings))

@@ -134,20 +134,13 @@ def asked_config(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def asked_settings(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings of --config < --set."""
     from odocal_ros.settings.config_file import parse_set, read_config_file
     asked = read_config_file(Path(args.config)) if args.config else {}
     return asked | dict(parse_set(text) for text in args.settings)
 
 
 def asked_topics(args: argparse.Namespace) -> dict[str, str]:
-    """Return slot -> requested topic."""
     return {slot: topic for slot in TOPICS if (topic := getattr(args, f'{slot}_topic'))}
-
-
-def _styled(stream: Any) -> bool:
-    """Return True if a stream is a terminal with colours."""
-    return stream.isatty() and 'NO_COLOR' not in os.environ and os.environ.get('TERM') != 'dumb'
 
 
 def _size(stream: Any) -> tuple[int, int | None]:
@@ -205,8 +198,10 @@ def _show(calibration: 'Combined', args: Any) -> OSError | None:
     """Print the result before the report is drawn; return an error of the stream, or None."""
     from odocal_ros.output.summary import screen
     columns, rows = _size(sys.stdout)
+    styled = (sys.stdout.isatty() and 'NO_COLOR' not in os.environ
+              and os.environ.get('TERM') != 'dumb')
     try:
-        say(screen(calibration, _styled(sys.stdout), columns, rows and rows - 9))
+        say(screen(calibration, styled, columns, rows and rows - 9))
         if args.holdout:
             say('\ntrack against fixes: last fifth of each leg, excluded from the fit')
         sys.stdout.flush()
@@ -217,7 +212,6 @@ def _show(calibration: 'Combined', args: Any) -> OSError | None:
 
 def _show_files(calibration: 'Combined', output: Path, written: list[Path],
                 report: list[Path]) -> None:
-    """Print the paths of the results."""
     from odocal_ros.output.summary import sentence
     columns, rows = _size(sys.stdout)
     text = f'written: {output}/ ({", ".join(p.name for p in written)})'

@@ -83,14 +83,12 @@ def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: 
         return ''
     words = ['odocal', 'replay', path]
     for slot, topic in mapping.items():
-        others = {s: t for s, t in mapping.items() if s != slot}
-        found = candidates(topics, slot, config, others)
+        found = candidates(topics, slot, config, {s: t for s, t in mapping.items() if s != slot})
         local = slot == 'fix' and topics[topic].msgtype != FIX      # stated, as it is unusual
         if slot in overrides or len(found) > 1 or topic not in found or local:
             words += [topic_option(slot), topic]
     if 'odometer_right' in mapping and 'odometer_right' not in overrides:
         extra = ['odometer.left=topic', 'odometer.right=topic', *extra]
     for option in extra:
-        words += option.split(' ', 1) if option.startswith('--') else [
-            '--set', option]
+        words += option.split(' ', 1) if option.startswith('--') else ['--set', option]
     return for_shell(words)

@@ -93,8 +93,7 @@ def _travelled(t: Floats, value: Floats, field: str) -> Floats:
     return value
 
 
-def sides(t: Floats, s: Floats, rolls: Bools,
-          imu: tuple[Floats, Floats] | None) -> list[str]:
+def sides(t: Floats, s: Floats, rolls: Bools, imu: tuple[Floats, Floats] | None) -> list[str]:
     """Return 'left', 'right' or '' of each value, by the gyro: the outer wheel travels farther."""
     k = len(rolls)
     none = [''] * k
@@ -135,14 +134,10 @@ def suggested(facts: list[dict[str, Any]]) -> tuple[str, ...]:
         return ()
     if len(left) > 1:
         axles = chain.from_iterable(zip(left, right, strict=True))
-        return (f'odometer.wheels=[{", ".join(map(_quoted, axles))}]',)
+        quoted = (f'"{key}"' if '[' in key else key for key in axles)      # for YAML
+        return (f'odometer.wheels=[{", ".join(quoted)}]',)
     return tuple(f'odometer.{side}={keys[0]}' for side, keys in zip(
         SIDES, (left, right), strict=True))
-
-
-def _quoted(key: str) -> str:
-    """Return a key as an element of a YAML list."""
-    return f'"{key}"' if '[' in key else key
 
 
 def in_words(facts: list[dict[str, Any]]) -> list[str]:

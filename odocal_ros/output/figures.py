@@ -23,13 +23,6 @@ COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 OF_LEG = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
 
-def decimals(sigma: float) -> int:
-    """Return the decimal places that show a sigma with two digits."""
-    if not (math.isfinite(sigma) and sigma > 0):
-        return 6
-    return max(0, min(12, 1 - math.floor(math.log10(sigma))))
-
-
 def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
                signed: bool = False) -> str:
     """
@@ -43,10 +36,10 @@ def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
     if sigma is None or not math.isfinite(sigma):
         return f'{value:+.6g}' if signed else f'{value:.6g}'
     sigma *= factor
-    places = decimals(sigma)
+    places = 1 - math.floor(math.log10(sigma)) if 0 < sigma < math.inf else 6
     if sigma >= 100:
-        whole = 1 - math.floor(math.log10(sigma))
-        value, sigma = round(value, whole), round(sigma, whole)
+        value, sigma = round(value, places), round(sigma, places)
+    places = max(0, min(12, places))
     return f'{value:{"+" if signed else ""}.{places}f} ± {sigma:.{places}f}'
 
 
@@ -87,7 +80,6 @@ def length(metres: float) -> str:
 
 
 def time_span(seconds: float) -> str:
-    """Return a duration as text."""
     if seconds < 120:
         return f'{seconds:.1f} s'
     minutes, rest = divmod(round(seconds), 60)

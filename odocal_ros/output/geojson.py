@@ -48,7 +48,8 @@ def features(number: int, leg: LegResult, most: int) -> list[dict[str, Any]]:
     out = []
     for name, rows, make in (('corrected', leg.track_n, _line),
                              ('as_configured', leg.track_before_n, _line),
-                             ('fixes', leg.reference_n, _points)):
+                             ('fixes', leg.reference_n, lambda rows: {
+                                 'type': 'MultiPoint', 'coordinates': rows.tolist()})):
         positions = _positions(rows, leg, most)
         if rows is not None and len(positions):
             out.append(_feature(make(positions), number, leg, name,
@@ -81,10 +82,6 @@ def _positions(rows_n: Floats | None, leg: LegResult, most: int) -> Floats:
         return degrees
     height_places = 3    # mm
     return np.column_stack([degrees, geodetic[:, 2].round(height_places)])
-
-
-def _points(positions: Floats) -> dict[str, Any]:
-    return {'type': 'MultiPoint', 'coordinates': positions.tolist()}
 
 
 def _line(positions: Floats) -> dict[str, Any]:

@@ -93,8 +93,7 @@ def compared(calibration: Calibration, name: str) -> list[tuple[str, str, str]]:
     return [_draw(panels, name, len(calibration.legs))] if panels else []
 
 
-def _scale(calibration: Calibration,
-           rows: list[tuple[str, str, dict[str, Estimate]]]) -> Panel:
+def _scale(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estimate]]]) -> Panel:
     result = known(calibration.estimates, 'scale_factor')
     all_of = [(text, method, known(estimates, 'scale_factor')) for text, method, estimates in rows]
     found = [(text, method, e.value / result.value - 1, (e.sigma or 0.0) / abs(result.value))

@@ -47,11 +47,9 @@ class Stored:
 
     @property
     def usable(self) -> bool:
-        """Return True if its values can be used."""
         return self.verdict is not Verdict.REJECTED
 
     def value(self, name: str) -> float | None:
-        """Return a value, None without one."""
         found = self.estimates.get(name)
         return None if found is None else found.value
 
@@ -72,8 +70,7 @@ def read_stored(path: Path) -> Stored:
     except OSError as error:
         in_folder = isinstance(error, FileNotFoundError) and path != Path(name)
         why = f'there is no {MAIN} in it' if in_folder else error.strerror
-        raise BadUsage(f'{name}: {why}; give a calibration.json or its folder') \
-            from None
+        raise BadUsage(f'{name}: {why}; give a calibration.json or its folder') from None
     except (ValueError, RecursionError) as error:      # of json, utf-8, or a value below
         why = (str(error).splitlines() or ['nested too deep'])[0]
         raise BadUsage(f'{name}: not a calibration.json of odocal ({why})') from None
