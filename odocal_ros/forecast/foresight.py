@@ -73,7 +73,8 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
     running = smoother_forecast.look(leg, config, smoother, wanted)
     only_smoother = deciding(config.method) == smoother_forecast.ONLY
     if only_smoother or smoother_forecast.gives_all(running):     # the end points add nothing
-        forecast = smoother_forecast.nothing_foreseen(config)
+        forecast = Forecast(Prospect(None, config.verdict.max_scale_sigma, None),
+                            Prospect(None, config.verdict.max_yaw_sigma, None))
     else:
         forecast = _by_ends(leg, fix_rate, config, wanted)
         if smoother is not None and 'smoother' in deciding(config.method):
@@ -90,8 +91,7 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
     return replace(forecast, estimates=estimates, until_ns=leg.stop_ns)
 
 
-def _by_ends(leg: Leg, fix_rate: float, config: Config,
-             wanted: Callable[[], bool]) -> Forecast:
+def _by_ends(leg: Leg, fix_rate: float, config: Config, wanted: Callable[[], bool]) -> Forecast:
     """Return the two_point forecast of the leg with its end points."""
     inputs = leg_so_far.screened_in_cells(leg, config).inputs
     driven = leg_so_far.profile_of(inputs, config)

@@ -79,8 +79,7 @@ class PlannedDrive:
     @property
     def distance(self) -> float:
         """Return the path length between the marks, forwards and backwards, m."""
-        inside = self.t >= 0.0
-        return float(np.abs(np.diff(self.travel[inside])).sum())
+        return float(np.abs(np.diff(self.travel[self.t >= 0.0])).sum())
 
     @property
     def duration(self) -> float:
@@ -90,8 +89,7 @@ class PlannedDrive:
     def standstills(self, shortest: float) -> list[tuple[float, float]]:
         """Return (begin, end) of the standstills of at least ``shortest`` s."""
         turning = np.abs(np.gradient(self.yaw, self.t)) > SPOT_TURN      # on the spot
-        rest = (np.abs(self.speed) <= REST_SPEED) & ~turning
-        spans = self.t[runs(rest) - [0, 1]]
+        spans = self.t[runs((np.abs(self.speed) <= REST_SPEED) & ~turning) - [0, 1]]
         return [(float(a), float(b)) for a, b in spans if b - a >= shortest]
 
     def lengthened(self, metres: float) -> 'PlannedDrive':
@@ -104,7 +102,6 @@ class PlannedDrive:
         return self._held(len(self.t) - 1, seconds, at_rest=True)._held(0, seconds, at_rest=True)
 
     def turned_around(self) -> 'PlannedDrive':
-        """Return the same drive in the other direction."""
         return replace(self, yaw=self.yaw + np.pi)
 
     def until(self, t_stop: float, rest: float) -> 'PlannedDrive':

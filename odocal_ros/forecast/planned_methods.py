@@ -132,8 +132,7 @@ class Plan:
     def verdict(self) -> Verdict:
         """Return the predicted verdict: of the drive and the best method."""
         order = list(Verdict)
-        best = min((verdict_of(self.reasons_of(name)) for name in self.deciding),
-                   key=order.index)
+        best = min((verdict_of(self.reasons_of(name)) for name in self.deciding), key=order.index)
         return Verdict.worst([verdict_of(self.two_point.of_drive), best])
 
     def reasons_of(self, name: str) -> tuple[Reason, ...]:

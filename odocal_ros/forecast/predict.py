@@ -117,7 +117,8 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     track = dead_reckon(drive.t, quat_from_matrix(drive.C_nb),
                         Travel(drive.t, drive.travel, sigmas.quantum))
     distance, said = judge_drive(track, drive.duration, 1.0, config.leg)
-    track = _from(track, alignment.t)
+    keep = track.t >= alignment.t - 1e-9
+    track = Track(track.t[keep], track.q_nb[keep], track.s[keep], track.P[keep])
     start, end = (_mark(t, track, drive, sigmas, spans, asked) for t, asked in (
         (0.0, config.reference.start), (drive.duration, config.reference.end)))
     chord = Chord(track, Origin(drive.latitude, drive.longitude, drive.height), start, end,
@@ -166,12 +167,6 @@ def _rest(t: float, spans: Sequence[tuple[float, float]]) -> float:
     """Return the duration of the standstill at a mark, s."""
     begin, end = standing_at(t, spans) or (0.0, 0.0)
     return end - begin
-
-
-def _from(track: Track, t: float) -> Track:
-    """Return the track from time t on, s."""
-    keep = track.t >= t - 1e-9
-    return Track(track.t[keep], track.q_nb[keep], track.s[keep], track.P[keep])
 
 
 def _mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,

@@ -4,7 +4,6 @@
 """Progress of a drive for the operator: distance, speed, standstill, clocks that differ."""
 
 from collections import deque
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -200,19 +199,16 @@ class Progress:
 
     def received_before(self, preroll_s: float) -> Received:
         """Return the samples so far that determine what a leg can estimate."""
-        fix = self._last.get('fix')
-        place = Received({})
+        fix, imu = self._last.get('fix'), self._last.get('imu')
+        place: dict[str, Any] = {}
         if fix is not None and np.isfinite(fix.latitude[-1]):
-            place = Received({}, latitude=float(fix.latitude[-1]),
-                          height=bool(np.isfinite(fix.height[-1])))
-        sent = {name: self._last.get(slot) for slot, name in (
-            ('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
-        variances = {name: np.inf if block is None else stated_variance(block)
-                     for name, block in sent.items()}
-        imu = self._last.get('imu')
-        return replace(place, variances=variances,
-                       has_accelerometer=imu is None or has_accelerometer(imu.f_i),
-                       rested_s=self._travel.rested_s(preroll_s) if self._travel else 0.0)
+            place = {'latitude': float(fix.latitude[-1]),
+                     'height': bool(np.isfinite(fix.height[-1]))}
+        variances = {name: stated_variance(self._last[slot]) if slot in self._last else np.inf
+                     for slot, name in (('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
+        return Received(variances, **place,
+                        has_accelerometer=imu is None or has_accelerometer(imu.f_i),
+                        rested_s=self._travel.rested_s(preroll_s) if self._travel else 0.0)
 
     def begin_leg(self) -> None:
         """Restart distance and highest speed."""

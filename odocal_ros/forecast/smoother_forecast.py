@@ -63,12 +63,6 @@ def gives_all(running: Running | None) -> bool:
         running.method.estimates[name].value is not None for name in PARAMETERS)
 
 
-def nothing_foreseen(config: Config) -> Forecast:
-    """Return a forecast with the required accuracies only."""
-    return Forecast(Prospect(None, config.verdict.max_scale_sigma, None),
-                    Prospect(None, config.verdict.max_yaw_sigma, None))
-
-
 def without_force(forecast: Forecast) -> Forecast:
     """Return a forecast without the values that need an accelerometer."""
     yaw = forecast.yaw
@@ -122,8 +116,7 @@ def _scale(running: Running, asked: float) -> Prospect:
     now = '' if e.value is None or e.sigma is None else digits(e.value, e.sigma)
     if now and e.unit != '1':
         now += f' {e.unit}'
-    return Prospect(sigma, asked, metres, sources_of(running.method, SCALE),
-                    UNREACHABLE, now)
+    return Prospect(sigma, asked, metres, sources_of(running.method, SCALE), UNREACHABLE, now)
 
 
 def _slow_share(running: Running) -> float:

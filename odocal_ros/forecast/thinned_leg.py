@@ -175,7 +175,6 @@ class LateSoFar:
 
 
 def _on_time(rows: OdometerSamples) -> OdometerSamples:
-    since_s = (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9
-    true_s = on_time(rows, since_s, UNROLLED, [])
+    true_s = on_time(rows, (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9, UNROLLED, [])
     true_ns = rows.stamp_ns[0] + np.rint(true_s * 1e9).astype(np.int64)
     return replace(rows, stamp_ns=np.maximum.accumulate(true_ns))

@@ -57,14 +57,12 @@ class FleetVehicle:
     changes: tuple[FleetChange, ...] = field(default=())
 
     def broken(self, bag: int) -> bool:
-        """Return True if the counter was broken in a drive."""
         return any(change.what == 'counter' and change.bag <= bag for change in self.changes)
 
 
 def fleet_of(vehicles: int, bags: int, seed: int) -> list[FleetVehicle]:
     """Return ``vehicles`` vehicles with ``bags`` drives each, one per week."""
-    rng = stream(seed, 'fleet')
-    order = rng.permutation(vehicles).tolist()
+    order = stream(seed, 'fleet').permutation(vehicles).tolist()
     fates: dict[int, str] = {}
     for what, share in FATES.items():
         for _ in range(math.ceil(vehicles * share - 1e-9) if vehicles > 2 and bags > 2 else 0):
@@ -96,7 +94,6 @@ def _vehicle(k: int, bags: int, fate: str | None, rng: np.random.Generator) -> F
 
 
 def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOptions) -> SimOptions:
-    """Return the options of a drive of the ``number``-th vehicle."""
     return replace(
         options, seed=options.seed + 1000 * (number + 1) + bag, yaw=float(vehicle.yaw[bag]),
         start_ns=options.start_ns + bag * 7 * DAY_NS + number % 100 * DAY_NS // 24,

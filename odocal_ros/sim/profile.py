@@ -50,8 +50,7 @@ class Profile:
         """Return the integral from the first break."""
         order = np.arange(1, self.powers.shape[1] + 1)
         powers = np.concatenate([np.zeros((len(self.powers), 1)), self.powers / order], axis=1)
-        gains = _horner(powers.T, np.diff(self.breaks))
-        powers[1:, 0] = np.cumsum(gains)[:-1]
+        powers[1:, 0] = np.cumsum(_horner(powers.T, np.diff(self.breaks)))[:-1]
         return Profile(self.breaks, powers)
 
     def _piece(self, t: ArrayLike) -> Ints:

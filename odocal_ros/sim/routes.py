@@ -218,8 +218,7 @@ def with_sideways_moves(duration: float, rng: np.random.Generator) -> Route:
     return replace(route, side=_clean(side.integral()))
 
 
-def _town_cycle(rng: np.random.Generator,
-                off: float) -> tuple[list[Piece], list[Piece], float]:
+def _town_cycle(rng: np.random.Generator, off: float) -> tuple[list[Piece], list[Piece], float]:
     up, top, down = _tenth(rng.uniform(5, 12)), rng.uniform(9, 14), _tenth(rng.uniform(6, 12))
     before, turning, between = (_tenth(rng.uniform(*r)) for r in ((1, 8), (6, 10), (2, 8)))
     weave, after, stop = (_tenth(rng.uniform(*r)) for r in ((4, 6), (1, 6), (4, 15)))

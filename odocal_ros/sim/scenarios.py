@@ -93,7 +93,6 @@ class Drive:
 
     @property
     def reference(self) -> Reference:
-        """Return the kind of the position reference."""
         return REFERENCES[self.options.reference]
 
     def leg(self) -> Leg:
@@ -121,7 +120,6 @@ class Drive:
 
 
 def motion_of(options: SimOptions) -> Motion:
-    """Return the true motion of resolved options."""
     make = with_sideways_moves if options.drive in HOLONOMIC else ROUTES[options.scenario]
     route = make(options.duration, stream(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
@@ -228,7 +226,5 @@ def _angles(options: SimOptions) -> tuple[float, float, float, float]:
 
 
 def _first_move(motion: Motion) -> float:
-    """Return the time at which the vehicle first moves, s."""
     speed = motion.speed
-    moves = np.flatnonzero((speed.powers != 0).any(axis=1))
-    return float(speed.breaks[moves[0]])
+    return float(speed.breaks[np.flatnonzero((speed.powers != 0).any(axis=1))[0]])

@@ -97,8 +97,7 @@ def _told_arm(options: SimOptions, name: str) -> list[float]:
     return [float(x + e) for x, e in zip(true, error, strict=True)]
 
 
-def settings(drive: Drive,
-             known_heading_sigma: float | None = None) -> dict[str, dict[str, Any]]:
+def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict[str, dict[str, Any]]:
     """
     Return the settings an operator of this vehicle would give, by group.
 

@@ -54,7 +54,7 @@ def wheels_of(options: SimOptions) -> list[SimWheel]:
         return [SimWheel('wheel_joint', 'L', middle, options.scale)]
     half = np.array([0.0, options.track_width / 2, 0.0])
     if options.drive == OMNI:
-        angle = omni_angles(n)
+        angle = 2 * np.pi * np.arange(n) / n      # counter-clockwise from the x axis
         arms = options.track_width / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
         return [SimWheel(f'omni_{k}', f'omni_{k}', middle + arm, scale) for k, (arm, scale)
                 in enumerate(zip(arms, _scales(options, np.ones(n, bool)), strict=True), 1)]
@@ -80,11 +80,6 @@ def _scales(options: SimOptions, counted: Bools) -> list[float]:
     scales = 1 + options.wheel_difference * stream(options.seed, 'wheels').standard_normal(n)
     scales *= options.scale * np.mean(1 / scales[counted])
     return [float(scale) for scale in scales]
-
-
-def omni_angles(count: int) -> Floats:
-    """Return the angles of omni wheels from the x axis, counter-clockwise, rad: (n,)."""
-    return 2 * np.pi * np.arange(count) / count
 
 
 def steered_path(state: State, arm: Floats) -> Floats:
@@ -154,8 +149,7 @@ def slip_share(state: State, real: Real) -> Floats:
 
 def tyre_slip(state: State, real: Real) -> Floats:
     """Return the accumulated tyre slip at each time, m: (n,)."""
-    path_length = np.diff(state.travel, prepend=state.travel[:1])
-    return np.cumsum(slip_share(state, real) * path_length)
+    return np.cumsum(slip_share(state, real) * np.diff(state.travel, prepend=state.travel[:1]))
 
 
 def leg_factor(state: State, real: Real) -> float:
