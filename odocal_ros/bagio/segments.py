@@ -85,7 +85,6 @@ class SegmentedBag:
         return [s for s in self.segments[1:] if s.first == s.last]
 
     def append(self, chunks: Sequence[Chunk]) -> None:
-        """Write chunks as the next segment."""
         number = self.segments[-1].last + 1 if self.segments else 0
         self.segments.append(self._write(part_name(number, number), number, number, chunks))
 
@@ -104,7 +103,8 @@ class SegmentedBag:
         """
         if room is None or self.size <= room:
             try:
-                self._write_whole()
+                self.segments = [self._write(whole_name(self.folder), 0, self.segments[-1].last,
+                                             _chunks_of(self.segments))]
             except OSError:
                 self._write_metadata()
                 return self.segments[0].path
@@ -119,11 +119,6 @@ class SegmentedBag:
         number = len(self.extra) + 1
         self.extra.append(self._write(whole_name(self.folder, number), 0, 0, chunks))
         self._write_metadata()
-
-    def _write_whole(self) -> None:
-        segments = self.segments
-        whole = self._write(whole_name(self.folder), 0, segments[-1].last, _chunks_of(segments))
-        self.segments = [whole]
 
     def _join(self, segments: list[Segment]) -> None:
         """Replace several files by one."""

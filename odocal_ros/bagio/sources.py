@@ -152,8 +152,7 @@ def _read_metadata(path: Path) -> Known:
 
 def _known(content: dict[str, dict[str, Any]]) -> Known:
     known = content['rosbag2_bagfile_information']
-    files = known.get('files') or ()
-    spans = ((Path(file['path']).name, _span(file)) for file in files)
+    spans = ((Path(file['path']).name, _span(file)) for file in known.get('files') or ())
     formats = {topic['topic_metadata'].get('serialization_format', 'cdr')
                for topic in known.get('topics_with_message_count') or ()}
     if not all(isinstance(form, str) for form in formats):
@@ -248,5 +247,4 @@ def _with_wal(path: Path, wal: Path, folder: Path) -> Path:
 
 
 def names(paths: Sequence[Path]) -> str:
-    """Return the names of files as one text."""
     return ', '.join(path.name for path in paths)

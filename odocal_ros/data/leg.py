@@ -134,7 +134,8 @@ class LegRecorder:
     def forget_before(self, stamp_ns: int, slots: Iterable[str] = SLOTS) -> None:
         """Drop blocks that are completely before a stamp, to limit memory."""
         for slot in slots:
-            self._rows[slot].forget(lambda block: _key(block) < stamp_ns)
+            self._rows[slot].forget(
+                lambda block: _placed(block.stamp_ns, block.received_ns) < stamp_ns)
 
     def clear(self) -> None:
         """Drop everything, as after a jump of time."""
@@ -169,12 +170,8 @@ def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
     return replace(leg, start_ns=start_ns, stop_ns=stop_ns).with_rows(**rows)
 
 
-def _key(samples: Samples) -> Ints:
-    """Return the time of each row: its stamp, or its arrival if it has none."""
-    return _placed(samples.stamp_ns, samples.received_ns)
-
-
 def _placed(stamp_ns: Ints, received_ns: Ints) -> Ints:
+    """Return the time of each row: its stamp, or its arrival if it has none."""
     return np.where(stamp_ns > 0, stamp_ns, received_ns)
 
 

@@ -58,7 +58,6 @@ class SensorPlan:
         return 'a message is incomplete'
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> Pairs:
-        """Return (slot, block) pairs."""
         stamps = stamp_ns(columns[0], columns[1])
         return [(self.slot, self._build(stamps, received_ns, *columns[2:]))]
 
@@ -106,10 +105,6 @@ def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
     return samples.VelocitySamples(stamps, received, velocity_n, np.where(known, variance, 0.0))
 
 
-def _scalar(stamps: Ints, received: Ints, sent: Floats) -> samples.ScalarSamples:
-    return samples.ScalarSamples(stamps, received, sent[:, 0], sent[:, 1])
-
-
 # format: of sensor_msgs/Imu, whose covariances are 3 x 3, row by row
 _ORIENTATION = (xyz('orientation', 'xyzw'), array('orientation_covariance', 0),
                 array('orientation_covariance', 8))
@@ -125,7 +120,8 @@ SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
     ('fix_velocity', 'geometry_msgs/msg/TwistWithCovarianceStamped'): (
         (xyz('twist.twist.linear'), array('twist.covariance', 0, 7, 14)), _velocity),
     ('pressure', 'sensor_msgs/msg/FluidPressure'): (
-        (fixed(np.float64, 'fluid_pressure', 'variance'),), _scalar),
+        (fixed(np.float64, 'fluid_pressure', 'variance'),),
+        lambda stamps, received, sent: samples.ScalarSamples(stamps, received, *sent.T)),
 }
 
 

@@ -84,7 +84,6 @@ class FrameChain:
 
     @property
     def frames(self) -> list[str]:
-        """Return the names of all frames received."""
         parents = {e.parent for e in self._moving.values()} | {p for p, _ in self._static.values()}
         return sorted(parents | set(self._moving) | set(self._static))
 
@@ -96,20 +95,14 @@ class FrameChain:
         """Return True if one of the transforms has stamps."""
         return any(name in self._moving for name in self._walk()[1])
 
-    def _parent_of(self, child: str) -> str | None:
-        if child in self._moving:
-            return self._moving[child].parent
-        return self._static[child][0] if child in self._static else None
-
     def _walk(self) -> tuple[str, list[str]]:
         """Return the last known frame from the child upwards, and the children below it."""
         here, path = self.child, list[str]()
         while here != self.parent and here not in path:
-            above = self._parent_of(here)
-            if above is None:
+            if here not in self._moving and here not in self._static:
                 break
             path.insert(0, here)
-            here = above
+            here = self._moving[here].parent if here in self._moving else self._static[here][0]
         return here, path
 
     def take(self) -> Known:

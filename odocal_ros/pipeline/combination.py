@@ -45,7 +45,9 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     used = good or legs
     names = dict.fromkeys(n for leg in used for n in leg.methods)
     carried = carried if carried and _belongs(carried, used) else None
-    before = carried or (imu if imu and _of_others(imu, used) else None)
+    # of other legs than those that determined the IMU constants
+    before = carried or (imu if imu and not any(
+        imu.first_ns <= leg.start_ns <= imu.last_ns for leg in used) else None)
     methods = {n: _combined(n, [
         (leg.methods[n], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
         if leg in used and n in leg.methods], config, before) for n in names}
@@ -78,11 +80,6 @@ def _belongs(carried: Carried, legs: Sequence[LegResult]) -> bool:
     smoothed = [leg.methods[SMOOTHER] for leg in legs if SMOOTHER in leg.methods]
     return all(m.estimates['scale_factor'].unit == carried.unit for m in smoothed) \
         and min(leg.start_ns for leg in legs) > carried.last_ns
-
-
-def _of_others(imu: Carried, legs: Sequence[LegResult]) -> bool:
-    """Return True if none of the legs can be among those that determined the IMU constants."""
-    return not any(imu.first_ns <= leg.start_ns <= imu.last_ns for leg in legs)
 
 
 def _carried_on(methods: Mapping[str, MethodResult], good: Sequence[LegResult],

@@ -150,8 +150,7 @@ def shortened_by_slopes(inputs: Inputs) -> float:
 def _nodes(t_fix: Floats) -> tuple[Floats, Ints, Ints]:
     """Return times of nodes, nodes with a position, and rows of positions, one per 0.1 s."""
     gap = max(LEAST_NODE, float(t_fix[-1] - t_fix[0]) / MOST_NODES)
-    slot = np.floor((t_fix - t_fix[0]) / gap + 1e-6)
-    used = np.flatnonzero(np.diff(slot, prepend=-1.0) > 0)
+    used = np.flatnonzero(np.diff(np.floor((t_fix - t_fix[0]) / gap + 1e-6), prepend=-1.0) > 0)
     kept = t_fix[used]
     parts = np.maximum(np.ceil(np.diff(kept) / (1.5 * gap)), 1).astype(np.int64)
     first = np.repeat(np.append(0, np.cumsum(parts)[:-1]), parts)
@@ -170,7 +169,6 @@ def _gyro(inputs: Inputs, t: Floats) -> Floats:
 
 
 def known_of(run: Run, config: Config) -> Known:
-    """Return the priors of the constants by the settings."""
     antenna, odometer = config.gnss.lever_arm, config.odometer.lever_arm
     grade = grade_of(config.imu)
     known = Known(

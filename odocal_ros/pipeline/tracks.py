@@ -121,8 +121,7 @@ def driven(ready: PreparedLeg) -> tuple[Floats, Floats]:
     return ready.track.t, path_length * ready.metres_per_unit
 
 
-def slip_check(ready: PreparedLeg, track: Track, f: Floats,
-               between: tuple[float, float]) -> Slips:
+def slip_check(ready: PreparedLeg, track: Track, f: Floats, between: tuple[float, float]) -> Slips:
     """
     Return the slips of the mean of the wheels, without those already attributed to one wheel.
 

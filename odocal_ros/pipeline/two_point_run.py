@@ -98,8 +98,7 @@ class TwoPointRun:
         chord = Chord(track, ready.origin, start, end, ready.lever_b,
                       self._velocity_change((start, end)), ready.alignment,
                       (self.inputs.doubt_t, self.inputs.doubt_sigma))
-        still = all(m.standing or m.surveyed for m in (start, end))
-        if still or refusal(chord, ready.rough):
+        if all(m.standing or m.surveyed for m in (start, end)) or refusal(chord, ready.rough):
             return chord
         path = ready.path(solve(chord, np.inf)[0])      # marks in motion depend on the solution
         return replace(chord, start=ready.mark(start.t, path, 'start') or start,
@@ -126,7 +125,11 @@ class TwoPointRun:
         up = check.track_residuals(ready.path(solve(chord)[0]), chord.start, fixes)
         residual[:, 2] = up[:, 2]              # without the error of the pitch
         covariance = self.inputs.covariance_n[between]
-        factor = self._noise_factor(residual, covariance, drift, chord)
+        factor = check.fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
+        if factor.max() > 1.0:
+            self.reasons.append(Reason(
+                Code.FIXES_NOISIER_THAN_SAID, f'the fixes deviate from the track {factor[0]:.1f} '
+                f'times (in height {factor[2]:.1f} times) as much as their covariance states'))
         if np.isnan(self.config.gnss.correlation_time):     # else configured
             start, end = marks_with_slow_errors(
                 (chord.start, chord.end), ready.spans, fixes[0], self.track.at(fixes[0]) @ f,
@@ -143,15 +146,6 @@ class TwoPointRun:
         sources = drift_sources(self.track.t[keep], D, self.track.q_nb[keep], self.ready.alignment)
         # the bow of a track fixed at both ends is a quarter of the drift of a free end
         return np.concatenate(list(sources.values()), axis=1) / 4
-
-    def _noise_factor(self, residual: Floats, covariance: Floats, drift: float,
-                      chord: Chord) -> Floats:
-        factor = check.fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
-        if factor.max() > 1.0:
-            self.reasons.append(Reason(
-                Code.FIXES_NOISIER_THAN_SAID, f'the fixes deviate from the track {factor[0]:.1f} '
-                f'times (in height {factor[2]:.1f} times) as much as their covariance states'))
-        return factor
 
     def _judge_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
                      drift: float) -> None:

@@ -106,8 +106,7 @@ def _late(y: Floats, x: Floats, x_late: float = 0.0) -> float:
     """
     reach = round(FARTHEST_OFFSET / OFFSET_CELL)
     size = 2 * max(len(x), reach)
-    both = np.fft.irfft(np.fft.rfft(y, size, axis=0) * np.fft.rfft(x, size, axis=0).conj(),
-                        axis=0)
+    both = np.fft.irfft(np.fft.rfft(y, size, axis=0) * np.fft.rfft(x, size, axis=0).conj(), axis=0)
     at = np.arange(-reach, reach + 1)
     seen = both[at]
     share = np.einsum('li,ij,lj->l', seen, np.linalg.pinv(x.T @ x), seen) / max(

@@ -224,8 +224,7 @@ def _off(t: Floats, travel: Floats, rows: Ints) -> Floats:
                 apart = time - other        # 0 for simultaneous rows, or at an end
                 weight *= (here - other) / np.where(np.abs(apart) > 1e-9, apart, 1e-9)
         meant += weight * (travel[at] - travel[rows])
-    whole = (rows + CUBIC[0] >= 0) & (rows + CUBIC[-1] <= last)
-    return np.where(whole, -meant, 0.0)
+    return np.where((rows + CUBIC[0] >= 0) & (rows + CUBIC[-1] <= last), -meant, 0.0)
 
 
 def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Floats:
