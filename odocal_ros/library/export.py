@@ -17,12 +17,7 @@ from odocal_ros.bagio.write import write_bag
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.export_pictures import (
-    draw_map,
-    draw_scale_by_speed,
-    LOCAL,
-    scale_by_speed,
-)
+from odocal_ros.library import export_pictures
 from odocal_ros.library.series import Left, left_in, residuals, Series, stacked, states, trajectory
 from odocal_ros.output.drawing import PICTURES
 from odocal_ros.outside.whole import whole_file
@@ -89,7 +84,7 @@ def kml(columns: Series) -> str:
     """Return the track of each leg as a line on the ground, for Google Earth."""
     ElementTree.register_namespace('', KML)
     if np.isnan(columns['latitude_deg']).all():
-        raise BadUsage(f'export: track.kml: {LOCAL}')
+        raise BadUsage(f'export: track.kml: {export_pictures.LOCAL}')
     root = ElementTree.Element(f'{{{KML}}}kml')
     document = ElementTree.SubElement(root, f'{{{KML}}}Document')
     for leg in np.unique(columns['leg']).tolist():
@@ -180,7 +175,7 @@ def _there(module: str) -> bool:
 
 SERIES: dict[str, Callable[[Calibration], Series]] = {
     'trajectory': trajectory, 'track': trajectory, 'states': states, 'residuals': residuals,
-    'scale_by_speed': scale_by_speed}
+    'scale_by_speed': export_pictures.scale_by_speed}
 TEXTS = {'tum': tum, 'csv': csv, 'kml': kml}
 KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
     f'{name}.{ending}' for name in ('trajectory', 'states', 'residuals', 'scale_by_speed')
@@ -219,7 +214,8 @@ def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
 def _write(result: Calibration, file: Path) -> None:
     name, ending = file.stem, file.suffix[1:]
     if file.suffix in PICTURES:
-        (draw_map if name == 'map' else draw_scale_by_speed)(result, file)
+        draw = export_pictures.draw_map if name == 'map' else export_pictures.draw_scale_by_speed
+        draw(result, file)
     elif ending == 'mcap':
         mcap(result, file)
     elif ending == 'rrd':

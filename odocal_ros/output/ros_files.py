@@ -12,18 +12,7 @@ import numpy as np
 
 from odocal_ros.calib.result import BESIDE, Calibration
 from odocal_ros.data.arrays import Floats
-from odocal_ros.output.device_files import (
-    about,
-    CONTROLLERS,
-    controllers,
-    DEVICES,
-    devices,
-    head,
-    IMU_ERRORS,
-    imu_errors,
-    TWIST,
-    wheel_covariance,
-)
+from odocal_ros.output import device_files
 from odocal_ros.output.geojson import geojson, TRACK
 from odocal_ros.output.tables import leg_table, LEGS
 from odocal_ros.outside import names
@@ -35,8 +24,8 @@ PARAMS = 'calibration.yaml'
 VELOCITY = 'vehicle_velocity_converter.param.yaml'
 IMU = 'imu_corrector.param.yaml'
 LAUNCH, URDF, COMMAND = ('imu_transform.launch.xml', 'imu_transform.urdf', 'imu_transform.txt')
-NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, CONTROLLERS, DEVICES, TRACK, LEGS, TWIST,
-         IMU_ERRORS}
+NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, TRACK, LEGS, device_files.CONTROLLERS,
+         device_files.DEVICES, device_files.TWIST, device_files.IMU_ERRORS}
 # declared by the node for every drive; of one wheel they stay unknown
 TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width')
 AXES = 'xyz'
@@ -71,7 +60,7 @@ def _params(calibration: Calibration, content: dict[str, Any]) -> str:
     result |= {'legs': len(calibration.legs),
                'valid': calibration.verdict is not Verdict.REJECTED,
                'stamp': no_date(content['created']), 'vehicle': content['vehicle']}
-    return (head(calibration, content)
+    return (device_files.head(calibration, content)
             + '# for the node calibrator at its start: --ros-args --params-file THIS_FILE\n'
             '# scale factor: metres of travel per pulse (per rad for joints, 1 for speeds)\n'
             '# angles: rad, of the IMU on the vehicle about fixed axes; yaw > 0: its x axis '
@@ -80,7 +69,7 @@ def _params(calibration: Calibration, content: dict[str, Any]) -> str:
 
 def _autoware(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     out = {}
-    top = head(calibration, content)
+    top = device_files.head(calibration, content)
     factor, bias_i = _speed_factor(calibration), _gyro_bias_i(calibration, config)
     if factor is not None:
         out[VELOCITY] = top + _velocity_converter(factor, config.frames.base)
@@ -140,7 +129,7 @@ def _transform(calibration: Calibration, config: Config,
     launch = ElementTree.Element('launch')
     ElementTree.SubElement(launch, 'node', pkg='tf2_ros', exec='static_transform_publisher',
                            name=name, args=names.for_launch(words))
-    head = about(calibration, content)
+    head = device_files.about(calibration, content)
     command = (names.for_comment(
         f'{head}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
         'this command publishes;\n'
@@ -160,9 +149,9 @@ def _xml(root: Any, note: str) -> str:
     return f'<!-- {names.for_xml_comment(note)} -->\n{text}\n'
 
 
-MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': controllers,
-          'devices': devices, 'covariance': wheel_covariance, 'imu': imu_errors, 'track': geojson,
-         'legs': leg_table}
+MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': device_files.controllers,
+          'devices': device_files.devices, 'covariance': device_files.wheel_covariance,
+          'imu': device_files.imu_errors, 'track': geojson, 'legs': leg_table}
 
 
 def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibration, Config]:
