@@ -82,8 +82,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     lists = {name: tap.values.facts(turn, fixes) for name, tap in taps.items() if tap.values}
     if fixes and config.odometer.quantity == 'auto':
         _set_meanings(bag, taps, lists, fixes)
-    matches = _matches(taps, lists, fixes) if fixes else {}
-    idle = odometer_search.still(matches)
+    idle = odometer_search.still(_matches(taps, lists, fixes) if fixes else {})
     mapping, config = likely_mapping(bag.topics, config, overrides, idle)
     topics = [_topic(bag, info, taps.get(name), refused.get(name, ''))
               for name, info in bag.topics.items()]
