@@ -149,9 +149,10 @@ class Session:
     def finish(self, results: tuple[LegResult, ...], calibration: Calibration) -> None:
         """Keep the computed leg."""
         self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, results))
-        self.legs[:-LEGS_HELD] = [
-            replace(leg, results=tuple(one.numbers() for one in leg.results))
-            for leg in self.legs[:-LEGS_HELD]]
+        if len(self.legs) > LEGS_HELD:
+            old = self.legs[-LEGS_HELD - 1]
+            self.legs[-LEGS_HELD - 1] = replace(
+                old, results=tuple(one.numbers() for one in old.results))
         self.unused = None
         self.settle(calibration)
 
