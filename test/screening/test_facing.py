@@ -184,7 +184,7 @@ def test_a_bend_of_one_g_moves_no_imu():
     assert turned_over(replace(inputs, f_b=force)) == ()
 
 
-def told(leg, config):
+def reasons_of(leg, config):
     return {r.code: r.text for r in screen(leg, config)[1]}
 
 
@@ -196,8 +196,8 @@ def told(leg, config):
 def test_a_counter_that_counts_up_in_reverse_is_seen_off_the_stop(route, kind):
     drive_ = made(ROUTES[route], **kind)
     leg = drive_.leg()
-    assert Code.REVERSING_UNSIGNED not in told(leg, settings(drive_))
-    text = told(without_direction(leg), settings(drive_))[Code.REVERSING_UNSIGNED]
+    assert Code.REVERSING_UNSIGNED not in reasons_of(leg, settings(drive_))
+    text = reasons_of(without_direction(leg), settings(drive_))[Code.REVERSING_UNSIGNED]
     times = '2 times' if route == 'three point turn' else '1 time'
     assert text.startswith(f'{times} the acceleration has the opposite sign')
     # how far: to a tenth, by a rough scale and the blur of its ends
@@ -250,7 +250,7 @@ def test_signed_counters_give_the_truth_over_it(route):
 @pytest.mark.parametrize('scenario', ['town', 'out_and_back'])
 def test_no_drive_forward_is_taken_for_it(scenario, seed):
     clean = drive(scenario=scenario, seed=seed, slope=0.08, imu_grade='consumer', sway=0.05)
-    assert Code.REVERSING_UNSIGNED not in told(clean.leg(), settings(clean))
+    assert Code.REVERSING_UNSIGNED not in reasons_of(clean.leg(), settings(clean))
 
 
 def starts(speeds, nose=None, noise=0.0):
@@ -289,4 +289,4 @@ def test_what_was_reversed_before_the_leg_does_not_matter():
     drive_ = made(ROUTES['10 m'])
     leg = without_direction(drive_.leg())
     late = shifted(leg, start=75.0)
-    assert Code.REVERSING_UNSIGNED not in told(late, settings(drive_))
+    assert Code.REVERSING_UNSIGNED not in reasons_of(late, settings(drive_))
