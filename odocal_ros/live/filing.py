@@ -3,7 +3,7 @@
 
 """Result files: written by the worker; a future has the answer."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +17,7 @@ import uuid
 
 from rclpy.task import Future
 
-from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.calib.result import Calibration
 from odocal_ros.errors import OdocalError
 from odocal_ros.live import answers
 from odocal_ros.live.console import PlainLog
@@ -34,10 +34,10 @@ RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # 
 
 @dataclass(frozen=True)
 class Filed:
-    """A written folder, the start marks of its legs, and the earlier target of ``latest``."""
+    """A written folder, the start of its last leg, ns, and the earlier target of ``latest``."""
 
     folder: Path
-    legs: frozenset[int]
+    last_ns: int
     before: str
 
 
@@ -52,11 +52,11 @@ class ResultFolders:
     def __init__(self) -> None:
         self._filed: list[Filed] = []
 
-    def file(self, folder: Path, legs: frozenset[int], force: bool) -> str:
+    def file(self, folder: Path, last_ns: int, force: bool) -> str:
         """
         Point ``latest`` at a new folder; return the reason if it stays unchanged, else empty.
 
-        legs : start marks, ns, of the legs in it.
+        last_ns : start of the last leg in it.
         """
         link = folder.parent / LATEST
         with locked(folder.parent):         # another node may write there, too
@@ -66,7 +66,7 @@ class ResultFolders:
             if worse:
                 return worse
             _point(link, folder.name)
-        self._filed.append(Filed(folder, legs, before))
+        self._filed.append(Filed(folder, last_ns, before))
         return ''
 
     def prune(self, newest: Path, kept: int) -> None:
@@ -93,14 +93,14 @@ class ResultFolders:
                 if found and found.config.get('leg.automatic'):
                     shutil.rmtree(root / name, ignore_errors=True)
 
-    def withdraw(self, left: frozenset[int]) -> Path | None:
+    def withdraw(self, since_ns: int) -> Path | None:
         """
-        Withdraw folders with dropped legs; ``left`` are the start marks, ns, of the others.
+        Withdraw the folders with legs that started at ``since_ns`` or later: they are dropped.
 
         Returns the newest folder of this session that is not withdrawn, None without one.
         """
-        dropped = [f for f in self._filed if not f.legs <= left]
-        self._filed = [f for f in self._filed if f.legs <= left]
+        dropped = [f for f in self._filed if f.last_ns >= since_ns]
+        self._filed = [f for f in self._filed if f.last_ns < since_ns]
         for one in reversed(dropped):
             root = one.folder.parent
             link = root / LATEST
@@ -147,11 +147,6 @@ def output_root(config: Config, node: str) -> Path:
     """Return the folder of results: the setting, else the node's own folder in the ROS home."""
     own = Path(os.environ.get('ROS_HOME') or '~/.ros') / 'odocal' / node.lstrip('/')
     return Path(config.output.directory or own).expanduser()
-
-
-def marks(legs: Iterable[LegResult]) -> frozenset[int]:
-    """Return the start marks of legs, ns; they identify the legs of a session."""
-    return frozenset(leg.start_ns for leg in legs)
 
 
 class Filing:
@@ -231,7 +226,8 @@ class Filing:
                 with suppress(OSError):
                     folder.rmdir()      # empty: its name was only reserved
                 raise
-            stays = self._folders.file(folder, marks(calibration.legs), force)
+            last_ns = max((leg.start_ns for leg in calibration.legs), default=0)
+            stays = self._folders.file(folder, last_ns, force)
             if config.leg.automatic:
                 self._folders.prune(folder, config.output.automatic_kept)
         except OSError as error:
@@ -254,8 +250,8 @@ class Filing:
         """Wait up to ``grace_s`` for the report; return True if it is drawn."""
         return self._artist.close(grace_s)
 
-    def withdraw(self, left: Iterable[LegResult]) -> None:
-        """Move ``latest`` and ``saved`` back to the newest result without dropped legs."""
+    def withdraw(self, since_ns: int) -> None:
+        """Move ``latest`` and ``saved`` back to the newest result of legs before ``since_ns``."""
         self.trouble = ''
 
         def then(folder: Path | None, error: Exception | None) -> None:
@@ -265,4 +261,4 @@ class Filing:
                                   f'{answers.one_line(error)}')
             self._show()
 
-        self._worker.submit(partial(self._folders.withdraw, marks(left)), then)
+        self._worker.submit(partial(self._folders.withdraw, since_ns), then)

@@ -207,7 +207,7 @@ class Operation(AutomaticLegs):
         left = [one for leg in self.session.begin_undo() for one in leg.results]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
-        self._filing.withdraw(left)
+        self._filing.withdraw(self.session.start_ns)
         self.show_status()
         if not left:
             self._publishing.set_results(None)
@@ -236,7 +236,7 @@ class Operation(AutomaticLegs):
             self.show_status()
         self._publishing.set_results(None)
         self._publishing.show_paths(worker.leg_paths(None, self._config()))
-        self._filing.withdraw([])
+        self._filing.withdraw(0)
         self.show_status()
         return True, f'reset: {len(dropped)} leg{"s" * (len(dropped) != 1)} dropped'
 

@@ -20,8 +20,9 @@ from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config, LegConfig
 
-# judgement: newest legs kept with their tracks, for plots; a day of legs must not fill the memory
-LEGS_HELD = 20
+# judgement: newest legs kept with their tracks, for plots, or at all with leg.automatic; legs of
+# the operator kept. A day of legs must not fill the memory
+LEGS_HELD, MARKED_LEGS_HELD = 20, 50
 
 
 class Refused(OdocalError):

@@ -22,7 +22,7 @@ from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.live import answers
-from odocal_ros.live.session import LEGS_HELD
+from odocal_ros.live.session import LEGS_HELD, MARKED_LEGS_HELD
 from odocal_ros.output.drawing import evenly
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold, refusal
@@ -82,7 +82,7 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     if by_itself and (why := refusal(results[0])):
         return LeftOut(results, why)
     paths = leg_paths(max(results, key=lambda one: one.distance), config)
-    folded = max(0, len(kept) + 1 - LEGS_HELD) if by_itself else 0
+    folded = max(0, len(kept) + 1 - (LEGS_HELD if by_itself else MARKED_LEGS_HELD))
     carried = fold([one for leg in kept[:folded] for one in leg], config, carried)
     left = [one for leg in kept[folded:] for one in leg]
     calibration = combine([*left, *results], config, carried, known_imu(config))

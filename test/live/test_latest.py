@@ -36,13 +36,13 @@ def latest(tmp_path):
 
 def test_latest_goes_with_each_result_but_not_to_a_worse_one(make, tmp_path):
     folders = ResultFolders()
-    assert folders.file(make('a'), frozenset({1}), False) == ''
-    assert folders.file(make('b'), frozenset({1, 2}), False) == ''
+    assert folders.file(make('a'), 1, False) == ''
+    assert folders.file(make('b'), 2, False) == ''
     assert latest(tmp_path) == Path('b')
     bad = make('bad')
-    assert folders.file(bad, frozenset({1, 2, 3}), False) == 'it is rejected'
+    assert folders.file(bad, 3, False) == 'it is rejected'
     assert latest(tmp_path) == Path('b')
-    assert folders.file(bad, frozenset({1, 2, 3}), True) == ''
+    assert folders.file(bad, 3, True) == ''
     assert latest(tmp_path) == Path('bad')
     assert sorted(p.name for p in tmp_path.iterdir()) == ['a', 'b', 'bad', 'latest']
 
@@ -62,7 +62,7 @@ def test_results_of_automatic_legs_are_bounded_but_for_the_good_and_the_operator
         folder = tmp_path / f'2026-05-{day:02}T09-12-00Z'
         folder.mkdir()
         of[folder.name] = made
-        folders.file(folder, frozenset({day}), False)
+        folders.file(folder, day, False)
         folders.prune(folder, 0)
     (tmp_path / 'journal').mkdir()
     assert len(list(tmp_path.glob('2026*'))) == 8        # 0: all
@@ -74,52 +74,52 @@ def test_results_of_automatic_legs_are_bounded_but_for_the_good_and_the_operator
 
 
 def test_a_result_of_an_earlier_session_counts_too(make, tmp_path):
-    ResultFolders().file(make('old'), frozenset({1}), False)
+    ResultFolders().file(make('old'), 1, False)
     folders = ResultFolders()
-    assert folders.file(make('bad'), frozenset({2}), False) == 'it is rejected'
+    assert folders.file(make('bad'), 2, False) == 'it is rejected'
     assert latest(tmp_path) == Path('old')
 
 
 def test_undo_takes_latest_back_to_the_legs_left(make, tmp_path):
-    ResultFolders().file(make('old'), frozenset({0}), False)
+    ResultFolders().file(make('old'), 0, False)
     folders = ResultFolders()
     a = make('a')
-    folders.file(a, frozenset({1}), False)
-    folders.file(make('b'), frozenset({1, 2}), False)
-    folders.file(make('c'), frozenset({1, 2}), False)
-    assert folders.withdraw(frozenset({1})) == a
+    folders.file(a, 1, False)
+    folders.file(make('b'), 2, False)
+    folders.file(make('c'), 2, False)
+    assert folders.withdraw(2) == a
     assert latest(tmp_path) == Path('a')
-    assert folders.withdraw(frozenset()) is None
+    assert folders.withdraw(0) is None
     assert latest(tmp_path) == Path('old')
-    assert folders.withdraw(frozenset()) is None
+    assert folders.withdraw(0) is None
 
 
 def test_undo_links_no_target_that_is_gone_or_never_was(make, tmp_path):
     old, folders = make('old'), ResultFolders()
-    folders.file(old, frozenset({1}), False)
-    folders.withdraw(frozenset())       # the first of all
+    folders.file(old, 1, False)
+    folders.withdraw(0)       # the first of all
     assert latest(tmp_path) is None
     assert old.is_dir()
-    ResultFolders().file(old, frozenset({0}), False)
+    ResultFolders().file(old, 0, False)
     folders = ResultFolders()
-    folders.file(make('a'), frozenset({1}), False)
+    folders.file(make('a'), 1, False)
     old.rmdir()
-    folders.withdraw(frozenset())
+    folders.withdraw(0)
     assert latest(tmp_path) is None
 
 
 def test_a_link_that_somebody_moved_is_left_alone(make, tmp_path):
     folders = ResultFolders()
-    folders.file(make('a'), frozenset({1}), False)
-    ResultFolders().file(make('other'), frozenset({5}), False)
-    folders.withdraw(frozenset())
+    folders.file(make('a'), 1, False)
+    ResultFolders().file(make('other'), 5, False)
+    folders.withdraw(0)
     assert latest(tmp_path) == Path('other')
 
 
 def test_two_nodes_file_one_after_the_other(make, tmp_path, monkeypatch):
     """Whoever looks at what is there points at its own before the next looks."""
     good, bad = make('good'), make('bad')
-    late = threading.Thread(target=lambda: ResultFolders().file(good, frozenset({1}), False))
+    late = threading.Thread(target=lambda: ResultFolders().file(good, 1, False))
     stored_in = module.stored_in
 
     def slowly(path):
@@ -129,6 +129,6 @@ def test_two_nodes_file_one_after_the_other(make, tmp_path, monkeypatch):
             late.join(0.3)
         return found
     monkeypatch.setattr(module, 'stored_in', slowly)
-    ResultFolders().file(bad, frozenset({2}), False)
+    ResultFolders().file(bad, 2, False)
     late.join()
     assert latest(tmp_path) == Path('good')

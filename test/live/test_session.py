@@ -5,11 +5,13 @@
 
 from dataclasses import replace
 import json
+from types import SimpleNamespace
 
 from drives import drive, settings
 import pytest
 
 from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.live import worker
 from odocal_ros.live.session import LEGS_HELD, Refused, Session, State
 from odocal_ros.output.files import as_json
 from odocal_ros.output.geojson import geojson
@@ -169,3 +171,23 @@ def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest():
     assert 'of the newest legs only, none of leg 1.' in report_html(both, config, content[1])
     track, = geojson(both, config, content[1]).values()
     assert {one['properties']['leg'] for one in json.loads(track)['features']} == {2}
+
+
+def test_legs_beyond_those_kept_stay_in_the_result(monkeypatch):
+    """A sigma may differ by 5 %: the scatter between legs is carried over on a grid."""
+    made = drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
+    whole, config = calibrate(made.leg(), settings(made, method='smoother')), settings(made)
+    every = [replace(whole, start_ns=whole.start_ns + day * 10**14,
+                     stop_ns=whole.stop_ns + day * 10**14) for day in range(4)]
+    monkeypatch.setattr(worker, 'MARKED_LEGS_HELD', 3)
+    monkeypatch.setattr(worker, 'calibrate_parts', lambda *_, **__: every[-1:])
+    done = worker.compute(SimpleNamespace(close=lambda *_: None), 0, 1,
+                          [(one,) for one in every[:-1]], config)
+    assert done.folded == 1
+    assert done.carried.legs == 1
+    assert done.calibration.legs == tuple(every[1:])
+    for name, wanted in combine(every, config).estimates.items():
+        if wanted.value is not None:
+            found = done.calibration.estimates[name]
+            assert abs(found.value - wanted.value) < 0.05 * wanted.sigma, name
+            assert found.sigma == pytest.approx(wanted.sigma, rel=0.05), name
