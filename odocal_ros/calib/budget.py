@@ -148,9 +148,9 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     start, end : reference positions.   t, D, q_nb : the track, as in drift_sources, from the
     alignment or the start mark to the end mark.   alignment : level, heading and gyro sigmas.
     quantum : size of an odometer count, m.   fix_scale : (3,) factor on the stated fix sigmas by
-    the residuals, east, north, up.   time_sigma : unknown latency of fixes, s.
+    the residuals, east, north, up.   time_sigma : unknown delay of fixes, s.
     velocity_change : (3,) velocity at the end mark minus that at the start, m/s; zero between
-    standing marks.   lever_arm_sigma : m, each axis.   odometer_time_sigma : unknown latency of
+    standing marks.   lever_arm_sigma : m, each axis.   odometer_time_sigma : unknown delay of
     the odometer, s.
     """
     forward = D[-1] / np.linalg.norm(D[-1])

@@ -238,7 +238,7 @@ def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
 
 def label(parameter: str) -> str:
     """Return the name of a parameter for people."""
-    return parameter.replace('_', ' ').replace(' angle', '')
+    return parameter.replace('gnss', 'fix').replace('_', ' ').replace(' angle', '')
 
 
 def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> str:

@@ -130,7 +130,7 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
             if name == 'heading_error':
                 text = _angle_text(estimate, 0) + (
                     '   heading error minus yaw mounting' if width >= WIDTH else '')
-            lines.append(_line(name.replace('_', ' '), text))
+            lines.append(_line(tables.source_label(name), text))
     lines += [_arm(estimates, name, word) for name, word in ARMS.items()]
     lines.append(_gyro_scale(calibration))
     biases = [known(estimates, name) for name in BIASES]

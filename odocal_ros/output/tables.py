@@ -30,7 +30,8 @@ SHOWN = {'scale_factor': '', 'scale_ratio': '1'}
 ANGLES = {'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad'}
 COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
-          'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion'}
+          'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion',
+          'fix_latency': 'fix delay', 'gnss_delay': 'fix delay'}
 HEAD = ('error budget', 'scale, ppm', 'yaw, deg', 'pitch, deg')
 WIDTHS = 24, 13, 15, 15      # judgement: with 'shared' within 80 columns
 SIDES = 'before', 'after'

@@ -62,7 +62,7 @@ class OdometerConfig:
     lever_arm: tuple[float, ...] = _place('Wheel contact point in base_link (forward, left, up).')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to odometer stamps.')
     # latency of a bus and a middleware is rarely less; u-blox requires 10 ms or better
-    time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown latency of the odometer, 1 '
+    time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown delay of the odometer, 1 '
                                 'sigma; matters in turns and at marks set in motion.')
     wheels: tuple[str, ...] = setting((), ro=True, item=str, about=(
         'Wheels in one message: joint names or array indices, the left and the right one of each '
@@ -147,7 +147,7 @@ class GnssConfig:
     lever_arm_sigma: float = setting(0.1, 'm', 0.0, 10.0, about='Uncertainty of the antenna '
                                      'position, each axis.')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to fix stamps.')
-    time_sigma: float = setting(0.05, 's', 0.0, 1.0, about='Unknown latency of fixes, 1 sigma; '
+    time_sigma: float = setting(0.05, 's', 0.0, 1.0, about='Unknown delay of fixes, 1 sigma; '
                                 'matters at marks set in motion.')
     min_status: int = setting(0, '', -1, 2, about='Minimum NavSatStatus of a used fix.')
     max_sigma: float = setting(NAN, 'm', 0.0, 1e4, about='Limit of the horizontal 1 sigma of a '
