@@ -7,15 +7,8 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from itertools import pairwise
 
+from odocal_ros.apply import spikes
 from odocal_ros.apply.attitude import rotated
-from odocal_ros.apply.spikes import (
-    is_possible,
-    is_single,
-    Row,
-    SINGLE_ROWS,
-    SpikeScreen,
-    time_of,
-)
 from odocal_ros.data.samples import NO_FORCE, Reading
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.settings.node_configs import ApplyConfig
@@ -38,9 +31,9 @@ class ImuStream:
         self._accel = (config.imu.accel_scale * C_bi).tolist()
         self._offset_ns = round(config.imu.time_offset * 1e9)
         self._notes = notes
-        self._screen = SpikeScreen()
-        self._held: list[Row] = []
-        self.rows: list[Row] = []
+        self._screen = spikes.SpikeScreen()
+        self._held: list[spikes.Row] = []
+        self.rows: list[spikes.Row] = []
         self.zero_ns = 0
         self.at = 0
         self.usual = 0.0
@@ -53,10 +46,10 @@ class ImuStream:
             w_b, f_b = rotated(self._gyro, w_i), rotated(self._accel, f_i)
             if not any(f_i) or sum(f_b) != sum(f_b):
                 f_b = NO_FORCE
-            if is_possible(w_b, f_b):
+            if spikes.is_possible(w_b, f_b):
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns
-                rows.append(Row((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
+                rows.append(spikes.Row((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
         self._say_dropped(before + len(readings) - len(rows),
                           'hold NaN or impossible values')
         kept, self._held = self._screen.sift(rows)
@@ -64,7 +57,7 @@ class ImuStream:
                           'jump and return, or repeat one value')
         for row in kept:
             self.rows.append(row)
-            if len(self.rows) - 2 > self.at and is_single(self.rows[-SINGLE_ROWS:]):
+            if len(self.rows) - 2 > self.at and spikes.is_single(self.rows[-spikes.SINGLE_ROWS:]):
                 self._say_dropped(1, 'are isolated outliers')
                 del self.rows[-2]
         self._unmeasured += len(kept)
@@ -84,7 +77,7 @@ class ImuStream:
 
     def from_time(self, t: float, low: int = 0) -> int:
         """Return the number of the first row at or after t, s, not before row ``low``."""
-        return bisect_left(self.rows, t, low, key=time_of)
+        return bisect_left(self.rows, t, low, key=spikes.time_of)
 
     def drop(self, row: int) -> None:
         """Drop the rows before a row; the current row must not be one of them."""

@@ -19,20 +19,8 @@ import zlib
 
 import numpy as np
 
+from odocal_ros.bagio import mcap_records as mcap
 from odocal_ros.bagio.channels import Channel
-from odocal_ros.bagio.mcap_records import (
-    CHANNEL,
-    CHUNK,
-    CHUNK_HEAD,
-    CHUNK_INDEX,
-    FOOTER,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_INDEX,
-    SCHEMA,
-    STATISTICS,
-    text_at,
-)
 from odocal_ros.outside.limits import zstd_module
 from odocal_ros.outside.whole import whole_file, WholeFile
 
@@ -66,8 +54,8 @@ def pack(channel: int, times_ns: Sequence[int], raws: Sequence[bytes], sequence:
     head = MESSAGE_HEAD.pack
     parts: list[bytes] = []
     for number, (time_ns, raw) in enumerate(zip(times_ns, raws, strict=True), sequence):
-        parts += (head(MESSAGE, len(raw) + 22, channel, number & 0xFFFFFFFF, time_ns, time_ns),
-                  raw)
+        parts += (head(mcap.MESSAGE, len(raw) + 22, channel, number & 0xFFFFFFFF, time_ns,
+                       time_ns), raw)
     records = b''.join(parts)
     lengths = np.array([len(raw) for raw in raws]) + MESSAGE_HEAD.size
     entries = np.empty((len(raws), 2), '<u8')
@@ -75,11 +63,11 @@ def pack(channel: int, times_ns: Sequence[int], raws: Sequence[bytes], sequence:
     entries[:, 1] = np.cumsum(lengths) - lengths
     form, packed = _packed(records)
     start_ns, end_ns = min(times_ns), max(times_ns)
-    body = (CHUNK_HEAD.pack(start_ns, end_ns, len(records), zlib.crc32(records)) + _text(form)
+    body = (mcap.CHUNK_HEAD.pack(start_ns, end_ns, len(records), zlib.crc32(records)) + _text(form)
             + struct.pack('<Q', len(packed)) + packed)
     index = struct.pack('<HI', channel, entries.nbytes) + entries.tobytes()
-    return Chunk(channel, start_ns, end_ns, len(raws), _record(CHUNK, body),
-                 _record(MESSAGE_INDEX, index))
+    return Chunk(channel, start_ns, end_ns, len(raws), _record(mcap.CHUNK, body),
+                 _record(mcap.MESSAGE_INDEX, index))
 
 
 @cache
@@ -118,11 +106,11 @@ def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chu
 
 def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> Written:
     described = b''.join(
-        _record(SCHEMA, struct.pack('<H', key) + _text(c.msgtype)
+        _record(mcap.SCHEMA, struct.pack('<H', key) + _text(c.msgtype)
                 + _text('ros2msg' if c.definition[0] else '') + _text(c.definition[1]))
-        + _record(CHANNEL, struct.pack('<HH', key, key) + _text(c.topic) + _text(c.serialization)
-                  + struct.pack('<I', 0)) for key, c in channels.items())
-    at = file.write(MAGIC + _record(HEADER, _text('ros2') + _text('odocal_ros')) + described)
+        + _record(mcap.CHANNEL, struct.pack('<HH', key, key) + _text(c.topic)
+                  + _text(c.serialization) + struct.pack('<I', 0)) for key, c in channels.items())
+    at = file.write(mcap.MAGIC + _record(HEADER, _text('ros2') + _text('odocal_ros')) + described)
     indexes, counts, start_ns, end_ns = [], Counter(dict.fromkeys(channels, 0)), 2**63 - 1, 0
     for chunk in chunks:
         indexes.append(_chunk_index(chunk, at))
@@ -134,24 +122,24 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chu
     tallies = b''.join(struct.pack('<HQ', *item) for item in counts.items())
     statistics = struct.pack('<QHIIIIQQI', counts.total(), len(channels), len(channels), 0, 0,
                              len(indexes), start_ns, end_ns, len(tallies)) + tallies
-    summary = described + _record(STATISTICS, statistics) + b''.join(indexes)
+    summary = described + _record(mcap.STATISTICS, statistics) + b''.join(indexes)
     footer = struct.pack('<QQI', at + len(end), 0, 0)
-    at += file.write(end + summary + _record(FOOTER, footer) + MAGIC)
+    at += file.write(end + summary + _record(mcap.FOOTER, footer) + mcap.MAGIC)
     return Written(at, start_ns, end_ns, counts)
 
 
 def _chunk_index(chunk: Chunk, at: int) -> bytes:
     """Return the index record of a chunk at an offset of the file."""
     _, _, size, _, form, packed = _chunk_body(chunk.record)
-    return _record(CHUNK_INDEX, struct.pack(
+    return _record(mcap.CHUNK_INDEX, struct.pack(
         '<QQQQIHQQ', chunk.start_ns, chunk.end_ns, at, len(chunk.record), 10, chunk.channel,
         at + len(chunk.record), len(chunk.index)) + _text(form) + struct.pack('<QQ', packed, size))
 
 
 def _chunk_body(record: bytes) -> tuple[int, int, int, int, str, int]:
     """Return start, end, unpacked size, CRC, compression and packed size of a chunk record."""
-    start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(record, 9)
-    form, at = text_at(record, 9 + CHUNK_HEAD.size)
+    start_ns, end_ns, size, crc = mcap.CHUNK_HEAD.unpack_from(record, 9)
+    form, at = mcap.text_at(record, 9 + mcap.CHUNK_HEAD.size)
     (packed,) = struct.unpack_from('<Q', record, at)
     return start_ns, end_ns, size, crc, form, packed
 
@@ -159,16 +147,16 @@ def _chunk_body(record: bytes) -> tuple[int, int, int, int, str, int]:
 def read_chunks(path: Path) -> Iterator[Chunk]:
     """Yield the chunks of a file that ``write_file`` wrote, one at a time."""
     with path.open('rb') as file:
-        file.seek(len(MAGIC))
+        file.seek(len(mcap.MAGIC))
         record = b''
         while head := file.read(9):
             op, size = struct.unpack('<BQ', head)
             if op == DATA_END:
                 return
             body = head + file.read(size)
-            if op == CHUNK:
+            if op == mcap.CHUNK:
                 record = body
-            elif op == MESSAGE_INDEX:
+            elif op == mcap.MESSAGE_INDEX:
                 channel, nbytes = struct.unpack_from('<HI', body, 9)
                 start_ns, end_ns, *_ = _chunk_body(record)
                 yield Chunk(channel, start_ns, end_ns, nbytes // 16, record, body)

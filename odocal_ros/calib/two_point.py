@@ -16,16 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.budget import (
-    budget,
-    budget_table,
-    correlations,
-    displacement,
-    epochs_between,
-    parameter_gradient,
-    PARAMETERS,
-    total_covariance,
-)
+from odocal_ros.calib import budget
 from odocal_ros.calib.judge import share
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
@@ -125,7 +116,7 @@ def unsolved(reasons: Iterable[Reason], scale_unit: str) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
     biases = {f'gyro_bias_{axis}': Estimate(None, None, 'rad/s') for axis in 'xyz'}
     return MethodResult('two_point', tuple(reasons), unknown_values(scale_unit) | biases,
-                        PARAMETERS)
+                        budget.PARAMETERS)
 
 
 def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix_scale: Floats,
@@ -140,7 +131,7 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
     f, vertical_known = solve(chord, fix_scale[2])
     sources = (*_sources(chord, f, vertical_known, quantum, fix_scale, config),
                *_doubt(chord, f))
-    covariance = total_covariance(sources)
+    covariance = budget.total_covariance(sources)
     sigma = np.sqrt(np.diag(covariance))
     K = float(np.linalg.norm(f))
     yaw, pitch = (float(a) for a in mounting_from_forward(f / K))
@@ -157,9 +148,9 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
         **_gyro_bias(chord.alignment)}
     check = _cross_check(chord, f, nominal_scale if 0.5 < nominal_scale / K < 2.0 else K, config)
     reasons += _planes_agree(check, K, sigma[0])
-    return MethodResult('two_point', reasons, estimates, PARAMETERS, sources, {
-        'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
-        'correlation': correlations(covariance, PARAMETERS), 'cross_check': check,
+    return MethodResult('two_point', reasons, estimates, budget.PARAMETERS, sources, {
+        'budget': budget.budget_table(sources, budget.PARAMETERS, (K, 1.0, 1.0)),
+        'correlation': budget.correlations(covariance, budget.PARAMETERS), 'cross_check': check,
         'heading_source': chord.alignment.heading_source, 'f': f})
 
 
@@ -177,16 +168,16 @@ def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_
     track = chord.track
     # gyro errors accumulate from the alignment, with a fixed heading from the start mark
     first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
-    keep = epochs_between(track, min(first, chord.start.t), chord.end.t)
+    keep = budget.epochs_between(track, min(first, chord.start.t), chord.end.t)
     t = track.t[keep]
-    D = displacement(track, keep, chord.start.t, f) * (t >= chord.start.t)[:, None]
+    D = budget.displacement(track, keep, chord.start.t, f) * (t >= chord.start.t)[:, None]
     start, end, M = chord.start, chord.end, chord.M
     if not vertical_known:       # the prior of the pitch replaces the heights
         fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
         rise = PITCH_PRIOR * float(np.linalg.norm(M @ f))
         start, end = _blind_height(start), _blind_height(end, rise)
     K = float(np.linalg.norm(f))
-    return budget(f, M, start, end, t, D, track.q_nb[keep], chord.alignment,
+    return budget.budget(f, M, start, end, t, D, track.q_nb[keep], chord.alignment,
                   quantum=quantum * K, fix_scale=fix_scale, time_sigma=config.gnss.time_sigma,
                   velocity_change=chord.velocity_change @ f,
                   lever_arm_sigma=config.gnss.lever_arm_sigma,
@@ -195,7 +186,7 @@ def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_
 
 def _doubt(chord: Chord, f: Floats) -> tuple[Source, ...]:
     """Return the sources of travel lost in gaps and resets, and of slip; empty if none."""
-    gradient = parameter_gradient(f) @ np.linalg.inv(chord.M)
+    gradient = budget.parameter_gradient(f) @ np.linalg.inv(chord.M)
     sources: tuple[Source, ...] = ()
     if len(chord.slips[0]):
         sources += (slip_source(chord.track, f, gradient, *chord.slips),)

@@ -19,13 +19,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals, solve, Solved
 from odocal_ros.estimator.changes import changes, Step
 from odocal_ros.estimator.equations import Equations, Weighted
-from odocal_ros.estimator.factors.factor import (
-    IMU,
-    JUMP,
-    SPREAD,
-    VARIANCE_FACTORS,
-    WANTED,
-)
+from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.factors.interval_noise import INTERVAL
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.point_rows import alike, PointRows, TAIL_SIGMAS
@@ -75,10 +69,10 @@ CONVERGENCE = Convergence()
 TURNS_BACK = -0.5
 # statistical: squares of noises, in sigmas, beyond which an interval is an outlier; chi2 of the
 # six of a sensor (two times, three axes) is as seldom above its limit
-TAILS = np.where(np.isin(VARIANCE_FACTORS, IMU), 20.06, TAIL_SIGMAS**2)
+TAILS = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU), 20.06, TAIL_SIGMAS**2)
 # tuned: least observable share of a noise; with 0 for all, one scale sigma of 60 is doubled
 # (docs/decisions/0016). A bias that steps is observed by the intervals after it, and has none
-SEEN = np.where(np.isin(VARIANCE_FACTORS, IMU[2:]), 0.0, 0.02)
+SEEN = np.where(np.isin(factor.VARIANCE_FACTORS, factor.IMU[2:]), 0.0, 0.02)
 AGAIN_PASSES = 6    # judgement: of a fit that starts from a converged one
 
 
@@ -136,13 +130,13 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     change = np.inf
     was_fitted = fitted
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
-    spread = about.spread if about else np.ones((len(state.t) - 1, SPREAD))
+    spread = about.spread if about else np.ones((len(state.t) - 1, factor.SPREAD))
     # passes in which heavy tails are updated: earlier, the residuals contain the start; later,
     # the tails are constant
     tails, last_tails = 1 if about else 3, 15
     # pass that estimates the effective sample size; of two starts only that of the better one
     judged = 3 if about is None else 0 if problem.per_effective else 1
-    of_all = np.where(np.arange(M) < WANTED, 1.0, CONVERGENCE.others)
+    of_all = np.where(np.arange(M) < factor.WANTED, 1.0, CONVERGENCE.others)
     flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), CONVERGENCE.flat_angle, np.inf)
     pace: dict[str, tuple[float, float]] = {}
     count, state, taken = 0, state.level(), np.zeros(M)
@@ -225,7 +219,7 @@ def slips(weighted: Weighted, marginals: JointMarginals, spread: Floats, levels:
     z2[found < SEEN] = 0.0          # not observable in this interval
     wanted = np.clip(spread * z2 / TAILS, 1.0, 1e6)
     # half the change in the logarithm: adjacent intervals share a slip and would oscillate
-    wanted[:, :JUMP] = np.sqrt(spread * wanted)[:, :JUMP]
+    wanted[:, :factor.JUMP] = np.sqrt(spread * wanted)[:, :factor.JUMP]
     return wanted
 
 

@@ -20,15 +20,8 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.mapped import let_go
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.imu_steps import ImuSteps
-from odocal_ros.estimator.state import (
-    ACCEL,
-    ACCEL_AXIS,
-    ACCEL_SIGNAL,
-    GYRO,
-    GYRO_AXIS,
-    GYRO_SIGNAL,
-)
 from odocal_ros.estimator.sums import Intervals, Points
 from odocal_ros.nav.rotations import (
     exp_so3,
@@ -125,8 +118,8 @@ class _Chunk:
         # shares of the signals that are errors, docs/method.md (S3)
         self.by_gyro, self.by_accel = np.zeros((3, 5)), np.zeros((3, 3))
         if constants is not None:
-            self.by_gyro[GYRO_AXIS, GYRO_SIGNAL] = constants[GYRO]
-            self.by_accel[ACCEL_AXIS, ACCEL_SIGNAL] = constants[ACCEL]
+            self.by_gyro[layout.GYRO_AXIS, layout.GYRO_SIGNAL] = constants[layout.GYRO]
+            self.by_accel[layout.ACCEL_AXIS, layout.ACCEL_SIGNAL] = constants[layout.ACCEL]
         gyro = biases[:, :3] + self.signals[:, OF_GYRO[1:]] @ self.by_gyro.T
         accel = biases[:, 3:] + self.signals[:, OF_ACCEL[1:]] @ self.by_accel.T
         self.turn, self.turn_mean = imu.turn[rows] - gyro, imu.turn_mean[rows] - gyro / 2
@@ -153,14 +146,15 @@ class _Chunk:
 
     def _gyro(self, x: Floats) -> Floats:
         """Return the effects of a gyro's bias and constants, (n, 3, 3 + g), from (n, 3, 3, 6)."""
-        out: Floats = x[:, :, [0, 1, 2, *GYRO_AXIS], [0, 0, 0, *np.add(GYRO_SIGNAL, 1)]]
+        signals = [0, 0, 0, *np.add(layout.GYRO_SIGNAL, 1)]
+        out: Floats = x[:, :, [0, 1, 2, *layout.GYRO_AXIS], signals]
         out[:, :, :3] = out[:, :, :3] @ (np.eye(3) - self.by_gyro[:, :3])
         return out
 
     def _accel(self, x: Floats) -> tuple[Floats, Floats]:
         """Return the effects of bias and constants of the accelerometer, from (n, 3, 3, 4)."""
         return (x[:, :, :, 0] @ (np.eye(3) - self.by_accel),
-                x[:, :, ACCEL_AXIS, np.add(ACCEL_SIGNAL, 1)])
+                x[:, :, layout.ACCEL_AXIS, np.add(layout.ACCEL_SIGNAL, 1)])
 
     def _running(self, step: Floats) -> tuple[Floats, Floats]:
         """Return the sum before each step since the interval's begin, and each interval's sum."""

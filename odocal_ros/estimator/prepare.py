@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import FACTORS, OUTSIDE
 from odocal_ros.estimator.factors.axle import rates_at, WARM_TIME
 from odocal_ros.estimator.factors.fixes import whitener
@@ -20,24 +21,6 @@ from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, SmootherLeg
 from odocal_ros.estimator.outside import Outside
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.start import standing
-from odocal_ros.estimator.state import (
-    ACCEL,
-    BY_SIGMA,
-    FIX_TIME,
-    GNSS_ARM,
-    GNSS_DELAY,
-    HEIGHT_DRIFT,
-    IMPERFECT,
-    KIND_SIZES,
-    M,
-    NO_ERROR,
-    ODO_ARM,
-    ODO_DELAY,
-    PITCH,
-    Priors,
-    SPEED_OFFSET,
-    YAW,
-)
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.screening.inputs import Inputs
@@ -145,22 +128,22 @@ def imperfect_sigmas(grade: Grade) -> Floats:
         'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4,    # rad per m/s^3
         # m: a car's 1.4, a truck's 2.5; in turns 0 of a body that rolls on level ground
         'pitch_centre': 1.5, 'pitch_centre_in_turns': 1.0}
-    return np.repeat([usual[kind] for kind in KIND_SIZES], list(KIND_SIZES.values()))
+    return np.repeat([usual[kind] for kind in layout.KIND_SIZES], list(layout.KIND_SIZES.values()))
 
 
-def with_imperfect(priors: Priors, sigmas: Floats) -> Priors:
+def with_imperfect(priors: layout.Priors, sigmas: Floats) -> layout.Priors:
     """Return priors with these sigmas of imperfections, (k,)."""
     constants = priors.constants.copy()
-    constants[IMPERFECT] = sigmas
+    constants[layout.IMPERFECT] = sigmas
     return replace(priors, constants=constants)
 
 
-def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
-    sigma = np.full(M, np.inf)
-    sigma[ODO_ARM] = sigma[GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
-    sigma[ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
-    sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
-    sigma[IMPERFECT] = np.maximum(imperfect_sigmas(grade), NO_ERROR)
+def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
+    sigma = np.full(layout.M, np.inf)
+    sigma[layout.ODO_ARM] = sigma[layout.GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
+    sigma[layout.ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
+    sigma[layout.GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
+    sigma[layout.IMPERFECT] = np.maximum(imperfect_sigmas(grade), layout.NO_ERROR)
     # of IMUs as sold, also for a calibrated one: otherwise a bias would be estimated as an axis
     # error, and change the yaw of a tilted IMU
     gyro_bias, accel = map(max, turn_on_bias(config.imu), (grade.gyro_bias, grade.accel_bias))
@@ -169,22 +152,23 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     # gravity times the scale error is a bias too
     up = np.hypot(accel, grade.accel_scale_error * G)
     accel_bias = np.maximum([accel, accel, up], 1e-6)
-    centre = np.zeros(M)
-    sigma[HEIGHT_DRIFT] = max(height_sigma(leg) / HEIGHT_TIME, NO_ERROR)
+    centre = np.zeros(layout.M)
+    sigma[layout.HEIGHT_DRIFT] = max(height_sigma(leg) / HEIGHT_TIME, layout.NO_ERROR)
     stated = leg.covariance_n.diagonal(axis1=1, axis2=2)
     # definition: of an error in sigmas; a constant one has no effect
-    sigma[BY_SIGMA] = np.where((stated != stated[:1]).any(axis=0), 1.0, NO_ERROR)
+    sigma[layout.BY_SIGMA] = np.where((stated != stated[:1]).any(axis=0), 1.0, layout.NO_ERROR)
     # physical: receivers with an odometer trust it for 5 to 60 s
-    centre[FIX_TIME], sigma[FIX_TIME] = np.log(20.0), 0.7
-    centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
+    centre[layout.FIX_TIME], sigma[layout.FIX_TIME] = np.log(20.0), 0.7
+    centre[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = _offset(leg.travel.coarse)
     for part in OUTSIDE:
         sent = leg.outside.get(part.name)
-        sigma[part.constants] = NO_ERROR if sent is None else part.prior_sigmas(sent, config)
+        sigma[part.constants] = (
+            layout.NO_ERROR if sent is None else part.prior_sigmas(sent, config))
     if not leg.has_accelerometer:        # mounting and attitude are not separable: as configured
-        sigma[ACCEL] = sigma[PITCH] = NO_ERROR
+        sigma[layout.ACCEL] = sigma[layout.PITCH] = layout.NO_ERROR
         if 'heading' not in leg.outside:
-            centre[YAW], sigma[YAW] = nominal_yaw(config), NO_ERROR
-    return Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, centre)
+            centre[layout.YAW], sigma[layout.YAW] = nominal_yaw(config), layout.NO_ERROR
+    return layout.Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, centre)
 
 
 def height_sigma(leg: SmootherLeg) -> float:
@@ -195,4 +179,4 @@ def height_sigma(leg: SmootherLeg) -> float:
 def _offset(coarse: CoarseSpeed | None) -> tuple[float, float]:
     """Return the offset of a coarse speed and its sigma: 0 to half a step."""
     half = coarse.truncation / 2 if coarse else 0.0
-    return half, half or NO_ERROR
+    return half, half or layout.NO_ERROR

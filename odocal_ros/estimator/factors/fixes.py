@@ -6,33 +6,11 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import PointRows
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import (
-    ACCEL,
-    BA,
-    BARE,
-    BG,
-    BY_SIGMA,
-    FIX_BY_MOTION,
-    FIX_LAG2,
-    FIX_TIME,
-    GNSS_ARM,
-    GNSS_CLOCK,
-    GNSS_DELAY,
-    GYRO,
-    HEIGHT_DRIFT,
-    M,
-    P,
-    PHI,
-    PITCH,
-    SLOW,
-    State,
-    V,
-    YAW,
-)
 from odocal_ros.nav.receiver_filter import odometer_error, smoothing
 from odocal_ros.nav.rotations import skew, turn
 
@@ -55,7 +33,7 @@ class Fixes(PointRows):
         v = state.v_n[k]
         w = leg.origin.earth_rate_n
         g = gravity_n(state.p_n[k], leg.origin)
-        self.arm_v = leg.antenna_arm - leg.imu_arm + state.constants[GNSS_ARM]
+        self.arm_v = leg.antenna_arm - leg.imu_arm + state.constants[layout.GNSS_ARM]
         arm_b = state.C_bv @ self.arm_v
         self.C_t = self.C @ points.R
         self.arm_n = self.C_t @ arm_b
@@ -71,14 +49,14 @@ class Fixes(PointRows):
         # of a receiver that smooths the mean age is a delay
         track = (state.t, *antenna(state, point.intervals.mean_rate, arm_b),
                  state.t[k] + points.tau)
-        smoothed, self.by_lag = smoothing(*track, state.constants[FIX_LAG2])
+        smoothed, self.by_lag = smoothing(*track, state.constants[layout.FIX_LAG2])
         added, self.by_motion, self.by_time = odometer_error(
-            *track, state.constants[FIX_BY_MOTION], state.constants[FIX_TIME])
+            *track, state.constants[layout.FIX_BY_MOTION], state.constants[layout.FIX_TIME])
         stated = np.sqrt(leg.covariance_n[problem.use].diagonal(axis1=1, axis2=2))
         # a constant error does not affect the results
         self.by_sigma = stated - np.median(stated, axis=0)
-        raw[:, 2] -= state.constants[HEIGHT_DRIFT] * self.t_fix
-        raw -= state.constants[BY_SIGMA] * self.by_sigma
+        raw[:, 2] -= state.constants[layout.HEIGHT_DRIFT] * self.t_fix
+        raw -= state.constants[layout.BY_SIGMA] * self.by_sigma
         self.raw = np.nan_to_num(raw) - smoothed - added
 
     def errors(self) -> Floats:
@@ -95,25 +73,26 @@ class Fixes(PointRows):
         tau = self.points.tau[:, None, None]
         m = len(tau)
         one = np.broadcast_to(np.eye(3), (m, 3, 3))
-        J, c = np.zeros((m, 3, n)), np.zeros((m, 3, M))
-        J[:, :, P], J[:, :, V] = -one, -one * tau
-        J[:, :, PHI] = skew(self.dp + self.arm_n)
-        J[:, :, BA] = self.C @ self.points.AA
+        J, c = np.zeros((m, 3, n)), np.zeros((m, 3, layout.M))
+        J[:, :, layout.P], J[:, :, layout.V] = -one, -one * tau
+        J[:, :, layout.PHI] = skew(self.dp + self.arm_n)
+        J[:, :, layout.BA] = self.C @ self.points.AA
         by_gyro = -self.C @ self.points.dp_by - skew(self.arm_n) @ self.C @ self.points.turned
-        J[:, :, BG], c[:, :, GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
-        if n > BARE:
-            J[:, :, SLOW] = -one * (1 - self.share)[:, None, None]
+        J[:, :, layout.BG], c[:, :, layout.GYRO] = by_gyro[:, :, :3], by_gyro[:, :, 3:]
+        if n > layout.BARE:
+            J[:, :, layout.SLOW] = -one * (1 - self.share)[:, None, None]
         by_yaw, by_pitch = self.state.C_bv_gradient
-        c[:, :, YAW], c[:, :, PITCH] = (-self.C_t @ (g @ self.arm_v) for g in (by_yaw, by_pitch))
-        c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
+        c[:, :, layout.YAW], c[:, :, layout.PITCH] = (
+            -self.C_t @ (g @ self.arm_v) for g in (by_yaw, by_pitch))
+        c[:, :, layout.GNSS_ARM] = -self.C_t @ self.state.C_bv
         # stamps late by d: the position is that of d earlier
-        c[:, :, GNSS_DELAY] = self.v_n
-        c[:, :, GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
-        c[:, 2, HEIGHT_DRIFT] = -self.t_fix
-        c[:, :, BY_SIGMA] = -self.by_sigma[:, :, None] * np.eye(3)
-        c[:, :, FIX_LAG2] = -self.by_lag
-        c[:, :, FIX_BY_MOTION], c[:, :, FIX_TIME] = -self.by_motion, -self.by_time
-        c[:, :, ACCEL] = self.C @ self.points.FF
+        c[:, :, layout.GNSS_DELAY] = self.v_n
+        c[:, :, layout.GNSS_CLOCK] = self.v_n * self.t_fix[:, None]
+        c[:, 2, layout.HEIGHT_DRIFT] = -self.t_fix
+        c[:, :, layout.BY_SIGMA] = -self.by_sigma[:, :, None] * np.eye(3)
+        c[:, :, layout.FIX_LAG2] = -self.by_lag
+        c[:, :, layout.FIX_BY_MOTION], c[:, :, layout.FIX_TIME] = -self.by_motion, -self.by_time
+        c[:, :, layout.ACCEL] = self.C @ self.points.FF
         return J, c
 
     @classmethod
@@ -127,7 +106,7 @@ class Fixes(PointRows):
         """Return the times of validity of the used fixes, s."""
         t = problem.leg.t_fix[problem.use]
         # the delay is that at the start mark
-        out: Floats = t - constants[GNSS_DELAY] - constants[GNSS_CLOCK] * t
+        out: Floats = t - constants[layout.GNSS_DELAY] - constants[layout.GNSS_CLOCK] * t
         return out
 
     def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
@@ -141,7 +120,7 @@ class Fixes(PointRows):
         return known
 
 
-def antenna(state: State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
+def antenna(state: layout.State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
     """Return places and velocities of the antenna at the keyframes, (N, 3) m and m/s."""
     rate = np.concatenate([mean_rate[:1], (mean_rate[:-1] + mean_rate[1:]) / 2, mean_rate[-1:]])
     return (state.p_n + state.C_nb @ arm_b,

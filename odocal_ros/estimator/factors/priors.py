@@ -9,40 +9,16 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint, WANTED
 from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import (
-    BA,
-    BG,
-    constants_from,
-    FIX_BY_MOTION,
-    FIX_ERRORS,
-    FIX_LAG2,
-    FIX_TIME,
-    GNSS_ARM,
-    GNSS_CLOCK,
-    GNSS_DELAY,
-    IMPERFECT,
-    KIND_OF,
-    KIND_SIZES,
-    NO_ERROR,
-    ODO_ARM,
-    ODO_CLOCK,
-    ODO_DELAY,
-    ODO_LAG2,
-    P,
-    PHI,
-    TYRES,
-    V,
-    VELOCITY,
-)
 
 # sizes of imperfections, by the square of the usual one: names of the levels, and their median.
 # Judgement: usual sizes are those of data sheets, which most sensors keep
-SIZES, SIZE = tuple(f'size_{kind}' for kind in KIND_SIZES), 0.5
+SIZES, SIZE = tuple(f'size_{kind}' for kind in layout.KIND_SIZES), 0.5
 # of the logarithms of sizes. Tuned: at 2 pitch is up to 5.2 sigma off in 113 drives, at 1 2.8
 # (docs/decisions/0016). Most receivers have no odometer, others one that is up to 2 % off, 6 of
 # the logarithm apart: at 1 the sigma of the scale is up to 2.8 times as large in drives without
@@ -53,24 +29,25 @@ LOG_SIZES = np.arange(np.log(1e-6), np.log(1e6), 0.05)
 # priors of the first keyframe: m, m/s, rad about east, north, up. Judgement: far wider than any
 # data
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
-    'position': (P, 1e4), 'velocity': (V, 100.0), 'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
+    'position': (layout.P, 1e4), 'velocity': (layout.V, 100.0),
+    'attitude': (layout.PHI, np.array([1.0, 1.0, 10.0]))}
 # m: without heights; with 1e4 m the rounding error is too large. Definition
-UP, LEVEL_START = slice(P.stop - 1, P.stop), 1.0
+UP, LEVEL_START = slice(layout.P.stop - 1, layout.P.stop), 1.0
 # priors of the vehicle, shared by all legs
 SHARED: dict[str, slice | Ints] = {
-    'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
-    'odometer_delay': np.array([ODO_DELAY, ODO_CLOCK, ODO_LAG2]),
-    'fix_latency': np.array([GNSS_DELAY, GNSS_CLOCK]),
-    'gyro_scale': constants_from('gyro_scale_z', 'gyro_scale_y'),
-    'gyro_axes': constants_from('gyro_axis_xy', 'gyro_axis_zy'),
-    'gyro_by_force': constants_from('gyro_x_by_force_x', 'gyro_z_by_force_y'),
-    'accelerometer_scale': constants_from('accelerometer_scale_x', 'accelerometer_scale_z'),
-    'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz'),
-    'receiver_smoothing': np.array([FIX_LAG2, FIX_BY_MOTION, FIX_TIME]),
-    'tyre_changes': TYRES,
-    'body_lean': constants_from('scale_by_pitching', 'pitch_centre_in_turns'),
-    'speed_truncation': constants_from('speed_offset'),
-    'heading': constants_from('heading_offset'), 'velocity': VELOCITY}
+    'odometer_lever_arm': layout.ODO_ARM, 'antenna_lever_arm': layout.GNSS_ARM,
+    'odometer_delay': np.array([layout.ODO_DELAY, layout.ODO_CLOCK, layout.ODO_LAG2]),
+    'fix_latency': np.array([layout.GNSS_DELAY, layout.GNSS_CLOCK]),
+    'gyro_scale': layout.constants_from('gyro_scale_z', 'gyro_scale_y'),
+    'gyro_axes': layout.constants_from('gyro_axis_xy', 'gyro_axis_zy'),
+    'gyro_by_force': layout.constants_from('gyro_x_by_force_x', 'gyro_z_by_force_y'),
+    'accelerometer_scale': layout.constants_from('accelerometer_scale_x', 'accelerometer_scale_z'),
+    'accelerometer_axes': layout.constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz'),
+    'receiver_smoothing': np.array([layout.FIX_LAG2, layout.FIX_BY_MOTION, layout.FIX_TIME]),
+    'tyre_changes': layout.TYRES,
+    'body_lean': layout.constants_from('scale_by_pitching', 'pitch_centre_in_turns'),
+    'speed_truncation': layout.constants_from('speed_offset'),
+    'heading': layout.constants_from('heading_offset'), 'velocity': layout.VELOCITY}
 
 
 class PriorRows(Factor):
@@ -80,10 +57,10 @@ class PriorRows(Factor):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
-        self.own = problem.own | {'slow_fix_errors': FIX_ERRORS}
+        self.own = problem.own | {'slow_fix_errors': layout.FIX_ERRORS}
         self.no_heights = bool(np.isnan(problem.leg.fixes_n[:, 2]).all())
         self.shared = {name: where for name, where in SHARED.items()
-                       if (problem.priors.constants[where] > NO_ERROR).any()}
+                       if (problem.priors.constants[where] > layout.NO_ERROR).any()}
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
@@ -92,9 +69,9 @@ class PriorRows(Factor):
 
     def weigh(self, levels: Levels) -> None:
         """Compute the priors from the sizes of imperfections: docs/method.md (S28)."""
-        size = np.array([levels[name] for name in SIZES])[KIND_OF]
+        size = np.array([levels[name] for name in SIZES])[layout.KIND_OF]
         constants = self.base.constants.copy()
-        constants[IMPERFECT] *= np.sqrt(size)
+        constants[layout.IMPERFECT] *= np.sqrt(size)
         self.priors = replace(self.base, constants=constants)
         self.log_R = float(np.log(size).sum())
 
@@ -106,15 +83,15 @@ class PriorRows(Factor):
         errors would change the size of one that is hardly observable. For the wide prior of a rare
         effect it is the most likely size: the mean is that of the few vehicles with the effect.
         """
-        at = 2 * self.n + np.arange(IMPERFECT.start, IMPERFECT.stop)
-        usual = self.base.constants[IMPERFECT]**2
-        weight = 1 / self.priors.constants[IMPERFECT]**2
+        at = 2 * self.n + np.arange(layout.IMPERFECT.start, layout.IMPERFECT.stop)
+        usual = self.base.constants[layout.IMPERFECT]**2
+        weight = 1 / self.priors.constants[layout.IMPERFECT]**2
         total = 1 / marginals[0][at, at]
         data = np.maximum(total - weight, 1e-9 * total)     # the share is below rounding
         known = data / (data + 1 / (SIZE * usual))
-        found = (self._constants_off()[IMPERFECT] * total / data)**2
+        found = (self._constants_off()[layout.IMPERFECT] * total / data)**2
         variance = np.exp(LOG_SIZES)[:, None] * usual + 1 / data
-        off = (known * (found / variance + np.log(variance))) @ np.eye(len(SIZES))[KIND_OF]
+        off = (known * (found / variance + np.log(variance))) @ np.eye(len(SIZES))[layout.KIND_OF]
         spread = np.array([SIZE_SPREADS[name] for name in SIZES])
         cost = off + ((LOG_SIZES[:, None] - np.log(SIZE)) / spread)**2
         likely = np.exp(LOG_SIZES[np.argmin(cost, axis=0)])
@@ -125,16 +102,17 @@ class PriorRows(Factor):
     def add_levels(self, out: LevelSides) -> None:
         """Add the right-hand sides of the sizes."""
         columns = out.at(SIZES)
-        off, sigma = self._constants_off()[IMPERFECT], self.priors.constants[IMPERFECT]
-        of = np.eye(len(SIZES))[KIND_OF]
-        out.border[IMPERFECT, columns] += of * (off / sigma**2)[:, None]
+        off = self._constants_off()[layout.IMPERFECT]
+        sigma = self.priors.constants[layout.IMPERFECT]
+        of = np.eye(len(SIZES))[layout.KIND_OF]
+        out.border[layout.IMPERFECT, columns] += of * (off / sigma**2)[:, None]
         out.square[columns, columns] += of.T @ (off / sigma)**2
 
     def _biases(self) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield columns, value and sigma of the biases at the first keyframe."""
         state, priors = self.state, self.priors
-        yield BG, state.gyro_bias[0], priors.gyro_bias
-        yield BA, state.accel_bias[0], priors.accel_bias
+        yield layout.BG, state.gyro_bias[0], priors.gyro_bias
+        yield layout.BA, state.accel_bias[0], priors.accel_bias
 
     def _constants_off(self) -> Floats:
         return self.state.constants - self.priors.centre
@@ -160,8 +138,8 @@ class PriorRows(Factor):
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
         """Yield the effects of the turn-on biases, and of constants of this leg alone."""
         first = self.with_wanted(marginals[0][None])[0]
-        yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
-        yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
+        yield 'gyro_bias', first[:, layout.BG] / self.priors.gyro_bias
+        yield 'accelerometer_bias', first[:, layout.BA] / self.priors.accel_bias
         for name, where in self.own.items():
             if where.stop <= self.m:
                 yield name, first[:, 2 * self.n:][:, where] / self.priors.constants[where]

@@ -19,19 +19,8 @@ own in the fit. They are subtracted as well.
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
-from odocal_ros.estimator.state import (
-    ACCEL,
-    ACCEL_AXIS,
-    ACCEL_SIGNAL,
-    BG,
-    GYRO,
-    GYRO_AXIS,
-    GYRO_SIGNAL,
-    P,
-    PHI,
-    V,
-)
 from odocal_ros.nav.rotations import transpose, turn
 
 FORCES = 3      # definition: number of the first gyro signal that is a force
@@ -52,7 +41,7 @@ class Signals:
         forward_n = state.C_nb @ state.forward
         noise = across(motion.axle.v_n, forward_n)
         moved = across(motion.residual[:, D], forward_n[:-1]) - noise[:-1] * motion.T
-        self.sway = (V, np.diff(noise, axis=0)), (P, moved)
+        self.sway = (layout.V, np.diff(noise, axis=0)), (layout.P, moved)
 
     def fit_rates(self, rows: slice, constants: Floats, by_bias: Floats, gyro: Floats) -> None:
         """
@@ -64,14 +53,15 @@ class Signals:
         Derivatives by g-sensitivity stay as they are: accelerometer noise is independent of the
         gyro.
         """
-        part, columns = self.motion.take(rows), constants[:, :, GYRO]
-        noise = turn(transpose(part.C), part.residual[:, PHI]) / part.T * part.fitted
+        part, columns = self.motion.take(rows), constants[:, :, layout.GYRO]
+        noise = turn(transpose(part.C), part.residual[:, layout.PHI]) / part.T * part.fitted
         rate = part.sums.mean_rate + noise
-        bound = LIKELY_NOISE**2 * (gyro[:, PHI]**2).sum(axis=(1, 2))[:, None] / 3 / part.T**2
+        bound = (LIKELY_NOISE**2 * (gyro[:, layout.PHI]**2).sum(axis=(1, 2))[:, None] / 3
+                 / part.T**2)
         noise -= rate * bound / (rate**2 + bound)
         by_bias = by_bias.copy()
-        by_bias[:, BG] = 0.0        # which walks, as a scale does not
-        for i, (into, by) in enumerate(zip(GYRO_AXIS, GYRO_SIGNAL, strict=True)):
+        by_bias[:, layout.BG] = 0.0        # which walks, as a scale does not
+        for i, (into, by) in enumerate(zip(layout.GYRO_AXIS, layout.GYRO_SIGNAL, strict=True)):
             if by < FORCES:
                 columns[:, :, i] += by_bias[:, :, into] * noise[:, by, None]
 
@@ -82,8 +72,9 @@ class Signals:
         # of the noise about each axis of b
         of_gyro = ((gyro.reshape(k, ROWS, -1, 3) @ C) * (found.reshape(k, 1, -1, 3) @ C)).sum(2)
         for axes, sway in self.sway:
-            self._by_forces(part, constants[:, axes, ACCEL], turn(transpose(part.C), sway[rows]),
-                            part.residual[:, axes], of_gyro[:, axes])
+            self._by_forces(part, constants[:, axes, layout.ACCEL],
+                            turn(transpose(part.C), sway[rows]), part.residual[:, axes],
+                            of_gyro[:, axes])
 
     def _by_forces(self, part: Motion, columns: Floats, sway: Floats, residual: Floats,
                    of_gyro: Floats) -> None:
@@ -96,7 +87,7 @@ class Signals:
         back = transpose(part.C)
         turned = back @ of_gyro      # towards an axis of b, about an axis of b
         own = turn(back, residual) - turned.sum(axis=2)
-        for i, (into, by) in enumerate(zip(ACCEL_AXIS, ACCEL_SIGNAL, strict=True)):
+        for i, (into, by) in enumerate(zip(layout.ACCEL_AXIS, layout.ACCEL_SIGNAL, strict=True)):
             noise = np.zeros_like(own)
             noise[:, into] = own[:, by] - sway[:, by]
             if into == by:      # a force along one axis, turned about another, toward the third

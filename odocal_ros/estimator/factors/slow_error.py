@@ -10,13 +10,7 @@ from scipy.linalg import solveh_banded
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals, Normal
-from odocal_ros.estimator.factors.factor import (
-    add_prior,
-    add_process,
-    Factor,
-    JUMP,
-    LinearisationPoint,
-)
+from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.level_information import LevelSides
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
@@ -28,7 +22,7 @@ USUAL_TIME, TIME_SPREAD = 100.0, 0.6
 WHITE_SHARE = 0.2       # initial white share of the variance; the slow share is 0.9: judgement
 
 
-class SlowError(Factor):
+class SlowError(factor.Factor):
     """
     Rows of the driving noise of the correlated fix error, and of its first value.
 
@@ -39,9 +33,9 @@ class SlowError(Factor):
 
     name = 'slow'
 
-    def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
+    def __init__(self, problem: Problem, point: factor.LinearisationPoint) -> None:
         self.state, self.T = point.state, problem.drift_time
-        self.jump = 1.0 if point.spread is None else point.spread[:, JUMP:]
+        self.jump = 1.0 if point.spread is None else point.spread[:, factor.JUMP:]
         self.time_given = not np.isnan(problem.fix_time)
         # start of runs of intervals without fixes: a fix ends a run
         ends = np.bincount(point.points['fixes'].interval, minlength=len(self.T)) > 0
@@ -77,8 +71,8 @@ class SlowError(Factor):
         return s[1:] - self.decay * s[:-1]
 
     def add(self, out: Normal) -> None:
-        add_process(out, SLOW, self.decay, 1 / self.drive, self.residual())
-        add_prior(out, 0, SLOW, self.power, self.state.slow_n[0])
+        factor.add_process(out, SLOW, self.decay, 1 / self.drive, self.residual())
+        factor.add_prior(out, 0, SLOW, self.power, self.state.slow_n[0])
 
     def cost(self) -> float:
         first = (self.state.slow_n[0]**2 / self.power).sum()

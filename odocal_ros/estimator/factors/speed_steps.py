@@ -11,31 +11,12 @@ not change, its error is up to a step.
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.axle import Axle, varies_with
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.point_rows import PointRows
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import (
-    ACCEL,
-    BA,
-    BG,
-    GYRO,
-    GYRO_AXIS,
-    GYRO_SIGNAL,
-    LN_K,
-    M,
-    ODO_ARM,
-    ODO_CLOCK,
-    ODO_DELAY,
-    ODO_LAG2,
-    PHI,
-    PITCH,
-    SPEED_OFFSET,
-    TYRES,
-    V,
-    YAW,
-)
 from odocal_ros.nav.coarse_speed import SpeedInstants
 from odocal_ros.nav.rotations import turn
 
@@ -58,7 +39,7 @@ class SpeedSteps(PointRows):
         C = state.C_nb[k]
         C_t, dv, g = C @ points.R, turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
         v_n, ahead = state.v_n[k] + dv + g * tau, C_t @ state.forward
-        self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
+        self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[layout.ODO_ARM]
         arm_b = state.C_bv @ self.arm_v
         speeds = (np.einsum('ki,ki->k', ahead, v_n) + np.cross(
             points.rate, arm_b) @ state.forward).reshape(len(FILTER_X) + 1, -1)
@@ -80,10 +61,10 @@ class SpeedSteps(PointRows):
         self.from_mean = varies_with(
             self.speed, state.t[self.k] - state.t[0] + points.tau, axle.acceleration()[self.k]
         ) - axle.means_by_way(point.intervals)
-        self.varied = 1 + self.from_mean @ c[TYRES]
-        said = self.instants.value + self.instants.side * c[SPEED_OFFSET]
+        self.varied = 1 + self.from_mean @ c[layout.TYRES]
+        said = self.instants.value + self.instants.side * c[layout.SPEED_OFFSET]
         self.said = state.scale * self.varied * said
-        self.raw = (self.said - self.speed - c[ODO_LAG2] * self.by_lag)[:, None]
+        self.raw = (self.said - self.speed - c[layout.ODO_LAG2] * self.by_lag)[:, None]
 
     @classmethod
     def there(cls, problem: Problem) -> bool:
@@ -94,7 +75,7 @@ class SpeedSteps(PointRows):
     def times(cls, problem: Problem, constants: Floats) -> Floats:
         """Return the times of the steps, s, then the times at which the filter needs a speed."""
         t, keyframes = _within(problem).t, problem.imu.t[problem.imu.key]
-        at = t - constants[ODO_DELAY] - constants[ODO_CLOCK] * t
+        at = t - constants[layout.ODO_DELAY] - constants[layout.ODO_CLOCK] * t
         before = filter_time(constants) * FILTER_X
         return np.concatenate([at, np.clip(
             at - before[:, None], keyframes[0], keyframes[-1]).ravel()])
@@ -115,28 +96,28 @@ class SpeedSteps(PointRows):
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
         """Return derivatives by the keyframe before and by constants: (m, 1, n), (m, 1, M)."""
         state, ahead, v = self.state, self.ahead, self.v_n
-        J, c = np.zeros((len(v), n)), np.zeros((len(v), M))
-        J[:, V], J[:, PHI] = -ahead, -np.cross(ahead, v - self.dv)
-        J[:, BA] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.A)
+        J, c = np.zeros((len(v), n)), np.zeros((len(v), layout.M))
+        J[:, layout.V], J[:, layout.PHI] = -ahead, -np.cross(ahead, v - self.dv)
+        J[:, layout.BA] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.A)
         arm = state.C_bv @ self.arm_v
         by_rate = np.cross(arm, state.forward)
         by_gyro = np.einsum('ki,kij->kj', np.cross(ahead, v), self.C @ self.points.turned) \
             - np.einsum('ki,kij->kj', ahead, self.C @ self.points.dv_by)
-        J[:, BG] = by_gyro[:, :3] + by_rate
-        c[:, GYRO] = by_gyro[:, 3:] + (by_rate[list(GYRO_AXIS)]
-                                       * self.points.measured[:, GYRO_SIGNAL])
+        J[:, layout.BG] = by_gyro[:, :3] + by_rate
+        c[:, layout.GYRO] = by_gyro[:, 3:] + (by_rate[list(layout.GYRO_AXIS)]
+                                       * self.points.measured[:, layout.GYRO_SIGNAL])
         K = state.scale * self.varied
         # by the published value: the speed is anywhere in its step, so only the speed has an error
-        c[:, LN_K], c[:, SPEED_OFFSET] = self.said, K * self.instants.side
-        c[:, TYRES] = (self.said / self.varied)[:, None] * self.from_mean
+        c[:, layout.LN_K], c[:, layout.SPEED_OFFSET] = self.said, K * self.instants.side
+        c[:, layout.TYRES] = (self.said / self.varied)[:, None] * self.from_mean
         rate = self.points.rate
-        for column, gradient in zip((YAW, PITCH), state.C_bv_gradient, strict=True):
+        for column, gradient in zip((layout.YAW, layout.PITCH), state.C_bv_gradient, strict=True):
             c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
                 rate, gradient @ self.arm_v) @ state.forward
-        c[:, ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
-        c[:, ODO_DELAY], c[:, ODO_CLOCK] = self.gained, self.gained * self.instants.t
-        c[:, ODO_LAG2] = -self.by_lag
-        c[:, ACCEL] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.F)
+        c[:, layout.ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
+        c[:, layout.ODO_DELAY], c[:, layout.ODO_CLOCK] = self.gained, self.gained * self.instants.t
+        c[:, layout.ODO_LAG2] = -self.by_lag
+        c[:, layout.ACCEL] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.F)
         return J[:, None], c[:, None]
 
 
@@ -149,4 +130,4 @@ def _within(problem: Problem) -> SpeedInstants:
 
 def filter_time(constants: Floats) -> float:
     """Return the time constant of a first-order filter with the variance of its delays, s."""
-    return float(np.sqrt(max(constants[ODO_LAG2], LEAST_FILTER**2)))
+    return float(np.sqrt(max(constants[layout.ODO_LAG2], LEAST_FILTER**2)))

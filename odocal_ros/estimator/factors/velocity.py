@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.fixes import antenna
 from odocal_ros.estimator.factors.least import LEAST
@@ -20,27 +21,6 @@ from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
 from odocal_ros.estimator.outside import from_place, Outside, thinned
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import (
-    ACCEL,
-    ACCEL_AXIS,
-    ACCEL_SIGNAL,
-    BA,
-    BARE,
-    BG,
-    GNSS_ARM,
-    GYRO,
-    GYRO_AXIS,
-    GYRO_SIGNAL,
-    M,
-    PHI,
-    PITCH,
-    V,
-    VELOCITY,
-    VELOCITY_DELAY,
-    VELOCITY_LAG2,
-    VELOCITY_SCALE,
-    YAW,
-)
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.receiver_filter import smoothing
 from odocal_ros.nav.rotations import skew, transpose, turn
@@ -68,7 +48,7 @@ class VelocityRows(OutsideRows):
 
     name, source = 'velocity', 'fix_velocity'
     levels_of = {'velocity': slice(0, 2)}
-    constants = VELOCITY
+    constants = layout.VELOCITY
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Velocity | None:
@@ -97,43 +77,46 @@ class VelocityRows(OutsideRows):
         assert isinstance(sent, Velocity)
         C, tau = state.C_nb[k], points.tau[:, None]
         C_t = C @ points.R
-        arm_v = leg.antenna_arm - leg.imu_arm + state.constants[GNSS_ARM]
+        arm_v = leg.antenna_arm - leg.imu_arm + state.constants[layout.GNSS_ARM]
         arm_b = state.C_bv @ arm_v
         dv, g = turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
         swing = turn(C_t, np.cross(points.rate, arm_b))
         _, at_keys = antenna(state, point.intervals.mean_rate, arm_b)
         faster = (np.diff(at_keys, axis=0) / point.intervals.T[:, None])[k]
         smoothed, by_lag = smoothing(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
-                                     state.t[k] + points.tau, state.constants[VELOCITY_LAG2])
+                                     state.t[k] + points.tau,
+                                     state.constants[layout.VELOCITY_LAG2])
         v = state.v_n[k] + dv + g * tau + swing + smoothed
         # the factor is on the prediction: on the measurement it would also scale its noise, and
         # small factors would fit best
-        times = 1 + state.constants[VELOCITY_SCALE]
+        times = 1 + state.constants[layout.VELOCITY_SCALE]
         m, t, rate = len(k), tau[:, :, None], point.intervals.mean_rate[k]
         measured = np.concatenate([rate, point.intervals.mean_force[k]], axis=1)[:, None]
-        J, c = np.zeros((m, 3, BARE)), np.zeros((m, 3, M))
-        J[:, :, V] = -np.eye(3)
-        J[:, :, PHI] = skew(dv + swing)
-        J[:, :, BA] = C @ points.A
+        J, c = np.zeros((m, 3, layout.BARE)), np.zeros((m, 3, layout.M))
+        J[:, :, layout.V] = -np.eye(3)
+        J[:, :, layout.PHI] = skew(dv + swing)
+        J[:, :, layout.BA] = C @ points.A
         by_gyro, by_rate = -C @ points.dv_by - skew(swing) @ C @ points.turned, -C_t @ skew(arm_b)
-        J[:, :, BG] = by_gyro[:, :, :3] + by_rate
-        c[:, :, GYRO] = by_gyro[:, :, 3:] + by_rate[:, :, GYRO_AXIS] * measured[:, :, GYRO_SIGNAL]
+        J[:, :, layout.BG] = by_gyro[:, :, :3] + by_rate
+        c[:, :, layout.GYRO] = by_gyro[:, :, 3:] + (
+            by_rate[:, :, layout.GYRO_AXIS] * measured[:, :, layout.GYRO_SIGNAL])
         by_yaw, by_pitch = state.C_bv_gradient
         W = C_t @ skew(rate)
-        c[:, :, YAW], c[:, :, PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
-        c[:, :, GNSS_ARM] = -W @ state.C_bv
-        c[:, :, VELOCITY_DELAY], c[:, :, VELOCITY_LAG2] = faster, -by_lag
-        force, signals = turn(transpose(C), faster - g), np.zeros((m, 3, len(ACCEL_AXIS)))
+        c[:, :, layout.YAW], c[:, :, layout.PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
+        c[:, :, layout.GNSS_ARM] = -W @ state.C_bv
+        c[:, :, layout.VELOCITY_DELAY], c[:, :, layout.VELOCITY_LAG2] = faster, -by_lag
+        force, signals = turn(transpose(C), faster - g), np.zeros((m, 3, len(layout.ACCEL_AXIS)))
         # fitted force, (m, 3) m/s^2, by its axes
-        signals[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]
-        c[:, :, ACCEL] = C @ signals * t
+        columns = range(len(layout.ACCEL_AXIS))
+        signals[:, layout.ACCEL_AXIS, columns] = force[:, layout.ACCEL_SIGNAL]
+        c[:, :, layout.ACCEL] = C @ signals * t
         J, c = J[:, :2] * times, c[:, :2] * times
-        c[:, :, VELOCITY_SCALE] = -v[:, :2]
+        c[:, :, layout.VELOCITY_SCALE] = -v[:, :2]
         return Rows(sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
-        out: Floats = super().times(problem, constants) - constants[VELOCITY_DELAY]
+        out: Floats = super().times(problem, constants) - constants[layout.VELOCITY_DELAY]
         return out
 
     @classmethod

@@ -16,6 +16,7 @@ from odocal_ros.calib.mounting import FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.slip import travel_reasons, unforced
 from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.equations import OUTSIDE
 from odocal_ros.estimator.factors.factor import WANTED
@@ -25,6 +26,7 @@ from odocal_ros.estimator.factors.slide import assumed
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
+from odocal_ros.estimator.result import remarks, slip
 from odocal_ros.estimator.result.as_sent import as_sent
 from odocal_ros.estimator.result.border import border_of
 from odocal_ros.estimator.result.exported import exported
@@ -32,38 +34,9 @@ from odocal_ros.estimator.result.filters import filter_reasons
 from odocal_ros.estimator.result.left_over import bias_sigmas, correlation, left_over, normalised
 from odocal_ros.estimator.result.mismatch import mismatch
 from odocal_ros.estimator.result.refusal import OPTIONAL, UNITS, unknown
-from odocal_ros.estimator.result.remarks import (
-    arms_off,
-    beside,
-    beyond_fit,
-    level_pitch,
-    MODEL_FLOOR,
-    remarks,
-)
 from odocal_ros.estimator.result.shares import shares
-from odocal_ros.estimator.result.slip import (
-    along,
-    find_slips,
-    level_when_changing,
-    Slip,
-    slip_reasons,
-    SLIP_VARIANCE,
-)
 from odocal_ros.estimator.result.wheel_result import wheel_details, wheel_estimates
 from odocal_ros.estimator.result.wheels import wheels_beside
-from odocal_ros.estimator.state import (
-    BG,
-    CONSTANTS,
-    GNSS_ARM,
-    GYRO,
-    LN_K,
-    M,
-    ODO_ARM,
-    ODO_LAG2,
-    PITCH,
-    VELOCITY,
-    YAW,
-)
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -71,7 +44,7 @@ from odocal_ros.settings.levels import INFORMED_SHARE, SCALE_LIMIT
 from odocal_ros.settings.nominal import nominal_yaw
 
 AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
-SCALES = range(GYRO.start, VELOCITY.start)    # errors of IMU, receiver, tyres, body
+SCALES = range(layout.GYRO.start, layout.VELOCITY.start)    # errors of IMU, receiver, tyres, body
 
 
 def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
@@ -81,36 +54,37 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     count = leg.travel.quantum * fit.state.scale
     state, c = fit.state, fit.state.constants
     covariance = floored(fit.covariance * widen**2)
-    beyond = beyond_fit(problem, fit, np.sqrt(np.diag(covariance)))
+    beyond = remarks.beyond_fit(problem, fit, np.sqrt(np.diag(covariance)))
     for i, _, own in beyond:
         covariance[i, i] += own**2
     sigma = np.sqrt(np.diag(covariance))
-    filtered = filter_reasons(c[ODO_LAG2], sigma[ODO_LAG2])
+    filtered = filter_reasons(c[layout.ODO_LAG2], sigma[layout.ODO_LAG2])
     slips, slip_said = _slips(leg, fit, near, count, filtered=bool(filtered))
     reasons += [*filtered, *slip_said]
     after = np.sqrt(np.diag(fit.covariance)) / fit.priors.constants
-    reasons += remarks(problem, fit, sigma, after, config)
-    ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
+    reasons += remarks.remarks(problem, fit, sigma, after, config)
+    ratio = {layout.CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
     found, undetermined = determined(c + configured(leg), sigma, after, leg.scale_unit,
                                      leg.nominal_scale, config, widen, {
-                                         CONSTANTS[i] for i, _, _ in beyond if i != LN_K})
+                                         layout.CONSTANTS[i] for i, _, _ in beyond
+                                         if i != layout.LN_K})
     reasons += undetermined
     if found['scale_factor'].value is not None:
         found |= as_sent(leg, state, covariance)
     up_b = state.C_bv[:, 2]
-    drift = float(np.sqrt(up_b @ near[0][BG, BG] @ up_b) * widen)
+    drift = float(np.sqrt(up_b @ near[0][layout.BG, layout.BG] @ up_b) * widen)
     wheels = wheels_beside(problem, fit, covariance, drift, config.odometer.track_width)
     if leg.wheels:
         of_wheels, why = wheel_estimates(
             [wheel.name for wheel in leg.wheels], wheels, found['scale_factor'], config)
         found, reasons = found | of_wheels, reasons + why
-    bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
+    bias_sigma = np.sqrt(np.diagonal(near[0])[layout.BG]) * widen
     for i, axis in enumerate('xyz'):
         name = f'gyro_bias_{axis}'
         ratio[name] = float(bias_sigma[i] / fit.first.gyro_bias[i])
         if ratio[name] < INFORMED_SHARE:
             found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
-    said = {CONSTANTS[i] for i in arms_off(c, sigma)}      # by LEVER_ARM_OFF
+    said = {layout.CONSTANTS[i] for i in remarks.arms_off(c, sigma)}      # by LEVER_ARM_OFF
     unsaid = [name for name in ratio if name in found and found[name].value is None
               and name not in said]
     if unsaid:
@@ -118,11 +92,11 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
     sources = [*(replace(s, effects=s.effects * widen) for s in shares(fit, near)),
-               Source('model', np.diag(MODEL_FLOOR))]
+               Source('model', np.diag(remarks.MODEL_FLOOR))]
     border = border_of(fit, configured(leg)).widened(widen)
     for i, name, own in beyond:
         sources.append(Source(name, own * np.eye(WANTED)[:, [i]]))
-        border = border.loosened({CONSTANTS[i]: own})
+        border = border.loosened({layout.CONSTANTS[i]: own})
     grade = problem.grade if leg.has_accelerometer else None
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
@@ -130,32 +104,32 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
                         | exported(leg, problem, fit, near, widen)
                         | {'key_bias_sigmas': bias_sigmas(near, widen),
                            'slips': [vars(s) for s in slips],
-                           'beside': beside(c, covariance, grade)}
+                           'beside': remarks.beside(c, covariance, grade)}
                         | ({} if grade is None else {
-                            'level_pitch_angle': level_pitch(fit, near, widen)}),
+                            'level_pitch_angle': remarks.level_pitch(fit, near, widen)}),
                         border)
 
 
 def _slips(leg: SmootherLeg, fit: Fit, near: JointMarginals, count: float, *,
-           filtered: bool) -> tuple[tuple[Slip, ...], list[Reason]]:
+           filtered: bool) -> tuple[tuple[slip.Slip, ...], list[Reason]]:
     """Return the slips, and the reasons that report them."""
     if leg.by_steps:    # only the steps of a coarse speed are used, which do not show slip
         return (), []
-    turned = along(fit, near)
-    slips = find_slips(fit, turned, count)
+    turned = slip.along(fit, near)
+    slips = slip.find_slips(fit, turned, count)
     speed = np.einsum('ni,nij,j->n', fit.state.v_n, fit.state.C_nb, fit.state.forward)
     sign = np.array([unforced(s.t, s.duration, s.metres, fit.state.t, speed) for s in slips], int)
     # the shape of a filter is unknown, and a late or held speed errs at changes of speed: no slip
-    level = '' if filtered or (sign > 0).any() else level_when_changing(fit, near, count)
+    level = '' if filtered or (sign > 0).any() else slip.level_when_changing(fit, near, count)
     slid = tuple(s for s, of in zip(slips, sign, strict=True) if not of)
-    return slips, [*slip_reasons(slid, level), *travel_reasons(
+    return slips, [*slip.slip_reasons(slid, level), *travel_reasons(
         np.array([s.t for s in slips]), np.array([s.metres for s in slips]), sign)]
 
 
 def floored(covariance: Floats) -> Floats:
     """Return the covariance with the floor of the model: docs/method.md (S31)."""
-    covariance, at = covariance.copy(), range(len(MODEL_FLOOR))
-    covariance[at, at] += MODEL_FLOOR**2
+    covariance, at = covariance.copy(), range(len(remarks.MODEL_FLOOR))
+    covariance[at, at] += remarks.MODEL_FLOOR**2
     return covariance
 
 
@@ -170,29 +144,32 @@ def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nom
     limits.   doubt : factor on the sigmas by model errors; angles must be determined with it.
     moved : angles that change in the leg.
     """
-    K, yaw, pitch = float(np.exp(value[LN_K])), float(wrap(value[YAW])), float(value[PITCH])
+    K, yaw = float(np.exp(value[layout.LN_K])), float(wrap(value[layout.YAW]))
+    pitch = float(value[layout.PITCH])
     found = unknown(scale_unit)
-    if sigma[LN_K] <= SCALE_LIMIT:
-        found['scale_factor'] = Estimate(K, float(K * sigma[LN_K]), scale_unit)
+    if sigma[layout.LN_K] <= SCALE_LIMIT:
+        found['scale_factor'] = Estimate(K, float(K * sigma[layout.LN_K]), scale_unit)
         if nominal:
-            found['scale_ratio'] = Estimate(K / nominal, float(K / nominal * sigma[LN_K]), '1')
+            found['scale_ratio'] = Estimate(K / nominal,
+                                            float(K / nominal * sigma[layout.LN_K]), '1')
     # an angle with a larger sigma than half a degree and the limit is not determined
     limit = max(np.deg2rad(0.5), config.verdict.max_yaw_sigma)
-    for name, i, angle in (('yaw_mounting_angle', YAW, yaw),
-                           ('pitch_mounting_angle', PITCH, pitch)):
+    for name, i, angle in (('yaw_mounting_angle', layout.YAW, yaw),
+                           ('pitch_mounting_angle', layout.PITCH, pitch)):
         # a configured mounting angle is not determined by the drive
         if doubt * sigma[i] <= limit and ratio[i] < INFORMED_SHARE:
             found[name] = Estimate(angle, float(sigma[i]), 'rad')
     for i in OPTIONAL:
         if ratio[i] < INFORMED_SHARE:
-            found[CONSTANTS[i]] = Estimate(float(value[i]), float(sigma[i]), UNITS[CONSTANTS[i]])
+            name = layout.CONSTANTS[i]
+            found[name] = Estimate(float(value[i]), float(sigma[i]), UNITS[name])
     return found, _undetermined(sigma, limit, doubt, config, yaw, moved)
 
 
 def configured(leg: SmootherLeg) -> Floats:
     """Return the values of the settings that constants are corrections to: (M,)."""
-    value = np.zeros(M)
-    value[ODO_ARM], value[GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
+    value = np.zeros(layout.M)
+    value[layout.ODO_ARM], value[layout.GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
     return value
 
 
@@ -225,16 +202,17 @@ def _undetermined(sigma: Floats, usual: float, doubt: float, config: Config, yaw
     reasons, wanted = [], f'; the limit is {np.rad2deg(limit):.2g} deg'
     if doubt > 1:
         wanted += f' ({np.rad2deg(usual):.2g} deg / {doubt:.2g} because of MODEL_MISMATCH)'
-    if sigma[LN_K] > SCALE_LIMIT:
+    if sigma[layout.LN_K] > SCALE_LIMIT:
         reasons.append(Reason(Code.SCALE_NOT_DETERMINED, 'scale uncertainty is '
-                              f'{100 * sigma[LN_K]:.0f} %, too large to state a value; the '
+                              f'{100 * sigma[layout.LN_K]:.0f} %, too large to state a value; the '
                               f'limit is {100 * SCALE_LIMIT:g} %'))
     off = abs(float(wrap(yaw - nominal_yaw(config))))
-    if sigma[YAW] > limit:
-        cause = 'see CHANGE_IN_LEG' if CONSTANTS[YAW] in moved else (
+    if sigma[layout.YAW] > limit:
+        cause = 'see CHANGE_IN_LEG' if layout.CONSTANTS[layout.YAW] in moved else (
             'too little acceleration, or too few turns')
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
-                              f'{np.rad2deg(sigma[YAW]):.1f} deg{wanted}. Likely cause: {cause}'))
+                              f'{np.rad2deg(sigma[layout.YAW]):.1f} deg{wanted}. '
+                              f'Likely cause: {cause}'))
     elif off > np.deg2rad(135.0):       # more than any mounting: reversed
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
                               'directions: positive counts mean backwards, or the IMU x axis '
@@ -242,10 +220,10 @@ def _undetermined(sigma: Floats, usual: float, doubt: float, config: Config, yaw
     elif off > FAR_YAW:
         reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+.1f} '
                               f'deg differs by {np.rad2deg(off):.1f} deg from its nominal value'))
-    if sigma[PITCH] > limit:
+    if sigma[layout.PITCH] > limit:
         reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
-                              f'{np.rad2deg(sigma[PITCH]):.1f} deg{wanted}',
-                              'See CHANGE_IN_LEG.' if CONSTANTS[PITCH] in moved else
+                              f'{np.rad2deg(sigma[layout.PITCH]):.1f} deg{wanted}',
+                              'See CHANGE_IN_LEG.' if layout.CONSTANTS[layout.PITCH] in moved else
                               'Drive longer, with stops and starts. Accurate ellipsoidal heights '
                               'also help.'))
     return reasons
@@ -271,13 +249,13 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'iterations': fit.iterations, 'widened': float(widen),
         'outside': _outside(problem, fit, sigma),
         'posterior_to_prior': ratio,
-        **{CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
+        **{layout.CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
            for i in SCALES},
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
                       'fix_correlation_2s': alike,
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
                       'fixes': len(t_fix), 'normalised': normalised(fit.weighted),
-                      'intervals_slipping': int((fit.spread[:, 0] > SLIP_VARIANCE).sum())},
+                      'intervals_slipping': int((fit.spread[:, 0] > slip.SLIP_VARIANCE).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float(turned), 'in_turns': problem.turned,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.factors.factor import ACCEL_STEP, GYRO_STEP
 from odocal_ros.estimator.factors.motion_rows import MotionRows
@@ -22,32 +23,15 @@ from odocal_ros.estimator.result.filters import (
     lag_reasons,
     odometer_reasons,
 )
-from odocal_ros.estimator.state import (
-    BA,
-    BY_SPEED,
-    BY_TIME,
-    CONSTANTS,
-    FIX_BY_MOTION,
-    FIX_LAG2,
-    FIX_TIME,
-    GNSS_ARM,
-    GNSS_CLOCK,
-    IMPERFECT,
-    LN_K,
-    ODO_ARM,
-    ODO_CLOCK,
-    PITCH,
-    YAW,
-)
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
 from odocal_ros.settings.levels import INFORMED_SHARE, REMARK_SIGMAS
 
-CLOCKS = {'fix': GNSS_CLOCK, 'odometer': ODO_CLOCK}
-IMU_SCALES = tuple(i for i, name in enumerate(CONSTANTS) if name.startswith(
+CLOCKS = {'fix': layout.GNSS_CLOCK, 'odometer': layout.ODO_CLOCK}
+IMU_SCALES = tuple(i for i, name in enumerate(layout.CONSTANTS) if name.startswith(
     ('gyro_scale', 'accelerometer_scale')))
-AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
+AXIS_XY, AXIS_ZX = map(layout.CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
 # 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
 # body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
@@ -77,14 +61,14 @@ def beside(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, 
     sigma = np.sqrt(np.diag(covariance))
     # scale_by_speed: the slope at FAST
     out: dict[str, Any] = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
-                 for name, i, unit in (('scale_by_speed', BY_SPEED, '1/(m/s)'),
-                                       ('scale_by_time', BY_TIME, '1/s'))}
+                 for name, i, unit in (('scale_by_speed', layout.BY_SPEED, '1/(m/s)'),
+                                       ('scale_by_time', layout.BY_TIME, '1/s'))}
     if grade is not None:
-        for name, angle, axis in (('yaw', YAW, AXIS_XY), ('pitch', PITCH, AXIS_ZX)):
+        for name, angle, axis in (('yaw', layout.YAW, AXIS_XY), ('pitch', layout.PITCH, AXIS_ZX)):
             out[f'{name}_mounting_angle_housing_sigma'] = _figure(
                 _of_housing(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
     next_drive = 1e-3       # physical: by so much tyres differ from drive to drive, warm or cold
-    out['scale_ratio_next_drive_sigma'] = _figure(np.hypot(sigma[LN_K], next_drive), '1')
+    out['scale_ratio_next_drive_sigma'] = _figure(np.hypot(sigma[layout.LN_K], next_drive), '1')
     return out
 
 
@@ -110,19 +94,20 @@ def level_pitch(fit: Fit, near: JointMarginals, widen: float) -> dict[str, Any]:
     """Return the pitch relative to the accelerometer's level: third pitch of method_real."""
     k = len(near) // 2
     n = fit.solved.step.shape[1]
-    at = np.array([2 * n + PITCH, BA.start])
+    at = np.array([2 * n + layout.PITCH, layout.BA.start])
     C = near[k][np.ix_(at, at)]
     row = np.array([1.0, -1 / G])
-    return {'value': float(row @ [fit.state.constants[PITCH], fit.state.accel_bias[k, 0]]),
+    return {'value': float(row @ [fit.state.constants[layout.PITCH], fit.state.accel_bias[k, 0]]),
             'sigma': float(np.sqrt(row @ C @ row) * widen), 'unit': 'rad'}
 
 
 def wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
     """Return the sigma of ln K by positions in a local frame that contain the wheels."""
-    if not problem.leg.origin.local or not follows_odometer(c[FIX_BY_MOTION],
-                                                            sigma[FIX_BY_MOTION]):
+    if not problem.leg.origin.local or not follows_odometer(c[layout.FIX_BY_MOTION],
+                                                            sigma[layout.FIX_BY_MOTION]):
         return 0.0
-    return by_map_drift(c[FIX_BY_MOTION], c[FIX_TIME], problem.leg.t_stop - problem.leg.t_begin)
+    return by_map_drift(c[layout.FIX_BY_MOTION], c[layout.FIX_TIME],
+                        problem.leg.t_stop - problem.leg.t_begin)
 
 
 def beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[tuple[int, str, float]]:
@@ -130,8 +115,8 @@ def beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[tuple[int, str
     by_map = wheels_in_map(problem, fit.state.constants, sigma)
     # which of the two values a later drive has is unknown
     moved = [(step.constant, 'change_of_mounting', abs(step.size)) for step in fit.steps
-             if step.constant != LN_K and step.certain]
-    return [(LN_K, 'wheels_in_positions', by_map)] * bool(by_map) + moved
+             if step.constant != layout.LN_K and step.certain]
+    return [(layout.LN_K, 'wheels_in_positions', by_map)] * bool(by_map) + moved
 
 
 def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
@@ -142,15 +127,15 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
     sigma : (M,) of the constants.   ratio : (M,) posterior sigma by that of the prior.
     """
     c = fit.state.constants
-    said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
-            *odometer_reasons(c[FIX_BY_MOTION], sigma[FIX_BY_MOTION], c[FIX_TIME],
-                              wheels_in_map(problem, c, sigma)),
+    said = [*_noisy(problem, fit.levels), *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
+            *odometer_reasons(c[layout.FIX_BY_MOTION], sigma[layout.FIX_BY_MOTION],
+                              c[layout.FIX_TIME], wheels_in_map(problem, c, sigma)),
             *(reason for name, i in CLOCKS.items()
               for reason in clock_reasons(name, c[i], sigma[i], float(np.ptp(fit.state.t)))),
             *_varies(fit, sigma), *_changes(fit), *_bias_steps(fit)]
     usual = imperfect_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))
-    off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)
+    off[layout.IMPERFECT] = np.abs(c[layout.IMPERFECT]) / np.maximum(usual, 1e-300)
     off *= np.abs(c) > REMARK_SIGMAS * sigma
     if off[[AXIS_XY, AXIS_ZX]].max() > REMARK_SIGMAS:
         worst = max((AXIS_XY, AXIS_ZX), key=lambda i: off[i])
@@ -161,7 +146,8 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
     worst = max(IMU_SCALES, key=lambda i: off[i])
     most = 4.0      # of the sigma of the grade: another IMU
     if off[worst] > most:
-        said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {CONSTANTS[worst].replace("_", " ")} '
+        name = layout.CONSTANTS[worst].replace('_', ' ')
+        said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {name} '
                            f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
                            f'the {config.imu.grade} grade (limit {most:g}); accounted for'))
     return said + _arms(c, sigma, ratio, config)
@@ -183,8 +169,8 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
     """Return the reason for a scale that varies in the leg."""
     motion, c = fit.weighted[MotionRows].motion, fit.state.constants
     said = []
-    for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from low to high speed'),
-                          (BY_TIME, motion.from_mean[:, 1], 'from start to end')):
+    for i, span, what in ((layout.BY_SPEED, motion.from_mean[:, 0], 'from low to high speed'),
+                          (layout.BY_TIME, motion.from_mean[:, 1], 'from start to end')):
         change, doubt = np.array([c[i], sigma[i]]) * np.ptp(span)
         if abs(change) > max(REMARK_SIGMAS * doubt, LEAST_CHANGE):
             said.append(f'{100 * change:+.2f} ± {100 * doubt:.2f} % {what}')
@@ -217,8 +203,8 @@ def _changes(fit: Fit) -> list[Reason]:
     said = []
     for step in fit.steps:
         if step.certain and abs(step.size) > LEAST_CHANGE:
-            what = CONSTANTS[step.constant].replace('_', ' ')
-            size = f'{100 * step.size:+.2f} %' if step.constant == LN_K else \
+            what = layout.CONSTANTS[step.constant].replace('_', ' ')
+            size = f'{100 * step.size:+.2f} %' if step.constant == layout.LN_K else \
                 f'{np.rad2deg(step.size):+.2f} deg'
             said.append(f'the {what} changes by about {size} near t = {step.t:.0f} s '
                         f'({abs(step.size) / step.sigma:.0f} sigma)')
@@ -227,8 +213,8 @@ def _changes(fit: Fit) -> list[Reason]:
 
 def arms_off(c: Floats, sigma: Floats) -> set[int]:
     """Return the axes of lever arms that the drive puts far from their setting, by index."""
-    axes = (*range(ODO_ARM.start, ODO_ARM.stop - 1),      # not z of the odometer
-            *range(GNSS_ARM.start, GNSS_ARM.stop))
+    axes = (*range(layout.ODO_ARM.start, layout.ODO_ARM.stop - 1),      # not z of the odometer
+            *range(layout.GNSS_ARM.start, layout.GNSS_ARM.stop))
     worth = 0.3     # m
     return {i for i in axes if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], worth)}
 
@@ -237,8 +223,8 @@ def _arms(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reaso
     """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
     said, do = [], []
     off = arms_off(c, sigma)
-    for name, arm, where in (('odometer.lever_arm', config.odometer.lever_arm, ODO_ARM),
-                             ('gnss.lever_arm', config.gnss.lever_arm, GNSS_ARM)):
+    for name, arm, where in (('odometer.lever_arm', config.odometer.lever_arm, layout.ODO_ARM),
+                             ('gnss.lever_arm', config.gnss.lever_arm, layout.GNSS_ARM)):
         for i, axis, value, most in zip(range(where.start, where.stop), 'xyz', arm, VEHICLE,
                                         strict=True):
             if i not in off:

@@ -13,13 +13,8 @@ from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.estimator.result.wheels import Wheel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import axles_of
+from odocal_ros.settings import levels
 from odocal_ros.settings.config import Config, SIDES
-from odocal_ros.settings.levels import (
-    FAULT_SIGMAS,
-    INFORMED_SHARE,
-    REMARK_SIGMAS,
-    TYRE_SPREAD,
-)
 
 Found = tuple[dict[str, Estimate], list[Reason]]
 FEWEST_ALIKE = 3        # definition: with fewer, the wheel that differs is unknown
@@ -50,7 +45,7 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
     found = unknown_wheels(names, scale.unit)
     if scale.value is None or scale.sigma is None:
         return found, []
-    limit = INFORMED_SHARE * (config.wheels.radius_range or TYRE_SPREAD)
+    limit = levels.INFORMED_SHARE * (config.wheels.radius_range or levels.TYRE_SPREAD)
     # left and right have the same line: the error of right over left is twice that of either
     sigma = 2 * max((wheel.ratio_sigma for wheel in wheels.values()), default=np.inf)
     if sigma > limit:
@@ -96,7 +91,7 @@ def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
     off = {}
     for name, wheel in wheels.items():
         usual = float(np.median([w.ratio for other, w in wheels.items() if other != name]))
-        if abs(wheel.ratio / usual - 1) > max(DEPARTS, FAULT_SIGMAS * wheel.ratio_sigma):
+        if abs(wheel.ratio / usual - 1) > max(DEPARTS, levels.FAULT_SIGMAS * wheel.ratio_sigma):
             off[name] = wheel.ratio / usual - 1
     return [Reason(Code.WHEEL_DEPARTS, f'the factor of wheel {name} is {100 * abs(x):.2f} % '
                    f'{"larger" if x > 0 else "smaller"} than that of the others. Likely cause: '
@@ -107,7 +102,7 @@ def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
 def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, list[Reason]]:
     width, sigma = left.y - right.y, left.y_sigma + right.y_sigma     # both have the same line
     none = Estimate(None, None, 'm')
-    if given and sigma >= INFORMED_SHARE * TRACK_WIDTH.taped_share * given:
+    if given and sigma >= levels.INFORMED_SHARE * TRACK_WIDTH.taped_share * given:
         return none, []         # the configured width is more accurate
     if sigma < TRACK_WIDTH.least and width < TRACK_WIDTH.least:
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
@@ -118,7 +113,7 @@ def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, lis
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
                              f'{sigma:.2g} m; the limit is {limit:.2g} m. Likely cause: too few '
                              'turns')]
-    if given and abs(width - given) > REMARK_SIGMAS * np.hypot(
+    if given and abs(width - given) > levels.REMARK_SIGMAS * np.hypot(
             TRACK_WIDTH.taped_share * given, sigma):
         return Estimate(width, sigma, 'm'), [Reason(
             Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.4f} ± '

@@ -25,6 +25,7 @@ import numpy as np
 from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import by_row
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.interval_noise import hard_and_turning
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.factors.odometer_filter import as_rolled, stamp_of
@@ -32,15 +33,6 @@ from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.wheel_noise import fit_line, Increments, Line
-from odocal_ros.estimator.state import (
-    GYRO,
-    GYRO_AXIS,
-    GYRO_SIGNAL,
-    LN_K,
-    ODO_CLOCK,
-    ODO_DELAY,
-    State,
-)
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.rotations import rotvec
 from odocal_ros.screening.axles import STEER_GRID, steering_path
@@ -101,10 +93,10 @@ def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
     if len(at) < FEWEST:
         return {}
     common = _Common(problem, fit, inside[at], s[:, at])
-    late = np.array([ODO_DELAY, ODO_CLOCK])
+    late = np.array([layout.ODO_DELAY, layout.ODO_CLOCK])
     row = np.array([1.0, state.t.mean()])
     delay = float(np.sqrt(row @ covariance[np.ix_(late, late)] @ row))
-    own = [LN_K, *range(GYRO.start, GYRO.stop)]
+    own = [layout.LN_K, *range(layout.GYRO.start, layout.GYRO.stop)]
     lines = [common.line(i, delay, drift, width) for i in range(len(wheels))]
     return {wheel.name: _wheel(line, common.moved(i, line), covariance[np.ix_(own, own)])
             for i, (wheel, line) in enumerate(zip(wheels, lines, strict=True))}
@@ -143,7 +135,7 @@ class _Common:
         turn = rotvec(np.swapaxes(state.C_nb[:-1], 1, 2) @ state.C_nb[1:]) @ up
         self.turn = np.diff(np.append(0.0, np.cumsum(turn))[at])
         signals = np.concatenate([motion.sums.mean_rate, motion.sums.mean_force], axis=1)
-        errors = signals[:, GYRO_SIGNAL] * up[list(GYRO_AXIS)] * motion.T
+        errors = signals[:, layout.GYRO_SIGNAL] * up[list(layout.GYRO_AXIS)] * motion.T
         ends = np.concatenate([np.zeros((1, errors.shape[1])), np.cumsum(errors, axis=0)])
         self.turn_errors = np.diff(ends[at], axis=0)     # by units of the gyro's errors
         rate = (problem.rate_b - state.gyro_bias) @ up
@@ -168,7 +160,7 @@ class _Common:
         alone = i == len(self.leg.wheels) - 1 and i % 2 == 0
         return 0.0 if alone else (width or TRACK_WIDTH.of_a_car) / 2 * (1 if i % 2 == 0 else -1)
 
-    def _steering(self, state: State, up: Floats, i: int) -> Floats:
+    def _steering(self, state: layout.State, up: Floats, i: int) -> Floats:
         """Return the path of a steered wheel beyond a fixed one by its squared distance, 1/m."""
         leg, scale = self.leg, state.scale
         t = np.arange(self.t[0], self.t[-1], STEER_GRID)
