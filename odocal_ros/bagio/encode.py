@@ -8,25 +8,25 @@ Messages of one topic all have the same length (one frame_id, one set of joint n
 of them is one structured array; no message objects are created.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+import struct
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data import samples as data
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.samples import (
-    FixSamples,
-    HeadingSamples,
-    ImuSamples,
-    OdometerSamples,
-    Samples,
-    ScalarSamples,
-    VelocitySamples,
-)
+from odocal_ros.messages import cdr
 
-VECTOR, SQUARE = ('<f8', 3), ('<f8', 9)    # format: of sensor_msgs and geometry_msgs
+# types that are written, but not read as columns
+SCHEMAS = cdr.SCHEMAS | {
+    'sensor_msgs/msg/FluidPressure': (
+        *cdr.HEADER, 'float64 fluid_pressure', 'float64 variance'),
+    'sensor_msgs/msg/CompressedImage': (*cdr.HEADER, 'string format', 'uint8[] data')}
+# a column of all messages, or a function that returns the values of a slice of them
+Values = Mapping[str, NDArray[Any] | Callable[[slice], Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,212 +44,183 @@ class Topic:
     pack: Callable[[slice], np.ndarray]
 
 
-class _Layout:
-    """Collects the fields of a message, with the padding of CDR before them."""
+def _empty(msgtype: str, parts: Mapping[str, Any]) -> tuple[bytes, dict[str, tuple[Any, ...]]]:
+    """
+    Return a message whose numbers are zero, and by path (type, shape) and offset of each.
 
-    def __init__(self) -> None:
-        self._fields: list[tuple[Any, ...]] = [('cdr', 'u1', 4)]
-        self._size = 0
-        self._texts: dict[str, bytes] = {}
+    parts : by path, texts, lists of texts, and lengths of lists of numbers; others are empty.
+    """
+    raw, places = bytearray((0, 1, 0, 0)), {}      # little-endian
 
-    def add(self, name: str, kind: str | tuple[str, int], align: int | None = None) -> '_Layout':
-        """Add a number, or a (number, count) array."""
-        base, count = kind if isinstance(kind, tuple) else (kind, 1)
-        item = np.dtype(base).itemsize
-        gap = -self._size % (align or item)
-        if gap:
-            self._fields.append((f'gap {self._size}', 'u1', (gap,)))
-        self._fields.append((name, base, (count,)) if count > 1 else (name, base))
-        self._size += gap + item * count
-        return self
-
-    def text(self, name: str, text: str) -> '_Layout':
-        """Add a string that is the same in every message."""
-        raw = text.encode() + b'\0'
-        self.add(f'{name} length', '<u4')
-        self._fields.append((name, f'S{len(raw)}'))
-        self._size += len(raw)
-        self._texts[name] = raw
-        return self
-
-    def header(self, frame: str) -> '_Layout':
-        return self.add('sec', '<i4').add('nanosec', '<u4').text('frame', frame)
-
-    def packer(self, fill: Callable[[NDArray[Any], slice], None],
-               n: int) -> Callable[[slice], NDArray[Any]]:
-        """Return a function that packs a slice of n rows; ``fill`` sets the fields."""
-        dtype, texts = np.dtype(self._fields), self._texts
-
-        def pack(rows: slice) -> NDArray[Any]:
-            out = np.zeros(len(range(*rows.indices(n))), dtype)
-            out['cdr'] = (0, 1, 0, 0)      # little-endian
-            for name, raw in texts.items():
-                out[name], out[f'{name} length'] = raw, len(raw)
-            fill(out, rows)
-            return out
-        return pack
-
-    def topic(self, name: str, msgtype: str, samples: Samples,
-              fill: Callable[[NDArray[Any], slice], None]) -> Topic:
-        """Return the topic of stamped samples; ``fill`` sets the fields except the stamp."""
-        def stamped(out: NDArray[Any], rows: slice) -> None:
-            out['sec'], out['nanosec'] = np.divmod(samples.stamp_ns[rows], 10**9)
-            fill(out, rows)
-        return Topic(name, msgtype, samples.received_ns,
-                     self.packer(stamped, len(samples.stamp_ns)))
+    def add(align: int, content: bytes) -> int:
+        raw.extend(bytes((4 - len(raw)) % align) + content)
+        return len(raw) - len(content)
+    for kind, path in map(str.split, SCHEMAS[msgtype]):
+        base, _, size = kind.partition('[')
+        part = parts.get(path, '' if base == 'string' else 0)
+        if size == ']':
+            add(4, struct.pack('<I', part if base in cdr.KINDS else len(part)))
+        if base == 'string':
+            for text in part if size else [part]:
+                add(4, struct.pack('<I', len(text.encode()) + 1))
+                add(1, text.encode() + b'\0')
+        else:
+            count = 1 if not size else part if size == ']' else int(size[:-1])
+            item = np.dtype(cdr.KINDS[base]).itemsize
+            at = add(item if count else 1, bytes(item * count))
+            places[path] = (cdr.KINDS[base], (count,) if size else ()), at
+    return bytes(raw), places
 
 
-def _imu_layout(frame: str) -> _Layout:
-    layout = _Layout().header(frame)
-    for field, kind in (('q', ('<f8', 4)), ('q_cov', SQUARE), ('w', VECTOR), ('w_cov', SQUARE),
-                        ('f', VECTOR), ('f_cov', SQUARE)):
-        layout.add(field, kind)
-    return layout
+def _topic(name: str, msgtype: str, time_ns: NDArray[np.int64], values: Values,
+           parts: Mapping[str, Any]) -> Topic:
+    """Return a topic; ``values`` by path, of x, y, z (and w) together by that of their parent."""
+    raw, places = _empty(msgtype, parts)
+    kinds, offsets = [], []
+    for path in values:
+        found = [one for known, one in places.items() if f'{known}.'.startswith(f'{path}.')]
+        (kind, shape), at = found[0]
+        kinds.append((kind, shape if len(found) == 1 else (len(found),)))
+        offsets.append(at)
+    # with a field of all bytes, so that a copy has those without a value too
+    dtype = np.dtype({'names': [*values, 'message'], 'formats': [*kinds, f'V{len(raw)}'],
+                      'offsets': [*offsets, 0]})
+
+    def pack(rows: slice) -> NDArray[Any]:
+        table = np.empty((len(range(*rows.indices(len(time_ns)))), len(raw)), np.uint8)
+        table[:] = np.frombuffer(raw, np.uint8)
+        out: NDArray[Any] = table.view(dtype)[:, 0]
+        for path, value in values.items():
+            out[path] = value(rows) if callable(value) else value[rows]
+        return out
+    return Topic(name, msgtype, time_ns, pack)
 
 
-def imu(name: str, samples: ImuSamples, frame: str = 'imu_link', w_variance: Floats | None = None,
-        f_variance: Floats | None = None) -> Topic:
+def _stamped(name: str, msgtype: str, samples: data.Samples, frame: str, values: Values,
+             parts: Mapping[str, Any] | None = None) -> Topic:
+    """Return the topic of samples with a header."""
+    stamps = {'header.stamp.sec': lambda rows: samples.stamp_ns[rows] // 10**9,
+              'header.stamp.nanosec': lambda rows: samples.stamp_ns[rows] % 10**9}
+    return _topic(name, msgtype, samples.received_ns, {**stamps, **values},
+                  {'header.frame_id': frame, **(parts or {})})
+
+
+def _diagonal(variance: Floats, size: int = 3) -> Callable[[slice], Floats]:
+    """Return a function for square covariances, row by row, of variances (n, 3) or (n, 1)."""
+    def covariance(rows: slice) -> Floats:
+        out = np.zeros((len(variance[rows]), size, size))
+        out[:, range(3), range(3)] = variance[rows]
+        return out.reshape(-1, size**2)
+    return covariance
+
+
+def imu(name: str, samples: data.ImuSamples, frame: str = 'imu_link',
+        w_variance: Floats | None = None, f_variance: Floats | None = None) -> Topic:
     """
     Return sensor_msgs/Imu of ImuSamples; without orientation if the yaw variance is NaN.
 
     w_variance, f_variance : (n, 3), optional, of turn rates and forces; default zeros: unknown.
     """
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        out['w'], out['f'] = samples.w_i[rows], samples.f_i[rows]
-        for field, variance in (('w_cov', w_variance), ('f_cov', f_variance)):
-            if variance is not None:
-                out[field][:, ::4] = variance[rows]
-        _orientation(out, samples.q_ni[rows], samples.yaw_variance[rows])
-    return _imu_layout(frame).topic(name, 'sensor_msgs/msg/Imu', samples, fill)
+    known = {f'{field}_covariance': _diagonal(variance) for field, variance in (
+        ('angular_velocity', w_variance), ('linear_acceleration', f_variance))
+        if variance is not None}
+    return _stamped(name, 'sensor_msgs/msg/Imu', samples, frame, {
+        **_orientation(samples), 'angular_velocity': samples.w_i,
+        'linear_acceleration': samples.f_i, **known})
 
 
-def heading(name: str, samples: HeadingSamples, frame: str = 'imu_link') -> Topic:
+def heading(name: str, samples: data.HeadingSamples, frame: str = 'imu_link') -> Topic:
     """Return sensor_msgs/Imu of HeadingSamples: an orientation, no rates (covariance -1)."""
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        out['w_cov'][:, 0] = out['f_cov'][:, 0] = -1.0
-        _orientation(out, samples.q_ni[rows], samples.yaw_variance[rows])
-    return _imu_layout(frame).topic(name, 'sensor_msgs/msg/Imu', samples, fill)
+    return _stamped(name, 'sensor_msgs/msg/Imu', samples, frame, {
+        **_orientation(samples), 'angular_velocity_covariance': _none,
+        'linear_acceleration_covariance': _none})
 
 
-def _orientation(out: NDArray[Any], q_ni: Floats, variance: Floats) -> None:
-    out['q'] = q_ni
-    out['q_cov'][:, ::4] = np.where(np.isnan(variance), 0.0, variance)[:, None]
-    out['q_cov'][np.isnan(variance), 0] = -1.0
+def _none(_rows: slice) -> Floats:
+    """Return the covariance of a value that is not sent (REP-145)."""
+    return np.array([-1.0, *[0.0] * 8])
 
 
-def counter(name: str, samples: OdometerSamples) -> Topic:
+def _orientation(samples: data.ImuSamples | data.HeadingSamples) -> Values:
+    none = np.isnan(samples.yaw_variance)
+    known = _diagonal(np.where(none, 0.0, samples.yaw_variance)[:, None])
+
+    def covariance(rows: slice) -> Floats:
+        out = known(rows)
+        out[none[rows], 0] = -1.0
+        return out
+    return {'orientation': samples.q_ni, 'orientation_covariance': covariance}
+
+
+def counter(name: str, samples: data.OdometerSamples) -> Topic:
     """Return std_msgs/Int64 of OdometerSamples: no header, so the bag time is the stamp."""
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        out['data'] = samples.value[rows]
-    return Topic(name, 'std_msgs/msg/Int64', samples.stamp_ns,
-                 _Layout().add('data', '<i8').packer(fill, len(samples.stamp_ns)))
+    return _topic(name, 'std_msgs/msg/Int64', samples.stamp_ns, {'data': samples.value}, {})
 
 
-def twist(name: str, samples: OdometerSamples, frame: str = 'base_link') -> Topic:
+def twist(name: str, samples: data.OdometerSamples, frame: str = 'base_link') -> Topic:
     """Return geometry_msgs/TwistStamped of OdometerSamples: forward speed, the rest zero."""
-    layout = _Layout().header(frame).add('linear', VECTOR).add('angular', VECTOR)
-
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        out['linear'][:, 0] = samples.value[rows]
-    return layout.topic(name, 'geometry_msgs/msg/TwistStamped', samples, fill)
+    return _stamped(name, 'geometry_msgs/msg/TwistStamped', samples, frame,
+                    {'twist.linear.x': samples.value})
 
 
-def joints(name: str, wheels: dict[str, OdometerSamples], frame: str = '',
+def joints(name: str, wheels: dict[str, data.OdometerSamples], frame: str = '',
            rates: bool = False) -> Topic:
     """Return sensor_msgs/JointState of OdometerSamples by joint: positions, or rates, only."""
-    first = next(iter(wheels.values()))
-    layout = _Layout().header(frame).add('names', '<u4')
-    for joint in wheels:
-        layout.text(f'joint {joint}', joint)
-    given = 'velocities' if rates else 'positions'
-    for field in ('positions', 'velocities', 'efforts'):
-        layout.add(field, '<u4')
-        for joint in wheels if field == given else ():
-            layout.add(joint, '<f8')
-
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        out['names'] = out[given] = len(wheels)
-        for joint, samples in wheels.items():
-            out[joint] = samples.value[rows]
-    return layout.topic(name, 'sensor_msgs/msg/JointState', first, fill)
+    first, *_ = every = list(wheels.values())
+    given = 'velocity' if rates else 'position'
+    return _stamped(
+        name, 'sensor_msgs/msg/JointState', first, frame,
+        {given: lambda rows: np.column_stack([one.value[rows] for one in every])},
+        {'name': list(wheels), given: len(every)})
 
 
-def fix(name: str, samples: FixSamples, frame: str = 'gnss') -> Topic:
-    layout = (_Layout().header(frame).add('status', 'i1').add('service', '<u2')
-              .add('place', VECTOR).add('cov', SQUARE).add('cov_type', 'u1'))
-
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        out['status'], out['service'] = samples.status[rows], 1
-        out['place'][:, 0] = np.degrees(samples.latitude[rows])
-        out['place'][:, 1] = np.degrees(samples.longitude[rows])
-        out['place'][:, 2] = samples.height[rows]
-        out['cov'] = samples.covariance_n[rows].reshape(-1, 9)
-        out['cov_type'] = samples.covariance_type[rows]
-    return layout.topic(name, 'sensor_msgs/msg/NavSatFix', samples, fill)
+def fix(name: str, samples: data.FixSamples, frame: str = 'gnss') -> Topic:
+    return _stamped(name, 'sensor_msgs/msg/NavSatFix', samples, frame, {
+        'status.status': samples.status, 'status.service': lambda rows: 1,
+        'latitude': lambda rows: np.degrees(samples.latitude[rows]),
+        'longitude': lambda rows: np.degrees(samples.longitude[rows]), 'altitude': samples.height,
+        'position_covariance': samples.covariance_n.reshape(-1, 9),
+        'position_covariance_type': samples.covariance_type})
 
 
-def point(name: str, samples: FixSamples, position: Floats, frame: str = 'map') -> Topic:
+def point(name: str, samples: data.FixSamples, position: Floats, frame: str = 'map') -> Topic:
     """Return geometry_msgs/PointStamped of positions, (n, 3) m, at the times of FixSamples."""
-    return _positions(name, 'PointStamped', samples, position,
-                      _Layout().header(frame).add('place', VECTOR))
+    return _stamped(name, 'geometry_msgs/msg/PointStamped', samples, frame, {'point': position})
 
 
-def pose(name: str, samples: FixSamples, position: Floats, frame: str = 'map') -> Topic:
+def pose(name: str, samples: data.FixSamples, position: Floats, frame: str = 'map') -> Topic:
     """Return geometry_msgs/PoseStamped of such positions, without a rotation."""
-    return _positions(name, 'PoseStamped', samples, position,
-                      _Layout().header(frame).add('place', VECTOR).add('q', ('<f8', 4)))
+    return _stamped(name, 'geometry_msgs/msg/PoseStamped', samples, frame, {
+        'pose.position': position, 'pose.orientation.w': lambda rows: 1.0})
 
 
-def pose_with_covariance(name: str, samples: FixSamples, position: Floats,
+def pose_with_covariance(name: str, samples: data.FixSamples, position: Floats,
                          frame: str = 'map') -> Topic:
-    return _positions(name, 'PoseWithCovarianceStamped', samples, position,
-                      _Layout().header(frame).add('place', VECTOR).add('q', ('<f8', 4)).add(
-                          'cov', ('<f8', 36)))
+    def covariance(rows: slice) -> Floats:
+        return np.pad(samples.covariance_n[rows], ((0, 0), (0, 3), (0, 3))).reshape(-1, 36)
+    return _stamped(name, 'geometry_msgs/msg/PoseWithCovarianceStamped', samples, frame, {
+        'pose.pose.position': position, 'pose.pose.orientation.w': lambda rows: 1.0,
+        'pose.covariance': covariance})
 
 
-def _positions(name: str, kind: str, samples: FixSamples, position: Floats,
-               layout: _Layout) -> Topic:
-    """Return a topic of positions, with rotation and covariance if the layout has them."""
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        fields = out.dtype.names or ()
-        out['place'] = position[rows]
-        if 'q' in fields:
-            out['q'][:, 3] = 1.0
-        if 'cov' in fields:
-            square = out['cov'].reshape(-1, 6, 6)
-            square[:, :3, :3] = samples.covariance_n[rows]
-            out['cov'] = square.reshape(-1, 36)
-    return layout.topic(name, f'geometry_msgs/msg/{kind}', samples, fill)
-
-
-def velocity(name: str, samples: VelocitySamples, frame: str = 'gnss') -> Topic:
+def velocity(name: str, samples: data.VelocitySamples, frame: str = 'gnss') -> Topic:
     """Return geometry_msgs/TwistWithCovarianceStamped of VelocitySamples; no angular rates."""
-    layout = _Layout().header(frame).add('linear', VECTOR).add('angular', VECTOR).add(
-        'cov', ('<f8', 36))
-
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        out['linear'] = samples.velocity_n[rows]
-        out['cov'][:, :15:7] = samples.variance_n[rows]
-    return layout.topic(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples, fill)
+    return _stamped(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples, frame, {
+        'twist.twist.linear': samples.velocity_n,
+        'twist.covariance': _diagonal(samples.variance_n, 6)})
 
 
-def pressure(name: str, samples: ScalarSamples, frame: str = 'imu') -> Topic:
-    layout = _Layout().header(frame).add('values', ('<f8', 2))
-
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        out['values'][:, 0], out['values'][:, 1] = samples.value[rows], samples.variance[rows]
-    return layout.topic(name, 'sensor_msgs/msg/FluidPressure', samples, fill)
+def pressure(name: str, samples: data.ScalarSamples, frame: str = 'imu') -> Topic:
+    return _stamped(name, 'sensor_msgs/msg/FluidPressure', samples, frame, {
+        'fluid_pressure': samples.value, 'variance': samples.variance})
 
 
 def camera(name: str, times_ns: Sequence[int], size: int, rng: np.random.Generator) -> Topic:
     """Return sensor_msgs/CompressedImage of ``size`` random bytes each, for a large bag."""
     time_ns = np.asarray(times_ns, dtype=np.int64)
-    layout = (_Layout().header('camera').text('format', 'jpeg').add('bytes', '<u4')
-              .add('data', ('u1', size)))
 
-    def fill(out: NDArray[Any], rows: slice) -> None:
-        out['sec'], out['nanosec'] = np.divmod(time_ns[rows], 10**9)
-        out['bytes'] = size
-        out['data'] = np.frombuffer(rng.bytes(out['data'].size), np.uint8).reshape(-1, size)
-    return Topic(name, 'sensor_msgs/msg/CompressedImage', time_ns,
-                 layout.packer(fill, len(time_ns)))
+    def random(rows: slice) -> NDArray[np.uint8]:
+        n = len(time_ns[rows])
+        return np.frombuffer(rng.bytes(n * size), np.uint8).reshape(n, size)
+    return _stamped(name, 'sensor_msgs/msg/CompressedImage', data.Samples(time_ns, time_ns),
+                    'camera', {'data': random}, {'format': 'jpeg', 'data': size})

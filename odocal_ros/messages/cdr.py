@@ -39,39 +39,39 @@ def _pose(prefix: str) -> tuple[str, ...]:
     return _each(f'{prefix}.position') + _each(f'{prefix}.orientation', 'xyzw')
 
 
-_HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
-FRAME_AT = 16       # format: offset of the text of _HEADER in CDR
+HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
+FRAME_AT = 16       # format: offset of the text of HEADER in CDR
 _LAYOUT = ('dim[] layout.dim', 'uint32 layout.data_offset')
 _DIM = ('string label', 'uint32 size', 'uint32 stride')
 
 # 'kind path', in order; kind[n] is an array, kind[] a list
 SCHEMAS: dict[str, tuple[str, ...]] = {
     'sensor_msgs/msg/Imu': (
-        *_HEADER, *_each('orientation', 'xyzw'), 'float64[9] orientation_covariance',
+        *HEADER, *_each('orientation', 'xyzw'), 'float64[9] orientation_covariance',
         *_each('angular_velocity'), 'float64[9] angular_velocity_covariance',
         *_each('linear_acceleration'), 'float64[9] linear_acceleration_covariance'),
     'sensor_msgs/msg/NavSatFix': (
-        *_HEADER, 'int8 status.status', 'uint16 status.service', 'float64 latitude',
+        *HEADER, 'int8 status.status', 'uint16 status.service', 'float64 latitude',
         'float64 longitude', 'float64 altitude', 'float64[9] position_covariance',
         'uint8 position_covariance_type'),
     'sensor_msgs/msg/JointState': (
-        *_HEADER, 'string[] name', 'float64[] position', 'float64[] velocity', 'float64[] effort'),
+        *HEADER, 'string[] name', 'float64[] position', 'float64[] velocity', 'float64[] effort'),
     'geometry_msgs/msg/Twist': _each('linear') + _each('angular'),
-    'geometry_msgs/msg/TwistStamped': (*_HEADER, *_twist('twist')),
+    'geometry_msgs/msg/TwistStamped': (*HEADER, *_twist('twist')),
     'geometry_msgs/msg/TwistWithCovarianceStamped': (
-        *_HEADER, *_twist('twist.twist'), 'float64[36] twist.covariance'),
-    'geometry_msgs/msg/PointStamped': (*_HEADER, *_each('point')),
-    'geometry_msgs/msg/PoseStamped': (*_HEADER, *_pose('pose')),
+        *HEADER, *_twist('twist.twist'), 'float64[36] twist.covariance'),
+    'geometry_msgs/msg/PointStamped': (*HEADER, *_each('point')),
+    'geometry_msgs/msg/PoseStamped': (*HEADER, *_pose('pose')),
     'geometry_msgs/msg/PoseWithCovarianceStamped': (
-        *_HEADER, *_pose('pose.pose'), 'float64[36] pose.covariance'),
+        *HEADER, *_pose('pose.pose'), 'float64[36] pose.covariance'),
     'geometry_msgs/msg/TransformStamped': (
-        *_HEADER, 'string child_frame_id', *_each('transform.translation'),
+        *HEADER, 'string child_frame_id', *_each('transform.translation'),
         *_each('transform.rotation', 'xyzw')),
     'nav_msgs/msg/Odometry': (
-        *_HEADER, 'string child_frame_id', *_pose('pose.pose'), 'float64[36] pose.covariance',
+        *HEADER, 'string child_frame_id', *_pose('pose.pose'), 'float64[36] pose.covariance',
         *_twist('twist.twist'), 'float64[36] twist.covariance'),
     'autoware_vehicle_msgs/msg/VelocityReport': (
-        *_HEADER, 'float32 longitudinal_velocity', 'float32 lateral_velocity',
+        *HEADER, 'float32 longitudinal_velocity', 'float32 lateral_velocity',
         'float32 heading_rate'),
     'std_msgs/msg/Int32MultiArray': (*_LAYOUT, 'int32[] data'),
     'std_msgs/msg/Int64MultiArray': (*_LAYOUT, 'int64[] data'),
@@ -209,7 +209,7 @@ def layout_of(msgtype: str, raw: bytes) -> Layout | None:
 
 def frame_of(msgtype: str, raw: bytes) -> str | None:
     """Return the frame_id of one message; None if it has no layout with a header."""
-    if SCHEMAS.get(msgtype, ())[:3] != _HEADER or layout_of(msgtype, raw) is None:
+    if SCHEMAS.get(msgtype, ())[:3] != HEADER or layout_of(msgtype, raw) is None:
         return None
     at, length = FRAME_AT, int.from_bytes(raw[FRAME_AT - 4:FRAME_AT], 'little')
     return raw[at:at + max(length - 1, 0)].decode()
