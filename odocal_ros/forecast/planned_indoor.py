@@ -28,15 +28,7 @@ from odocal_ros.forecast.predict import Sigmas
 from odocal_ros.forecast.smoother_forecast import relative
 from odocal_ros.nav.earth import rate_without_north
 from odocal_ros.pipeline.planar_run import known_of
-from odocal_ros.settings.config import (
-    Config,
-    DIFFERENTIAL,
-    HOLONOMIC,
-    MECANUM,
-    SIDES,
-    SKID,
-    with_settings,
-)
+from odocal_ros.settings import config as settings
 
 # m^2/m, judgement: usual in fits of robots without sideways slip, 0.3 mm in a metre
 NO_SIDE_SLIP = 1e-7
@@ -85,18 +77,18 @@ def planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Floats]:
 
 def _wheels(d: Floats, robot: Robot) -> tuple[Wheels, list[float]]:
     """Return the wheels of body increments, (n, 3), and the constants after the curvature."""
-    if robot.drive in HOLONOMIC:
+    if robot.drive in settings.HOLONOMIC:
         rows = rows_of(robot.drive, robot.wheels)
         count = (d * [1.0, 1.0, robot.width / 2]) @ rows.T
-        return Wheels(count, rows, robot.drive), [1.0] * (robot.drive == MECANUM)
+        return Wheels(count, rows, robot.drive), [1.0] * (robot.drive == settings.MECANUM)
     apart = d[:, 2] * robot.width
     arc = 1 / (robot.straight_width or robot.width) - 1 / robot.width
 
     def of(apart: Floats) -> Wheels:
         return of_sides(d[:, 0] - apart / 2, d[:, 0] + apart / 2, robot.drive)
-    for _ in range(50 * (robot.drive == SKID)):      # the width depends on the paths
+    for _ in range(50 * (robot.drive == settings.SKID)):      # the width depends on the paths
         apart = d[:, 2] / (1 / robot.width + arc * of(apart).straightness)
-    return of(apart), [arc] * (robot.drive == SKID)
+    return of(apart), [arc] * (robot.drive == settings.SKID)
 
 
 def _measured(motion: RobotMotion, robot: Robot) -> Ints:
@@ -110,7 +102,7 @@ def _measured(motion: RobotMotion, robot: Robot) -> Ints:
     return node
 
 
-def predict_planar(motion: RobotMotion, robot: Robot, config: Config) -> MethodResult:
+def predict_planar(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:
     """Return the prediction of the planar estimator: covariance of its fit at the truth."""
     run, state, constants = planar_run(motion, robot)
     known = replace(known_of(run, config), drift_length=robot.drift_length)
@@ -132,19 +124,19 @@ def _levels(motion: RobotMotion, robot: Robot, run: Run) -> dict[str, float]:
         metres = (path[of] + 0.1 * MOTION_STEP).sum() if of.any() else 1.0
         return float(robot.slip**2 * max(of.sum(), 1) * MOTION_STEP / metres)
     table = (run.wheels.table**2).sum(1) * len(run.wheels.rows) / robot.wheels
-    side = level(moving) * table[1] if robot.drive in HOLONOMIC else NO_SIDE_SLIP
+    side = level(moving) * table[1] if robot.drive in settings.HOLONOMIC else NO_SIDE_SLIP
     found = {'along': level(moving) * table[0], 'turn': level(moving & ~spins) * table[2],
              'spin': level(spins) * table[2], 'drift': robot.drift**2, 'side': side,
              'white': 0.0 if robot.at_rests else 1.0, 'gyro': 1.0}
     return {name: max(value, LEAST * LEVELS[name]) for name, value in found.items()}
 
 
-def predict_with_imu(motion: RobotMotion, robot: Robot, config: Config) -> MethodResult:
+def predict_with_imu(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:
     """Return the prediction of the smoother for two wheels: covariance of its fit at the truth."""
     speed = motion.distance / float(motion.t[-1])
     drifts = robot.drift > 0 and not robot.at_rests
     correlated = robot.drift_length / max(speed, 1e-3) if drifts else 0.0
-    config = with_settings(config.in_local_frame(), {'gnss.correlation_time': correlated})
+    config = settings.with_settings(config.in_local_frame(), {'gnss.correlation_time': correlated})
     sigmas = Sigmas(config=config, fix=robot.white, fix_up=robot.white, fix_rate=robot.rate,
                     sway=float(robot.slip * np.sqrt(planned_methods.SWAY_RATE)),
                     slip=float(robot.slip / np.sqrt(robot.wheels)))
@@ -157,7 +149,7 @@ def predict_with_imu(motion: RobotMotion, robot: Robot, config: Config) -> Metho
         leg, t_fix=leg.t_fix[used], fixes_n=leg.fixes_n[used],
         covariance_n=leg.covariance_n[used],
         wheels=tuple(replace(leg.travel, s=leg.travel.s + side * turned, name=name)
-                     for side, name in zip((-1, 1), SIDES, strict=True)),
+                     for side, name in zip((-1, 1), settings.SIDES, strict=True)),
         origin=replace(leg.origin, local=rate_without_north(leg.origin.latitude)))
     # the positions of a mark share one error
     made = replace(made, leg=leg, fixes_in_one=1.0 if robot.at_rests else made.fixes_in_one)
@@ -197,9 +189,9 @@ def _at_rests(t_fix: Floats, motion: RobotMotion) -> Ints:
     return out
 
 
-def predict_robot(motion: RobotMotion, robot: Robot, config: Config) -> MethodResult:
+def predict_robot(motion: RobotMotion, robot: Robot, config: settings.Config) -> MethodResult:
     """Return the prediction of the method that calibrates this robot."""
-    by_smoother = robot.imu and robot.drive == DIFFERENTIAL
+    by_smoother = robot.imu and robot.drive == settings.DIFFERENTIAL
     return (predict_with_imu if by_smoother else predict_planar)(motion, robot, config)
 
 
@@ -207,7 +199,7 @@ def ratio_sigma(method: MethodResult) -> float | None:
     """Return the sigma of right over left wheel, relative; None: not determined."""
     if 'ratio_sigma' in method.details:
         return float(method.details['ratio_sigma'])
-    left, right = (method.estimates.get(f'scale_factor_{side}') for side in SIDES)
+    left, right = (method.estimates.get(f'scale_factor_{side}') for side in settings.SIDES)
     rho = method.details['correlation'].get('scale_factor_left,scale_factor_right')
     a, b = (relative(one) if one else None for one in (left, right))
     if a is None or b is None or rho is None:

@@ -25,14 +25,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.screening.screen import screen
-from odocal_ros.settings.config import (
-    Config,
-    DIFFERENTIAL,
-    FEWEST_OMNI,
-    HOLONOMIC,
-    MECANUM,
-    OMNI,
-)
+from odocal_ros.settings import config as settings
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.nominal import nominal_scale
 
@@ -47,13 +40,13 @@ BY_AXLE = 'left before right of each axle from front to rear.'
 OF_IMU = {Code.NO_IMU, Code.NO_ACCELEROMETER, Code.IMU_GAP, Code.LOCAL_FRAME}
 
 
-def is_planar(leg: Leg, config: Config) -> bool:
+def is_planar(leg: Leg, config: settings.Config) -> bool:
     """Return True for a leg of the planar estimator: several wheels and no IMU, or its drives."""
     several = len(leg.wheel_slots) > 1
-    return config.odometer.drive != DIFFERENTIAL or several and not len(leg.imu.stamp_ns)
+    return config.odometer.drive != settings.DIFFERENTIAL or several and not len(leg.imu.stamp_ns)
 
 
-def planar_leg(leg: Leg, config: Config, notes: Sequence[Reason],
+def planar_leg(leg: Leg, config: settings.Config, notes: Sequence[Reason],
                progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     inputs, found = screen(leg, config, judged=False)
@@ -67,7 +60,7 @@ def planar_leg(leg: Leg, config: Config, notes: Sequence[Reason],
     return leg_result(leg, inputs, reasons, {PLANAR: method}, deciding=(PLANAR,), **more)
 
 
-def _guarded(run: Run, inputs: Inputs, config: Config, progress: Callable[[Stage], None],
+def _guarded(run: Run, inputs: Inputs, config: settings.Config, progress: Callable[[Stage], None],
              ) -> tuple[MethodResult, dict[str, Any]]:
     """Return the method's result and plot data; an error only rejects the method."""
     from odocal_ros.calib.planar.fit import fit
@@ -92,7 +85,7 @@ def _guarded(run: Run, inputs: Inputs, config: Config, progress: Callable[[Stage
         return failed(unknown, PLANAR, error), {}
 
 
-def _run_of(inputs: Inputs, config: Config) -> tuple[Run | None, list[Reason]]:
+def _run_of(inputs: Inputs, config: settings.Config) -> tuple[Run | None, list[Reason]]:
     """Return the run on nodes, or None and the reasons."""
     travels, kind = inputs.travels, config.odometer.drive
     if lacking := _lacking_wheels(kind, len(travels)):
@@ -111,7 +104,7 @@ def _run_of(inputs: Inputs, config: Config) -> tuple[Run | None, list[Reason]]:
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     steps = np.array([np.diff(one.at(t)) for one in travels])
     wheels = (Wheels(steps.T, rows_of(kind, len(steps), config.odometer.wheel_offset), kind)
-              if kind in HOLONOMIC else
+              if kind in settings.HOLONOMIC else
               of_sides(steps[::2].mean(axis=0), steps[1::2].mean(axis=0), kind))
     if not wheels.count.any():
         return None, [Reason(Code.ODOMETER_STILL, 'the wheels do not turn during the leg')]
@@ -121,8 +114,8 @@ def _run_of(inputs: Inputs, config: Config) -> tuple[Run | None, list[Reason]]:
 def _lacking_wheels(kind: str, count: int) -> Reason | None:
     """Return the reason if the number of wheels with known sides does not fit the drive."""
     needed, fits, order = {
-        MECANUM: ('4', count == len(MECANUM_ROWS), BY_AXLE),
-        OMNI: (f'{FEWEST_OMNI} or more', count >= FEWEST_OMNI,
+        settings.MECANUM: ('4', count == len(MECANUM_ROWS), BY_AXLE),
+        settings.OMNI: (f'{settings.FEWEST_OMNI} or more', count >= settings.FEWEST_OMNI,
                'counter-clockwise, the first at odometer.wheel_offset.')}.get(
         kind, ('2', count >= 2 and count % 2 == 0, BY_AXLE))
     return None if fits else Reason(
@@ -168,11 +161,11 @@ def _gyro(inputs: Inputs, t: Floats) -> Floats:
     return np.diff(integral_at(t, inputs.t_imu, rate))
 
 
-def known_of(run: Run, config: Config) -> Known:
+def known_of(run: Run, config: settings.Config) -> Known:
     antenna, odometer = config.gnss.lever_arm, config.odometer.lever_arm
     grade = grade_of(config.imu)
     known = Known(
-        width=config.odometer.track_width * (run.wheels.kind not in HOLONOMIC),
+        width=config.odometer.track_width * (run.wheels.kind not in settings.HOLONOMIC),
         offset=(antenna[0] - odometer[0], antenna[1] - odometer[1]),
         offset_sigma=max(config.gnss.lever_arm_sigma, 1e-3), delay_sigma=config.gnss.time_sigma,
         gyro_noise=max(grade.gyro_noise, GYRO_LEAST),
