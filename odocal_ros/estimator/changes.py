@@ -20,7 +20,8 @@ from odocal_ros.estimator.state import LN_K, PITCH, YAW
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 STEP_PLACES = 15       # judgement: times of a step, at equal distances along the path
-STEPPING = LN_K, YAW, PITCH      # definition: constants that are tested
+STEPPING = LN_K, YAW, PITCH      # definition: constants that are tested, the scale first
+GRADUAL = 1e-3      # physical: 1 sigma of the change of the scale in a leg as tyres warm up
 
 
 @dataclass(frozen=True)
@@ -48,14 +49,30 @@ def changes(weighted: Weighted, solved: Solved) -> tuple[Step, ...]:
     score -= left * (np.einsum('kil,ki->l', chain, solved.step)
                      + border.T @ solved.step_border[:len(border)])
     taken, _ = solved.products(chain, border)
-    of_rows = np.diag(square)
-    information = (of_rows - np.diag(taken)).reshape(len(STEPPING), STEP_PLACES)
+    of_rows, whole = np.diag(square), square - taken
+    information = np.diag(whole).copy()
+    scale = slice(STEP_PLACES)
+    score[scale], information[scale] = _beside_gradual(score[scale], whole[scale, scale])
+    information = information.reshape(len(STEPPING), STEP_PLACES)
     # standing before or after a place, or a constant that no row depends on
     known = information > 1e-9 * of_rows.reshape(information.shape)
     sigma = 1 / np.sqrt(np.where(known, information, np.inf))
     return tuple(_largest(constant, weighted.state.t[at], score_of, sigma_of)
                  for constant, score_of, sigma_of in zip(
                      STEPPING, score.reshape(sigma.shape), sigma, strict=True) if sigma_of.any())
+
+
+def _beside_gradual(score: Floats, information: Floats) -> tuple[Floats, Floats]:
+    """
+    Return score and information of each step of the scale, beside a gradual change of it.
+
+    The change is quadratic in the path, as a sum of steps at all places, and has a prior.
+    """
+    shares = GRADUAL / STEP_PLACES * np.vander(np.linspace(-1.0, 1.0, STEP_PLACES), 2)
+    across = information @ shares
+    by = np.linalg.solve(np.eye(2) + shares.T @ across,
+                         np.column_stack([across.T, shares.T @ score]))
+    return score - across @ by[:, -1], np.diag(information) - (across * by[:, :-1].T).sum(axis=1)
 
 
 def _largest(constant: int, t: Floats, score: Floats, sigma: Floats) -> Step:
