@@ -76,14 +76,18 @@ def _share_of_two(x: Floats) -> float:
     size = np.abs(off).max(axis=1)
     good = size <= OUTLYING * np.median(size)
     mean = x[1:count * MEAN_ROWS + 1].reshape(parts.shape).mean(axis=1)[good]
-    off, A = off[good], np.column_stack([np.ones(len(mean)), mean])
+    # a section that tilts and vibrates more would explain its own noise: equal noise of all means
+    parts, A = parts[good], np.column_stack([np.ones(len(mean)), mean])
+    noise = np.sqrt((parts**2).mean(axis=(1, 2)))
+    noise = np.maximum(noise, np.median(noise) or 1.0)[:, None]
+    off, A, parts = off[good] / noise, A / noise, parts / noise[:, None]
     free = len(off) - A.shape[1]
     if free < FEWEST_MEANS // 2:
         return 0.0
     rest = off - A @ np.linalg.lstsq(A, off, rcond=None)[0]
     left, total = (rest**2).sum(axis=0), (off**2).sum(axis=0)
     slow = (rest[1:] * rest[:-1]).sum(axis=0)
-    explained, power = total - left, (parts[good]**2).mean(axis=(0, 1))
+    explained, power = total - left, (parts**2).mean(axis=(0, 1))
     sure = (explained * free > SURE_F * A.shape[1] * left) & (
         explained / len(off) > LEAST_POWER * power / MEAN_ROWS)
     vibrating = slow > np.maximum(MOST_CORRELATED * left, MOST_SLOW * explained)

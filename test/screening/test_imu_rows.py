@@ -182,6 +182,15 @@ def test_biases_that_drift_are_of_two_imus(leg, drift):
                        leg.imu.f_i)
 
 
+@pytest.mark.parametrize('seed', [8, 9, 11, 12, 14])
+def test_a_section_that_tilts_and_vibrates_more_is_no_second_imu(seed):
+    rng = np.random.default_rng(seed)
+    lifted = (np.arange(N) > 0.9 * N)[:, None]
+    f = np.array([0.0, 0.0, G]) + rng.standard_normal((N, 3)) * np.where(lifted, 0.072, 0.006)
+    f[:, 0] -= 1.4 * lifted[:, 0] * np.sin(np.linspace(0.0, 10 * np.pi, N))**2
+    assert not alternating(NONE, f)
+
+
 def test_a_spike_is_no_second_imu(leg):
     w = leg.imu.w_i.copy()
     w[len(w) // 2] += 50.0
