@@ -62,8 +62,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.LEG_CUT: 'The IMU was silent for longer than `leg.max_gap`. The leg is cut there; '
         'its sections are calibrated as legs and combined. A section too short to calibrate is '
         'left out. If no section is long enough, the leg is rejected (`IMU_GAP`). Or the vehicle '
-        'was carried, as by a ferry: the fixes move by 100 m or more, and the odometer only '
-        'counts before and after it.',
+        'was carried, as by a ferry: the fixes move by 100 m or more, or by 20 m or more in more '
+        'than 20 s, and the odometer only counts before and after it.',
         Code.TOPIC_GAP: 'Odometer or fixes are silent for more than five of their usual '
         'intervals, or the odometer starts late or ends early. Or IMU, odometer or fixes cover '
         'only a part of a recording without marks (10 s or more are missing): the leg is limited '
@@ -115,7 +115,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'backwards, or the IMU x axis points backwards. Accelerations then point backwards in '
         'the IMU frame.',
         Code.ODOMETER_STILL: 'The fixes move, but the counter does not: from the start, or for '
-        '100 m or more of the drive. If it counts again, the leg is cut there (`LEG_CUT`).',
+        '100 m or more of the drive (20 m if this takes more than 20 s), and 1 % of its path. If '
+        'it counts again, the leg is cut there (`LEG_CUT`).',
         Code.SEVERAL_IMUS: 'Messages on the IMU topic have different frame_ids: only one IMU '
         'was used, the first on the topic. Or they have one frame_id, and every second message is '
         'of another IMU with other axes or biases. Which one is meant cannot be decided from the '

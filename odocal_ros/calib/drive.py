@@ -7,15 +7,17 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import Track
-from odocal_ros.nav.local_frame import GNSS_MOVES
+from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import yaw_from_quat
 from odocal_ros.nav.statistics import NORMAL_MEDIAN
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
-from odocal_ros.settings.levels import FASTEST, TYRE_SPREAD
+from odocal_ros.settings.levels import FASTEST
 
-FURTHEST_SLIDE = 100.0   # m, physical: wheel slides and errors of fixes are smaller
+# physical: wheels slide less far and for a shorter time, m and s; after that time GNSS_MOVES is
+# enough. Judgement: of the path, a smaller share is found elsewhere
+FURTHEST_SLIDE, LONGEST_SLIDE, LEAST_SHARE = 100.0, 20.0, 0.01
 
 
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
@@ -111,31 +113,36 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
     wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
     if wheels_move and fixes_move:
-        return _stopped(travel, t_here, here, max(FURTHEST_SLIDE, 10 * fix_sigma))
+        return _stopped(travel, t_here, here, fix_sigma)
     if fixes_move:
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, but the odometer does not'),)
     return (Reason(Code.LEG_TOO_SHORT, 'the odometer counts, but the fixes do not move'
                    if wheels_move else 'the vehicle did not move'),)
 
 
-def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Reason, ...]:
-    """Return a reason if the fixes, (k, 2) at (k,) s, move ``least`` m without counts."""
-    far, since, until = max(_without_counts(travel, t, fixes, least), default=(0.0, 0.0, 0.0))
-    # smaller shares of the path are within the tolerance of tyres, and are found elsewhere
-    if far < least or far < TYRE_SPREAD * path_and_chord(t, fixes)[0]:
+def _stopped(travel: Travel, t: Floats, fixes: Floats, fix_sigma: float) -> tuple[Reason, ...]:
+    """Return a reason if the fixes, (k, 2) at (k,) s, move far without counts."""
+    far, since, until = max(_without_counts(travel, t, fixes, fix_sigma), default=(0.0, 0.0, 0.0))
+    if not far or far < LEAST_SHARE * path_and_chord(t, fixes)[0]:
         return ()
     return (Reason(Code.ODOMETER_STILL, f'the fixes move by {far:.0f} m from t = {since:.0f} s '
                    f'to {until:.0f} s, but the odometer does not count'),)
 
 
 def _without_counts(travel: Travel, t: Floats, fixes: Floats,
-                    least: float) -> list[tuple[float, float, float]]:
+                    fix_sigma: float) -> list[tuple[float, float, float]]:
     """Return motion of the fixes, m, begin and end, s, of each interval without counts."""
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
-    return [(_motion_between(fixes[(t >= begin[k]) & (t <= end[k])], least), begin[k], end[k])
-            for k in np.flatnonzero(end - begin > least / FASTEST)]
+    found = []
+    for k in np.flatnonzero(end - begin > FURTHEST_SLIDE / FASTEST):
+        least = max(GNSS_MOVES if end[k] - begin[k] > LONGEST_SLIDE else FURTHEST_SLIDE,
+                    10 * fix_sigma)
+        far = _motion_between(fixes[(t >= begin[k]) & (t <= end[k])], least)
+        if far >= least:
+            found.append((far, begin[k], end[k]))
+    return found
 
 
 def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
@@ -144,14 +151,13 @@ def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) ->
 
     The fixes move without counts, and the odometer counts again afterwards.
     """
-    least = max(FURTHEST_SLIDE, 10 * fix_sigma)
     spans = []
-    for far, begin, end in _without_counts(travel, t_fix, fixes_n[:, :2], least):
+    for far, begin, end in _without_counts(travel, t_fix, fixes_n[:, :2], fix_sigma):
         rows = np.flatnonzero((t_fix >= begin) & (t_fix <= end))
-        if far < least or end >= travel.t[-1]:
+        if end >= travel.t[-1]:
             continue
         t, p, few = t_fix[rows], fixes_n[rows, :2], 3     # fixes, of which one may be an outlier
-        near = max(GNSS_MOVES, 10 * fix_sigma)
+        near = min(max(LOCAL_MOVES, 10 * fix_sigma), far / 4)
         first, last = (np.hypot(*(p - np.median(of, axis=0)).T) > near
                        for of in (p[:few], p[-few:]))
         spans.append((t[np.argmax(first)], t[len(t) - 1 - np.argmax(last[::-1])]))
