@@ -146,7 +146,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'from its configured position. Sliding in turns is not modelled: for a vehicle with skid '
         'steering the estimated point is where it slides least, not the position of the wheel.',
         Code.GYRO_SIGN: 'The gyro turns opposite to the course of the fixes, or the accelerations '
-        'in turns are opposite to it.',
+        'in turns are opposite to it. If gyro and accelerations match, the fixes are mirrored, or '
+        'the accelerometer is negated.',
         Code.GYRO_AXES: 'One axis of the gyro has the wrong sign, or two are swapped, while the '
         'accelerometer is right. Gravity turns in the frame of the accelerometer when a vehicle '
         'tilts; the gyro must measure that turn. Only slopes, bumps or turns reveal the fault. On '

@@ -14,7 +14,7 @@ rates in mirrored axes have these signs.
 import numpy as np
 
 from odocal_ros.calib.check import ONE_MOTION_RATIO
-from odocal_ros.calib.turning import turn_ratio
+from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row
 from odocal_ros.reasons import Code, Reason
@@ -47,6 +47,27 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
     e1 /= np.linalg.norm(e1)
     axes = np.stack([e1, np.cross(up, e1), up])
     return axes, [_name(axis) for axis in (first, second, np.sign(up[k]) * np.eye(3)[k])]
+
+
+def turning(inputs: Inputs, placed: Placed, faces: Facing | None,
+            gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
+    """
+    Return turns by the gyro over those by the fixes, None if unknown, and the reason for a fault.
+
+    Arguments as for ``gyro_axes``.   gyro_scale : as configured.
+    """
+    ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
+                       inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)
+    found = gyro_reasons(ratio, gyro_scale)
+    if not any(one.code is Code.GYRO_SIGN for one in found):
+        return ratio, gyro_axes(inputs, placed, faces) or found
+    text = found[0].text
+    if faces and abs(faces.inward) > max(-INVERTED, FAR_SIGMAS * faces.inward_sigma):
+        text += (', and to the accelerations in turns: angular_velocity has the wrong sign'
+                 if faces.inward < 0 else ', but match the accelerations in turns: latitude and '
+                 'longitude are swapped, or linear_acceleration is negated')
+    return ratio, (Reason(Code.GYRO_SIGN, text, '' if inputs.has_accelerometer else
+                          'Set imu.mounting_rpy, or correct the sign in the IMU driver.'),)
 
 
 def gyro_axes(inputs: Inputs, placed: Placed, faces: Facing | None) -> tuple[Reason, ...]:

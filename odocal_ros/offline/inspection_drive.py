@@ -11,9 +11,9 @@ import numpy as np
 
 from odocal_ros.bagio.read import Bag
 from odocal_ros.calib.drive import path_and_chord
+from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.judge import far_from_nominal
 from odocal_ros.calib.mounting import mounting, with_axes
-from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.pieces import lengths, medians
@@ -26,10 +26,10 @@ from odocal_ros.pipeline.calibrate import missing_data
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.clock_offset import screen_aligned
 from odocal_ros.screening.clocks import TOO_FAR
-from odocal_ros.screening.facing import imu_sanity, MAX_RATE
+from odocal_ros.screening.facing import facing, imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.imu_changes import turned_over, unit_changes
-from odocal_ros.screening.inputs import Inputs
+from odocal_ros.screening.inputs import Inputs, place
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
@@ -143,13 +143,14 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config:
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}
-    up_i = medians(f_i)
-    up_i = up_i / max(float(np.linalg.norm(up_i)), 1e-9)
-    ratio = turn_ratio(inputs.t_imu, w_i @ up_i, drive.t_fix, drive.fixes_n, drive.sigma,
-                       inputs.least_motion)
+    placed = place(inputs, config)
+    faces = facing(inputs, placed.rough) if inputs.has_accelerometer and placed.rough else None
+    ratio, wrong = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), placed, faces,
+                           config.imu.gyro_scale)
     found['drive']['gyro_over_course'] = ratio
-    findings += gyro_reasons(ratio, config.imu.gyro_scale)
-    if m.rpy is None or not found['mounting']['needed']:
+    findings += wrong
+    # no rotation corrects a mirrored axis
+    if wrong or m.rpy is None or not found['mounting']['needed']:
         return options
     return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 

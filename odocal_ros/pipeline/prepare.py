@@ -9,13 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.drive import check_path, judge_drive, not_moving, uncovered
-from odocal_ros.calib.gyro_axes import gyro_axes
+from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.mounting import with_axes
-from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, of_axles, WheelSlips
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.pipeline.align import align, with_observed_walk
@@ -51,9 +49,9 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     pushed = facing.accelerations(inputs, placed.rough) if inputs.has_accelerometer else None
     faces = None if pushed is None else facing.facing_of(pushed)
     reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop))
-    turning = turned_about(pushed) or _turning(inputs, config, placed, faces)
-    if turning:             # a mirrored axis turns the orientation around
-        return None, (*reasons, *turning)
+    wrong = turned_about(pushed) or turning(inputs, placed, faces, config.imu.gyro_scale)[1]
+    if wrong:             # a mirrored axis turns the orientation around
+        return None, (*reasons, *wrong)
     axes = facing.axes_reasons(faces, config.imu.nominal_yaw)
     reasons = (*reasons, *with_axes(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
@@ -113,17 +111,6 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
     if covered.sum() < fewest_rows:
         return imu_gap(inputs.t_imu, 0.0, inputs.t_stop, 0.0)
     return None
-
-
-def _turning(inputs: Inputs, config: Config, placed: Placed,
-             faces: facing.Facing | None) -> tuple[Reason, ...]:
-    """Return the reason for a gyro that does not turn with the fixes or the accelerometer."""
-    ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
-                       inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)
-    scale_or_sign = gyro_reasons(ratio, config.imu.gyro_scale)
-    if any(r.code is Code.GYRO_SIGN for r in scale_or_sign):
-        return scale_or_sign
-    return gyro_axes(inputs, placed, faces) or scale_or_sign
 
 
 def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,

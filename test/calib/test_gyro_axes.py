@@ -65,6 +65,19 @@ def test_a_mirrored_axis_of_the_accelerometer_is_not_blamed_on_the_gyro(axis):
     assert f'negate linear_acceleration.{axis}' in next(r.do for r in result.reasons)
 
 
+@pytest.mark.parametrize(('topic', 'changes', 'cause'), [
+    ('imu', {'w_i': np.negative}, 'angular_velocity has the wrong sign'),
+    ('imu', {'f_i': lambda f: f * [-1.0, 1.0, 1.0], 'w_i': lambda w: w * [1.0, -1.0, -1.0]},
+     'latitude and longitude are swapped, or linear_acceleration is negated'),
+    ('fix', {'longitude': np.negative}, 'latitude and longitude are swapped, or linear_acceler'),
+    ('imu', {'w_i': np.negative, 'f_i': lambda f: np.full_like(f, np.nan)}, 'instead of 1)')])
+def test_the_sign_that_is_wrong_is_found_by_the_third_sensor(topic, changes, cause):
+    leg = replace(town().leg(), **{topic: changed(getattr(town(), topic), **changes)})
+    (found,) = (r for r in calibrate(leg, settings(town())).reasons if r.code is Code.GYRO_SIGN)
+    assert cause in found.text
+    assert ('Set imu.mounting_rpy' in found.do) == ('f_i' in changes and cause == 'instead of 1)')
+
+
 def test_turns_the_fixes_do_not_show_still_show_a_mirrored_gyro():
     """Where the course of few fixes says nothing, the accelerometer does."""
     made = town()

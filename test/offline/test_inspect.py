@@ -280,6 +280,9 @@ def test_units(tmp_path, capsys):
     assert 'typical for counting four edges per pulse (x4)' in ' '.join(text.split())
     seen, _ = inspect(ros_bags.write(tmp_path / 'sign', drive(gyro=-1.0)), capsys)
     assert 'GYRO_SIGN' in codes(seen)
+    seen, _ = inspect(ros_bags.write(tmp_path / 'negated', drive(accel=-1.0)), capsys)
+    assert 'GYRO_SIGN' in codes(seen)
+    assert 'imu.mounting_rpy' not in seen['command'], 'no rotation corrects it'
 
 
 def test_topics_that_cannot_be_combined(tmp_path, capsys):
