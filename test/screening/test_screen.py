@@ -261,7 +261,7 @@ def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
      'latitude 0, longitude 0 deg, altitude '),
     ({'latitude': 2.0}, '4 at an invalid position (the first: latitude 114.592, '),
     ({'longitude': 1.0}, '4 at an invalid position'),      # half a world from the others
-    ({'height': 1e6}, 'altitude 1e+06 m)'),
+    ({'height': 5e4}, 'altitude 50000 m)'),      # 50 m in mm
     ({'status': -1}, '4 with status below 0')])
 def test_fixes_at_no_real_place_are_left_out(leg, columns, text):
     bad = changed(leg.fix, **{k: lambda a, v=v: a.__setitem__(slice(70, 74), v)
