@@ -58,7 +58,8 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
         return []
     config = settings_by_frame(leg.fix, config)
     leg, inputs, reasons = screen_aligned(leg, config)
-    findings += [r for r in reasons if r.code is not Code.NO_FIX or 'fix' in found['mapping']]
+    findings += [r for r in reasons if r.code is not Code.NO_FIX or len(
+        recorder.rows('fix').stamp_ns)]
     if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:
         known = {reason.code for reason in findings}
         findings += [r for r in missing_data(leg, inputs) if r.code not in known]
@@ -203,10 +204,17 @@ def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:
 
 def lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
     """Return the reasons on data that a calibration lacks."""
-    out = [Reason(code, f'no topic for the {word}') for slot, code, word in (
-        ('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER, 'odometer'),
-        ('fix', Code.NO_FIX, 'fixes'))
-        if slot not in mapping and (slot != 'imu' or config.odometer.needs_imu)]
+    topics = {topic['name']: topic for topic in found['topics']}
+    out = []
+    for slot, code, word in (('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER,
+                             'odometer'), ('fix', Code.NO_FIX, 'fixes')):
+        facts = topics.get(mapping.get(slot, ''), {})
+        if not facts and (slot != 'imu' or config.odometer.needs_imu):
+            out.append(Reason(code, f'no topic for the {word}'))
+        elif 'trouble' in facts and 'timing' not in facts:
+            out.append(Reason(code, f'{facts["name"]}: no message can be used: '
+                              f'{facts["trouble"]}', 'Check the type and the driver of the topic, '
+                              'or name another topic.'))
     drive = found['drive']
     if not drive:
         return out

@@ -20,7 +20,7 @@ def text(found: dict[str, Any]) -> str:
     roles = {topic: slot for slot, topic in found['mapping'].items()}
     blocks = [_head(found), _topics(found, roles)]
     blocks += [_details(topic, roles) for topic in found['topics']
-               if {'timing', 'moves', 'fields'} & topic.keys()]
+               if {'timing', 'moves', 'fields', 'trouble'} & topic.keys()]
     blocks += [_drive(found), _findings(found), _length_text(found)]
     return '\n\n'.join('\n'.join(block) for block in blocks if block)
 

@@ -285,6 +285,18 @@ def test_units(tmp_path, capsys):
     assert 'imu.mounting_rpy' not in seen['command'], 'no rotation corrects it'
 
 
+@pytest.mark.parametrize(('name', 'code', 'kind'), [
+    ('/imu/data', 'NO_IMU', 'sensor_msgs/msg/Imu'),
+    ('/odometer', 'NO_ODOMETER', 'std_msgs/msg/Int64'),
+    ('/fix', 'NO_FIX', 'sensor_msgs/msg/NavSatFix')])
+def test_a_topic_whose_messages_cannot_be_read_is_missing(tmp_path, capsys, name, code, kind):
+    rows = [(topic, ns, b'' if topic == name else m) for topic, ns, m in drive(60)]
+    seen, text = inspect(ros_bags.write(tmp_path / 'bag', rows, types={name: kind}), capsys)
+    assert code in codes(seen)
+    assert f'{code}: {name}: no message can be used: ' in ' '.join(text.split())
+    assert 'under open sky' not in text
+
+
 def test_topics_that_cannot_be_combined(tmp_path, capsys):
     rows = drive(60)
     for name, _, message in rows:
