@@ -24,6 +24,7 @@ LEAST_CELLS = 3.0          # judgement: cells that the values must span
 GRID_COHERENCE = 0.9
 # judgement: cells of the values' span; FFT size with zero padding; FFT size of the quick test
 GRID_CELLS, GRID_PADDED, GRID_ROUGH = 2**17, 2**20, 2**18
+LEAST_NUMBER = 1e-300      # format: floats below it are integers of a wrong type; 1 / x overflows
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +175,7 @@ def grid(value: Floats) -> float | None:
     """
     value = np.abs(value[value != 0])
     span = np.ptp(value) if len(value) else 0.0
-    if span <= 0:
+    if span < LEAST_NUMBER:
         return None
     u, count = np.unique(np.rint((value - value.min()) / span * (GRID_CELLS - 1)).astype(int),
                          return_counts=True)

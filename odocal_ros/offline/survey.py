@@ -13,6 +13,7 @@ from odocal_ros.calib.drive import path_and_chord, white_noise, within_reach
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import across, lengths, median, medians
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
+from odocal_ros.nav.coarse_speed import LEAST_NUMBER
 from odocal_ros.screening.fix_screen import origin_amid, placed, usable_fixes
 from odocal_ros.screening.glitches import beyond, oriented
 from odocal_ros.screening.inputs import Inputs, place
@@ -168,7 +169,7 @@ class FixPath:
         inside = (self.t_ns[:-1] >= t_ns[0]) & (self.t_ns[1:] <= t_ns[-1])
         step = np.diff(np.interp(self.t_ns, t_ns, travel))[inside]
         length, run = self.length[inside], np.abs(step)
-        moved = (run > 0) & (length > length.mean()) if len(length) else inside[:0]
+        moved = (run > LEAST_NUMBER) & (length > length.mean()) if len(length) else inside[:0]
         if len(length) < FEWEST_STEPS or not moved.any() or not np.isfinite(run).all():
             return NO_MATCH
         error = np.abs(length - np.median(length[moved] / run[moved]) * run)

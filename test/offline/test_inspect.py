@@ -7,6 +7,7 @@ import json
 import math
 import re
 import shlex
+import struct
 
 import numpy as np
 import pytest
@@ -295,6 +296,14 @@ def test_a_topic_whose_messages_cannot_be_read_is_missing(tmp_path, capsys, name
     assert code in codes(seen)
     assert f'{code}: {name}: no message can be used: ' in ' '.join(text.split())
     assert 'under open sky' not in text
+
+
+def test_counts_read_as_floats_are_no_motion(tmp_path, capsys, recwarn):
+    rows = [(topic, ns, b'\0\1\0\0' + struct.pack('<q', m.data) if topic == '/odometer' else m)
+            for topic, ns, m in drive(60)]
+    inspect(ros_bags.write(tmp_path / 'bag', rows, types={'/odometer': 'std_msgs/msg/Float64'}),
+            capsys)
+    assert not [one for one in recwarn if one.category is RuntimeWarning]
 
 
 def test_topics_that_cannot_be_combined(tmp_path, capsys):
