@@ -152,8 +152,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'accelerometer is right. Gravity turns in the frame of the accelerometer when a vehicle '
         'tilts; the gyro must measure that turn. Only slopes, bumps or turns reveal the fault. On '
         'a flat straight road a wrong axis is not detected, and the pitch may be wrong.',
-        Code.BAG_TRUNCATED: 'A recording was not closed properly. All readable messages were '
-        'used.',
+        Code.BAG_TRUNCATED: 'A recording was not closed properly, or some of its files are missing '
+        'or unreadable. All readable messages were used.',
         Code.STOP_MARK_MISSING: 'The node marked the start of the leg, but the recording ends '
         'before its stop mark: the node or the computer stopped, or the bag was stopped too '
         'early. The leg ends at the last sample that all topics have; the vehicle may be moving '

@@ -220,7 +220,8 @@ def _opened(path: Path, stack: ExitStack) -> Bag:
         parts.append(part)
     if not parts:
         raise lost[0]
-    bag_notes = tuple(f'{error}; the other files are read' for error in lost)
+    bag_notes = tuple(Reason(Code.BAG_TRUNCATED, f'{error}; the other files are read')
+                      for error in lost)
     formats = {c.serialization for part in parts for c in part.channels if c.count}
     if formats and not formats & {'cdr', 'ros1'}:
         raise BadBag(f'{path}: its serialization format is {", ".join(formats)!r}, '

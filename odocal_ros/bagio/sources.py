@@ -16,6 +16,7 @@ from odocal_ros.bagio.segments import JOURNAL, without_joined
 from odocal_ros.errors import BadBag
 from odocal_ros.outside import limits
 from odocal_ros.outside.yaml_files import loader
+from odocal_ros.reasons import Code, Reason
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}
@@ -53,7 +54,7 @@ class Source:
 
     name: str
     files: tuple[Path, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Reason | str, ...] = ()
     known: Known = Known()
 
 
@@ -83,13 +84,14 @@ def _folder(path: Path) -> Source:
     beside = path / 'metadata.yaml'
     known = _read_metadata(beside) if beside.exists() else None
     wanted = known.names if known else ()
-    notes = [known.trouble] if known and known.trouble else []
+    notes: list[Reason | str] = [known.trouble] if known and known.trouble else []
     files = _distinct([path / file for file in wanted if limits.is_file(path / file)])
     lost = [file for file in wanted if not limits.is_file(path / file)]
     if lost and files:
         named = ', '.join(lost[:10]) + ' ...' * (len(lost) > 10)
-        notes.append(f'{path}: {len(lost)} of {len(wanted)} files named in metadata.yaml are '
-                     f'missing ({named}); the others are read')
+        notes.append(Reason(Code.BAG_TRUNCATED, f'{path.resolve().name}: {len(lost)} of '
+                            f'{len(wanted)} files named in metadata.yaml are missing ({named}); '
+                            'the others are read', 'Copy the missing files into the folder.'))
     if not files:
         files = _distinct(sorted((f for f in path.iterdir()
                                   if f.name.endswith(ENDINGS) and limits.is_file(f)),

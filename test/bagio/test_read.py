@@ -362,10 +362,14 @@ def test_a_lost_or_ruined_split_file_leaves_the_others(tmp_path):
     text = (path / 'metadata.yaml').read_text()
     (path / 'metadata.yaml').write_text(text.replace('- bag.mcap\n', '- bag.mcap\n  - b_1.mcap\n'))
     with open_bag(path) as bag:
-        assert '1 of 2 files named in metadata.yaml are missing (b_1.mcap)' in texts(bag)[0]
+        (note,) = bag.notes
+        assert note.code is Code.BAG_TRUNCATED
+        assert '1 of 2 files named in metadata.yaml are missing (b_1.mcap)' in note.text
     (path / 'b_1.mcap').write_bytes(b'')
     with open_bag(path) as bag:
-        assert any('b_1.mcap: is an empty file' in text for text in texts(bag))
+        (note,) = bag.notes
+        assert note.code is Code.BAG_TRUNCATED
+        assert 'b_1.mcap: is an empty file' in note.text
         assert bag.topics['/imu/data'].count == 200
 
 
