@@ -282,7 +282,9 @@ def test_an_odometer_that_stops_counting_on_the_way(made, leg):
     assert Code.ODOMETER_STILL not in stands(40.0, 41.0)[1]
     # nor do fixes move that jump by 200 m while the vehicle waits, or stray and come back
     t = drives.seconds(leg, leg.fix)
-    for knots, north in (([100, 100.1], [0, 200]), ([91, 97, 100, 104], [0, 200, 200, 0])):
+    end = t[-1]
+    for knots, north in (([100, 100.1], [0, 200]), ([91, 97, 100, 104], [0, 200, 200, 0]),
+                         ([end - 40, end], [0, 60])):       # parked among walls
         latitude = leg.fix.latitude + np.interp(t, knots, north) * np.deg2rad(1 / 111e3)
         assert Code.ODOMETER_STILL not in run(
             replace(leg, fix=replace(leg.fix, latitude=latitude)), drives.settings(made))[1]

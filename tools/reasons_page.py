@@ -115,8 +115,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'backwards, or the IMU x axis points backwards. Accelerations then point backwards in '
         'the IMU frame.',
         Code.ODOMETER_STILL: 'The fixes move, but the counter does not: from the start, or for '
-        '100 m or more of the drive (20 m if this takes more than 20 s), and 1 % of its path. If '
-        'it counts again, the leg is cut there (`LEG_CUT`).',
+        '100 m or more of the drive, and 1 % of its path. If it counts again, the leg is cut '
+        'there (`LEG_CUT`), also for 20 m or more in more than 20 s.',
         Code.SEVERAL_IMUS: 'Messages on the IMU topic have different frame_ids: only one IMU '
         'was used, the first on the topic. Or they have one frame_id, and every second message is '
         'of another IMU with other axes or biases. Which one is meant cannot be decided from the '
@@ -152,8 +152,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'accelerometer is right. Gravity turns in the frame of the accelerometer when a vehicle '
         'tilts; the gyro must measure that turn. Only slopes, bumps or turns reveal the fault. On '
         'a flat straight road a wrong axis is not detected, and the pitch may be wrong.',
-        Code.BAG_TRUNCATED: 'A recording was not closed properly, or some of its files are missing '
-        'or unreadable. All readable messages were used.',
+        Code.BAG_TRUNCATED: 'A recording was not closed properly, or some of its files are '
+        'missing or unreadable. All readable messages were used.',
         Code.STOP_MARK_MISSING: 'The node marked the start of the leg, but the recording ends '
         'before its stop mark: the node or the computer stopped, or the bag was stopped too '
         'early. The leg ends at the last sample that all topics have; the vehicle may be moving '

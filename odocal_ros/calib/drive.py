@@ -137,8 +137,9 @@ def _without_counts(travel: Travel, t: Floats, fixes: Floats,
     end = travel.t[np.append(counts, len(travel.t) - 1)]
     found = []
     for k in np.flatnonzero(end - begin > FURTHEST_SLIDE / FASTEST):
-        least = max(GNSS_MOVES if end[k] - begin[k] > LONGEST_SLIDE else FURTHEST_SLIDE,
-                    10 * fix_sigma)
+        # at the end, where no cut helps, a parked vehicle has such errors of the fixes
+        small = end[k] - begin[k] > LONGEST_SLIDE and end[k] < travel.t[-1]
+        least = max(GNSS_MOVES if small else FURTHEST_SLIDE, 10 * fix_sigma)
         far = _motion_between(fixes[(t >= begin[k]) & (t <= end[k])], least)
         if far >= least:
             found.append((far, begin[k], end[k]))
