@@ -93,7 +93,8 @@ def units(rng, rows):
     kind, fields = odometer_of(rows)
     name, fields, factor = rng.choice([
         (IMU, RATES, DEG), (IMU, RATES, 1 / DEG), (IMU, FORCES, 1 / G), (IMU, FORCES, 1000 / G),
-        (FIX, ['latitude', 'longitude'], 1 / DEG), (FIX, ['altitude'], 1 / 0.3048),
+        (FIX, ['latitude', 'longitude'], 1 / DEG),
+        (FIX, ['altitude'], rng.choice([1 / 0.3048, 1000])),
         (kind, fields, rng.choice([2, 4, 100, -1])), (kind, fields, rng.choice([2, 10, 1000]))])
     put_all(rows, name, fields, lambda *x: [value * factor for value in x])
     return (1 / abs(factor),) * 2 if name == kind else SAME
@@ -166,5 +167,35 @@ def clock_step(rng, rows):
     return SAME
 
 
+def wrapped(rng, rows):
+    """Have the odometer start again at a turn, or at a number of fewer bits."""
+    kind, fields = odometer_of(rows)
+    span = rng.choice([256, 1000, 4096, 2**16] if kind == COUNTER else [2 * math.pi, 360.0])
+    put_all(rows, kind, fields, lambda x: [x % span])
+    return SAME
+
+
+def carried(rng, rows):
+    """Have the vehicle wait at a standstill while something carries it, or lifts it."""
+    kind, fields = odometer_of(rows)
+    at, form = layout_of(kind, rows[kind][0][1]).find(fields[0])
+    value = [np.frombuffer(data, form, 1, at)[0] for _, data in rows[kind]]
+    still = [k for k in range(60, len(value)) if value[k] == value[k - 15]]
+    time_ns, wait_ns, again_ns = (rows[kind][rng.choice(still)][0],
+                                  rng.choice([20, 60, 200]) * 10**9, 2 * 10**9)
+    metres = rng.choice([0.0, 5.0, 30.0, 100.0, 1000.0])
+    for name, some in rows.items():
+        last = [row for row in some if time_ns - again_ns < row[0] <= time_ns]
+        more = [(t, data[:12] + rng.choice(last)[1][12:], by_ns)     # of a header and another row
+                for by_ns in range(again_ns, wait_ns + 1, again_ns) for t, data in last]
+        after = [(*row, wait_ns) for row in some if row[0] > time_ns]
+        rows[name] = [row for row in some if row[0] <= time_ns] + [
+            (t + by_ns, stamped(name, data, by_ns)) for t, data, by_ns in more + after]
+    gone = [metres / 111e3 * min(max((t - time_ns) / wait_ns, 0.0), 1.0) for t, _ in rows[FIX]]
+    rows[FIX] = [(t, put(FIX, data, ['latitude'], lambda x, by=by: [x + by]))
+                 for (t, data), by in zip(rows[FIX], gone, strict=True)]
+    return SAME
+
+
 ALL = [second_imu, axes, units, exchanged_fix, doubled_range, spliced, second_publisher,
-       clock_step]
+       clock_step, wrapped, carried]
