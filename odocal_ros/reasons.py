@@ -107,8 +107,8 @@ class Code(Enum):
                               'forward, y left, z up). If both lever arms differ by the same '
                               'amount, check imu.lever_arm. A vehicle that slides in turns (skid '
                               'steering, tracks) also looks like this: then change nothing.')
-    GYRO_SIGN = REJECT, ('Correct the signs in the IMU driver, or the order of latitude and '
-                         'longitude. imu.mounting_rpy cannot: it rotates gyro and accelerometer '
+    GYRO_SIGN = REJECT, ('Correct the signs in the IMU driver, or the order of the '
+                         'coordinates. imu.mounting_rpy cannot: it rotates gyro and accelerometer '
                          'together.')
     GYRO_AXES = REJECT, ('Correct the axes of angular_velocity in the IMU driver. '
                          'imu.mounting_rpy cannot: it rotates gyro and accelerometer together.')

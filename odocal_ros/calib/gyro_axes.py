@@ -65,7 +65,7 @@ def turning(inputs: Inputs, placed: Placed, faces: Facing | None,
     if faces and abs(faces.inward) > max(-INVERTED, FAR_SIGMAS * faces.inward_sigma):
         text += (', and to the accelerations in turns: angular_velocity has the wrong sign'
                  if faces.inward < 0 else ', but match the accelerations in turns: latitude and '
-                 'longitude are swapped, or linear_acceleration is negated')
+                 'longitude (x and y) are swapped, or linear_acceleration is negated')
     return ratio, (Reason(Code.GYRO_SIGN, text, '' if inputs.has_accelerometer else
                           'Set imu.mounting_rpy, or correct the sign in the IMU driver.'),)
 

@@ -68,8 +68,8 @@ def test_a_mirrored_axis_of_the_accelerometer_is_not_blamed_on_the_gyro(axis):
 @pytest.mark.parametrize(('topic', 'changes', 'cause'), [
     ('imu', {'w_i': np.negative}, 'angular_velocity has the wrong sign'),
     ('imu', {'f_i': lambda f: f * [-1.0, 1.0, 1.0], 'w_i': lambda w: w * [1.0, -1.0, -1.0]},
-     'latitude and longitude are swapped, or linear_acceleration is negated'),
-    ('fix', {'longitude': np.negative}, 'latitude and longitude are swapped, or linear_acceler'),
+     'longitude (x and y) are swapped, or linear_acceleration is negated'),
+    ('fix', {'longitude': np.negative}, 'longitude (x and y) are swapped, or linear_acceler'),
     ('imu', {'w_i': np.negative, 'f_i': lambda f: np.full_like(f, np.nan)}, 'instead of 1)')])
 def test_the_sign_that_is_wrong_is_found_by_the_third_sensor(topic, changes, cause):
     leg = replace(town().leg(), **{topic: changed(getattr(town(), topic), **changes)})
