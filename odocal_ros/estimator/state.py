@@ -51,15 +51,15 @@ ACCEL_AXIS, ACCEL_SIGNAL = zip(*ACCEL_ERRORS.values(), strict=True)
 CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_lever_arm_x', 'odometer_lever_arm_y', 'odometer_lever_arm_z',
              'antenna_lever_arm_x', 'antenna_lever_arm_y', 'antenna_lever_arm_z',
-             'odometer_delay', 'gnss_delay', 'heading_offset', *GYRO_ERRORS, *ACCEL_ERRORS,
+             'odometer_delay', 'gnss_delay', 'heading_offset', 'fix_motion_time',
+             *GYRO_ERRORS, *ACCEL_ERRORS,
              'fix_lag_square', 'fix_error_by_motion', 'gnss_clock_rate', 'odometer_clock_rate',
              'odometer_lag_square',
              'scale_by_speed', 'scale_by_time', 'scale_by_pull', 'scale_by_braking',
              'scale_by_pitching', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
-             'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns',
-             'fix_motion_time', 'fix_height_drift', 'fix_error_east', 'fix_error_north',
-             'fix_error_up', 'speed_offset', 'velocity_delay', 'velocity_lag_square',
-             'velocity_scale',
+             'pitch_centre', 'pitch_centre_of_bumps', 'pitch_centre_in_turns', 'lift_by_turning',
+             'fix_height_drift', 'fix_error_east', 'fix_error_north', 'fix_error_up',
+             'speed_offset', 'velocity_delay', 'velocity_lag_square', 'velocity_scale',
              'pressure_offset', 'pressure_drift', 'pressure_by_speed_square', 'pressure_scale')
 
 
@@ -85,7 +85,6 @@ FIX_LAG2 = CONSTANTS.index('fix_lag_square')
 HEIGHT_DRIFT = CONSTANTS.index('fix_height_drift')
 # fix errors per stated sigma, east, north, up: they decrease as a receiver converges (S15a)
 BY_SIGMA = constants_from('fix_error_east', 'fix_error_up')
-# of fix errors, for this leg only
 FIX_ERRORS = constants_from('fix_height_drift', 'fix_error_up')
 # relative: rate of the clock of its stamps minus that of the IMU
 GNSS_CLOCK, ODO_CLOCK = map(CONSTANTS.index, ('gnss_clock_rate', 'odometer_clock_rate'))
@@ -107,8 +106,12 @@ BY_PITCHING = CONSTANTS.index('scale_by_pitching')
 # change, rad per m/s^3: the body reacts with a delay, tyres immediately
 LEAN = constants_from('squat', 'sideslip_by_jerk')
 # m, ahead of the odometer: points about which the body pitches on hills, in addition on bumps,
-# and in turns about its own left axis, on banked ground
-PITCH_CENTRE = constants_from('pitch_centre', 'pitch_centre_in_turns')
+# and in turns about its own left axis, on banked ground; and m/rad: the last times the roll of the
+# ground in the mean of the leg, which tilts that axis
+PITCH_CENTRE = constants_from('pitch_centre', 'lift_by_turning')
+LIFT = constants_from('lift_by_turning')
+# of each leg alone: its ground and its fixes
+OF_LEG = constants_from('lift_by_turning', 'fix_error_up')
 # deviations from an ideal vehicle
 IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre_in_turns')
 # kinds of deviations with one common size each, and their numbers of constants

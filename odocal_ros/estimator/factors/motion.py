@@ -174,7 +174,9 @@ class Motion:
         nose_down = np.einsum('ki,ki->k', self.rate_n, self.level_left) * T[:, 0]
         # on banked ground a turn of the vehicle pitches it about its own axis
         left = np.einsum('ki,ki->k', self.rate_n, self.C @ self.left) * T[:, 0]
-        self.nose_down = np.stack([nose_down, nose_down - slowly(nose_down), left - nose_down], -1)
+        turned = self.sums.mean_rate @ self.up * T[:, 0]
+        self.nose_down = np.stack(
+            [nose_down, nose_down - slowly(nose_down), left - nose_down, turned], -1)
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
     def _inclined(self, straight: Floats) -> Floats:
@@ -232,9 +234,10 @@ class Motion:
         gyro = self._by_gyro()
         a[:, :, BG] = gyro[:, :, :3]
         # biases change little over HILL_INTERVALS: they do not affect the faster part
-        lift, (hills, _, turns) = T * (C @ self.up)[:, :, None], state.constants[PITCH_CENTRE]
+        lift, centres = T * (C @ self.up)[:, :, None], state.constants[PITCH_CENTRE]
+        hills, _, turns, tilted = centres
         a[:, D, BG] += lift * ((hills - turns) * turn(transpose(C), self.level_left)
-                               + turns * self.left)[:, None]
+                               + turns * self.left + tilted * self.up)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
         a[:, PHI, PHI] = -one

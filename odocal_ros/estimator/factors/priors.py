@@ -57,7 +57,8 @@ class PriorRows(Factor):
 
     def __init__(self, problem: Problem, point: LinearisationPoint) -> None:
         self.state, self.base = point.state, point.priors
-        self.own = problem.own | {'slow_fix_errors': layout.FIX_ERRORS}
+        self.own = problem.own | {'slow_fix_errors': layout.FIX_ERRORS,
+                                  'vertical_motion': layout.LIFT}
         self.no_heights = bool(np.isnan(problem.leg.fixes_n[:, 2]).all())
         self.shared = {name: where for name, where in SHARED.items()
                        if (problem.priors.constants[where] > layout.NO_ERROR).any()}

@@ -9,7 +9,7 @@ from odocal_ros.calib.border import Border
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.priors import PriorRows, SIZES
 from odocal_ros.estimator.fit import Fit
-from odocal_ros.estimator.state import CONSTANTS, FIX_ERRORS, NO_ERROR
+from odocal_ros.estimator.state import CONSTANTS, NO_ERROR, OF_LEG
 
 
 def border_of(fit: Fit, configured: Floats) -> Border:
@@ -23,13 +23,13 @@ def border_of(fit: Fit, configured: Floats) -> Border:
     """
     at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
     reduced, g_reduced = fit.solved.reduced, fit.solved.g_reduced
-    # each leg has its own errors of the fixes, with their own priors
-    own = np.linalg.solve(reduced[FIX_ERRORS, FIX_ERRORS], reduced[FIX_ERRORS]).T
-    g_reduced = g_reduced - own @ g_reduced[FIX_ERRORS]
-    reduced = reduced - own @ reduced[FIX_ERRORS]
+    # each leg has its own ground and errors of the fixes, with their own priors
+    own = np.linalg.solve(reduced[OF_LEG, OF_LEG], reduced[OF_LEG]).T
+    g_reduced = g_reduced - own @ g_reduced[OF_LEG]
+    reduced = reduced - own @ reduced[OF_LEG]
     weight = 1 / priors.constants**2
     free = priors.constants > NO_ERROR
-    free[FIX_ERRORS] = False
+    free[OF_LEG] = False
     return Border(
         CONSTANTS, at + configured,
         (reduced - np.diag(weight)) * np.outer(free, free),

@@ -44,7 +44,7 @@ from odocal_ros.settings.levels import INFORMED_SHARE, SCALE_LIMIT
 from odocal_ros.settings.nominal import nominal_yaw
 
 AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
-SCALES = range(layout.GYRO.start, layout.VELOCITY.start)    # errors of IMU, receiver, tyres, body
+SCALES = range(layout.FIX_TIME, layout.VELOCITY.start)    # errors of IMU, receiver, tyres, body
 
 
 def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
