@@ -234,8 +234,8 @@ class Motion:
         gyro = self._by_gyro()
         a[:, :, BG] = gyro[:, :, :3]
         # biases change little over HILL_INTERVALS: they do not affect the faster part
-        lift, centres = T * (C @ self.up)[:, :, None], state.constants[PITCH_CENTRE]
-        hills, _, turns, tilted = centres
+        lift = T * (C @ self.up)[:, :, None]
+        hills, _, turns, tilted = state.constants[PITCH_CENTRE]
         a[:, D, BG] += lift * ((hills - turns) * turn(transpose(C), self.level_left)
                                + turns * self.left + tilted * self.up)[:, None]
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
