@@ -25,8 +25,9 @@ from odocal_ros.screening.inputs import Inputs, Placed
 Found = list[tuple[str, str, str]]      # published axis, true axis with its sign, sentence
 SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a correct gyro
 TURNED = np.array([1.0, -1.0, 1j, -1j])      # definition: of axes mirrored or swapped
-# statistical: all four must hold. False alarms in 0 of 384 zoo drives; detection: docs/zoo.md
-LARGEST_SIGMA, FAR_SIGMAS, NEAR_TURNED, FEWEST_SEGMENTS = 0.2, 5.0, 0.4, 4.0
+# statistical: both must hold. False alarms in 0 of 384 zoo drives; detection: docs/zoo.md
+LARGEST_CHANCE, NEAR_TURNED = 1e-4, 0.4
+FAR_SIGMAS = 5.0    # statistical: a sign of the accelerations in turns
 INVERTED = -0.5     # judgement: 1 is expected; a vehicle that leans into its turns has 0
 
 
@@ -152,11 +153,10 @@ def by_gravity(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, axes: F
     found: Found = []
     if fit is None:
         return found
-    for k in np.flatnonzero((fit.sigma < LARGEST_SIGMA) & (fit.segments > FEWEST_SEGMENTS)):
-        c = fit.coefficient[k]
+    for k, c in enumerate(fit.coefficient):
         nearest = TURNED[np.argmin(np.abs(TURNED - c))]
         if (nearest == SOUND[k] or abs(c - nearest) > NEAR_TURNED
-                or abs(c - SOUND[k]) < FAR_SIGMAS * fit.sigma[k]):
+                or fit.chance(k, SOUND[k]) > LARGEST_CHANCE):
             continue
         along, part = (names[0], c.real) if nearest.imag == 0 else (names[1], c.imag)
         sent, true = _measured(names[k], along, float(part))

@@ -46,6 +46,20 @@ class GravityFit:
     sigma: Floats
     segments: Floats
 
+    def chance(self, k: int, correct: complex) -> float:
+        """
+        Return the probability that a gyro with a correct axis k has this coefficient by chance.
+
+        correct : its coefficient; noise of the gyro attenuates it, and the nearest value from
+        there to 0 is used. Student's t in the complex plane: the scatter of ``segments`` segments
+        has one degree of freedom less.
+        """
+        c = self.coefficient[k]
+        expected = np.clip((np.conj(correct) * c).real, 0.0, 1.0) * correct
+        freedom = max(self.segments[k] - 1, 1e-9)
+        ratio = abs(c - expected)**2 / (self.sigma[k]**2 * freedom)
+        return float((1 + ratio)**-freedom)
+
 
 @dataclass(frozen=True, eq=False)
 class Rows:

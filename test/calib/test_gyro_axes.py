@@ -9,6 +9,7 @@ from functools import cache
 from drives import changed, drive, everything_said, rejecting, settings
 import numpy as np
 import pytest
+from scipy.stats import f as f_distribution
 
 from odocal_ros.calib.gyro_axes import sensor_axes
 from odocal_ros.calib.mounting import mounting
@@ -17,7 +18,7 @@ from odocal_ros.data.samples import take
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code
-from odocal_ros.screening.gravity_turn import gravity_fit
+from odocal_ros.screening.gravity_turn import gravity_fit, GravityFit
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import with_settings
 
@@ -54,6 +55,26 @@ def test_a_wrong_axis_rejects_the_leg_and_its_correction_is_named(name):
     result = calibrate(leg, settings(made))
     assert rejecting(result) == {Code.GYRO_AXES} == set(everything_said(result))
     assert f': {DO[name]}' in next(r.do for r in result.reasons)
+
+
+@pytest.mark.parametrize('seed', [5, 6])
+@pytest.mark.parametrize('name', ['mirrored x', 'x and y swapped'])
+def test_a_precise_coefficient_of_three_segments_names_the_axis(seed, name):
+    """On gentle hills three segments determine the roll: 1.00 ± 0.04, ± 0.06."""
+    made = drive(scenario='town', duration=300.0, imu_rate=50.0, imu_grade='industrial',
+                 odometer_rate=20.0, fix_rate=5.0, fix_noise='rtk', slope=0.03, seed=seed)
+    assert 'measures the turn of gravity' in of_gyro(made, AXES[name])[Code.GYRO_AXES].text
+    assert Code.GYRO_AXES not in of_gyro(made, np.eye(3))
+
+
+@pytest.mark.parametrize('segments', [1.5, 3.0, 12.0])
+@pytest.mark.parametrize(('found', 'nearest'), [(1j, 0.0), (-1.0, 0.0), (0.5 + 0.3j, 0.5),
+                                                (1.2, 1.0)])
+def test_the_chance_of_a_coefficient_is_that_of_f(segments, found, nearest):
+    """A complex mean has two degrees of freedom, its scatter two for each segment but one."""
+    fit = GravityFit(np.array([found]), np.array([0.1]), np.array([segments]))
+    assert fit.chance(0, 1.0) == pytest.approx(
+        f_distribution.sf(abs(found - nearest)**2 / 0.1**2, 2, 2 * (segments - 1)), rel=1e-9)
 
 
 @pytest.mark.parametrize('axis', ['x', 'y'])
