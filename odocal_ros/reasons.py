@@ -215,8 +215,8 @@ class Code(Enum):
                                    'from accelerations.')
     PARAMETER_NOT_DETERMINED = NOTE, 'Drive with left and right turns, stops and starts.'
     MODEL_MISMATCH = CAUTION, ('The residuals are larger than the noise model predicts; '
-                               'uncertainties were increased. Check slip, lever arms, delays and '
-                               'sky view.')
+                               'uncertainties were increased. Check slip, lever arms, delays, '
+                               'sky view and the unit of heights.')
     METHOD_REJECTED = CAUTION, ('See docs/reasons.md for the code named. The values come from '
                                 'another method, which may not detect this problem.')
     METHOD_FAILED = REJECT, ('Please report this with the trace file. The other methods are not '

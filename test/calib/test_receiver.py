@@ -153,6 +153,21 @@ def test_heights_that_drift_are_found_and_the_pitch_is_within_its_sigma():
     assert pitch.sigma < CHANGE / path_of(drive) / 2        # the rise as the pitch's would show
 
 
+@pytest.mark.parametrize(('unit', 'implausible'), [(1.0, False), (1 / 0.3048, False),
+                                                   (100.0, True)])
+def test_heights_beyond_errors_of_receivers_are_a_caution_that_names_them(unit, implausible):
+    """Slopes of 1 % in cm; in feet the scale is 20 ppm off."""
+    _, config, leg = made(scenario='town', duration=300.0, imu_grade='industrial',
+                          fix_noise='rtk', slope=0.01, seed=5)
+    said = {r.code: r for r in smooth(replace(leg, fixes_n=leg.fixes_n * [1.0, 1.0, unit]),
+                                      config).reasons}
+    assert (Code.MODEL_MISMATCH in said) == implausible
+    if implausible:
+        assert 'height error of the fixes is ' in said[Code.MODEL_MISMATCH].text
+        assert said[Code.MODEL_MISMATCH].text.endswith('(limit 50 m)')
+        assert 'unit of heights' in said[Code.MODEL_MISMATCH].remedy
+
+
 def test_fixes_that_converge_are_found_and_the_scale_is_within_its_sigma():
     drive, config, leg = made(scenario='motorway', duration=500.0, fix_noise='white',
                               fix_sigma=WHITE, imu_grade='industrial')

@@ -72,6 +72,11 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     sideslip, most = max(level['side'], level['side_turn']), 0.2    # m/sqrt(s), of wheels
     if sideslip > most:
         odd.append(f'sideslip at the odometer is {sideslip:.2f} m/√s (limit {most:g})')
+    # m, judgement: receivers err by up to 10 m; with heights in cm slopes of 0.5 % make it 80 m
+    most = max(50.0, 4 * problem.height_sigma)
+    if level['slow_up'] > most:
+        odd.append(f'the time-correlated height error of the fixes is {level["slow_up"]:.0f} m '
+                   f'(limit {most:.0f} m)')
     reasons += _heading(problem.outside.get('heading'), float(fit.state.constants[HEADING]))
     if odd:
         known = 'See IMU_WORSE_THAN_GRADE.' if worse else remedy
