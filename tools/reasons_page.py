@@ -164,7 +164,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.COVARIANCE_UNKNOWN: 'Fixes have no covariance, or zero or NaN in it; '
         '`gnss.default_sigma` is used, in a local frame `reference.default_sigma`.',
         Code.FIXES_NOISIER_THAN_SAID: 'The fixes deviate from the track more than their '
-        'covariance states. Their sigma was increased to match the residuals.',
+        'covariance states, or are rounded to steps that it does not include (float32, NMEA with '
+        '4 decimals of a minute). Their sigma was increased to match.',
         Code.VELOCITY_UNUSABLE: 'Displacements from the GNSS velocity were compared with the '
         'displacements between fixes, 10 s apart. They differ by more than 10 % in size or '
         'direction. Usual causes: north and east swapped, vehicle axes, a speed without '

@@ -40,7 +40,7 @@ class SmootherLeg:
     travel: Travel
     t_fix: Floats               # (k,)
     fixes_n: Floats             # (k, 3) m
-    covariance_n: Floats        # (k, 3, 3) m^2
+    covariance_n: Floats        # (k, 3, 3) m^2, with rounding
     standstills: Floats         # (s, 2) s
     rough_scale: float          # metres per unit of travel, good to 30 %
     nominal_scale: float = 0.0  # K0, 0 unknown
@@ -53,6 +53,14 @@ class SmootherLeg:
     outside: Mapping[str, Outside] = field(default_factory=dict)     # by the name of its factor
     wheels: tuple[Travel, ...] = ()     # in the order of odometer.wheels
     has_accelerometer: bool = True      # False: f_b is constant gravity
+    # (k, 3) or (1, 3) m^2, part of the variances of the fixes by rounding
+    rounding_n: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+
+    @property
+    def stated_sigma(self) -> Floats:
+        """Return the sigmas that the receiver states: (k, 3) m."""
+        variance = self.covariance_n.diagonal(axis1=1, axis2=2) - self.rounding_n
+        return np.sqrt(np.maximum(variance, 0.0))
 
     @property
     def by_steps(self) -> bool:

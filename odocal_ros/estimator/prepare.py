@@ -55,8 +55,9 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
     return SmootherLeg(
         origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
         w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel, t_fix=inputs.t_fix,
-        fixes_n=fixes_n, covariance_n=inputs.covariance_n, standstills=np.asarray(spans),
-        rough_scale=float(rough_scale), nominal_scale=nominal_scale(config, inputs.scale_unit),
+        fixes_n=fixes_n, covariance_n=inputs.covariance_n, rounding_n=inputs.rounding_n,
+        standstills=np.asarray(spans), rough_scale=float(rough_scale),
+        nominal_scale=nominal_scale(config, inputs.scale_unit),
         scale_unit=inputs.scale_unit, imu_arm=np.array(config.imu.lever_arm, float),
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
@@ -158,9 +159,9 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     centre = np.zeros(layout.M)
     sigma[layout.LIFT] = LIFT_SIGMA
     sigma[layout.HEIGHT_DRIFT] = max(height_sigma(leg) / HEIGHT_TIME, layout.NO_ERROR)
-    stated = leg.covariance_n.diagonal(axis1=1, axis2=2)
+    constant = np.isclose(leg.stated_sigma, leg.stated_sigma[:1]).all(axis=0)
     # definition: of an error in sigmas; a constant one has no effect
-    sigma[layout.BY_SIGMA] = np.where((stated != stated[:1]).any(axis=0), 1.0, layout.NO_ERROR)
+    sigma[layout.BY_SIGMA] = np.where(constant, layout.NO_ERROR, 1.0)
     # physical: receivers with an odometer trust it for 5 to 60 s
     centre[layout.FIX_TIME], sigma[layout.FIX_TIME] = np.log(20.0), 0.7
     centre[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = _offset(leg.travel.coarse)

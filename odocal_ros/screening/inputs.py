@@ -48,6 +48,7 @@ class Inputs:
     t_fix: NDArray[np.float64]         # (k,)
     geodetic: NDArray[np.float64]      # (k, 3) latitude, longitude rad, height m (NaN: none)
     covariance_n: NDArray[np.float64]  # (k, 3, 3) m^2
+    rounding_n: NDArray[np.float64]    # (k, 3) m^2, part of these variances by rounding
     outside: Mapping[str, UsableRows]      # of the other sensors, by slot
     fixes_rejected: int
     scale_unit: str

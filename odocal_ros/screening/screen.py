@@ -29,6 +29,7 @@ from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.inputs import Inputs, place, UsableRows
 from odocal_ros.screening.leg_kind import with_force, without_north
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, reversing_reasons
+from odocal_ros.screening.rounded_fixes import rounding_of
 from odocal_ros.screening.row_screen import topic_gap, usable_rows
 from odocal_ros.screening.several_imus import alternating, other_imus
 from odocal_ros.screening.wheel_travel import Wheels, wheels
@@ -119,15 +120,19 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
     found += why
     found += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
-    t_fix, covariance = rows.t_fix[use], covariance[use]
+    t_fix = rows.t_fix[use]
     geodetic = np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
+    rounding, rounded = rounding_of(geodetic, covariance[use])
+    covariance = covariance[use] + rounding[:, :, None] * np.eye(3)
+    found += rounded
     unlike = contradicted(velocity.t, velocity.sent.velocity_n, t_fix, geodetic, covariance) \
         if config.gnss.use_velocity else ()
     found += unlike
     if unlike:
         outside = outside | {'fix_velocity': UsableRows(VelocitySamples.none(), np.empty(0))}
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
-            'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum()), 'outside': outside}
+            'rounding_n': rounding, 'outside': outside,
+            'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}
 
 
 def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:
@@ -175,7 +180,7 @@ def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> In
     lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma, np.interp(inputs.t_fix, t, track))
     found += why
     return replace(inputs, t_fix=inputs.t_fix[~lost], geodetic=inputs.geodetic[~lost],
-                   covariance_n=inputs.covariance_n[~lost],
+                   covariance_n=inputs.covariance_n[~lost], rounding_n=inputs.rounding_n[~lost],
                    fixes_rejected=inputs.fixes_rejected + int(lost.sum())) if why else inputs
 
 

@@ -20,6 +20,8 @@ OUTLIER_SIGMAS = 5.0
 FASTEST = 100.0         # m/s, physical: beyond any land vehicle: a counter reset or a wrong unit
 # physical: wear changes a tyre's radius by 2 %, pressure and load by 1 %, another make by 3 %
 TYRE_SPREAD = 0.05      # relative, largest difference of scales of one vehicle's wheels, or drives
+# judgement: real over stated sigma of fixes, worth a note: receivers state their errors no better
+FIX_NOISE_LIMIT = 1.5
 SCALE_LIMIT = 0.05      # judgement: relative sigma, above it a scale is not determined
 # judgement: ratio of posterior to prior sigma below which the data determined the value: at half,
 # the data have three times the weight of the prior

@@ -52,7 +52,7 @@ class Fixes(PointRows):
         smoothed, self.by_lag = smoothing(*track, state.constants[layout.FIX_LAG2])
         added, self.by_motion, self.by_time = odometer_error(
             *track, state.constants[layout.FIX_BY_MOTION], state.constants[layout.FIX_TIME])
-        stated = np.sqrt(leg.covariance_n[problem.use].diagonal(axis1=1, axis2=2))
+        stated = leg.stated_sigma[problem.use]
         # a constant error does not affect the results
         self.by_sigma = stated - np.median(stated, axis=0)
         raw[:, 2] -= state.constants[layout.HEIGHT_DRIFT] * self.t_fix

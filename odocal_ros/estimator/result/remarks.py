@@ -26,7 +26,7 @@ from odocal_ros.estimator.result.filters import (
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
-from odocal_ros.settings.levels import INFORMED_SHARE, REMARK_SIGMAS
+from odocal_ros.settings.levels import FIX_NOISE_LIMIT, INFORMED_SHARE, REMARK_SIGMAS
 
 CLOCKS = {'fix': layout.GNSS_CLOCK, 'odometer': layout.ODO_CLOCK}
 IMU_SCALES = tuple(i for i, name in enumerate(layout.CONSTANTS) if name.startswith(
@@ -157,11 +157,11 @@ def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
     """Return the reason for fix errors, white and correlated, above the stated ones."""
     slow = levels['slow'] * levels.correlation_time / 2 if levels.correlation_time else 0.0
     factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
-    most = 1.5      # worth a word: receivers state their errors no better
-    if factor <= most:
+    if factor <= FIX_NOISE_LIMIT:
         return []
     return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'fix errors (white and time-correlated) are '
-                   f'{factor:.1f} times as large as their covariance states (limit {most:g})',
+                   f'{factor:.1f} times as large as their covariance states (limit '
+                   f'{FIX_NOISE_LIMIT:g})',
                    OF_POSES if problem.leg.origin.local else '')]
 
 
