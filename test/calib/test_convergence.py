@@ -137,7 +137,7 @@ def test_a_part_without_fixes_is_joined_with_its_neighbour(gap):
     drive, config, leg = made(**DRIVE)
     seen = (leg.t_fix < gap[0]) | (leg.t_fix > gap[1])
     sparse = replace(leg, t_fix=leg.t_fix[seen], fixes_n=leg.fixes_n[seen],
-                     covariance_n=leg.covariance_n[seen])
+                     covariance_n=leg.covariance_n[seen], rounding_n=leg.rounding_n[seen])
     problem = problem_of(sparse, config)
     start = first_state(sparse, problem.imu, problem.priors)
     assert (start.state.t == problem.imu.t[problem.imu.key]).all()
