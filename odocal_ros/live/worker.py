@@ -83,7 +83,9 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
         return LeftOut(results, why)
     paths = leg_paths(max(results, key=lambda one: one.distance), config)
     folded = max(0, len(kept) + 1 - (LEGS_HELD if by_itself else MARKED_LEGS_HELD))
-    carried = fold([one for leg in kept[:folded] for one in leg], config, carried)
+    before, carried = carried, fold([one for leg in kept[:folded] for one in leg], config, carried)
+    if carried is before and not by_itself:      # two-point results carry nothing: all are kept
+        folded = 0
     left = [one for leg in kept[folded:] for one in leg]
     calibration = combine([*left, *results], config, carried, known_imu(config))
     return Computed(results, paths, calibration, carried, folded)
