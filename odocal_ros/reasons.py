@@ -100,9 +100,10 @@ class Code(Enum):
     IMU_BIAS_STEP = NOTE, ('No action needed for this leg. Check that the IMU is firmly mounted '
                            'and its supply is stable; if the bias steps in each drive, replace '
                            'the IMU.')
-    IMU_AXES_SKEW = NOTE, ('No action needed: the mounting angles refer to the measurement axes '
-                           'of the IMU. To silence this, set imu.misalignment_sigma to the value '
-                           'of this IMU.')
+    IMU_AXES_SKEW = CAUTION, ('Check signs and order of the gyro axes in the IMU driver. On flat '
+                              'ground a wrong gyro axis looks like this, and the pitch is then '
+                              'wrong. If the axes are right, set imu.misalignment_sigma to the '
+                              'value of this IMU.')
     LEVER_ARM_OFF = CAUTION, ('Measure this lever arm again and set it (from base_link: x '
                               'forward, y left, z up). If both lever arms differ by the same '
                               'amount, check imu.lever_arm. A vehicle that slides in turns (skid '

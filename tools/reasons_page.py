@@ -140,8 +140,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.IMU_BIAS_STEP: 'The bias of the gyro or of the accelerometer changes within a second '
         'or two by more than 10 times its usual change: a knock, a strained board or a change of '
         'the supply. The bias is estimated before and after; values and sigmas hold.',
-        Code.IMU_AXES_SKEW: 'The axes of the IMU deviate more from perpendicular than its grade. '
-        'The fit accounts for it; mounting angles measured on the housing differ accordingly.',
+        Code.IMU_AXES_SKEW: 'The axes of accelerometer and gyro deviate more from perpendicular '
+        'than the grade of the IMU. The fit accounts for real ones; mounting angles measured on '
+        'the housing differ accordingly. A wrong gyro axis, which flat ground does not show '
+        'directly, looks the same.',
         Code.LEVER_ARM_OFF: 'In turns and while leaning, a sensor moves as if it were decimetres '
         'from its configured position. Sliding in turns is not modelled: for a vehicle with skid '
         'steering the estimated point is where it slides least, not the position of the wheel.',

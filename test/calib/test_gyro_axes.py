@@ -17,7 +17,7 @@ from odocal_ros.calib.reversal import against_travel, backwards, level_track, Pi
 from odocal_ros.data.samples import take
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate, faults, screened
-from odocal_ros.reasons import Code
+from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.gravity_turn import gravity_fit, GravityFit
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import with_settings
@@ -65,6 +65,21 @@ def test_a_precise_coefficient_of_three_segments_names_the_axis(seed, name):
                  odometer_rate=20.0, fix_rate=5.0, fix_noise='rtk', slope=0.03, seed=seed)
     assert 'measures the turn of gravity' in of_gyro(made, AXES[name])[Code.GYRO_AXES].text
     assert Code.GYRO_AXES not in of_gyro(made, np.eye(3))
+
+
+@pytest.mark.parametrize(('name', 'pitch'), [('mirrored x', 0.4), ('x and y swapped', 0.4),
+                                             ('x and y swapped', 2.0)])
+def test_wrong_axes_that_flat_ground_does_not_show_are_a_skew_of_the_accelerometer(name, pitch):
+    """Turns show the pitch by the gyro, accelerations by the accelerometer: they contradict."""
+    made = drive(scenario='town', duration=400.0, imu_grade='industrial', slope=0.0, seed=5,
+                 fix_rate=5.0, pitch=pitch * DEG)
+    config = settings(made, method='smoother')
+    said = {}
+    for axes in (np.eye(3), AXES[name]):
+        leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w, M=axes: w @ M.T))
+        result = calibrate(leg, config)
+        said[axes is AXES[name]] = result.verdict, Code.IMU_AXES_SKEW in everything_said(result)
+    assert said == {False: (Verdict.ACCEPTED, False), True: (Verdict.CAUTION, True)}
 
 
 @pytest.mark.parametrize('segments', [1.5, 3.0, 12.0])

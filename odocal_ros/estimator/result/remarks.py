@@ -31,7 +31,9 @@ from odocal_ros.settings.levels import FIX_NOISE_LIMIT, INFORMED_SHARE, REMARK_S
 CLOCKS = {'fix': layout.GNSS_CLOCK, 'odometer': layout.ODO_CLOCK}
 IMU_SCALES = tuple(i for i, name in enumerate(layout.CONSTANTS) if name.startswith(
     ('gyro_scale', 'accelerometer_scale')))
+AXES = layout.constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz')
 AXIS_XY, AXIS_ZX = map(layout.CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
+ANOTHER_IMU = 4.0       # statistical: of the sigma of the grade, for scales and axes
 # 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
 # body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
@@ -137,19 +139,20 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
     off = np.zeros(len(c))
     off[layout.IMPERFECT] = np.abs(c[layout.IMPERFECT]) / np.maximum(usual, 1e-300)
     off *= np.abs(c) > REMARK_SIGMAS * sigma
-    if off[[AXIS_XY, AXIS_ZX]].max() > REMARK_SIGMAS:
-        worst = max((AXIS_XY, AXIS_ZX), key=lambda i: off[i])
+    skew = float(np.linalg.norm(off[AXES]))
+    if skew > ANOTHER_IMU:
+        seen = np.rad2deg(np.linalg.norm(c[AXES][off[AXES] > 0]))
         said.append(Reason(Code.IMU_AXES_SKEW, 'accelerometer axes are '
-                           f'{np.rad2deg(abs(c[worst])):.2f} deg off perpendicular, '
-                           f'{off[worst]:.0f} times the sigma of the {config.imu.grade} grade '
-                           f'(limit {REMARK_SIGMAS:g}); accounted for'))
+                           f'{seen:.2f} deg off perpendicular, '
+                           f'{skew:.0f} times the sigma of the {config.imu.grade} grade '
+                           f'(limit {ANOTHER_IMU:g}); accounted for'))
     worst = max(IMU_SCALES, key=lambda i: off[i])
-    most = 4.0      # of the sigma of the grade: another IMU
-    if off[worst] > most:
+    if off[worst] > ANOTHER_IMU:
         name = layout.CONSTANTS[worst].replace('_', ' ')
         said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {name} '
                            f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
-                           f'the {config.imu.grade} grade (limit {most:g}); accounted for'))
+                           f'the {config.imu.grade} grade (limit {ANOTHER_IMU:g}); '
+                           'accounted for'))
     return said + _arms(c, sigma, ratio, config)
 
 
