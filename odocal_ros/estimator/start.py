@@ -27,7 +27,7 @@ from odocal_ros.estimator.state import LN_K, M, PITCH, Priors, State, YAW
 from odocal_ros.estimator.sums import Intervals
 from odocal_ros.nav.alignment import level_frame
 from odocal_ros.nav.earth import gravity
-from odocal_ros.nav.rotations import skew
+from odocal_ros.nav.rotations import exp_so3, skew
 
 # s each side, for the mean of a speed: some rows of an odometer. Judgement
 SPEED_WINDOW = 0.4
@@ -133,32 +133,38 @@ def _part(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _P
     rest = rest_bias(leg, imu)
     bias = before if rest is None else rest
     sigma = np.maximum(priors.gyro_bias, 1e-3) if rest is None else np.full(3, 2e-4)
-    sums, C_0k = _sums(leg, imu, bias)
+    K, change = len(imu.key) - 1, np.zeros(3)
+    found, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
+                            np.array([1.0, 0.0, 0.0]), np.empty(0))
+    sums, C_0k = _with_bias(found, change)
     for _ in range(2):
-        up, change = _level(leg, sums, C_0k, sigma)
-        bias = bias + change
-        sums, C_0k = _sums(leg, imu, bias)
+        up, more = _level(leg, sums, C_0k, sigma)
+        change = change + more
+        sums, C_0k = _with_bias(found, change)
         sigma = np.minimum(sigma, 5e-4)
     C_Lk = level_frame(up) @ C_0k
     t = imu.t[imu.key]
     track = FittedTrack(leg, t, C_Lk, sums)
     if track.slope is not None:
         up_b = C_Lk[:, 2].mean(axis=0)
-        bias = bias - track.slope * up_b / np.linalg.norm(up_b)
-        sums, C_0k = _sums(leg, imu, bias)
+        change = change - track.slope * up_b / np.linalg.norm(up_b)
+        sums, C_0k = _with_bias(found, change)
         C_Lk = level_frame(up) @ C_0k
         track = FittedTrack(leg, t, C_Lk, sums)
-    return _Part(t, C_Lk, bias, track, *_heading(leg, t, C_Lk, sums, track))
+    return _Part(t, C_Lk, bias + change, track, *_heading(leg, t, C_Lk, sums, track))
 
 
-def _sums(leg: SmootherLeg, imu: ImuSteps, bias: Floats) -> tuple[Intervals, Floats]:
-    K = len(imu.key) - 1
-    sums, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
-                           np.array([1.0, 0.0, 0.0]), np.empty(0))
-    C = np.empty((K + 1, 3, 3))
+def _with_bias(sums: Intervals, change: Floats) -> tuple[Intervals, Floats]:
+    """Return sums for a gyro bias changed by (3,), to first order, and the attitudes C_0k."""
+    by = slice(0, 3)
+    S = sums.S.copy()
+    S[:, :, 0] += sums.S_by[:, :, by] @ change
+    sums = replace(sums, R=exp_so3(-sums.turned[:, :, by] @ change) @ sums.R,
+                   dv=sums.dv + sums.dv_by[:, :, by] @ change, S=S)
+    C = np.empty((len(sums.T) + 1, 3, 3))
     C[0] = np.eye(3)
-    for k in range(K):
-        C[k + 1] = C[k] @ sums.R[k]
+    for k, R in enumerate(sums.R):
+        C[k + 1] = C[k] @ R
     return sums, C
 
 

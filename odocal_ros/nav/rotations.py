@@ -17,11 +17,11 @@ from odocal_ros.nav.angles import arctan2
 
 def skew(a: ArrayLike) -> Floats:
     """Return the matrix of the cross product with a: (..., 3) to (..., 3, 3)."""
-    x, y, z = np.moveaxis(np.asarray(a, dtype=float), -1, 0)
-    S = np.zeros((*x.shape, 3, 3))
-    for (i, j), value in zip(((2, 1), (0, 2), (1, 0)), (x, y, z), strict=True):
-        S[..., i, j] = value
-        S[..., j, i] = -value
+    a = np.asarray(a, dtype=float)
+    S = np.zeros((*a.shape, 3))
+    for axis, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
+        S[..., i, j] = a[..., axis]
+        S[..., j, i] = -a[..., axis]
     return S
 
 
