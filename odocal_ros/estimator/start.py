@@ -136,11 +136,11 @@ def _part(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _P
     K, change = len(imu.key) - 1, np.zeros(3)
     found, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
                             np.array([1.0, 0.0, 0.0]), np.empty(0))
-    sums, C_0k = _with_bias(found, change)
+    sums, C_0k = with_bias(found, change)
     for _ in range(2):
         up, more = _level(leg, sums, C_0k, sigma)
         change = change + more
-        sums, C_0k = _with_bias(found, change)
+        sums, C_0k = with_bias(found, change)
         sigma = np.minimum(sigma, 5e-4)
     C_Lk = level_frame(up) @ C_0k
     t = imu.t[imu.key]
@@ -148,13 +148,13 @@ def _part(leg: SmootherLeg, imu: ImuSteps, priors: Priors, before: Floats) -> _P
     if track.slope is not None:
         up_b = C_Lk[:, 2].mean(axis=0)
         change = change - track.slope * up_b / np.linalg.norm(up_b)
-        sums, C_0k = _with_bias(found, change)
+        sums, C_0k = with_bias(found, change)
         C_Lk = level_frame(up) @ C_0k
         track = FittedTrack(leg, t, C_Lk, sums)
     return _Part(t, C_Lk, bias + change, track, *_heading(leg, t, C_Lk, sums, track))
 
 
-def _with_bias(sums: Intervals, change: Floats) -> tuple[Intervals, Floats]:
+def with_bias(sums: Intervals, change: Floats) -> tuple[Intervals, Floats]:
     """Return sums for a gyro bias changed by (3,), to first order, and the attitudes C_0k."""
     by = slice(0, 3)
     S = sums.S.copy()

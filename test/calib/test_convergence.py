@@ -13,8 +13,9 @@ from smoother_legs import made, truth
 
 from odocal_ros.estimator import fit, smooth
 from odocal_ros.estimator.fit import damped
+from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.start import first_state
+from odocal_ros.estimator.start import first_state, with_bias
 from odocal_ros.nav.rotations import rotvec, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
@@ -130,6 +131,27 @@ def test_a_gyro_that_warms_up_is_level_in_each_part():
     assert np.percentile(angle, 90) < 0.3
     assert np.log(start.state.scale / drive.truth.scale) == pytest.approx(0.0, abs=0.02)
     assert len(np.unique(start.state.gyro_bias, axis=0)) == 3
+
+
+def test_the_sums_of_a_start_follow_a_change_of_the_gyro_bias_to_first_order():
+    _, config, leg = made(duration=120.0, imu_rate=50.0, odometer_rate=20.0)
+    imu = problem_of(leg, config).imu
+    K = len(imu.key) - 1
+
+    def of_bias(bias, change):
+        sums, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
+                               np.array([1.0, 0.0, 0.0]), np.empty(0))
+        sums, C = with_bias(sums, change)
+        return sums.R, sums.dv, sums.S[:, :, 0], C
+    change, none = np.array([0.01, -0.02, 0.015]), np.zeros(3)
+    apart = []
+    for delta in (change, change / 2):
+        apart.append([np.abs(x - y).max() for x, y in zip(
+            of_bias(none, delta), of_bias(delta, none), strict=True)])
+    # the rest is of second order, of intervals of a second
+    assert (np.divide(*apart) > 3.5).all()
+    force_and_speed = np.array([1.0, 10.0, 20.0 / leg.rough_scale])
+    assert (apart[0][:3] < force_and_speed * (change @ change)).all()
 
 
 @pytest.mark.parametrize('gap', [(-20.0, 605.0), (595.0, 1225.0), (1215.0, 1850.0)])
