@@ -10,6 +10,7 @@ import inspect
 import numpy as np
 
 from odocal_ros.data.samples import OdometerSamples, take
+from odocal_ros.forecast.planned_drive import from_rates
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.pipeline.calibrate import calibrate
@@ -96,6 +97,14 @@ def shifted(leg, **marks):
     """Return a leg with its marks moved by seconds: start=, stop=."""
     return replace(leg, **{f'{name}_ns': getattr(leg, f'{name}_ns') + round(s * 1e9)
                            for name, s in marks.items()})
+
+
+def planned(motion, options):
+    """Return the drive of a simulated motion as one that is planned."""
+    t = np.arange(0.0, motion.duration + 1e-9, 0.1)
+    return from_rates(t, motion.speed(t), motion.yaw_rate(t), options.heading,
+                      latitude=options.latitude, longitude=options.longitude,
+                      height=options.height)
 
 
 def two_point(leg, config, **more):

@@ -18,7 +18,7 @@ from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.start import first_state, with_bias
 from odocal_ros.nav.rotations import rotvec, transpose
 from odocal_ros.pipeline.calibrate import calibrate, combine
-from odocal_ros.reasons import Code
+from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.draw import drawn
 from odocal_ros.sim.real import Real
@@ -107,6 +107,7 @@ def test_at_the_limit_of_passes_the_best_so_far_is_stated_with_a_wider_sigma():
     whole = smooth(leg, config)
     few = smooth(leg, with_settings(config, {'leg.compute_limit': 5}))
     assert few.details['iterations'] == 5
+    assert (few.verdict, few.details['widened']) == (Verdict.CAUTION, 2.0)
     said = {r.code: r.text for r in few.reasons}
     assert 'after 5 iterations the estimates still changed' in said[Code.MODEL_MISMATCH]
     a, b = (m.estimates['scale_factor'] for m in (whole, few))

@@ -429,15 +429,3 @@ def test_a_yaw_that_no_leg_tells_may_come_of_all(legs):
     two = combine([leg_result(refused(one), i) for i, one in enumerate(results[:2])], config)
     assert two.estimates[YAW].value is None
     assert [r.text[:4] for r in two.reasons if r.code is Code.YAW_NOT_DETERMINED] == ['yaw ']
-
-
-def test_a_leg_that_is_rejected_is_left_out_and_named(legs):
-    _, config, results = legs
-    odd = results[1].border
-    bad = replace(results[1], border=replace(odd, value=odd.value + 0.01))
-    whole = combine([leg_result(results[0], 1), leg_result(bad, 2, Code.IMU_GAP),
-                     leg_result(results[2], 3)], config)
-    two = combine_legs([results[0], results[2]], [10**12, 3 * 10**12], config)
-    assert whole.estimates[SCALE].value == two.estimates[SCALE].value
-    assert [r.text for r in whole.reasons if r.code is Code.LEG_REJECTED] == [
-        'leg 2: rejected and not used: IMU_GAP']

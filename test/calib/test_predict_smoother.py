@@ -6,11 +6,11 @@
 from dataclasses import replace
 import math
 
+from drives import planned
 import numpy as np
 import pytest
 from smoother_legs import made, truth
 
-from odocal_ros.errors import BadConfig
 from odocal_ros.estimator import bound, prepare, smooth
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.prepare import problem_of
@@ -40,14 +40,6 @@ def sigmas_of(method):
     return np.array([method.estimates[n].sigma for n in NAMES], float)
 
 
-def planned(drive):
-    """Return a simulated drive as one that is planned."""
-    motion, o = drive.motion, drive.options
-    t = np.arange(0.0, motion.duration + 1e-9, 0.1)
-    return from_rates(t, motion.speed(t), motion.yaw_rate(t), o.heading, latitude=o.latitude,
-                      longitude=o.longitude, height=o.height)
-
-
 def figures(drive, config, tau=0.0):
     return Sigmas(config=with_settings(config, {'gnss.correlation_time': tau}),
                   fix=drive.options.fix_sigma, quantum=drive.options.scale, sway=0.05, slip=0.01)
@@ -67,8 +59,8 @@ def test_the_bound_of_ideal_samples_is_that_of_a_simulated_leg_at_its_truth(opti
     sigma = np.hypot(np.sqrt(np.diag(true))[:3], MODEL_FLOOR)
     # rests are found to a second or so of the twenty and more that a drive has, keyframes fall
     # elsewhere: 5 % of what rests tell
-    np.testing.assert_allclose(sigmas_of(predict_smoother(planned(drive), sigmas)) / sigma, 1.0,
-                               atol=0.05)
+    predicted = predict_smoother(planned(drive.motion, drive.options), sigmas)
+    np.testing.assert_allclose(sigmas_of(predicted) / sigma, 1.0, atol=0.05)
 
 
 def test_the_sigma_predicted_is_the_one_that_the_smoother_states():
@@ -80,8 +72,8 @@ def test_the_sigma_predicted_is_the_one_that_the_smoother_states():
     # it finds the noise itself: slip and slide from some 400 intervals (1 / sqrt(800) = 3.5 %),
     # gyro and accelerometer from 100 s at rest in three axes (4 %): three of their root sum
     # squared would be 16 %, the rests and the shares that are certain take half of that
-    np.testing.assert_allclose(sigmas_of(predict_smoother(
-        planned(drive), figures(drive, config, tau))) / stated, 1.0, atol=0.12)
+    predicted = predict_smoother(planned(drive.motion, drive.options), figures(drive, config, tau))
+    np.testing.assert_allclose(sigmas_of(predicted) / stated, 1.0, atol=0.12)
 
 
 def stop_and_go():
@@ -218,9 +210,3 @@ def test_more_slip_and_slide_cost_what_they_should(town_sigmas):
     for i, name in enumerate(NAMES):
         assert math.sqrt(sum(row[name]**2 for row in budget.values())) == pytest.approx(
             at[0][i], rel=1e-6)
-
-
-@pytest.mark.parametrize('change', [{'sway': -0.1}, {'slip': math.nan}])
-def test_impossible_roads_are_refused(change):
-    with pytest.raises(BadConfig, match=f'{next(iter(change))} '):
-        Sigmas(**change)

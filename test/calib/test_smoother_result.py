@@ -192,20 +192,6 @@ def still_moved(method, passes):
                            'sigma', text)[1])
 
 
-def test_a_fit_cut_off_gives_what_it_has_with_wider_sigmas(monkeypatch):
-    drive, config, leg = made(**SHORT)
-    _, whole = result()
-    monkeypatch.setattr(smoother, 'fit', lambda *given, **more: fit(*given[:3], 3, **more))
-    method = smooth(leg, config)
-    assert method.verdict is Verdict.CAUTION
-    assert 0.1 < still_moved(method, 3) < 0.5
-    assert method.details['widened'] == 2.0
-    for name in ('scale_factor', 'yaw_mounting_angle'):
-        # widened alone makes it twice, less what floors of the model are of it
-        assert method.estimates[name].sigma > 1.9 * whole.estimates[name].sigma
-    assert off(method, drive, *BOTH) < 3.3
-
-
 def test_what_still_moves_far_widens_by_as_much():
     _, config, leg = made(**SHORT)
     problem = problem_of(leg, config)
