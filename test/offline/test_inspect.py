@@ -172,11 +172,6 @@ def test_bags_without_any_input(data_dir, capsys, name):
     assert ('metadata.yaml is missing' in unwrapped) == ('no_metadata' in name)
 
 
-def test_bag_that_cannot_be_read(tmp_path, capsys):
-    assert main(['inspect', str(tmp_path / 'nothing')]) == 2
-    assert 'no such file or folder' in capsys.readouterr().err
-
-
 # ---- made drives ---------------------------------------------------------------------------
 
 @pytest.mark.core

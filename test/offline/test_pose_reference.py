@@ -81,12 +81,6 @@ def test_what_is_exported_has_no_place_on_a_map(bag, tmp_path, capsys, monkeypat
         assert np.ptp(rows['east_m']) > 100
 
 
-def test_a_simulated_reference_has_a_name(tmp_path, capsys):
-    assert cli.main(['simulate', '--scenario', 'town', '--reference', 'sonar', '--out',
-                     str(tmp_path / 'x')]) == 2
-    assert '--reference sonar: required: one of fix, pose' in capsys.readouterr().err
-
-
 def test_comma2k19_with_poses_gives_the_scale_of_its_fixes(data_dir, tmp_path):
     """The frame looks anywhere, has no latitude and says nothing of its errors, as the fixes."""
     from odocal_ros import calibrate_bag

@@ -147,6 +147,7 @@ def test_force_keeps_an_operators_own_settings(tmp_path, capsys):
 
 @pytest.mark.parametrize(('asked', 'told'), [
     (['--scenario', 'moon'], '--scenario moon: required: one of paper'),
+    (['--reference', 'sonar'], '--reference sonar: required: one of fix, pose'),
     (['--imu-rate', 'fast'], "invalid float value: 'fast'"),
     (['--outage', '5'], '5: required: A:B, two numbers of seconds'),
     (['--known-heading-sigma-deg', '-1'], '--known-heading-sigma-deg -1: required: 0 to 180'),
