@@ -106,20 +106,6 @@ def test_the_check_shows_the_correction(made):
     assert result.after.max < 5 * 1.5 * np.sqrt(2)
 
 
-def test_several_legs_of_one_vehicle(made):
-    others = [drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=s,
-                           start_ns=s * 10**12)
-              for s in (5, 6, 7, 8)]
-    legs = [calibrate(d.leg(), drives.settings(d)) for d in others]
-    whole = combine(legs, drives.settings(made))
-    one = legs[0].methods['two_point'].estimates
-    assert Code.LEGS_DISAGREE not in {r.code for r in whole.reasons}
-    assert whole.estimates[SCALE].sigma == pytest.approx(one[SCALE].sigma / 2, rel=0.25)
-    # the heading given is one and the same
-    assert 1e-3 < whole.estimates[YAW].sigma < one[YAW].sigma
-    assert abs(whole.estimates[SCALE].value - made.truth.scale) < 4 * whole.estimates[SCALE].sigma
-
-
 @pytest.mark.parametrize(('option', 'value'), [
     ('outliers', 0.05), ('outages', ((70.0, 90.0), (100.0, 104.0))), ('slip_walk', 0.01),
     ('two_wheels', True), ('odometer', 'speed'), ('odometer', 'angle'), ('roll', 0.05),
