@@ -9,12 +9,8 @@ from drives import cached, drive, everything_said, off, settings
 import numpy as np
 import pytest
 
-from odocal_ros.bagio import encode
-from odocal_ros.messages.decode import make_reader
-from odocal_ros.messages.sensor_types import IMU
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
-from odocal_ros.settings.config import Config
 
 pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 200.0, 'slope': 0.03}
@@ -126,25 +122,3 @@ def test_a_leg_without_force_tells_another_no_angle():
     assert all(found.estimates[name].value is None for name in ANGLES)
     assert off(found, one) < 3
     assert not any('housing' in name for name in found.methods['smoother'].details['beside'])
-
-
-def test_an_imu_that_says_so_in_its_covariance_is_heard():
-    """REP-145: linear_acceleration_covariance[0] of -1, whatever the values are."""
-    imu = drive(**TOWN).imu
-    topic = encode.imu('/imu', imu)
-    packed = topic.pack(slice(0, 5)).copy()
-    raw = [row.tobytes() for row in packed]
-    at = _offset_of_covariance(raw[0], imu.f_i[0])
-    none = [r[:at] + np.float64(-1.0).tobytes() + r[at + 8:] for r in raw]
-    reader = make_reader('imu', IMU, Config())
-    for rows, has in ((raw, True), (none, False)):
-        (_, block), = reader.rows(rows, [1] * len(rows), None)
-        assert np.isfinite(block.f_i).all() == has
-        assert np.isfinite(block.w_i).all()
-
-
-def _offset_of_covariance(raw, f_i):
-    """Return where the covariance begins: after the last number of the acceleration."""
-    at = raw.find(np.asarray(f_i).tobytes())
-    assert at > 0
-    return at + 24
