@@ -7,7 +7,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.earth import A, C_en, E2, earth_rate_n, ecef_from_geodetic, gravity, OMEGA
+from odocal_ros.nav.earth import A, C_en, E2, ecef_from_geodetic, gravity, OMEGA
 from odocal_ros.nav.rotations import exp_so3, skew
 from odocal_ros.sim import motion as true_motion
 from odocal_ros.sim.profile import chain, hold, ramp, smooth, turn
@@ -85,23 +85,6 @@ def test_the_papers_drive_is_11200_m_of_loxodrome():
         return np.arctanh(s) - e * np.arctanh(e * s)
     east = (end.longitude[0] - 0.2) - (isometric(end.latitude[0]) - isometric(np.radians(40)))
     assert east * A == pytest.approx(0, abs=2e-8)
-
-
-def test_at_rest_the_imu_feels_gravity_upwards_and_the_earths_turn():
-    state = still().at(np.arange(3.0))
-    w_v, f_v = true_motion.inertial_v(state, (0, 0, 0))
-    assert_allclose(f_v, np.tile([0, 0, gravity(HOME.latitude, 50.0)], (3, 1)), atol=1e-15)
-    w_n = np.einsum('nij,nj->ni', true_motion.attitude(state), w_v)
-    assert_allclose(w_n, earth_rate_n(state.latitude), atol=1e-19)
-
-
-def test_at_rest_a_lever_arm_feels_the_gravity_of_its_own_place():
-    state = still().at(np.arange(2.0))
-    _, f_v = true_motion.inertial_v(state, (0.0, 0.0, 100.0))
-    assert_allclose(f_v[0], [0, 0, gravity(HOME.latitude, 150.0)], atol=1e-12)
-    # 100 m to the side: the vertical there leans by 100 m / R, outwards
-    _, f_v = true_motion.inertial_v(state, (0.0, 100.0, 0.0))
-    assert f_v[0, 1] == pytest.approx(9.80 * 100 / 6.37e6, rel=0.01)
 
 
 def test_travel_speed_and_position_belong_together():

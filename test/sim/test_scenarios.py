@@ -129,6 +129,10 @@ def test_every_choice_is_filled_in():
     ({'outliers': 0.6}, '--outliers 0.6: the limit is 0.5'),
     ({'outages': ((5.0, 2.0),)}, '--outage 5:2: required: A:B'),
     ({'two_wheels': True, 'odometer': 'speed'}, '--wheels require'),
+    ({'wheels': 4, 'odometer': 'speed'}, '--wheels require'),
+    ({'wheels': 9}, '1 to 8'), ({'wheels': 0}, '1 to 8'),
+    ({'scenario': 'town', 'drive': 'skid'}, '--drive skid: --scenario town: required: one of '
+     'indoor'),
     ({'duration': 30_000.0, 'imu_rate': 1000.0}, 'more than 20,000,000 samples'),
     ({'duration': 100.0}, 'scenario straight: --duration 100 s is too short, give 180'),
     ({'scenario': 'paper', 'duration': 411.0}, 'scenario paper: .* give 420'),

@@ -88,11 +88,6 @@ def test_a_robot_without_an_imu_sends_none_and_can_be_read(tmp_path):
         read_bag(bag)       # wheels of unknown sides: the IMU is required
 
 
-def test_other_scenarios_have_no_such_robots():
-    with pytest.raises(BadUsage, match='--drive skid: --scenario town: required: one of indoor'):
-        simulate(SimOptions(scenario='town', drive='skid'))
-
-
 TOWN = SimOptions(scenario='town', duration=200.0, imu_rate=20.0, wheels=4, seed=5)
 
 
@@ -136,14 +131,6 @@ def test_a_steered_wheel_rolls_along_its_own_curve():
     # the derivatives by differences of 1 ms are off by some ppm
     np.testing.assert_allclose(rolled, np.interp(at, t, path), atol=0.01)
     assert rolled[-1] - state.travel[-1] > 0.5        # m: far above that
-
-
-@pytest.mark.parametrize(('change', 'words'), [
-    ({'wheels': 9}, '1 to 8'), ({'wheels': 0}, '1 to 8'),
-    ({'odometer': 'speed'}, '--wheels require')], ids=str)
-def test_impossible_wheels_are_refused(change, words):
-    with pytest.raises(BadUsage, match=words):
-        resolved(replace(TOWN, **change))
 
 
 RUN = {'scenario': 'straight', 'duration': 400.0, 'imu_rate': 20.0}
