@@ -11,15 +11,12 @@ from functools import cache
 import random
 
 import numpy as np
+from streams import odometry_of
 
-from odocal_ros.apply.odometry import Odometry
-from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.calib.result import Estimate
 from odocal_ros.data.samples import ImuSamples, OdometerSamples, take
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import matrix_from_quat
-from odocal_ros.settings.config import with_settings
-from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -36,6 +33,12 @@ def calibration(truth, rng):
             'yaw_mounting_angle': (truth.yaw, 2e-3), 'pitch_mounting_angle': (truth.pitch, 2e-3)}
     return {name: Estimate(value + sigma * rng.standard_normal(), sigma, '')
             for name, (value, sigma) in true.items()}
+
+
+def started(drive, seed, **changes):
+    """Return the odometry of a drive whose calibration errs by a seed."""
+    estimates = calibration(drive.truth, np.random.default_rng(seed))
+    return odometry_of(drive, estimates, **{'publish__rate': 5.0} | changes)
 
 
 @cache
@@ -217,9 +220,7 @@ def stream(seed, number):
     with np.errstate(all='ignore'):
         faults = [rng.choice(FAULTS)(rng, topics) for _ in range(
             rng.choice([1, 1, 2, 3]))] if number >= DRIVES else ['none']
-    config = with_settings(ApplyConfig(), {'imu.grade': 'consumer', 'publish.rate': 5.0})
-    estimates = calibration(drive.truth, np.random.default_rng(number))
-    odometry = Odometry(vehicle_of(estimates, config), config)
+    odometry = started(drive, number)
     try:
         poses, said = run(drive, odometry, topics)
     except Exception as error:       # that none comes is what is tested

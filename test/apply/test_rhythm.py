@@ -5,18 +5,14 @@
 
 from dataclasses import replace
 
-import faulty_streams
-from faulty_streams import calibration
+from faulty_streams import columns_of, run, started
 import numpy as np
 import pytest
 
 from odocal_ros.apply.arrivals import Rhythm
 from odocal_ros.apply.delay import DelaySearch, LEAST_DELAY_ROWS
 from odocal_ros.apply.errors import GRAVITY
-from odocal_ros.apply.odometry import Odometry
-from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.samples import take
-from odocal_ros.settings.config import with_settings
 from odocal_ros.settings.node_configs import ApplyConfig
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -144,10 +140,7 @@ def twists(mean_late_s, seed):
     stamps = begin_ns + np.rint(1e9 * in_order((rows.stamp_ns - begin_ns) * 1e-9 + late)).astype(
         np.int64)
     counter = replace(rows, stamp_ns=stamps, received_ns=stamps)
-    config = with_settings(ApplyConfig(), {'imu.grade': 'industrial'})
-    odometry = Odometry(vehicle_of(calibration(drive.truth, np.random.default_rng(seed)), config),
-                        config)
-    poses = []
+    odometry, poses = started(drive, seed, publish__rate=ApplyConfig().publish.rate), []
     for edge in range(begin_ns, int(stamps[-1]), PIECE_NS):
         for slot, block in (('imu', drive.imu), ('odometer', counter)):
             a, b = np.searchsorted(block.received_ns, [edge, edge + PIECE_NS])
@@ -230,12 +223,10 @@ def test_a_minute_is_needed_and_unusable_seconds_do_not_count():
 def test_late_stamps_of_a_drive_are_reported(late):
     drive = simulate(SimOptions(scenario='town', duration=240.0, seed=5, imu_rate=100.0,
                                 odometer_rate=20.0, imu_grade='industrial'))
-    config = with_settings(ApplyConfig(), {'imu.grade': 'industrial', 'publish.rate': 5.0})
-    topics = faulty_streams.columns_of(drive)
+    topics = columns_of(drive)
     for column in ('stamp', 'arrival'):
         topics['imu'][column] = topics['imu'][column] + round(late * 1e9)
-    vehicle = vehicle_of(faulty_streams.calibration(drive.truth, np.random.default_rng(5)), config)
-    _, said = faulty_streams.run(drive, Odometry(vehicle, config), topics)
+    _, said = run(drive, started(drive, 5), topics)
     reports = [text for text in said if REPORT in text]
     if late:
         assert float(reports[-1].split('are ')[1].split(' s')[0]) == pytest.approx(late, abs=0.04)

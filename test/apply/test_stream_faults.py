@@ -3,18 +3,14 @@
 
 """Faulty streams into odometry: nothing unsaid, no NaN, no pose beyond five of its sigmas."""
 
-from faulty_streams import calibration, columns_of, drive_of, run, SIGMAS, stream, worst_of
+from faulty_streams import columns_of, drive_of, run, SIGMAS, started, stream, worst_of
 import numpy as np
 import pytest
 
 from odocal_ros.apply.arrivals import Arrivals, MOVED_ROWS, STAYS_ROWS
-from odocal_ros.apply.odometry import Odometry
 from odocal_ros.apply.spikes import Row, SpikeScreen
-from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.apply.wheel import Wheel
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.settings.config import with_settings
-from odocal_ros.settings.node_configs import ApplyConfig
 
 pytestmark = pytest.mark.slow
 STREAMS = 6       # of any number: benchmarks/stream_faults.py
@@ -25,9 +21,7 @@ def published(drive, topics):
     """Return the odometry after 75 s of a stream, its poses, and what it said."""
     topics = {name: {k: v[:row_at(topic, 75.0)] for k, v in topic.items()}
               for name, topic in topics.items()}
-    config = with_settings(ApplyConfig(), {'imu.grade': 'consumer', 'publish.rate': 5.0})
-    odometry = Odometry(vehicle_of(calibration(drive.truth, np.random.default_rng(5)), config),
-                        config)
+    odometry = started(drive, 5)
     poses, said = run(drive, odometry, topics)
     return odometry, poses, said
 
