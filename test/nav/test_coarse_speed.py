@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Speeds sent in steps: rounded to a grid, or held until they have changed by a step."""
+"""Speeds sent in steps: rounded to a grid, held until changed by a step, zero in a dead band."""
 
 import numpy as np
 from numpy.testing import assert_allclose
@@ -11,6 +11,7 @@ from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, grid
 from odocal_ros.nav.held_speed import held_speed
 from odocal_ros.nav.odometer import travel
+from odocal_ros.screening.odometer_care import with_uncertainty
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.wheels import coarse, held
 
@@ -212,3 +213,34 @@ def test_reversed_counts_are_held_on_the_other_side():
     assert_allclose(back.s, way.s)
     assert_allclose(back.coarse.value, way.coarse.value)
     assert_allclose(back.coarse.instants.value, way.coarse.instants.value)
+
+
+# to and fro, each stop and start at an acceleration of its own
+CORNERS = np.cumsum(np.tile([3.0, 1.5, 6.0, 2.1], 20))
+TO_AND_FRO = np.interp(AT, np.r_[0.0, CORNERS], np.r_[0.0, np.tile([0.0, 1.7, 1.7, 0.0], 20)])
+TO_AND_FRO[CORNERS[39] < AT] *= -1
+BAND = 0.25
+
+
+@pytest.mark.parametrize('reversed_counts', [False, True])
+def test_the_way_below_a_dead_band_is_put_back_and_doubted(reversed_counts):
+    zeroed = np.where(np.abs(TO_AND_FRO) < BAND, 0.0, TO_AND_FRO)
+    raw, _ = travel(AT, zeroed, RATE, reversed_counts=reversed_counts)
+    way, t, sigma = with_uncertainty(raw, zeroed, RATE)
+    true, _ = travel(AT, TO_AND_FRO, RATE, reversed_counts=reversed_counts)
+    lost = np.abs(np.diff(raw.s)).sum() - np.abs(np.diff(true.s)).sum()
+    left = np.abs(np.diff(way.s)).sum() - np.abs(np.diff(true.s)).sum()
+    assert lost < -0.8          # 40 times v^2 / 2a
+    # a band ends within a row: half a row's speed of 1.1 m/s^2, of 0.25 m/s
+    assert abs(left) < 0.11 * abs(lost)
+    # each is doubted by half of it, where it is
+    assert sigma.sum() == pytest.approx(abs(lost) / 2, rel=0.11)
+    at = np.interp(t, AT, np.abs(TO_AND_FRO))
+    assert (at < BAND + 0.1).all()
+
+
+def test_a_speed_that_falls_to_zero_stays_as_it_is():
+    exact, _ = travel(AT, TO_AND_FRO, RATE)
+    way, t, _ = with_uncertainty(exact, TO_AND_FRO, RATE)
+    np.testing.assert_array_equal(way.s, exact.s)
+    assert not len(t)
