@@ -171,3 +171,27 @@ def test_the_radius_gives_the_travel_of_the_factor():
     _, (settings,) = blocks()
     travel = 2 * math.pi / float(settings['WENC_CPR']) * float(settings['WENC_RADIUS'])
     assert abs(travel - 0.0213) < 1e-7
+
+
+TAGS = re.findall(r'\\tag\{([STW])(\d+)\}', (ROOT / 'docs/method.md').read_text(encoding='utf-8'))
+TAGS = {letter: [int(n) for a, n in TAGS if a == letter] for letter in 'STW'}
+MOST = {'S': 30, 'T': 15, 'W': 7}      # there are more of them: smoother, two-point, two wheels
+
+
+def _cited(text, letter):
+    """Return the numbers that a text cites, (S5) to (S8) all four."""
+    ends = re.findall(rf'\({letter}(\d+)\)(?: to \({letter}(\d+)\))?', text)
+    return {n for first, last in ends for n in range(int(first), int(last or first) + 1)}
+
+
+@pytest.mark.parametrize('letter', 'STW')
+def test_equations_of_the_method_are_in_order_and_cited_and_no_others_are(letter):
+    assert list(range(1, len(TAGS[letter]) + 1)) == TAGS[letter]
+    assert len(TAGS[letter]) > MOST[letter]
+    code = set()
+    for page in (*(ROOT / 'odocal_ros').rglob('*.py'), *(ROOT / 'docs').rglob('*.md')):
+        cited = _cited(page.read_text(encoding='utf-8'), letter)
+        lacks = cited - set(TAGS[letter])
+        assert not lacks, f'{page} cites {lacks} of {letter}'
+        code |= cited if page.suffix == '.py' else set()
+    assert set(TAGS[letter]) == code
