@@ -123,19 +123,10 @@ def test_at_the_truth_noise_says_nothing_of_the_imus_errors(monkeypatch):
     assert both[0] - both[1] < -1.5
 
 
-def test_two_hours_of_gyro_noise_are_no_scale_error():
-    drive, config, leg = made(duration=7200.0, imu_grade='consumer', imu_rate=10.0, fix_rate=0.5,
-                              odometer_rate=5.0)
-    found = smooth(leg, by_grade(config))
-    # with the noise of small rates the fit has not converged after 40 passes, x is up to 10 % off
-    assert found.estimates['scale_factor'].value == pytest.approx(
-        drive.truth.scale, abs=3.3 * found.estimates['scale_factor'].sigma)
-    for name in SCALES:
-        one = found.details[name]
-        assert abs(one['value']) < 3.3 * one['sigma'], name
-
-
 @pytest.mark.parametrize('drive', [
+    # with the noise of small rates the fit has not converged after 40 passes, x is up to 10 % off
+    {'duration': 7200.0, 'imu_grade': 'consumer', 'imu_rate': 10.0, 'fix_rate': 0.5,
+     'odometer_rate': 5.0, 'odometer': 'counts'},
     {'duration': 1200.0, 'imu_grade': 'consumer', 'sway': 0.05, 'odometer_rate': 10.0,
      'speed_noise': 0.05},
     # few turns in long sway: a signal that contains it is a scale y 4.6 sigmas off
@@ -146,7 +137,7 @@ def test_two_hours_of_gyro_noise_are_no_scale_error():
     # sway, by a path with sway, makes them 5 sigmas larger
     {'scenario': 'yard', 'duration': 900.0, 'imu_grade': 'consumer', 'sway': 0.02, 'seed': 2,
      'odometer_rate': 20.0, 'fix_rate': 1.0, 'real': Real(slow_errors=((1.5, 100.0),))}])
-def test_a_road_that_shakes_makes_no_scale_error(drive):
+def test_gyro_noise_and_a_road_that_shakes_make_no_scale_error(drive):
     drive, config, leg = made(**{'odometer': 'speed'} | drive)
     found = smooth(leg, by_grade(config))
     assert abs(found.estimates['scale_factor'].value - drive.truth.scale) < (

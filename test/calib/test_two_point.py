@@ -34,7 +34,9 @@ def found(made, config=None, leg=None):
     {'scenario': 'town', 'duration': 200.0, 'seed': 2, 'mounting_rpy': (np.pi, 0.0, 1.0)},
     {'scenario': 'straight', 'duration': 200.0, 'latitude': -60 * DEG, 'longitude': 179.999 * DEG,
      'heading': 80 * DEG, 'height': 2500.0},
-], ids=['straight', 'angles', 'town', 'antenna', 'wheel', 'axes', 'antimeridian'])
+    *({'scenario': 'paper', 'yaw': DEG, 'odometer': o} for o in ('counts', 'angle', 'speed')),
+], ids=['straight', 'angles', 'town', 'antenna', 'wheel', 'axes', 'antimeridian', 'paper, counts',
+        'paper, angle', 'paper, speed'])
 def test_error_free_data_give_the_truth(options):
     """
     What remains is the trapezoid rule of attitude over travel in turns, 20 ms a step.
@@ -42,7 +44,7 @@ def test_error_free_data_give_the_truth(options):
     A turn of w rad/s bends a step by w^2 dt^2 / 12 of itself: at 0.3 rad/s 3e-6, on the quarter
     of the way that is turns; yaw and pitch alike.
     """
-    made = drives.drive(**CLEAN, **options)
+    made = drives.drive(**CLEAN | options)
     scale, yaw, pitch = found(made)
     assert scale == pytest.approx(made.truth.scale, rel=1e-6)
     assert yaw == pytest.approx(made.truth.yaw, abs=3e-6)
