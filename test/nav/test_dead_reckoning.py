@@ -1,8 +1,9 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Dead reckoning: closed forms, order, symmetries, the ellipsoid; mounting angles; rough scale."""
+"""Dead reckoning: closed forms, order, symmetries, the ellipsoid; mounting angles; scales."""
 
+from drives import configured, drive
 from hypothesis import given, strategies as st
 import numpy as np
 from numpy.testing import assert_allclose
@@ -14,6 +15,7 @@ from odocal_ros.nav.dead_reckoning import (
     mounting_from_forward,
     Origin,
     rough_scale,
+    section_ratio,
     Track,
 )
 from odocal_ros.nav.earth import C_en
@@ -24,6 +26,8 @@ from odocal_ros.nav.rotations import (
     quat_from_rotvec,
     quat_multiply,
 )
+from odocal_ros.pipeline.prepare import prepare
+from odocal_ros.screening.screen import screen
 
 pytestmark = pytest.mark.core
 RADIUS = 20.0
@@ -212,3 +216,23 @@ def test_rough_scale_needs_motion_of_both():
     assert rough_scale(none, t, fixes(10 * t, rng, 1.5), 1.5) is None
     assert rough_scale(moving, np.empty(0), np.empty((0, 3)), 1.5) is None
     assert rough_scale(moving, t + 1e3, fixes(10 * t, rng, 1.5), 1.5) is None
+
+
+def test_chords_of_a_circle_are_compared_with_those_of_its_path():
+    s = np.linspace(0.0, 100.0, 301)                # of a radius of 10
+    path = 10 * np.stack([np.sin(s / 10), 1 - np.cos(s / 10)], -1)
+    turned = path @ [[0.0, 1.0], [-1.0, 0.0]] * 0.7 + [3.0, -5.0]
+    assert section_ratio(s, path, turned, 10.0) == pytest.approx(0.7, rel=1e-12)
+    # a chord of 10 m on a radius of 7 m spans 2 asin(5 / 7) = 1.591 rad, 2 sin(x / 2) / x of it
+    assert section_ratio(s, s[:, None], turned, 10.0) < 0.7 * 2 * (5 / 7) / 1.591
+    assert section_ratio(s, path, 0 * turned, 10.0) is None
+
+
+@pytest.mark.parametrize('seed', [1, 3, 4])
+def test_reversing_in_a_yard_does_not_change_the_ratio(seed):
+    """With RTK, whose 3 cm are 0.15 % of 20 m, and an industrial gyro: slopes, less than 1 %."""
+    made = drive(scenario='yard', duration=300.0, fix_noise='rtk', imu_grade='industrial',
+                 seed=seed)
+    leg, config = made.leg(), configured(made)
+    prepared, _ = prepare(leg, screen(leg, config)[0], config)
+    assert prepared.path_ratio == pytest.approx(made.truth.scale, rel=0.01)

@@ -3,6 +3,7 @@
 
 """Standstill: found where it is, not where a vehicle creeps, rocks or turns on the spot."""
 
+from drives import drive
 import numpy as np
 import pytest
 from scipy.stats import norm, rayleigh
@@ -14,7 +15,6 @@ from odocal_ros.nav.statistics import NORMAL_MEDIAN, RAYLEIGH_MEDIAN, robust_sig
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import GRADES
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.core
 RATE = 100.0       # Hz
@@ -167,9 +167,8 @@ def test_too_little_data(n):
 
 @pytest.mark.parametrize('scale', [0.35, 1.0, 1.7])
 def test_one_pulse_a_turn_of_the_wheel_still_shows_a_stop(scale):
-    drive = simulate(SimOptions(scenario='straight', duration=200.0, imu_rate=50.0,
-                                odometer_rate=20.0, scale=scale, nominal_scale=scale))
-    inputs, _ = screen(drive.leg(), Config())
+    made = drive(scenario='straight', duration=200.0, scale=scale, nominal_scale=scale)
+    inputs, _ = screen(made.leg(), Config())
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, 2.0)
     assert len(spans) == 2
     # 0.5 m/s^2: within two counts of the onset, sqrt(2 * 2 * scale / 0.48)
