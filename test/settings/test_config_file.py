@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from odocal_ros.errors import BadConfig, BadUsage, OdocalError
-from odocal_ros.settings.config import Config, flat, SETTINGS, with_settings
+from odocal_ros.settings.config import Config, flat, SETTINGS
 from odocal_ros.settings.config_file import parse_set, read_config_file, scalar
 
 pytestmark = pytest.mark.core
@@ -142,15 +142,6 @@ def test_set_says_what_is_wrong(text, error, match):
         parse_set(text)
     assert '\n' not in str(caught.value)
     assert isinstance(caught.value, OdocalError)
-
-
-def test_file_then_set_is_the_order(write):
-    config = with_settings(Config(), read_config_file(write(
-        BLOCK + '    leg.min_distance: 50.0\n    leg.min_speed: 1.0\n')))
-    config = with_settings(config, dict([parse_set('leg.min_distance=70')]))
-    assert config.leg.min_distance == 70.0
-    assert config.leg.min_speed == 1.0
-    assert config.leg.max_gap == Config().leg.max_gap
 
 
 SCALARS = ['true', 'yes', 'Y', 'on', 'off', 'no', 'n', '3', '+3', '-3', '0x10', '010', '08', '0',
