@@ -3,8 +3,7 @@
 
 """Attitudes of odometry in plain numbers; its start where rows have gaps or a wheel is late."""
 
-from functools import cache
-
+from drives import drive
 import numpy as np
 import pytest
 from streams import odometry_of, poses_of, samples_of
@@ -13,7 +12,6 @@ from odocal_ros.apply import attitude
 from odocal_ros.data.samples import take
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply, skew
 from odocal_ros.nav.strapdown import rotation_increments
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SECOND = 10**9
 
@@ -44,17 +42,10 @@ def test_rotation_increments_are_those_of_the_strapdown(uneven):
     np.testing.assert_array_equal(np.transpose(own), rotation_increments(t, w))
 
 
-@cache
-def drive():
-    """Simulate a drive that begins with 20 s at rest."""
-    return simulate(SimOptions(scenario='town', duration=135.0, imu_rate=50.0, odometer_rate=20.0,
-                               imu_grade='industrial'))
-
-
 @pytest.mark.core
 @pytest.mark.parametrize('from_s', [1.0, 4.0, 6.0, 9.0])
 def test_it_does_not_start_across_a_gap_of_the_imu(from_s):
-    made = drive()
+    made = drive(scenario='town', duration=135.0, imu_grade='industrial')     # 20 s at rest first
     blocks = samples_of(made)
     t = (blocks['imu'].stamp_ns - made.imu.stamp_ns[0]) / SECOND
     blocks['imu'] = take(blocks['imu'], (t < 5.0) | (t > 10.0))

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-from bench import Client, NodeProcess, PATIENCE, ROOT, wait_for
+from bench import Client, given, NodeProcess, PATIENCE, ROOT, wait_for
 from kills import same_result
 from player import ended, messages_of, part, Player, straight
 import pytest
@@ -44,10 +44,8 @@ def drive():
 def session(drive, tmp_path_factory):
     """Drive two legs through one node and keep everything it said; the tests then look."""
     folder = tmp_path_factory.mktemp('results')
-    settings = [x for name, value in SETTINGS.items() for x in ('-p', f'{name}:={value}')]
-    node = NodeProcess('-p', f'output.directory:={folder}', '-p',
-                       f'alignment.heading:={drive.heading!r}', *settings)
-    client = Client()
+    node, client = NodeProcess(*given(SETTINGS | {
+        'output.directory': folder, 'alignment.heading': drive.heading})), Client()
     seen = SimpleNamespace(node=node, client=client, folder=folder)
     try:
         _early(seen, client)

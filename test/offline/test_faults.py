@@ -10,6 +10,7 @@ from pathlib import Path
 import subprocess
 import sys
 
+from drives import drive
 import pytest
 import ros_bags
 import yaml
@@ -78,11 +79,10 @@ def test_memory_that_runs_out_is_called_so(bag):
 @pytest.fixture(scope='module')
 def evil(tmp_path_factory):
     """Write a drive whose IMU frame and folder name are commands."""
-    drive = simulate(SimOptions(scenario='straight', duration=200.0, imu_grade='tactical',
-                                imu_rate=50.0, odometer_rate=20.0))
-    topics = [t for t in drive_topics(drive) if t.name != '/imu/data']
+    made = drive(scenario='straight', duration=200.0, imu_grade='tactical')
+    topics = [t for t in drive_topics(made) if t.name != '/imu/data']
     return write_bag(tmp_path_factory.mktemp('evil') / 'drive\ntouch ran: \x1b[2J',
-                     [encode.imu('/imu/data', drive.imu, FRAME), *topics])
+                     [encode.imu('/imu/data', made.imu, FRAME), *topics])
 
 
 def test_replay_of_a_bag_of_evil_names_writes_and_says_nothing_that_acts(

@@ -7,6 +7,7 @@ from contextlib import suppress
 import random
 import shutil
 
+from drives import drive
 import pytest
 import ros_bags
 import yaml
@@ -16,7 +17,6 @@ from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.library.asked import parse_leg
 from odocal_ros.offline.cli import main
 from odocal_ros.settings.config_file import parse_set, read_config_file
-from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 ODD = [None, True, -1, 0, 10**400, 2**63, float('inf'), float('nan'), '', 'text', '\0', [], [[]],
@@ -114,9 +114,8 @@ def test_a_sentence_ends_somewhere(capsys):
 
 
 def test_an_option_given_again_adds_its_files(tmp_path):
-    drive = simulate(SimOptions(scenario='straight', duration=200.0, imu_rate=50.0,
-                                odometer_rate=20.0))
-    bag = write_bag(tmp_path / 'drive', drive_topics(drive))
+    made = drive(scenario='straight', duration=200.0)
+    bag = write_bag(tmp_path / 'drive', drive_topics(made))
     main(['replay', str(bag), '--output', str(tmp_path / 'out'), '--quiet', '--set',
           'output.formats=[params]', '--export',
           'trajectory.tum,track.kml', '--export', 'trajectory.csv'])
