@@ -143,6 +143,7 @@ def test_several_bags_are_legs_of_one_vehicle(tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert [Path(leg['bag']).stem for leg in printed['legs']] == ['drive1', 'drive2', 'drive3']
     assert len({entry['sha256'] for entry in printed['inputs']}) == 3
+    assert 'LEGS_DISAGREE' not in {r['code'] for r in printed['reasons']}
     whole = printed['result']['scale_ratio']
     single = [leg['methods']['two_point']['estimates']['scale_ratio']['sigma']
               for leg in printed['legs']]
