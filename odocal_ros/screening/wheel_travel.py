@@ -127,11 +127,11 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats, name: str, *,
     size = round(span.size) if np.issubdtype(samples.value.dtype, np.integer) else span.size
     value: NDArray[Any] = samples.value + size * np.cumsum(turns)
     times = len(span.rows)
-    about = f'about {span.size:.6g} (± {span.sigma:.2g})' if span.sigma else NAMED_SPANS.get(
+    about = f'about {span.size:.0f} (± {span.sigma:.2g})' if span.sigma else NAMED_SPANS.get(
         span.size, f'{span.size:.0f}')
     angle = span.size in NAMED_SPANS     # exact, and no modulus of odometer.wrap, which is whole
     code = Code.COUNTER_ROLLOVER if of_one or angle else Code.WHEEL_COUNTERS_DIFFER
-    do = f'Set odometer.wrap to {span.size:.6g}.' if of_one and not angle else ''
+    do = f'Set odometer.wrap to {span.size:.0f}.' if of_one and not angle else ''
     found = Reason(code, f'{name} rolls over at {about}, '
                    f'not at the range of its message type: {times} jump{"s" * (times > 1)} of '
                    f'this size against the travel, first at t = {t[span.rows[0] + 1]:.2f} s; '

@@ -142,15 +142,18 @@ def test_imu_packets_with_one_stamp_are_spread_over_their_time(leg, packet):
     assert 'packets with one stamp' in codes[Code.STAMPS_NOT_RISING]
 
 
-@pytest.mark.parametrize('span', [2**12, 2**16, 10_000])
-def test_a_counter_that_rolls_over_within_its_type_was_not_reset(span):
-    made = drive(**STRAIGHT | {'duration': 900.0}, odometer='counts', scale=0.02)
+@pytest.mark.parametrize(('span', 'scale'), [
+    (2**12, 0.02), (2**16, 0.02), (10_000, 0.02), (2**21, 0.0005)])
+def test_a_counter_that_rolls_over_within_its_type_was_not_reset(span, scale):
+    made = drive(**STRAIGHT | {'duration': 900.0}, odometer='counts', scale=scale)
     alone, *_ = said(made.leg())
-    inputs, codes, _ = said(replace(made.leg(), odometer=changed(
-        made.leg().odometer, value=lambda value: value % span)))
+    inputs, found = screen(replace(made.leg(), odometer=changed(
+        made.leg().odometer, value=lambda value: value % span)), Config())
+    codes, remedies = {r.code: r.text for r in found}, [r.remedy for r in found]
     assert np.diff(made.odometer.value[[0, -1]]) > 3 * span
     assert f'rolls over at {span}' in codes[Code.COUNTER_ROLLOVER]
     assert Code.COUNTER_RESET not in codes
+    assert f'Set odometer.wrap to {span}.' in remedies
     np.testing.assert_array_equal(inputs.travel.s, alone.travel.s)
 
 
