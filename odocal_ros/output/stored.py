@@ -216,8 +216,11 @@ def _worse(label: str, old: Estimate | None, new: Estimate | None) -> str:
     if new is None or new.value is None:
         return f'the new result has no {label}, the old one has {said(old)}'
     clearly = 2.0    # times the sigma: four times as many such legs would be needed
-    if new.unit == old.unit and new.sigma and new.sigma > clearly * old.sigma:
-        return (f'the uncertainty of the {label} is {new.sigma / old.sigma:.1f} times larger: '
+    larger = (new.sigma or 0.0) / old.sigma
+    if old.unit != 'rad' and new.value:      # relative: the vehicles may differ
+        larger *= abs(old.value / new.value)
+    if new.unit == old.unit and larger > clearly:
+        return (f'the uncertainty of the {label} is {larger:.1f} times larger: '
                 f'{said(new)}, the old result has {said(old)}')
     return ''
 

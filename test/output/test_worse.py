@@ -50,6 +50,14 @@ def test_a_sigma_twice_as_large_is_worse(why, good, name, factor, worse):
     assert not worse or f'{name.replace("_", " ")} is 2.1 times larger' in said
 
 
+def test_scales_of_two_vehicles_are_compared_by_their_relative_sigma(why, good):
+    old = good.estimates['scale_factor']
+    assert why(good, later(good, scale_factor=replace(
+        old, value=10 * old.value, sigma=6 * old.sigma))) == ''
+    assert '6.0 times larger' in why(good, later(good, scale_factor=replace(
+        old, value=old.value / 10, sigma=0.6 * old.sigma)))
+
+
 def test_a_value_lost_is_worse_and_one_gained_or_of_another_unit_is_not(why, good):
     lost = later(good, yaw_mounting_angle=Estimate(None, None, 'rad'))
     assert why(good, lost) == ('the new result has no yaw mounting angle, the old one has '
