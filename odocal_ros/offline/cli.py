@@ -9,7 +9,7 @@ import os
 import sys
 import tempfile
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from odocal_ros import __version__
 from odocal_ros.errors import BadUsage, OdocalError
@@ -58,6 +58,13 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise an error that ``main`` reports in one line, with exit code 2."""
         raise _Usage(f'{self.prog}: {message} (see {self.prog} --help)')
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse unknown arguments here: the parser of the command names its own help."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f'unrecognized arguments: {" ".join(unknown)}')
+        return found, unknown
 
 
 class _Usage(OdocalError):
