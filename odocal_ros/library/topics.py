@@ -53,7 +53,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str],
         if len(found) == 1:
             chosen[slot] = found[0]
         elif not _optional(slot, config, found):
-            troubles.append(_trouble(topics, slot, found, config, chosen.get('fix', '')))
+            troubles.append(_trouble(topics, slot, found, config, chosen))
     if troubles:
         raise BadUsage('; '.join(troubles) + (
             '' if all('; choose one with ' in text for text in troubles) else
@@ -162,8 +162,10 @@ def _may_serve(msgtype: str, slot: str) -> bool:
     return full_type(msgtype) in types_of(slot, OdometerConfig())
 
 
-def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: str) -> str:
+def _trouble(topics: Topics, slot: str, found: list[str], config: Config,
+             chosen: dict[str, str]) -> str:
     """Return the explanation why a slot is open and the option that selects it."""
+    fix = chosen.get('fix', '')
     if slot == 'odometer' and fix and not found and topics[fix].msgtype in ODOMETERS:
         return (f'no odometer in the bag besides {fix}, which is the position reference '
                 f'({topic_option("fix")}): an odometer cannot be calibrated against itself')
@@ -179,7 +181,9 @@ def _trouble(topics: Topics, slot: str, found: list[str], config: Config, fix: s
         return (f'no {INPUTS[slot].label} (a topic of {", ".join(types[:-1])} or {types[-1]}) in '
                 f'the bag; name a {TRANSFORMS} or nav_msgs/msg/Odometry with {topic_option(slot)}')
     what = ' or '.join(types) if len(types) < 3 else 'an odometer type'
-    beside = ' besides the IMU' if slot == 'heading' else ''
+    used = [topic for topic in chosen.values() if topics[topic].msgtype in types]
+    beside = ' besides the IMU' if slot == 'heading' else (
+        f' besides {", ".join(used)}' if used else '')
     return f'no {INPUTS[slot].label} (a topic of {what}{beside}) in the bag'
 
 

@@ -52,6 +52,9 @@ def test_missing_lists_what_there_is():
     with pytest.raises(BadUsage, match=r'no IMU \(a topic of sensor_msgs/msg/Imu\) in the bag; '
                        r'the bag has /odometer \(std_msgs/msg/Int64\), /fix'):
         choose(topics(imu__data=None))
+    with pytest.raises(BadUsage, match=r'no IMU \(a topic of sensor_msgs/msg/Imu besides '
+                       r'/imu/data\) in the bag'):
+        choose(topics(), {'heading': '/imu/data'})
     with pytest.raises(BadUsage, match='--fix-topic /gps: no such topic; the bag has /imu/data'):
         choose(topics(), {'fix': '/gps'})
     # not as if the others were missing, which it would be taken from
