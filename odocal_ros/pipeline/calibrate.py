@@ -218,17 +218,17 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
             return [whole]
     if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:
         return good      # the gap is before the mark
-    return [replace(one, reasons=(*one.reasons, _cut(leg, one, len(good), why)),
-                    cut_from_ns=leg.start_ns) for one in good]
+    cause, do = (why.text, 'If the vehicle was carried (ferry, train), ignore. Otherwise check '
+                 'the wheel sensor and the odometer topic.') if why else (
+        f'no IMU data for more than {config.leg.max_gap:g} s', '')
+    return [replace(one, cut_from_ns=leg.start_ns, reasons=(*one.reasons, Reason(
+        Code.LEG_CUT, f'{cause}; {_section(leg, one, len(good))}', do))) for one in good]
 
 
-def _cut(leg: Leg, one: LegResult, count: int, why: Reason | None) -> Reason:
+def _section(leg: Leg, one: LegResult, count: int) -> str:
+    """Return the span of one of ``count`` sections within its leg, as text."""
     begin, end = ((t - leg.start_ns) * 1e-9 for t in (one.start_ns, one.stop_ns))
-    text = (f'this section covers {begin:.1f} to {end:.1f} s of the '
+    return (f'this section covers {begin:.1f} to {end:.1f} s of the '
             f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s leg'
             + (f', one of {count} sections' if count > 1 else
                ', the only section long enough to calibrate'))
-    if why is None:
-        return Reason(Code.LEG_CUT, text)
-    return Reason(Code.LEG_CUT, f'{why.text}; {text}', 'If the vehicle was carried (ferry, '
-                  'train), ignore. Otherwise check the wheel sensor and the odometer topic.')

@@ -78,7 +78,7 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
     whole = combine(results, config)
     assert whole.verdict is Verdict.ACCEPTED
     assert [r.text for r in whole.reasons if r.code is Code.LEG_CUT][0].startswith(
-        'leg 1: this section covers 0.0 to 200.0 s')
+        'leg 1: no IMU data for more than 0.5 s; this section covers 0.0 to 200.0 s')
     assert off(whole, made, SCALE, YAW, PITCH) < 4
     for name in (SCALE, YAW, PITCH):
         # each part has sizes of imperfections of its own; the joint ones lie between them, so that
