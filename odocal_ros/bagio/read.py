@@ -90,9 +90,10 @@ class Bag:
             span = span or (known.whole if after is None else None)
             end_ns = span.end_ns if span else after.start_ns if after else None
             seconds = (part.end_ns - part.start_ns) * 1e-9
-            missing = (f'{max(end_ns - part.end_ns, 0) * 1e-9:.1f} s at the end are missing'
-                       if end_ns is not None else
-                       'without metadata.yaml the lost time is unknown')
+            lost = 0.0 if end_ns is None else (end_ns - part.end_ns) * 1e-9
+            missing = ('without metadata.yaml the lost time is unknown' if end_ns is None else
+                       f'{lost:.1f} s at the end are missing' if lost > MISSING else
+                       'the end is there, messages before it are missing')
             found.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
                                 f'{seconds:.1f} s were read; {missing}'))
         lost = (known.whole.end_ns - self.end_ns) * 1e-9 if known.whole else 0.0
@@ -230,7 +231,9 @@ def _opened(path: Path, stack: ExitStack) -> Bag:
         damage = ' or '.join({part.damage for part in parts if part.damage})
         topics = sum(len(part.channels) for part in parts)
         raise BadBag(f'{path}: the bag is empty, 0 messages on {topics} topics in '
-                     f'{names(source.files)}{f" ({damage})" if damage else ""}; record again')
+                     f'{names(source.files)}'
+                     + (f' ({damage}); copy it again from its source' if damage else
+                        '; record again'))
     return Bag(replace(source, notes=source.notes + bag_notes), parts, types)
 
 

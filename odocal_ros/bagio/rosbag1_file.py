@@ -53,7 +53,9 @@ class Rosbag1File(Recording):
         return reader
 
     def _unreadable(self, error: Exception) -> BadBag:
-        why = ' '.join(str(error).split()).rstrip('.')[:200] or type(error).__name__
+        # an error of rosbags may contain the one that it is raised from, as a tuple
+        why = ' '.join(str(error.__cause__ or error).split()).rstrip('.')[:200]
+        why = why or type(error).__name__
         return BadBag(f"{self.path}: cannot be read ({why}); try 'rosbag reindex' on it")
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:

@@ -148,7 +148,8 @@ def _read_metadata(path: Path) -> Known:
     except limits.LimitReached as error:
         return Known(trouble=f'{error}; it is ignored')
     except Exception as error:      # any error: types, numbers, nesting, encoding
-        why = ' '.join(str(error).split())[:100] or type(error).__name__
+        why = ' '.join(str(error).split())[:100] if isinstance(error, yaml.YAMLError) else (
+            'not the structure that rosbag2 writes')
         return Known(trouble=f'{path}: cannot be parsed ({why}) and is ignored')
 
 

@@ -116,8 +116,11 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
         return _stopped(travel, t_here, here, fix_sigma)
     if fixes_move:
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, but the odometer does not'),)
-    return (Reason(Code.LEG_TOO_SHORT, 'the odometer counts, but the fixes do not move'
-                   if wheels_move else 'the vehicle did not move'),)
+    if wheels_move:
+        return (Reason(Code.LEG_TOO_SHORT, 'the odometer counts, but the fixes do not move',
+                       'If the vehicle moved, check the receiver: latitude and longitude in '
+                       'degrees, static hold off.'),)
+    return (Reason(Code.LEG_TOO_SHORT, 'the vehicle did not move'),)
 
 
 def _stopped(travel: Travel, t: Floats, fixes: Floats, fix_sigma: float) -> tuple[Reason, ...]:

@@ -230,7 +230,8 @@ def _judge_angles(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
     elif alignment.heading_separable and far > FAR_YAW:
         reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'heading ({alignment.heading_source}) and '
                            f'course give a yaw mounting of {np.rad2deg(yaw):+.1f} deg, '
-                           f'{np.rad2deg(far):.1f} deg from its nominal value'),)
+                           f'{np.rad2deg(far):.1f} deg from its nominal value; the limit is '
+                           f'{np.rad2deg(FAR_YAW):.0f} deg'),)
     if not vertical_known:
         reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the heights of the fixes are too '
                            f'inaccurate for the pitch; 0 ± {np.rad2deg(PITCH_PRIOR):.1f} deg is '

@@ -57,8 +57,8 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
         best = best_fit(problem, config, trace)
     except (NotPositive, np.linalg.LinAlgError) as error:
         return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}. '
-                               'Likely cause: missing or invalid samples '
-                               'there')], leg.scale_unit, leg.wheels)
+                               'Likely cause: missing or invalid samples')],
+                       leg.scale_unit, leg.wheels)
     if implausible := no_imu(best):
         return refused(implausible, leg.scale_unit, leg.wheels)
     return outcome(leg, problem, best, config)

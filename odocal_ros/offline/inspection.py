@@ -26,6 +26,7 @@ from odocal_ros.offline import odometer_search, survey, wheel_survey
 from odocal_ros.offline.inspection_drive import lacking, look
 from odocal_ros.offline.suggest import command, left_open, likely_mapping
 from odocal_ros.offline.survey import fix_path, FixPath, Match
+from odocal_ros.output.figures import counted
 from odocal_ros.output.files import plain
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import beyond
@@ -172,7 +173,7 @@ def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[st
         return facts | ({'trouble': trouble} if trouble else {})
     slot = tap.reader.slot
     rows = tap.recorder.rows(slot)
-    trouble = tap.trouble or (f'{tap.reader.unreadable} messages cannot be read: '
+    trouble = tap.trouble or (f'{counted(tap.reader.unreadable, "message")} skipped: '
                               f'{tap.reader.trouble}' if tap.reader.unreadable else '')
     if trouble:
         facts['trouble'] = trouble

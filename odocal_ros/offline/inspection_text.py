@@ -164,11 +164,10 @@ def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
         yield (f'recorded {abs(late):.3f} s {where} its header stamp '
                f'(spread {timing["header_to_bag_spread"]:.3f} s)')
     odd = [f'{timing[key]} {what}' for key, what in (
-        ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the stamp of the previous '
-                                             'message'),
-        ('backward_steps', 'with an earlier stamp than the previous message')) if timing[key]]
+        ('zero_stamps', 'have no stamp'), ('repeated_stamps', 'repeat the previous stamp'),
+        ('backward_steps', 'have an earlier stamp than the one before')) if timing[key]]
     if odd:
-        yield f'warning: {", ".join(odd)} of {topic["count"]} messages'
+        yield f'warning: of {topic["count"]} messages {", ".join(odd)}'
     if timing['gap_count']:
         longest = max(timing['gaps'], key=lambda gap: gap['length'])
         yield (f'warning: {counted(timing["gap_count"], "gap")}, the '
@@ -192,7 +191,8 @@ def _drive(found: dict[str, Any]) -> list[str]:
     lines += _legs(found['legs'])
     if len(found['each_stop']) > 1:
         lines.append(f'  --leg each-stop: {len(found["each_stop"])} legs, '
-                     + ', '.join(f'{leg["way"]:.0f} m' for leg in found['each_stop'][:8]))
+                     + ', '.join(f'{leg["distance"]:.0f} m' for leg in found['each_stop'][:8])
+                     + ', ...' * (len(found['each_stop']) > 8))
     lines += [f'  straight: {_leg(leg)}' for leg in found['straight'][:3]]
     return lines + _mounting(found['mounting'])
 

@@ -82,7 +82,7 @@ def usable_fixes(fix: FixSamples, sent: int,
     if bad:
         code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
         said, do = zip(*bad, strict=True)
-        found += (Reason(code, f'{sent - int(use.sum())} of {sent} fixes are not used: '
+        found += (Reason(code, f'{int((~use).sum())} of {sent} fixes are not used: '
                          f'{", ".join(said)}', ' '.join(do)),)
     return use, covariance, found
 

@@ -274,6 +274,14 @@ def test_fixes_at_no_real_place_are_left_out(leg, columns, text):
     assert inputs.fixes_rejected == 4
 
 
+def test_fixes_that_other_reasons_name_are_not_counted_as_invalid(leg):
+    bad = changed(leg.fix, latitude=lambda a: a.__setitem__(slice(70, 74), 2.0),
+                  stamp_ns=lambda a: a.__setitem__(90, a[89]))
+    _, found = screen(replace(leg, fix=bad), Config())
+    (text,) = [r.text for r in found if 'are not used' in r.text]
+    assert text.startswith(f'4 of {len(bad.stamp_ns)} fixes are not used: 4 at an invalid ')
+
+
 @pytest.mark.parametrize('how', ['zero', 'nan', 'inf', 'negative', 'type'])
 def test_an_unknown_covariance_is_taken_from_the_settings_and_said(leg, how):
     if how == 'type':

@@ -219,7 +219,8 @@ def _undetermined(sigma: Floats, usual: float, doubt: float, config: Config, yaw
                               f'points backwards (yaw {np.rad2deg(yaw):+.1f} deg)'))
     elif off > FAR_YAW:
         reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+.1f} '
-                              f'deg differs by {np.rad2deg(off):.1f} deg from its nominal value'))
+                              f'deg differs by {np.rad2deg(off):.1f} deg from its nominal value; '
+                              f'the limit is {np.rad2deg(FAR_YAW):.0f} deg'))
     if sigma[layout.PITCH] > limit:
         reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
                               f'{np.rad2deg(sigma[layout.PITCH]):.1f} deg{wanted}',
