@@ -199,8 +199,8 @@ def path_and_chord(t_fix: Floats, fixes_n: Floats,
     if len(p) < 2:
         return 0.0, 0.0
     knots = [*knots_of(p, max(min(2.0, least), 10 * white_noise(p))), len(p) - 1]
-    way = float(np.hypot(*np.diff(p[knots], axis=0).T).sum())
-    return way, float(np.hypot(*(p[-1] - p[0])))
+    path = float(np.hypot(*np.diff(p[knots], axis=0).T).sum())
+    return path, float(np.hypot(*(p[-1] - p[0])))
 
 
 def within_reach(t_fix: Floats, fixes_n: Floats) -> Bools:

@@ -187,8 +187,8 @@ def _bend(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
     bent = np.zeros(len(first))
     for _ in range(3 if curved else 0):     # with reduced weights the estimate changes
         x, _ = legs.solve()
-        way = np.array([x[legs.place(j)][at] - b.value[at] for j, b in enumerate(first)])
-        bent = (way**2).sum(axis=1) / 2
+        moved = np.array([x[legs.place(j)][at] - b.value[at] for j, b in enumerate(first)])
+        bent = (moved**2).sum(axis=1) / 2
         legs.take([b.loosened(dict.fromkeys(curved, size))
                    for b, size in zip(first, bent, strict=True)])
     return bent

@@ -121,8 +121,8 @@ def _left(t: Floats, weight: Floats, tau: float) -> float:
         return 1.0
     pick = np.unique(np.linspace(0, len(t) - 1, min(len(t), 400)).round().astype(int))
     w = weight[pick] / weight[pick].sum()
-    alike = np.exp(-np.abs(t[pick][:, None] - t[pick]) / tau)
-    return float(max(w @ alike @ w, weight @ weight))
+    correlation = np.exp(-np.abs(t[pick][:, None] - t[pick]) / tau)
+    return float(max(w @ correlation @ w, weight @ weight))
 
 
 def _correlation_time(t: Floats, z: Floats, fast: float, slow: float) -> float:

@@ -16,11 +16,11 @@ PIECE_LENGTHS = 100.0, 500.0, 1000.0    # m, definition: as in KITTI's benchmark
 PIECE_STARTS = 10                       # definition: of pieces, on the length of one, as there
 
 
-def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
+def per_distance(path: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
     """
     Return the errors of two tracks over pieces of the path, each set to the fix at its begin.
 
-    way : (k,) path length at each fix, m.   before, after : (k, 3) track minus fixes, m, up to a
+    path : (k,) path length at each fix, m.   before, after : (k, 3) track minus fixes, m, up to a
     constant.
 
     Returns
@@ -30,36 +30,37 @@ def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistanc
     """
     return tuple(PerDistance(length, float(np.sqrt(was.mean())), float(np.sqrt(now.mean())),
                              pieces)
-                 for length, pieces, (was, now) in _lengths(way, before, after))
+                 for length, pieces, (was, now) in _lengths(path, before, after))
 
 
-def _lengths(way: Floats, before: Floats,
+def _lengths(path: Floats, before: Floats,
              after: Floats) -> Iterator[tuple[float, float, list[Floats]]]:
     for length in PIECE_LENGTHS:
-        a, b = _ends(way, length)
+        a, b = _ends(path, length)
         if len(a):
             squares = [((x[b] - x[a])[:, :2]**2).sum(axis=1) for x in (before, after)]
             yield length, len(a) / PIECE_STARTS, squares
 
 
-def _ends(way: Floats, length: float) -> tuple[Ints, Ints]:
+def _ends(path: Floats, length: float) -> tuple[Ints, Ints]:
     """Return first and last rows of pieces of a length, whose begins are a tenth of it apart."""
-    begin = np.arange(way[0], way[-1] - length, length / PIECE_STARTS) if len(way) else np.empty(0)
-    a = np.searchsorted(way, begin)
-    b = np.searchsorted(way, way[a] + length)
-    whole = b < len(way)
+    begin = np.arange(path[0], path[-1] - length,
+                      length / PIECE_STARTS) if len(path) else np.empty(0)
+    a = np.searchsorted(path, begin)
+    b = np.searchsorted(path, path[a] + length)
+    whole = b < len(path)
     a, b = a[whole], b[whole]
-    near = way[b] - way[a] <= 1.2 * length      # in longer ones fixes are missing
+    near = path[b] - path[a] <= 1.2 * length      # in longer ones fixes are missing
     return a[near], b[near]
 
 
-def check_worse(way: Floats, before: Floats, after: Floats, configured: bool) -> list[Reason]:
+def check_worse(path: Floats, before: Floats, after: Floats, configured: bool) -> list[Reason]:
     """
     Return CHECK_WORSE if the correction significantly increases the distance to the fixes.
 
-    before, after, way : as for ``per_distance``.   configured : a nominal scale is configured.
+    before, after, path : as for ``per_distance``.   configured : a nominal scale is configured.
     """
-    for length, pieces, (was, now) in _lengths(way, before, after):
+    for length, pieces, (was, now) in _lengths(path, before, after):
         more = now - was
         # fewer than three pieces end to end have no known scatter; a tenth more is acceptable
         if pieces < 3 or now.mean() < 1.1**2 * was.mean() \

@@ -44,14 +44,14 @@ class Pieces(NamedTuple):
     stretch: Floats
 
 
-def level_track(way: Floats, turned: Floats) -> Floats:
+def level_track(travel: Floats, turned: Floats) -> Floats:
     """
     Return the path of travel on level ground, up to a rotation: (n, 2) in units of travel.
 
-    turned, way : (n,) arrays, turn about the upward axis, rad, and travel.
+    turned, travel : (n,) arrays, turn about the upward axis, rad, and travel.
     """
     middle = (turned[1:] + turned[:-1]) / 2
-    step = np.diff(way)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
+    step = np.diff(travel)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
     return np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
 
 

@@ -14,7 +14,8 @@ from odocal_ros.data.arrays import Complexes, Floats
 # lags of the correlation of residuals, in blocks: judgement, the next block and one at which
 # additional white noise does not hide it
 BLOCK_LAGS = (1, 3)
-Stretch = tuple[np.complexfloating, Complexes, float]      # rotation and scale, residuals, spread
+# rotation and scale; residuals, m; sum of squared distances from the middle, m^2
+Similarity = tuple[np.complexfloating, Complexes, float]
 # judgement: grid of the correlation from block to block, finer where the sigma of a scale grows
 MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])
 
@@ -33,7 +34,7 @@ class Sections:
     sigma: NDArray[np.float64]
 
 
-def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> Sections:
+def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> Sections:
     """
     Return the scale of each tenth of the path, relative to the one used in dead reckoning.
 
@@ -44,28 +45,28 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
     sections together, including the effect of the fit on them.
     Errors that change more slowly than over a section are not included.
 
-    way : (k,) path length at each fix, m, rising.   reckoned_n, fix_n : (k, 3) dead-reckoned and
+    path : (k,) path length at each fix, m, rising.   reckoned_n, fix_n : (k, 3) dead-reckoned and
     fixed positions, m.   sigma : (k,) stated for a fix, m per horizontal axis; a hundredth of its
     median is the lower limit of the error.
     """
-    whole = way[-1] - way[0] if len(way) else 0.0
+    whole = path[-1] - path[0] if len(path) else 0.0
     fewest = 8      # fixes of a section, twice the parameters of its fit
-    count = int(min(10, len(way) // fewest, whole // 10.0))      # tenths, of 10 m at least
+    count = int(min(10, len(path) // fewest, whole // 10.0))      # tenths, of 10 m at least
     if count < 1:
         return Sections(*(np.empty(0) for _ in range(4)))
-    edges = way[0] + whole * np.linspace(0.0, 1.0, count + 1)
-    part = np.clip(np.searchsorted(edges, way, side='right') - 1, 0, count - 1)
+    edges = path[0] + whole * np.linspace(0.0, 1.0, count + 1)
+    part = np.clip(np.searchsorted(edges, path, side='right') - 1, 0, count - 1)
     z, w = reckoned_n[:, 0] + 1j * reckoned_n[:, 1], fix_n[:, 0] + 1j * fix_n[:, 1]
     ratio, error = np.full(count, np.nan), np.full(count, np.nan)
     fits = {}
     for i in range(count):
         rows = np.flatnonzero(part == i)
-        if len(rows) >= fewest and np.ptp(way[rows]) > 0:
+        if len(rows) >= fewest and np.ptp(path[rows]) > 0:
             # means of fixes: 24 of them, with little noise from fix to fix
             blocks = np.array_split(rows, min(len(rows), 24))
             z_b, w_b = (np.array([x[b].mean() for b in blocks]) for x in (z, w))
             if (z_b != z_b[0]).any():      # else the path stays where it is
-                fits[i] = _stretched(z_b, w_b)
+                fits[i] = _similarity(z_b, w_b)
     for i, found in zip(fits, _errors(list(fits.values()), float(np.median(sigma))),
                         strict=True):
         if found < 1.0:
@@ -73,20 +74,20 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
     return Sections(edges[:-1], edges[1:], ratio, error)
 
 
-def _stretched(z: Complexes, w: Complexes) -> Stretch:
-    """Return rotation and scale from z to w (complex, m), residuals, and spread of z, m^2."""
+def _similarity(z: Complexes, w: Complexes) -> Similarity:
+    """Return the similarity from z to w (complex, m) by least squares."""
     z, w = z - z.mean(), w - w.mean()
     spread = float(np.vdot(z, z).real)
     c = np.vdot(z, w) / spread
     return c, w - c * z, spread
 
 
-def _errors(fits: list[Stretch], stated: float) -> list[float]:
+def _errors(fits: list[Similarity], stated: float) -> list[float]:
     """Return the sigma of each scale."""
     if not fits:
         return []
     n = int(np.median([len(left) for _, left, _ in fits]))
-    left_over, widening, *alike = _process(n)
+    residual_power, widening, *correlations = _process(n)
     power = np.array([np.vdot(left, left).real / len(left) for _, left, _ in fits]) / 2
     whole = sum(np.vdot(left, left).real for _, left, _ in fits)
     at = np.arange(len(MEMORIES))
@@ -94,8 +95,8 @@ def _errors(fits: list[Stretch], stated: float) -> list[float]:
     # larger memory counts; the longer lag is used with enough blocks
     memory = max(np.interp(sum(np.vdot(left[:-lag], left[lag:]).real for _, left, _ in fits)
                            / whole if whole else 0.0, row, at)
-                 for lag, row in zip(BLOCK_LAGS, alike, strict=True) if lag == 1 or n >= 16)
-    level = np.maximum(power, np.median(power)) / np.interp(memory, at, left_over)
+                 for lag, row in zip(BLOCK_LAGS, correlations, strict=True) if lag == 1 or n >= 16)
+    level = np.maximum(power, np.median(power)) / np.interp(memory, at, residual_power)
     level = np.maximum(level, (0.01 * stated)**2)    # lower limit from fix to fix
     return [float(np.sqrt(v * np.interp(memory, at, widening) / spread))
             for v, (_, _, spread) in zip(level, fits, strict=True)]

@@ -114,8 +114,8 @@ class _Windows:
 
     def excess(self, late: float) -> Floats:
         """Return odometer minus IMU path in each window, at an odometer delay, s: (m,) m."""
-        way = self.K * np.interp(self.grid + late, self.track.t, self.track.s)
-        return np.where(self.turns, 0.0, excess_way(SPAN, self.a, way))
+        path = self.K * np.interp(self.grid + late, self.track.t, self.track.s)
+        return np.where(self.turns, 0.0, excess_path(SPAN, self.a, path))
 
     def events(self, late: float) -> tuple[Floats, Floats]:
         """Return time, s, and size, m, of each slip, at an odometer delay, s."""
@@ -137,7 +137,7 @@ def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward
     return out
 
 
-def excess_way(span: int, a: Floats, way: Floats) -> Floats:
+def excess_path(span: int, a: Floats, path: Floats) -> Floats:
     """
     Return the odometer path over each window minus that by acceleration: (m,) m.
 
@@ -146,7 +146,7 @@ def excess_way(span: int, a: Floats, way: Floats) -> Floats:
     """
     u = np.concatenate([[0.0], np.cumsum(a) * SPIN_GRID])        # speed up to a constant
     x = np.concatenate([[0.0], np.cumsum((u[:-1] + u[1:]) / 2) * SPIN_GRID])
-    ahead = way - x                 # its slope is odometer speed minus speed by acceleration
+    ahead = path - x                 # its slope is odometer speed minus speed by acceleration
     lacks = (ahead[2 * PIN_STEPS:] - ahead[:-2 * PIN_STEPS]) / (2 * PIN_STEPS * SPIN_GRID)
     ahead = ahead[PIN_STEPS:-PIN_STEPS]
     lacked = (lacks[:-span] + lacks[span:]) / 2 * span * SPIN_GRID

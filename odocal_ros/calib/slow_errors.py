@@ -26,7 +26,7 @@ def window_means(t: Floats, *columns: Floats) -> tuple[Ints, Ints, list[Floats]]
     return count[full], full, [np.bincount(window, x)[full] / count[full] for x in columns]
 
 
-def slow_variance(t: Floats, along: Floats, way: Floats, variance: Floats,
+def slow_variance(t: Floats, along: Floats, place: Floats, variance: Floats,
                   drift: float) -> tuple[float, float]:
     """
     Return the variance of slow fix errors over SLOW_WINDOW, m^2, and their correlation time, s.
@@ -36,11 +36,11 @@ def slow_variance(t: Floats, along: Floats, way: Floats, variance: Floats,
     Only residuals along the chord are used, because gyro drift acts across it; a straight line
     over the path, the effect of the errors of the two marks, is removed.
 
-    t, along, way : (n,) times, s, corrected track minus fixes along the chord, m, and position
+    t, along, place : (n,) times, s, corrected track minus fixes along the chord, m, and position
     along it, m.   variance : (n,) stated, m^2.   drift : possible track error by gyro drift along
     the chord, m, which is subtracted.
     """
-    count, number, (means, places) = window_means(t, along, way)
+    count, number, (means, places) = window_means(t, along, place)
     if len(count) < 5:      # after mean and slope, a variance by five has a sigma of 80 %
         return 0.0, np.inf
     means, places = means - means.mean(), places - places.mean()
@@ -53,16 +53,16 @@ def slow_variance(t: Floats, along: Floats, way: Floats, variance: Floats,
     if seen <= white * (1 + 3 * np.sqrt(2 / free)):
         return 0.0, np.inf
     next_to = (means[1:] * means[:-1])[np.diff(number) == 1]
-    alike = (next_to.mean() - drift**2) / (seen - white) if len(next_to) else 1.0
-    return float(seen - white), _time_constant(alike)
+    correlated = (next_to.mean() - drift**2) / (seen - white) if len(next_to) else 1.0
+    return float(seen - white), _time_constant(correlated)
 
 
-def _time_constant(alike: float) -> float:
+def _time_constant(correlated: float) -> float:
     """Return the time constant, s, by the correlation of adjacent means of SLOW_WINDOW."""
     times = np.geomspace(2.0, 2000.0, 100)      # s, that such a window can determine
     x = SLOW_WINDOW / times
     correlation = (1 - np.exp(-x))**2 / (2 * (x - 1 + np.exp(-x)))
-    return float(np.interp(alike, correlation, times))
+    return float(np.interp(correlated, correlation, times))
 
 
 def slow_share(seconds: float, tau: float) -> float:

@@ -53,9 +53,9 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     if course @ course < 1.0 + U_TURN * len(about) or power == 0:
         return None
     slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
-    alike = slope**2 * power / (course @ course)
-    certain = alike * (len(t) - 1 - drift.shape[1]) > SLOPE_SIGMAS**2 * (1 - alike)
-    return 1 / slope if alike > SAME_TURNS**2 and certain else None
+    explained = slope**2 * power / (course @ course)      # share of the course's variance
+    certain = explained * (len(t) - 1 - drift.shape[1]) > SLOPE_SIGMAS**2 * (1 - explained)
+    return 1 / slope if explained > SAME_TURNS**2 and certain else None
 
 
 def _pivots(ends: Floats, angle: Floats) -> Bools:

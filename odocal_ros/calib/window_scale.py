@@ -39,12 +39,12 @@ def _scale(t: Floats, fix: Floats, dead: Floats, length: float) -> tuple[float, 
     i, j = np.searchsorted(t, begin), np.searchsorted(t[:-1], begin + length)
     near = np.abs(t[j] - t[i] - length) < length / 4     # judgement: else fixes are missing
     i, j = i[near], j[near]
-    way = dead[j] - dead[i]
-    size = np.hypot(*way.T)
-    i, j, way, size = (x[size > 0] for x in (i, j, way, size))
+    chord = dead[j] - dead[i]
+    size = np.hypot(*chord.T)
+    i, j, chord, size = (x[size > 0] for x in (i, j, chord, size))
     if len(i) < FEWEST_WINDOWS:
         return None
-    along = (way * (fix[j] - fix[i] - way)).sum(axis=1) / size
+    along = (chord * (fix[j] - fix[i] - chord)).sum(axis=1) / size
     most = 4 * max(robust_sigma(along), 1e-9)       # statistical: one in 16,000
     along = np.clip(along, -most, most)
     block = np.minimum((PARTS * (t[i] - t[0]) / (t[-1] - t[0])).astype(int), PARTS - 1)

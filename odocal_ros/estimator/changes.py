@@ -42,7 +42,7 @@ class Step:
 def changes(weighted: Weighted, solved: Solved) -> tuple[Step, ...]:
     """Return the most significant step of each constant that has any; before ``marginals``."""
     rows = weighted[MotionRows]
-    path = np.cumsum(np.linalg.norm(rows.motion.way, axis=1))
+    path = np.cumsum(np.linalg.norm(rows.motion.displacement, axis=1))
     at = np.searchsorted(path, path[-1] * np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1))
     chain, border, square, score = rows.step_sides(at, STEPPING)
     left = 1 / solved.taken - 1      # of the step, if it was shortened: to the minimum

@@ -22,7 +22,7 @@ from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors import factor
 from odocal_ros.estimator.factors.interval_noise import INTERVAL
 from odocal_ros.estimator.factors.motion_rows import MotionRows
-from odocal_ros.estimator.factors.point_rows import alike, PointRows, TAIL_SIGMAS
+from odocal_ros.estimator.factors.point_rows import PointRows, rows_per_effective, TAIL_SIGMAS
 from odocal_ros.estimator.factors.slow_error import SlowError
 from odocal_ros.estimator.factors.speed_steps import SpeedSteps
 from odocal_ros.estimator.level_steps import prior_information, update
@@ -229,5 +229,5 @@ def per_effective(problem: Problem, weighted: Weighted) -> dict[str, float]:
 
     Of other sensors, and of speed steps: at constant acceleration their errors repeat.
     """
-    return {name: alike(part) for name, part in weighted.parts.items()
+    return {name: rows_per_effective(part) for name, part in weighted.parts.items()
             if name in (*problem.outside, SpeedSteps.name) and isinstance(part, PointRows)}

@@ -47,9 +47,9 @@ class FittedTrack:
             at_mid = np.interp(middle, t_fix, np.arange(len(t_fix)))
             k = np.unique(np.round(at_mid).astype(int))
             run = np.abs(np.diff(at[k]))
-            way = np.abs(np.diff(z[k]))
+            chord = np.abs(np.diff(z[k]))
             if (run > 0).any():
-                self.K = float(np.median(way[run > 0] / run[run > 0]))
+                self.K = float(np.median(chord[run > 0] / run[run > 0]))
         self.bend = 0.0 if self.slope is None else self.slope
         self.chi_at = self.chi + self.bend * (t - t[0])
         self.place = self._place(t, t_fix, z)

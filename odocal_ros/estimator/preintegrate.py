@@ -215,9 +215,9 @@ class _Chunk:
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval."""
         T, ds = np.diff(self.t[self.key]), np.diff(travel(self.t))[:, None]
-        way = self.mean * ds[:, :, None]
-        walked, walk = self._running(way @ forward)
-        S_rest = walk[self.own] - walked - way @ forward
+        moved = self.mean * ds[:, :, None]
+        walked, walk = self._running(moved @ forward)
+        S_rest = walk[self.own] - walked - moved @ forward
         cross, ahead = skew(self.turn), skew(forward)
         own = ahead / 2 + (cross @ ahead + skew(np.cross(self.turn, forward))) / 6
         S_by = self._sum(_by(_cross(S_rest, self.mean) + self.R @ own * ds[:, :, None],
@@ -226,7 +226,7 @@ class _Chunk:
             self.key[:-1], self.key[1:], self.dv, self.dp, T[:, None, None])
         measured = self._sum(self.signals[:, 1:7]) / T[:, None]
         return Intervals(T, self.R_end, self.dv, self.dp, A, AA, F, FF, turned, dv_by, dp_by,
-                         self._sum(way), self._gyro(S_by), measured[:, :3], measured[:, 3:],
+                         self._sum(moved), self._gyro(S_by), measured[:, :3], measured[:, 3:],
                          np.maximum.reduceat(self.longest, self.key[:-1]))
 
     def points(self, t: Floats, j: Ints, interval: Ints, first: int) -> Points:

@@ -48,7 +48,7 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
     (the rest is held out); the stop mark by default.
     """
     t_stop = inputs.t_stop if t_stop is None else t_stop
-    if not inputs.has_accelerometer:         # the ground is taken as level, so heights have no say
+    if not inputs.has_accelerometer:         # level ground is assumed: heights are not used
         fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
     before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = min(0.0, float(before[-1][0])) if before else 0.0

@@ -171,9 +171,10 @@ def _largest(found: Joint, numbers: list[int]) -> str:
 
 def _sources(used: Floats, C: Floats) -> tuple[Source, ...]:
     """Return the budget: shared priors of the vehicle, and the effects of each leg."""
-    alike = np.abs(C[:WANTED] / np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))).max(axis=0)
+    sigmas = np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))
+    correlation = np.abs(C[:WANTED] / sigmas).max(axis=0)
     shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
-              if alike[i].max() > 1e-9]      # of a correlation: rounding
+              if correlation[i].max() > 1e-9]      # of a correlation: rounding
     apart = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
     return (*shared, Source('legs', root_of(C[:WANTED, :WANTED] - apart)),
             Source('model', np.diag(MODEL_FLOOR)))

@@ -83,8 +83,8 @@ def _reckoned(state: State, problem: Problem) -> State:
         on['C_nb'][n + k] = on['C_nb'][n + k - 1] @ sums.R[k]
     C = on['C_nb']
     arm_b = state.C_bv @ (leg.odometer_arm - leg.imu_arm)
-    way = np.einsum('kij,kj->ki', C[n - 1:-1], sums.S @ f) - (C[n:] - C[n - 1:-1]) @ arm_b
-    on['p_n'][n:] = on['p_n'][n - 1] + np.cumsum(way, axis=0)
+    steps = np.einsum('kij,kj->ki', C[n - 1:-1], sums.S @ f) - (C[n:] - C[n - 1:-1]) @ arm_b
+    on['p_n'][n:] = on['p_n'][n - 1] + np.cumsum(steps, axis=0)
     speed = (travel(t[n:] + SPEED_WINDOW) - travel(t[n:] - SPEED_WINDOW)) / (2 * SPEED_WINDOW)
     on['v_n'][n:] = (C[n:] @ f) * speed[:, None]
     gained = np.einsum('kij,kj->ki', C[n - 1:-1], sums.dv) + sums.T[:, None] * gravity_n(

@@ -74,7 +74,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     # speeds with the printed scale
     truer = scale / drive.scale if scale and drive.scale else 1.0
     found['drive'] = {
-        'way': path_length, 'chord': chord, 'fix_sigma': drive.sigma,
+        'distance': path_length, 'chord': chord, 'fix_sigma': drive.sigma,
         'rough_scale': scale, 'scale_unit': inputs.scale_unit,
         'slowest': drive.slowest * truer, 'fastest': drive.fastest * truer,
         'usable_fixes': len(drive.t_fix), 'travel': driven}
@@ -168,7 +168,7 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, 
         here = (drive.t_fix >= start) & (drive.t_fix <= stop)
         path_length, chord = path_and_chord(drive.t_fix[here], drive.fixes_n[here],
                                             inputs.least_motion)
-        return {'start': base + start, 'stop': base + stop, 'way': path_length,
+        return {'start': base + start, 'stop': base + stop, 'distance': path_length,
                 'chord': chord} | more
 
     marks = marked_legs(bag)
@@ -185,7 +185,7 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, 
     if marks or config.method != 'two_point' or not all(closed(leg) for leg in found['legs']):
         return []
     open_legs = [leg for leg in found['each_stop']
-                 if leg['way'] >= config.leg.min_distance and not closed(leg)]
+                 if leg['distance'] >= config.leg.min_distance and not closed(leg)]
     if len(open_legs) > 1 and len(open_legs) == len(found['each_stop']):
         return ['--leg each-stop']
     return [f'--leg {leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in found['straight']]
@@ -193,7 +193,7 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, 
 
 def closed(leg: dict[str, Any]) -> bool:
     """Return True if a leg ends where it starts: ratio of chord to path length."""
-    return bool(leg['chord'] < 0.2 * leg['way'])
+    return bool(leg['chord'] < 0.2 * leg['distance'])
 
 
 def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:
@@ -227,13 +227,13 @@ def lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> l
                           for leg in legs for _, stop in found['standstills']):
         out.append(Reason(Code.NO_STANDSTILL, 'no standstill before the drive: the first is '
                           f'at {found["standstills"][0][0]:.1f} s'))
-    short = [leg for leg in legs if leg['way'] < config.leg.min_distance]
+    short = [leg for leg in legs if leg['distance'] < config.leg.min_distance]
     loops = [leg for leg in legs if leg not in short and closed(leg)]
     limit = f'{config.leg.min_distance:g} m'
-    for some, code, said in ((short, Code.LEG_TOO_SHORT, 'has a path length of {way:.0f} m; the '
-                              f'limit is {limit}'), (
+    for some, code, said in ((short, Code.LEG_TOO_SHORT, 'has a path length of {distance:.0f} m; '
+                              f'the limit is {limit}'), (
             loops, Code.CHORD_TOO_SHORT, 'is a loop: {chord:.0f} m from start to end, less than a '
-            'fifth of the path length of {way:.0f} m')):
+            'fifth of the path length of {distance:.0f} m')):
         if some:
             many = '' if len(some) == 1 else f'{len(some)} of {len(legs)} legs; for example, '
             out.append(Reason(code, many + 'the leg {start:.1f}:{stop:.1f} s '.format(

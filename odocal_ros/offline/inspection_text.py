@@ -180,8 +180,8 @@ def _drive(found: dict[str, Any]) -> list[str]:
         return []
     lines = ['drive (seconds from the first message)']
     if drive['usable_fixes']:
-        lines.append(f'  path length {drive["way"]:.0f} m from the fixes, {drive["chord"]:.0f} m '
-                     f'from first to last; speed {drive["slowest"]:.1f} to '
+        lines.append(f'  path length {drive["distance"]:.0f} m from the fixes, '
+                     f'{drive["chord"]:.0f} m from first to last; speed {drive["slowest"]:.1f} to '
                      f'{drive["fastest"]:.1f} m/s')
     if drive['rough_scale'] and drive['scale_unit'] != '1':
         lines.append(f'  about {drive["rough_scale"]:.4g} {drive["scale_unit"]}')
@@ -207,13 +207,13 @@ def _legs(legs: list[dict[str, Any]]) -> list[str]:
         return [f'  leg {whose}: {_leg(leg)}' for leg in legs]
     return [f'  {len(legs)} legs {whose}, s and m', '    '
             f'{"leg":>3}{"from":>10}{"to":>10}{"length":>8}{"start to end":>14}'] + [
-        f'    {i:>3}{leg["start"]:>10.1f}{leg["stop"]:>10.1f}{leg["way"]:>8.0f}'
+        f'    {i:>3}{leg["start"]:>10.1f}{leg["stop"]:>10.1f}{leg["distance"]:>8.0f}'
         f'{leg["chord"]:>14.0f}' for i, leg in enumerate(legs, 1)]
 
 
 def _leg(leg: dict[str, Any]) -> str:
-    return (f'{leg["start"]:.1f} to {leg["stop"]:.1f} s, path length {leg["way"]:.0f} m, start '
-            f'to end {leg["chord"]:.0f} m')
+    return (f'{leg["start"]:.1f} to {leg["stop"]:.1f} s, path length {leg["distance"]:.0f} m, '
+            f'start to end {leg["chord"]:.0f} m')
 
 
 def _mounting(mounting: dict[str, Any]) -> list[str]:

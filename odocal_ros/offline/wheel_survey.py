@@ -77,7 +77,7 @@ class Values:
         scales = [m.scale if m.follows else None for m in matches] or [None] * len(keys)
         found = sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
         unit = 'rad' if self.msgtype == JOINTS else 'counts'
-        return [{'key': key, 'field': field, 'unit': unit, 'way': float(w), 'span': float(d),
+        return [{'key': key, 'field': field, 'unit': unit, 'distance': float(w), 'span': float(d),
                  'rolls': bool(r), 'side': side, 'scale': scale} for key, w, d, r, side, scale in
                 zip(keys, path_length, span, rolls, found, scales, strict=True)]
 
@@ -146,6 +146,6 @@ def in_words(facts: list[dict[str, Any]]) -> list[str]:
         side = f'; {f["side"]} side (matches gyro)' if f['side'] else ''
         grows = f', {f["scale"]:.3g} m/{f["unit"].rstrip("s")}' if f['scale'] else ''
         kind = f'a wheel{grows}{side}' if f['rolls'] else 'no wheel'
-        return (f'{f["key"]} travels {f["way"]:.5g} {f["unit"]} in total, range {f["span"]:.5g} '
-                f'{f["unit"]}: {kind}')
+        return (f'{f["key"]} travels {f["distance"]:.5g} {f["unit"]} in total, range '
+                f'{f["span"]:.5g} {f["unit"]}: {kind}')
     return [one(f) for f in facts]

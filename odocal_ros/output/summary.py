@@ -172,11 +172,11 @@ def _path_ratio(calibration: result.Calibration, scale: result.Estimate,
                 sent: result.Estimate) -> str:
     """Return the line that compares the path ratio of the legs with the factor it belongs to."""
     ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
-    way = sum(distance for _, distance in ratios)
+    path = sum(distance for _, distance in ratios)
     factor, word = (scale, 'scale factor') if sent.value is None else (sent, 'factor as sent')
-    if not factor.value or not way:
+    if not factor.value or not path:
         return ''
-    ratio = sum(r * distance for r, distance in ratios) / way
+    ratio = sum(r * distance for r, distance in ratios) / path
     unit = '' if scale.unit == '1' else f' {scale.unit}'
     plain = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'  # 4 digits
     return _line('  path ratio', f'{plain}{unit}   fixes / odometer, '

@@ -71,8 +71,8 @@ def _offsets(inputs: Inputs, placed: Placed) -> Iterator[tuple[str, float]]:
         return
     count, (force,) = bin_means(t, edges, inputs.f_b)
     force[count == 0] = inputs.usual_f_b
-    way = np.diff(travel.at(edges))
-    odometer = _late(_quick(np.gradient(way)[:, None], SLOW_FORCE), _quick(force, SLOW_FORCE))
+    moved = np.diff(travel.at(edges))
+    odometer = _late(_quick(np.gradient(moved)[:, None], SLOW_FORCE), _quick(force, SLOW_FORCE))
     if odometer:
         yield 'odometer', odometer
     place = np.stack([np.interp(edges, t_fix, axis) for axis in placed.fixes_n[:, :2].T], -1)

@@ -244,19 +244,19 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
         return []
     step = min(max(1, round(COMPARED_EVERY / float(np.median(np.diff(t))))), len(t) - 1)
     t, place, sigma, track = t[::step], place[::step], sigma[::step], track[::step]
-    dt, way, moved = np.diff(t), np.diff(track), np.diff(place)
+    dt, steps, moved = np.diff(t), np.diff(track), np.diff(place)
     whole = dt < MISSING_INTERVALS * np.median(dt)
-    moving = whole & (np.abs(way) > MOVED_LEAST)
+    moving = whole & (np.abs(steps) > MOVED_LEAST)
     # each with the last one in motion before it, since a jump may come at a standstill
-    before = np.maximum.accumulate(np.where(moving, np.arange(len(way)), -1))[:-1]
+    before = np.maximum.accumulate(np.where(moving, np.arange(len(steps)), -1))[:-1]
     rows = np.flatnonzero(whole[1:] & (before >= 0)) + 1
     before = before[rows - 1]
     driven = moving[rows] & (before == rows - 1)
     if driven.sum() <= SMOOTH_ROWS:
         return []
-    ratio, onward = moved[before] / way[before], np.gradient(way) / np.median(dt)
-    off = _without_delay(moved[rows] - ratio * way[rows],
-                         ratio * (onward[rows] - onward[before] * way[rows] / way[before]))
+    ratio, onward = moved[before] / steps[before], np.gradient(steps) / np.median(dt)
+    off = _without_delay(moved[rows] - ratio * steps[rows],
+                         ratio * (onward[rows] - onward[before] * steps[rows] / steps[before]))
     usual, at = float(np.median(off[driven])), rows[driven]
     smooth = off[driven] < max(SMOOTH_LIMIT * usual, min(FINE_LIMIT, FINE_SHARE * usual))
     spans: list[tuple[float, float, float]] = []

@@ -174,8 +174,8 @@ def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> In
     t = inputs.t_imu[::1 + len(inputs.t_imu) // TRACK_ROWS]
     heading = np.exp(1j * integral_at(t, inputs.t_imu, rate))
     x, y, _ = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
-    way = np.diff(inputs.travel.at(t), prepend=0.0) * placed.rough
-    track = np.cumsum(heading * way) + heading * (x + 1j * y)
+    steps = np.diff(inputs.travel.at(t), prepend=0.0) * placed.rough
+    track = np.cumsum(heading * steps) + heading * (x + 1j * y)
     sigma = np.sqrt(inputs.covariance_n[:, :2, :2].trace(axis1=1, axis2=2) / 2)
     lost, why = reckoned(inputs.t_fix, placed.fixes_n, sigma, np.interp(inputs.t_fix, t, track))
     found += why

@@ -13,7 +13,7 @@ from smoother_legs import leg_of, made, truth, VELOCITY_SIGMA as SIGMA, with_vel
 
 from odocal_ros.estimator import bound, smooth
 from odocal_ros.estimator.equations import Equations
-from odocal_ros.estimator.factors.point_rows import alike
+from odocal_ros.estimator.factors.point_rows import rows_per_effective
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import PRESSURE, YAW
@@ -95,9 +95,9 @@ def test_velocity_errors_that_stay_promise_no_more():
         return out
 
     method = fitted(with_velocity(drive, slow), config)
-    # neighbours are 0.95 alike: (1 + 0.95) / (1 - 0.95) = 39 count as one, less what the
-    # smoothing takes for motion
-    assert 10 < method.details['outside']['velocity']['alike'] < 80
+    # neighbours have a correlation of 0.95: (1 + 0.95) / (1 - 0.95) = 39 count as one, less those
+    # that the smoothing takes for motion
+    assert 10 < method.details['outside']['velocity']['rows_per_effective'] < 80
     assert off(method, drive, *BOTH) < 3.3
 
 
@@ -144,7 +144,7 @@ def test_white_errors_are_not_alike():
         r, weight = rng.standard_normal((1000, 3)), np.ones((1000, 3))
 
     # the largest of seven ratios of chi2 with 24 to 1000 degrees of freedom: 1 + 3 / sqrt(12)
-    assert alike(White) < 1.9
+    assert rows_per_effective(White) < 1.9
 
 
 @pytest.mark.parametrize('how', ['topic', 'fixed', 'imu'])

@@ -98,7 +98,7 @@ def test_comma(data_dir, capsys):
                            'YAW_NOT_SEPARABLE'}
     assert seen['standstills'] == []
     assert seen['drive']['slowest'] > 7.9          # README: 8 to 20 m/s, never at rest
-    assert seen['drive']['way'] == pytest.approx(1004, rel=0.01)
+    assert seen['drive']['distance'] == pytest.approx(1004, rel=0.01)
     assert seen['drive']['rough_scale'] == pytest.approx(0.010084, rel=0.005)
     # README: forward-right-down, pitch 3.75 deg on top
     assert seen['mounting']['rpy'] == pytest.approx([math.pi, 0, 0], abs=1e-9)
@@ -131,14 +131,14 @@ def test_husky(data_dir, capsys):
     (start, stop), = seen['standstills']           # README: one stop of 11 s
     assert stop - start == pytest.approx(11, abs=1)
     leg, = seen['legs']
-    assert leg['chord'] < 0.1 * leg['way']         # a closed loop
-    assert leg['way'] == pytest.approx(0.98 * 359, rel=0.02)
+    assert leg['chord'] < 0.1 * leg['distance']         # a closed loop
+    assert leg['distance'] == pytest.approx(0.98 * 359, rel=0.02)
     assert {'CHORD_TOO_SHORT', 'SPEED_TOO_LOW', 'IMU_AXES', 'YAW_NOT_SEPARABLE'} <= codes(seen)
     assert seen['drive']['gyro_over_course'] == pytest.approx(1, abs=0.2)
     # its counts, at the 0.980 mm of its README: 0.996 m in the fastest second
     assert seen['drive']['fastest'] == pytest.approx(0.996, rel=0.013)
     assert len(seen['straight']) == 2              # the long sides of 145 x 70 m
-    assert all(leg['chord'] > 0.9 * leg['way'] for leg in seen['straight'])
+    assert all(leg['chord'] > 0.9 * leg['distance'] for leg in seen['straight'])
     # the whole drive gives the smoother more than its straight sides: 1.7 % instead of 3.3 %
     assert '--leg' not in seen['command']
     alone = text[text.index('affects the two-point method only'):]
@@ -182,7 +182,7 @@ def test_a_good_drive_lacks_only_a_heading(tmp_path, capsys):
     assert (a, b, c, d) == pytest.approx((0, 12, 140, 150), abs=1.2)
     leg, = seen['legs']
     t, v, w, _ = planar()
-    assert leg['way'] == pytest.approx(v.sum() / RATE, rel=0.02)
+    assert leg['distance'] == pytest.approx(v.sum() / RATE, rel=0.02)
     assert leg['start'] == pytest.approx(12, abs=1.2)
     assert seen['drive']['rough_scale'] == pytest.approx(K, rel=0.02)
     assert seen['drive']['gyro_over_course'] == pytest.approx(1, abs=0.05)
@@ -392,7 +392,7 @@ def test_loops_short_drives_and_odd_values(tmp_path, capsys):
     at = next(i for i, row in enumerate(rows) if i > 5 and row[0] == '/imu/data')
     rows[at] = ('/imu/data', rows[at][1], make.imu(rows[at][1], w=(math.nan, 0, 0)))
     seen, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
-    assert 'LEG_TOO_SHORT' not in codes(seen) or seen['legs'][0]['way'] < 100
+    assert 'LEG_TOO_SHORT' not in codes(seen) or seen['legs'][0]['distance'] < 100
     assert topic(seen, '/imu/data')['imu']['not_finite'] == 1
     nan = [('/speed', T0 + i, make.real(math.nan)) for i in range(5)]
     seen, text = inspect(ros_bags.write(tmp_path / 'nan', nan), capsys)

@@ -149,6 +149,6 @@ def repeats(rows: Floats) -> float:
     power = np.fft.irfft(spectrum.sum(axis=0), 2 * k)[:k]
     if not power[0] > 0:
         return 1.0
-    alike = power / power[0]
-    end = np.argmax(alike < 0) if (alike < 0).any() else k
-    return float(1 + 2 * alike[1:end].sum())
+    correlation = power / power[0]
+    end = np.argmax(correlation < 0) if (correlation < 0).any() else k
+    return float(1 + 2 * correlation[1:end].sum())

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.slip import acceleration, excess_way, PIN_STEPS, SPIN_GRID, SPIN_TURN
+from odocal_ros.calib.slip import acceleration, excess_path, PIN_STEPS, SPIN_GRID, SPIN_TURN
 from odocal_ros.calib.wheels.wheel_slips import (
     NO_SLIPS,
     SLIP_GRID,
@@ -106,14 +106,14 @@ def _level(two: Pair, apart: Floats, quantum_m: float) -> Floats:
 
     Slopes by rounding at a steady speed, at most two counts over a window, are not removed.
     """
-    way, n = _way(two), 200     # steps of a slope, 20 s: longer than most slips
-    run, climb = way[n:] - way[:-n], apart[n:] - apart[:-n]
+    path, n = _path(two), 200     # steps of a slope, 20 s: longer than most slips
+    run, climb = path[n:] - path[:-n], apart[n:] - apart[:-n]
     if len(run) < n:
         return apart
     moves = run > max(np.median(run) / 2, 2 * two.quantum)
     slope = np.median(climb[moves] / run[moves]) if moves.any() else 0.0
     doubt = 2 * quantum_m * (two.quantum > 0) / max(np.median(run), 1e-9)
-    out: Floats = apart - np.sign(slope) * max(abs(slope) - doubt, 0.0) * way
+    out: Floats = apart - np.sign(slope) * max(abs(slope) - doubt, 0.0) * path
     return out
 
 
@@ -159,13 +159,13 @@ def _events(two: Pair, apart: Floats, quantum_m: float,
 
 def _ends(two: Pair, apart: Floats, event: Event) -> bool:
     """Return True if a slip ends: it is short, or its slope is absent before and after it."""
-    way = _way(two)
-    begin, end = np.interp(event[:2], two.t, way)
-    if end - begin < way[-1] / 16:      # half a step between the places tested by `changed`
+    path = _path(two)
+    begin, end = np.interp(event[:2], two.t, path)
+    if end - begin < path[-1] / 16:      # half a step between the places tested by `changed`
         return True
-    at = np.searchsorted(two.t, event[:2]).clip(0, len(way) - 1)
-    for a, b in ((0, at[0]), (at[1], len(way) - 1)):
-        would, does = _slope(two, event) * (way[b] - way[a]), apart[b] - apart[a]
+    at = np.searchsorted(two.t, event[:2]).clip(0, len(path) - 1)
+    for a, b in ((0, at[0]), (at[1], len(path) - 1)):
+        would, does = _slope(two, event) * (path[b] - path[a]), apart[b] - apart[a]
         if abs(would) < 0.1 or abs(does) > abs(would) / 2:      # m, observable
             return False
     return True
@@ -173,27 +173,27 @@ def _ends(two: Pair, apart: Floats, event: Event) -> bool:
 
 def _slope(two: Pair, event: Event) -> float:
     """Return the slope of a slip, size by path, between a tenth and nine tenths of its size."""
-    begin, end = np.interp(event[:2], two.t, _way(two))
+    begin, end = np.interp(event[:2], two.t, _path(two))
     out: float = 0.8 * event[2] / max(end - begin, 1e-9)
     return out
 
 
-def _way(two: Pair) -> Floats:
+def _path(two: Pair) -> Floats:
     return np.append(0.0, np.cumsum(np.abs(np.diff(two.left + two.right)) / 2))
 
 
 def _limit(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -> Floats:
     """Return the limit of jumps between two means that occur by chance, m."""
     n, ends = len(jump), span + MEAN_STEPS - 1
-    way = _way(two)
+    path = _path(two)
     turned = np.append(0.0, np.cumsum(np.abs(np.diff(two.turn))))
-    run = way[ends:][:n] - way[:n]
+    run = path[ends:][:n] - path[:n]
     spread = np.zeros(n)
     if (run > 0).any():
         usual = robust_sigma(jump[run > 0])
         spread = usual * np.maximum(1.0, run / np.median(run[run > 0]))
     turn = TURN_DOUBT * width * (turned[ends:][:n] - turned[:n])
-    counts = (way[MEAN_STEPS - 1:] - way[:len(way) - MEAN_STEPS + 1]) / max(two.quantum, 1e-9)
+    counts = (path[MEAN_STEPS - 1:] - path[:len(path) - MEAN_STEPS + 1]) / max(two.quantum, 1e-9)
     rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, MEAN_STEPS)
     # rounding is bounded: at most one count at both ends of both wheels
     rounding = np.minimum(WHOLE_DRIVE_SIGMAS**2 * (rounding[span:] + rounding[:-span]),
@@ -240,7 +240,7 @@ def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: T
     if len(grid) < 3 * span:
         return 0
     a = acceleration(grid, imu[0], imu[2], track, np.array([1.0, 0.0, 0.0]), latitude)
-    excess = excess_way(span, a, np.interp(grid, two.t, mean))
+    excess = excess_path(span, a, np.interp(grid, two.t, mean))
     turn = np.interp(grid, two.t, two.turn)[PIN_STEPS:-PIN_STEPS]
     straight = np.abs(turn[span:] - turn[:-span]) < SPIN_TURN
     at = int(np.searchsorted(grid, (begin + end) / 2)) - PIN_STEPS - span // 2

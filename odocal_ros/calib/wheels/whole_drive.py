@@ -89,11 +89,11 @@ def changed(two: Pair, signals: Floats, metres_per_unit: float,
     Reasons; the change of the ratio, at half the path, that sigmas must include, 0 for none.
 
     """
-    way = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
+    path = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
     best = (0.0, 0.0, 0.0, 0)
     for share in np.arange(1, 8) / 8:       # of the path
-        at = int(np.searchsorted(way, share * way[-1]))
-        late = np.where(np.arange(len(way)) > at, two.left - two.left[at], 0.0)
+        at = int(np.searchsorted(path, share * path[-1]))
+        late = np.where(np.arange(len(path)) > at, two.left - two.left[at], 0.0)
         x, covariance = fitted(two, np.column_stack([signals, late]), metres_per_unit)
         if x is None or covariance is None or x[0] <= 0:
             continue

@@ -92,13 +92,13 @@ class Axle:
         up: Floats = G * self._slope() * np.sign(speed[1:] + speed[:-1])
         return np.diff(np.abs(speed)) / np.diff(self.state.t) + up
 
-    def means_by_way(self, sums: Intervals) -> Floats:
+    def means_by_path(self, sums: Intervals) -> Floats:
         """Return the means of ``varies_with`` over a leg, weighted by distance: (4,)."""
         state = self.state
-        way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
+        path = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
-        share = way / max(way.sum(), 1e-9)
-        mean: Floats = share @ varies_with(way / sums.T, t - state.t[0], self.acceleration())
+        share = path / max(path.sum(), 1e-9)
+        mean: Floats = share @ varies_with(path / sums.T, t - state.t[0], self.acceleration())
         return mean
 
 

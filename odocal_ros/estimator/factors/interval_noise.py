@@ -64,7 +64,7 @@ class IntervalNoise:
         """Return the effects of unit noises in the intervals of a slice: (k, 18, c)."""
         motion = self.motion.take(rows)
         T, C = motion.T[:, 0], motion.C
-        force, way = skew(motion.dv / motion.T), skew(motion.way / motion.T)
+        force, displacement = skew(motion.dv / motion.T), skew(motion.displacement / motion.T)
         one = np.broadcast_to(np.eye(3), (len(T), 3, 3))
         out = np.zeros((len(T), ROWS, len(self.component)))
         for point, (x, weight) in enumerate(zip(GAUSS_X, GAUSS_W, strict=True)):
@@ -72,11 +72,11 @@ class IntervalNoise:
             gyro, accel, gyro_walk, accel_walk = (
                 out[:, :, first:first + 3] for first in 12 * point + 3 * np.arange(4))
             gyro[:, PHI], gyro[:, V] = -one, force * u
-            gyro[:, P], gyro[:, D] = force * (u**2 / 2), way * u
+            gyro[:, P], gyro[:, D] = force * (u**2 / 2), displacement * u
             accel[:, V], accel[:, P] = one, one * u
             gyro_walk[:, PHI], gyro_walk[:, V] = -C * u, force @ C * (u**2 / 2)
             gyro_walk[:, P] = force @ C * (u**3 / 6)
-            gyro_walk[:, D], gyro_walk[:, BG] = way @ C * (u**2 / 2), one
+            gyro_walk[:, D], gyro_walk[:, BG] = displacement @ C * (u**2 / 2), one
             accel_walk[:, V], accel_walk[:, P] = -C * u, -C * (u**2 / 2)
             accel_walk[:, BA] = one
             root = np.sqrt(weight * T)[:, None] * np.repeat(self.imu[rows], 3, axis=1)
@@ -121,7 +121,7 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     axes = np.swapaxes(motion.C_end @ motion.state.C_bv, 1, 2)      # rows: forward, left, up
     axes = axes + np.swapaxes(motion.C @ motion.state.C_bv, 1, 2)
     axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
-    speed = np.linalg.norm(motion.way, axis=1) / T
+    speed = np.linalg.norm(motion.displacement, axis=1) / T
     share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero if a wheel hardly turns
     hard, turning = hard_and_turning(motion)
     spread = np.ones((K, SPREAD)) if spread is None else spread
@@ -179,7 +179,7 @@ def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
     Above 0.5 m/s^2, where a wheel may slip, and TURNING_RATE, where it may slide.
     """
     T = motion.T[:, 0]
-    speed = np.einsum('ki,ki->k', motion.way, (motion.f_n + motion.f_n_end) / 2) \
+    speed = np.einsum('ki,ki->k', motion.displacement, (motion.f_n + motion.f_n_end) / 2) \
         / motion.state.scale / T
     padded = np.pad(speed, 1, mode='edge')
     hard = np.abs(padded[2:] - padded[:-2]) > 0.5 * 2 * T
@@ -198,11 +198,11 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     extra[:, PHI] = (rate * gap[:, None])**2
     extra[:, V] = (force * gap[:, None])**2
     extra[:, P] = (force * gap * T)[:, None]**2
-    t, way = motion.state.t, leg.travel
+    t, travel = motion.state.t, leg.travel
     stamp = stamp_of(t, motion.state.constants)
-    outside = (stamp[:-1] < way.t[0] - 0.1) | (stamp[1:] > way.t[-1] + 0.1)
+    outside = (stamp[:-1] < travel.t[0] - 0.1) | (stamp[1:] > travel.t[-1] + 0.1)
     extra[outside, D] = ABSENT_VARIANCE
-    extra[:, D] += _in_gaps(stamp, way, motion.state.scale)[:, None]
+    extra[:, D] += _in_gaps(stamp, travel, motion.state.scale)[:, None]
     for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
         k = np.searchsorted(t, at) - 1
         if 0 <= k < len(T) and sigma > 0:
@@ -211,7 +211,7 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     return extra
 
 
-def _in_gaps(stamp: Floats, way: Travel, scale: float) -> Floats:
+def _in_gaps(stamp: Floats, travel: Travel, scale: float) -> Floats:
     """
     Return variances of travel that is interpolated across gaps of the odometer: (K,) m^2.
 
@@ -219,9 +219,9 @@ def _in_gaps(stamp: Floats, way: Travel, scale: float) -> Floats:
     times its acceleration. An interval contains at most the travel of the whole gap.
     """
     variance = np.zeros(len(stamp) - 1)
-    for begin, end in gaps_in_rhythm(way.t):
+    for begin, end in gaps_in_rhythm(travel.t):
         inside = (stamp[1:] > begin) & (stamp[:-1] < end)
         T = np.minimum(np.diff(stamp)[inside], (end - begin) / 4)
-        moved = scale * abs(float(np.diff(way.at(np.array([begin, end])))[0]))
+        moved = scale * abs(float(np.diff(travel.at(np.array([begin, end])))[0]))
         variance[inside] += np.minimum(HIDDEN_FORCE * (end - begin) * T / 2, moved)**2
     return variance

@@ -53,9 +53,9 @@ ROWS = D.stop
 # judgement: intervals of a hill; faster pitching is a bump of the road, or squat
 HILL_INTERVALS = 5
 # attributes of Motion with a row for each interval
-EACH = ('T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid', 'pushed',
-        'nose_down', 'rate_n', 'level_left', 'swung', 'up_n', 'shorter', 'from_mean', 'varied',
-        'travelled', 'residual')
+EACH = ('T', 't_middle', 'C', 'C_end', 'dv', 'dp', 'displacement', 'rolled', 'faster', 'unsaid',
+        'pushed', 'nose_down', 'rate_n', 'level_left', 'swung', 'up_n', 'shorter', 'from_mean',
+        'varied', 'travelled', 'residual')
 
 
 def gravity_n(position_n: Floats, origin: Origin) -> Floats:
@@ -104,10 +104,10 @@ class Motion:
         straight = turn(half @ self.C, turn(intervals.S, along))
         self.rolled = straight * self.varied * self._inclined(straight)[:, None]
         self.faster = self._by_odometer_filter()
-        self.way = self.rolled + self.vertical_shift
+        self.displacement = self.rolled + self.vertical_shift
         self.unsaid = self._by_speed_offset(leg.travel.coarse)
         if self.unsaid is not None:
-            self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
+            self.displacement = self.displacement + self.unsaid * state.constants[SPEED_OFFSET]
         self.dv, self.dp = dv, dp
         g = gravity_n((p[:-1] + p[1:]) / 2, leg.origin)
         r_p = moved - (v[:-1] * T + dp - dp @ W.T * T / 3 + g * T**2 / 2
@@ -117,7 +117,7 @@ class Motion:
         r_phi = rotvec(self.C_end @ transpose(predicted))
         e = state.travel_error
         f_n, f_n_end = self.f_n, self.f_n_end
-        r_d = self.travelled - (self.way - f_n_end * e[1:, None] + f_n * e[:-1, None])
+        r_d = self.travelled - (self.displacement - f_n_end * e[1:, None] + f_n * e[:-1, None])
         self.residual = np.concatenate(
             [r_p, r_v, r_phi, np.diff(state.gyro_bias, axis=0),
              np.diff(state.accel_bias, axis=0), r_d], axis=1)
@@ -164,7 +164,7 @@ class Motion:
         self.t_middle = (state.t[1:] + state.t[:-1]) / 2
         self.from_mean = varies_with(
             speed, self.t_middle - state.t[0],
-            self.axle.acceleration()) - self.axle.means_by_way(self.sums)
+            self.axle.acceleration()) - self.axle.means_by_path(self.sums)
         self.swung = np.maximum(self.left @ self.swings @ self.left, 0.0) / 2
         self.varied = 1 + self.from_mean @ c[TYRES, None] + self.swung[:, None] * c[BY_PITCHING]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
@@ -242,7 +242,7 @@ class Motion:
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
         a[:, PHI, PHI] = -one
         a[:, BG, BG] = a[:, BA, BA] = -one
-        a[:, D, P], a[:, D, PHI] = -one, skew(C @ arm_b + self.way)
+        a[:, D, P], a[:, D, PHI] = -one, skew(C @ arm_b + self.displacement)
         by_begin, by_end = self._by_slope(C, arm_b, -1.0), self._by_slope(self.C_end, arm_b, 1.0)
         a[:, D, P] += by_begin[:, :, :3]
         a[:, D, PHI] += by_begin[:, :, 3:]
@@ -269,11 +269,11 @@ class Motion:
         c = np.zeros((len(self.T), ROWS, M))
         swing = self.C_end - C
         # the odometer does not count its vertical motion by pitch
-        way = self.way
+        displacement = self.displacement
         if self.fitted:     # without sway and vertical motion, which are road noise
             along = self.rolled / np.maximum(np.linalg.norm(self.rolled, axis=1), 1e-6)[:, None]
-            way = along * np.einsum('ki,ki->k', along, self.travelled)[:, None]
-        c[:, D, LN_K] = self.vertical_shift - way
+            displacement = along * np.einsum('ki,ki->k', along, self.travelled)[:, None]
+        c[:, D, LN_K] = self.vertical_shift - displacement
         by_scale = c[:, D, LN_K] / self.varied
         c[:, D, TYRES] = by_scale[:, :, None] * self.from_mean[:, None]
         c[:, D, BY_PITCHING] = by_scale * self.swung[:, None]

@@ -222,7 +222,7 @@ class PointRows(Factor):
         yield self.source, np.concatenate(parts)
 
 
-def alike(rows: PointRows) -> float:
+def rows_per_effective(rows: PointRows) -> float:
     """Return rows per independent row, by the scatter of means of adjacent rows."""
     r = rows.r / np.sqrt(rows.weight)
     r = (r - np.median(r, axis=0))[:, :2]       # horizontal: determine scale and yaw

@@ -44,8 +44,8 @@ def turned(leg: SmootherLeg, imu: ImuSteps) -> float:
     turn = imu.over_intervals(imu.turn) - (0.0 if bias is None else bias) * T[:, None]
     up = imu.signals[:, 3:].sum(axis=0)
     angle = np.abs(turn @ up) / np.linalg.norm(up)
-    way = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
-    return float(angle[(angle > TURNING_RATE * T) & (way > 0.2 * T)].sum())    # m/s: moving
+    path = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
+    return float(angle[(angle > TURNING_RATE * T) & (path > 0.2 * T)].sum())    # m/s: moving
 
 
 def least_slide(angle: float) -> float:

@@ -60,7 +60,7 @@ class SpeedSteps(PointRows):
         axle = Axle(problem, state)
         self.from_mean = varies_with(
             self.speed, state.t[self.k] - state.t[0] + points.tau, axle.acceleration()[self.k]
-        ) - axle.means_by_way(point.intervals)
+        ) - axle.means_by_path(point.intervals)
         self.varied = 1 + self.from_mean @ c[layout.TYRES]
         said = self.instants.value + self.instants.side * c[layout.SPEED_OFFSET]
         self.said = state.scale * self.varied * said

@@ -26,9 +26,10 @@ def exported(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMarginals,
     Biases at the start of the leg in b, m/s^2, with the ratio of their sigmas to the prior's.
     """
     motion = fit.weighted[MotionRows].motion
-    way, moving = np.linalg.norm(motion.way, axis=1), ~problem.still[:-1] & ~problem.still[1:]
+    path = np.linalg.norm(motion.displacement, axis=1)
+    moving = ~problem.still[:-1] & ~problem.still[1:]
     moving = moving if moving.any() else ~moving
-    speed = (way / motion.T[:, 0])[moving]
+    speed = (path / motion.T[:, 0])[moving]
     rate = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate))[moving]
     t, coarse = leg.travel.t, leg.travel.coarse
     within = (t >= leg.t_begin) & (t <= leg.t_stop)

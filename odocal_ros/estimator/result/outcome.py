@@ -238,8 +238,8 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
     arm = state.C_bv @ motion.arm_v
     step = max(1, len(state.t) // KEPT_ROWS)
     t_fix = leg.t_fix[problem.use]
-    alike, _ = correlation(t_fix, fixes.r[:, :2])
-    speed = np.linalg.norm(motion.way, axis=1) / motion.T[:, 0]
+    fix_correlation, _ = correlation(t_fix, fixes.r[:, :2])
+    speed = np.linalg.norm(motion.displacement, axis=1) / motion.T[:, 0]
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)
                     * motion.T[:, 0]).sum()
     return {
@@ -253,11 +253,11 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         **{layout.CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
            for i in SCALES},
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
-                      'fix_correlation_2s': alike,
+                      'fix_correlation_2s': fix_correlation,
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
                       'fixes': len(t_fix), 'normalised': normalised(fit.weighted),
                       'intervals_slipping': int((fit.spread[:, 0] > slip.SLIP_VARIANCE).sum())},
-        'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
+        'excitation': {'distance': float(np.linalg.norm(motion.displacement, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float(turned), 'in_turns': problem.turned,
                        'standing': float(problem.still.sum())},
@@ -270,6 +270,6 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
 def _outside(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, dict[str, Any]]:
     """Return details of the sensors besides IMU, odometer and fixes."""
     return {part.name: {'messages': len(sent.t),
-                        'alike': problem.per_effective.get(part.name, 1.0),
+                        'rows_per_effective': problem.per_effective.get(part.name, 1.0),
                         **part.details(sent, fit.state.constants, sigma)}
             for part in OUTSIDE if (sent := problem.outside.get(part.name)) is not None}

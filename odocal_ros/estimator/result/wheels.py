@@ -130,7 +130,7 @@ class _Common:
         self.leg, self.s = problem.leg, s
         self.fixed = np.array([not wheel.ahead for wheel in self.leg.wheels])
         self.mean = s[self.fixed].mean(axis=0)
-        self.way = np.diff(self.mean)
+        self.path = np.diff(self.mean)
         up = state.C_bv[:, 2]
         turn = rotvec(np.swapaxes(state.C_nb[:-1], 1, 2) @ state.C_nb[1:]) @ up
         self.turn = np.diff(np.append(0.0, np.cumsum(turn))[at])
@@ -178,7 +178,7 @@ class _Common:
         Unknown are a - 1, a y, own delay, common delay, drift of the turn; a x^2 if it steers.
         """
         y0 = self._left(i, width)
-        X = np.stack([self.way, -self.turn, self.faster, y0 * self.turning, y0 * self.T], -1)
+        X = np.stack([self.path, -self.turn, self.faster, y0 * self.turning, y0 * self.T], -1)
         taped = TRACK_WIDTH.taped_share * width / 2
         prior = np.array([1.0, taped or TRACK_WIDTH.any_sigma, OWN_DELAY,
                           max(delay, 1e-4), max(drift, 1e-9)])
@@ -200,7 +200,7 @@ class _Common:
         by_scale, by_gyro = [0.0, line.x[1]], -line.gain[rows] @ self.turn_errors * line.x[1]
         if i in self.steer:     # q is proportional to the squared turn over the path
             by_scale.append(2 * line.x[-1])
-            curvature = self.turn / np.where(self.way, self.way, np.inf)
+            curvature = self.turn / np.where(self.path, self.path, np.inf)
             by_gyro += line.gain[rows] @ (curvature[:, None] * self.turn_errors) * line.x[-1]
         return np.column_stack([by_scale, by_gyro])
 
