@@ -150,6 +150,8 @@ def _bags_in(name: str) -> list[str]:
 
 def _in_folder(fs: Any, path: str) -> list[str]:
     if not fs.isdir(path):
+        if not fs.exists(path):
+            raise BadUsage(f'{path}: no such file or folder')
         return [path]
     files = fs.find(path)
     folders = {str(PurePosixPath(f).parent) for f in files if PurePosixPath(f).name == META}

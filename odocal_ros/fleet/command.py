@@ -69,6 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Calibrate a fleet; return 0 without failures (with --accept: all pass), else 1."""
     from odocal_ros.fleet.engine import check_installed
+    from odocal_ros.output.figures import counted
     check_installed()
     from odocal_ros.fleet.bags import find_bags
     from odocal_ros.fleet.engine import dashboard, engine
@@ -87,7 +88,8 @@ def run(args: argparse.Namespace) -> int:
     writable(output)
     with engine(args.scheduler, args.workers, args.task_memory, args.tries) as client:
         if not args.quiet:
-            warn(f'odocal: {len(jobs)} bags of {len({b.vehicle for b in bags})} vehicles; '
+            warn(f'odocal: {counted(len(jobs), "bag")} of '
+                 f'{counted(len({b.vehicle for b in bags}), "vehicle")}; '
                  f'dashboard: {dashboard(client)}')
         rows = _computed(client, jobs, args)
         vehicles = write_outcome(client, jobs, rows, output, args)

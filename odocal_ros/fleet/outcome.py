@@ -19,6 +19,7 @@ from odocal_ros.fleet.bags import at_hand
 from odocal_ros.fleet.engine import results
 from odocal_ros.fleet.page import fleet_page, remarks
 from odocal_ros.fleet.tables import VEHICLES
+from odocal_ros.output.figures import counted
 from odocal_ros.outside.names import for_table
 from odocal_ros.outside.whole import locked, write_text
 from odocal_ros.reasons import Verdict
@@ -104,7 +105,7 @@ def said(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
     failed = sum(row['bags_failed'] for row in vehicles)
     bags = sum(row['bags'] for row in vehicles)
     lines = [', '.join(f'{n} {what}' for what, n in sorted(counts.items()))
-             + f'; {bags} bags, {failed} failed']
+             + f'; {counted(bags, "bag")}, {failed} failed']
     worth = [row for row in vehicles if second_stage.flagged(row)]
     lines += [f'  {row["vehicle"]}: {"; ".join(remarks(row))}' for row in worth[:most]]
     if len(worth) > most:

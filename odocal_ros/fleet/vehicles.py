@@ -177,7 +177,7 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
     return row | none | {
         'legs': 0, 'legs_good': 0, 'distance_km': 0.0, 'driven_h': 0.0, 'first': None,
         'last': None, 'unit': '', 'since': None, 'verdict': Verdict.REJECTED.value,
-        'decision': decision, 'why': f'none of {row["bags"]} bags could be calibrated',
+        'decision': decision, 'why': 'none of its bags could be calibrated',
         'remedy': LOOK_AT_BAGS, 'reasons': '', 'changes': '[]', 'odd_legs': '',
         'rejected_for': '', 'rejected_since': None,
         'drift_per_year': None, 'drift_per_year_sigma': None, 'drift_per_1000_km': None,

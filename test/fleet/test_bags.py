@@ -42,6 +42,8 @@ def test_bags_are_found_in_folders_and_by_globs_and_named_by_their_path(fleet):
     for wrong, what in ((r'/(\d+)/x', 'not match'), ('no group', 'group'), ('(', '--vehicle')):
         with pytest.raises(BadUsage, match=what):
             find_bags([str(fleet.folder)], wrong)
+    with pytest.raises(BadUsage, match='/nothing: no such file or folder'):
+        find_bags([str(fleet.folder), f'{fleet.folder}/nothing'], None)
 
 
 @pytest.mark.parametrize(('text', 'what'), [
