@@ -173,9 +173,9 @@ class Code(Enum):
                                        'odometer. The limit is odometer.max_scale_deviation.')
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
                                      'source.')
-    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, use better fixes (RTK, longer stops '
-                                      'at both marks), or combine more legs. The limit is '
-                                      'verdict.max_scale_sigma.')
+    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, use more accurate positions (such '
+                                      'as RTK), stand longer at both marks, or combine more '
+                                      'legs. The limit is verdict.max_scale_sigma.')
     YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, provide a better '
                                     'heading, or combine legs. The limit is '
                                     'verdict.max_yaw_sigma.')

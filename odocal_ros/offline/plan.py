@@ -18,7 +18,8 @@ NOISE = {'white': 0.0, 'correlated': 60.0}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add('--scenario', metavar='NAME', help='scenario: paper, straight, out_and_back or town')
+    add('--scenario', metavar='NAME', help='scenario of odocal simulate, such as town; '
+        'a robot indoors: --indoor')
     add('--duration', type=float, metavar='S', help='duration of the scenario, s')
     add('--gpx', metavar='FILE', help='GPX track (needs --speed if it has no times)')
     add('--bag', metavar='BAG', help='recorded bag, with its own fix accuracy and rate')

@@ -64,7 +64,7 @@ def _head(before: Plan, sigmas: Sigmas) -> list[str]:
     lines = [f'{length(two_point.distance)} in {time_span(two_point.duration)}, {stands[0]} at '
              f'the start mark, {stands[1]} at the end mark; marks {length(two_point.chord)} apart',
              f'IMU grade {sigmas.config.imu.grade}, heading from {a.heading_source} '
-             f'({math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:g} m at '
+             f'({math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:.3g} m at '
              f'{sigmas.fix_rate:.3g} Hz, {noise}']
     if 'smoother' in before.methods:
         slip = 1000 * sigmas.slip
@@ -98,7 +98,7 @@ def _shown(parameter: str, sigma: float | None) -> str:
         if sigma >= 0.01:
             return share(sigma)
         return f'{sigma * 1e6:.3g} ppm' if sigma < 1e-3 else f'{sigma * 1e6:.0f} ppm'
-    return f'{math.degrees(sigma):.3g} deg'
+    return f'{math.degrees(sigma):#.3g} deg'
 
 
 def _budgets(before: Plan) -> list[str]:

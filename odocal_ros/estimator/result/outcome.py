@@ -211,7 +211,7 @@ def _undetermined(sigma: Floats, usual: float, doubt: float, config: Config, yaw
         cause = 'see CHANGE_IN_LEG' if layout.CONSTANTS[layout.YAW] in moved else (
             'too little acceleration, or too few turns')
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
-                              f'{np.rad2deg(sigma[layout.YAW]):.1f} deg{wanted}. '
+                              f'{np.rad2deg(sigma[layout.YAW]):.2f} deg{wanted}. '
                               f'Likely cause: {cause}'))
     elif off > np.deg2rad(135.0):       # more than any mounting: reversed
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
@@ -223,7 +223,7 @@ def _undetermined(sigma: Floats, usual: float, doubt: float, config: Config, yaw
                               f'the limit is {np.rad2deg(FAR_YAW):.0f} deg'))
     if sigma[layout.PITCH] > limit:
         reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
-                              f'{np.rad2deg(sigma[layout.PITCH]):.1f} deg{wanted}',
+                              f'{np.rad2deg(sigma[layout.PITCH]):.2f} deg{wanted}',
                               'See CHANGE_IN_LEG.' if layout.CONSTANTS[layout.PITCH] in moved else
                               'Drive longer, with stops and starts. Accurate ellipsoidal heights '
                               'also help.'))
