@@ -69,7 +69,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Calibrate a fleet; return 0 without failures (with --accept: all pass), else 1."""
     from odocal_ros.fleet.engine import check_installed
-    from odocal_ros.output.figures import counted
     check_installed()
     from odocal_ros.fleet.bags import find_bags
     from odocal_ros.fleet.engine import dashboard, engine
@@ -77,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.fleet.kpi import limits_of, write_kpi
     from odocal_ros.fleet.outcome import asked, exit_code, said, write_outcome
     from odocal_ros.offline.cli import OK, REJECTED
+    from odocal_ros.output.figures import counted
     if not args.task_timeout > 0:
         raise BadUsage(f'--task-timeout {args.task_timeout:g}: required: seconds above 0')
     output = Path(args.output)

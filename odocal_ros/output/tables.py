@@ -73,7 +73,7 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any
             unit = unit or calibration.estimates[name].unit
             found = _estimate(leg, calibration, name)
             row |= {f'{name} [{unit}]': found.value, f'{name}_sigma [{unit}]': found.sigma}
-    for name in ('before', 'after'):
+    for name in SIDES:
         check = getattr(leg, name)
         row |= {f'{name}_{part} [m]': None if check is None else getattr(check, part)
                 for part in ('rms', 'mean', 'max', 'end')}
@@ -228,10 +228,11 @@ def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str,
     for label, name in zip((before_label(legs), 'as calibrated'), SIDES, strict=True):
         check = overall([(getattr(leg, name), leg.fixes) for leg in legs])
         if check is not None:
+            share = check.percent_of_distance
             rows.append((label, [
                 *(length(getattr(x, name)) for x in pieces), length(check.rms),
                 length(check.max), length(check.mean), length(check.end),
-                f'{check.percent_of_distance:.3f} %']))
+                f'{share:.{3 if share < 100 else 0}f} %']))
     heads = [f'in {x.length:g} m' if x.length < 1000 else f'in {x.length / 1000:g} km'
              for x in pieces]
     return [*heads, 'rms', 'max', 'mean', 'at end', 'of path'], rows

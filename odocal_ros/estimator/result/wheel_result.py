@@ -113,11 +113,12 @@ def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, lis
         return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
                              f'{sigma:.2g} m; the limit is {limit:.2g} m. Likely cause: too few '
                              'turns')]
-    if given and abs(width - given) > levels.REMARK_SIGMAS * np.hypot(
-            TRACK_WIDTH.taped_share * given, sigma):
+    far = levels.REMARK_SIGMAS * float(np.hypot(TRACK_WIDTH.taped_share * given, sigma))
+    if given and abs(width - given) > far:
         return Estimate(width, sigma, 'm'), [Reason(
             Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.4f} ± '
-            f'{sigma:.4f} m; odometer.track_width is {given:.4g} m')]
+            f'{sigma:.4f} m; odometer.track_width is {given:.4g} m; the limit of the difference '
+            f'is {far:.2g} m')]
     return Estimate(width, sigma, 'm'), []
 
 
