@@ -17,13 +17,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Ints
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.mapped import blocks, room, stepping
 from odocal_ros.errors import OdocalError
-
-Floats = NDArray[np.float64]
 
 
 class NotPositive(OdocalError):

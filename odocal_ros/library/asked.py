@@ -174,7 +174,7 @@ def _edge(text: str, whole: str) -> tuple[int | None, bool]:
     except InvalidOperation:
         pass
     try:
-        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
+        moment = datetime.fromisoformat(text)
     except ValueError:
         raise BadUsage(f'--leg {whole}: {text!r} is neither seconds nor an ISO 8601 date; use A:B '
                        'for seconds, A/B for dates') from None

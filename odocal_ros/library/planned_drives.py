@@ -3,7 +3,7 @@
 
 """Planned drives from figures, a named scenario, a GPX track or a recorded bag."""
 
-from datetime import UTC
+from datetime import datetime, UTC
 import math
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, from_rates, marked, PlannedDrive
 from odocal_ros.nav.angles import arctan2
+from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.outside.limits import read_bytes
 from odocal_ros.settings.config import Config
 
@@ -29,9 +30,9 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     Turns are spread evenly over the section at full speed. A drive too short to reach ``speed``
     brakes from a lower one.
     """
-    for flag, value, least in (('--speed', speed, 0.0), ('--distance', distance, 0.0),
-                               ('--acceleration', acceleration, 0.0)):
-        if not (math.isfinite(value) and value > least):
+    for flag, value in (('--speed', speed), ('--distance', distance),
+                        ('--acceleration', acceleration)):
+        if not (math.isfinite(value) and value > 0):
             raise BadUsage(f'{flag} {value:g}: required: a number above 0')
     if not (math.isfinite(standstill) and standstill >= 0):
         raise BadUsage(f'--standstill {standstill:g}: required: 0 s or more')
@@ -80,7 +81,6 @@ def from_gpx(path: Path, speed: float | None = None) -> PlannedDrive:
     speed is given.
     """
     t, geodetic = _gpx_points(path)
-    from odocal_ros.nav.dead_reckoning import Origin
     position_n = Origin(*geodetic[0]).to_n(geodetic)
     if t is None:
         if speed is None:
@@ -92,7 +92,7 @@ def from_gpx(path: Path, speed: float | None = None) -> PlannedDrive:
 
 def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
     """Return times since the first point, s (None: none given), and (n, 3) geodetic, rad, m."""
-    import xml.etree.ElementTree as ElementTree
+    from xml.etree import ElementTree
     try:
         root = ElementTree.fromstring(read_bytes(Path(path), LONGEST_TRACK))
     except OSError as error:
@@ -133,10 +133,9 @@ def _child(point: Any, name: str) -> str | None:
 
 def _seconds(text: str | None) -> float | None:
     """Return seconds since 1970 of an ISO 8601 date, None without one."""
-    from datetime import datetime
     if text is None:
         return None
-    moment = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
+    moment = datetime.fromisoformat(text.strip())
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 

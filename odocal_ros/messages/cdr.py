@@ -211,8 +211,8 @@ def frame_of(msgtype: str, raw: bytes) -> str | None:
     """Return the frame_id of one message; None if it has no layout with a header."""
     if SCHEMAS.get(msgtype, ())[:3] != HEADER or layout_of(msgtype, raw) is None:
         return None
-    at, length = FRAME_AT, int.from_bytes(raw[FRAME_AT - 4:FRAME_AT], 'little')
-    return raw[at:at + max(length - 1, 0)].decode()
+    length = int.from_bytes(raw[FRAME_AT - 4:FRAME_AT], 'little')
+    return raw[FRAME_AT:FRAME_AT + max(length - 1, 0)].decode()
 
 
 class _Walk:

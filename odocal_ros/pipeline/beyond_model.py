@@ -56,7 +56,7 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
                  *judged))
 
 
-def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+def with_wheel_change(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """
     Return a method's result with the change of one wheel, if any, in its sigmas.
 
@@ -72,7 +72,7 @@ def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
                             | dict.fromkeys(wheel_factors(method.estimates), own))
 
 
-def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+def with_hills(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """Return a result; without an accelerometer with the error of hills and without pitch."""
     if prepared.inputs.has_accelerometer:
         return method
@@ -102,7 +102,7 @@ def half_step(inputs: Inputs) -> float:
     return coarse.truncation / mean if mean else 0.0
 
 
-def held_steps(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+def with_truncation(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """Return a method's result, with truncation in its sigmas if the method integrates speeds."""
     size = half_step(prepared.inputs)
     if method.name != 'two_point' or not size:

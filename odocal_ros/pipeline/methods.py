@@ -20,7 +20,12 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
-from odocal_ros.pipeline.beyond_model import delay_notes, held, held_steps, upright
+from odocal_ros.pipeline.beyond_model import (
+    delay_notes,
+    with_hills,
+    with_truncation,
+    with_wheel_change,
+)
 from odocal_ros.pipeline.prepare import checked_with_scale
 from odocal_ros.pipeline.prepared import MethodRun, Passed, PreparedLeg, Stage
 from odocal_ros.pipeline.tracks import check_of, tracks
@@ -66,7 +71,7 @@ def run_methods(names: Iterable[str], prepared: PreparedLeg,
         passed = begun(name)
         let_go()
         runs[name] = _guarded(name, prepared, partial(METHODS[name], prepared, passed))
-    return {name: _guarded(name, prepared, partial(_doubted, run, prepared))
+    return {name: _guarded(name, prepared, partial(_with_errors, run, prepared))
             for name, run in runs.items()}
 
 
@@ -91,9 +96,11 @@ def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
     return [*found, *(odometer or ()), *notes]
 
 
-def _doubted(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
+def _with_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
     """Return a method's run with the errors beyond its own model."""
-    result = upright(held_steps(held(run.result, prepared), prepared), prepared)
+    result = run.result
+    for add in (with_wheel_change, with_truncation, with_hills):
+        result = add(result, prepared)
     about = (*prepared.about_alignment, *prepared.of_ends) if result.name == 'two_point' else ()
     return run._replace(result=replace(result, reasons=(*about, *result.reasons)))
 

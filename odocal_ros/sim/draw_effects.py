@@ -72,8 +72,8 @@ def grade(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Set ``imu.grade`` to the true one, or one better or worse (at most navigation, consumer)."""
     names = list(GRADES)
     stated = names.index(vehicle.grade) + int(rng.integers(-1, 2))
-    told_grade = names[max(0, min(stated, len(names) - 1))]
-    return {}, {} if told_grade == vehicle.grade else {'told_grade': told_grade}
+    configured_grade = names[max(0, min(stated, len(names) - 1))]
+    return {}, {} if configured_grade == vehicle.grade else {'configured_grade': configured_grade}
 
 
 def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:

@@ -17,7 +17,7 @@ from odocal_ros.settings.grades import GRADES
 Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row
 NONE3, NONE9 = (0.0,) * 3, (0.0,) * 9    # definition
-WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
+WORDS = {'speed_rounding': ('floor', 'round'), 'configured_grade': tuple(GRADES)}
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_step',
           'accel_step', 'gyro_slope', 'accel_slope', 'warm_rise', 'rectification', 'speed_law',
           'warming', 'imu_arm_error', 'odometer_arm_error', 'antenna_arm_error',
@@ -108,7 +108,7 @@ class Real:
     fix_jitter: float = 0.0          # s, 1 sigma, on top of fix_delay
     fix_clock_rate: float = 0.0      # relative rate error of its clock to that of the IMU
     stated_factor: float = 1.0       # stated sigma over true sigma
-    told_grade: str | None = None    # configured imu.grade; None: the true one
+    configured_grade: str | None = None    # configured imu.grade; None: the true one
 
     def __post_init__(self) -> None:
         for field in fields(self):

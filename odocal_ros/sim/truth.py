@@ -91,7 +91,7 @@ def _plain(value: Any) -> Any:
     return [_plain(v) for v in value] if isinstance(value, tuple) else value
 
 
-def _told_arm(options: SimOptions, name: str) -> list[float]:
+def _configured_arm(options: SimOptions, name: str) -> list[float]:
     """Return a lever arm as configured: the true one plus the measurement error."""
     true, error = getattr(options, f'{name}_lever_arm'), getattr(options.real, f'{name}_arm_error')
     return [float(x + e) for x, e in zip(true, error, strict=True)]
@@ -105,9 +105,9 @@ def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict[str
     of this sigma.
     """
     options = drive.options
-    grade = options.real.told_grade or options.imu_grade
+    grade = options.real.configured_grade or options.imu_grade
     odometer: dict[str, Any] = {'nominal_scale': float(options.nominal_scale),
-                      'lever_arm': _told_arm(options, 'odometer')}
+                      'lever_arm': _configured_arm(options, 'odometer')}
     if options.drive != DIFFERENTIAL:
         odometer['drive'] = options.drive
     if options.wheel_count > len(SIDES):
@@ -119,8 +119,8 @@ def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict[str
         'odometer': odometer,
         'imu': {'grade': STANDS_FOR_PERFECT if grade == 'perfect' else grade,
                 'mounting_rpy': [float(x) for x in options.mounting_rpy],
-                'lever_arm': _told_arm(options, 'imu')},
-        'gnss': {'lever_arm': _told_arm(options, 'antenna')},
+                'lever_arm': _configured_arm(options, 'imu')},
+        'gnss': {'lever_arm': _configured_arm(options, 'antenna')},
     }
     if known_heading_sigma is not None:
         error = known_heading_sigma * stream(options.seed, 'known heading').standard_normal()

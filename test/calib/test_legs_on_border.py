@@ -18,7 +18,7 @@ from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS
 from odocal_ros.estimator import several, smooth
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.several import combine_legs
-from odocal_ros.pipeline.beyond_model import held
+from odocal_ros.pipeline.beyond_model import with_wheel_change
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import with_settings
@@ -352,7 +352,7 @@ def test_a_wheel_that_changes_on_the_way_is_in_the_border_too(legs):
     _, config, results = legs
     run = SimpleNamespace(distance=1000.0, nominal=0.0, config=config,
                           wheel_slips=replace(NO_SLIPS, change=8e-4))
-    loose = held(results[0], run)
+    loose = with_wheel_change(results[0], run)
     scale = loose.estimates[SCALE]
     assert scale.sigma / scale.value > 2e-4
     variance = joint([loose.border], []).covariance[0, 0] + MODEL_FLOOR[0]**2

@@ -73,7 +73,7 @@ def test_arms_left_at_zero_and_wrong_grades_are_what_the_operator_sets():
                                                       o.real.antenna_arm_error), 0)]
     assert len(zero) == pytest.approx(0.3 * 60, abs=5 * np.sqrt(60 * 0.21))
     # consumer cannot be too modest: a third of the draws says industrial
-    wrong = [o for o in vehicles if o.real.told_grade == 'industrial']
+    wrong = [o for o in vehicles if o.real.configured_grade == 'industrial']
     assert len(wrong) == pytest.approx(60 / 3, abs=5 * np.sqrt(60 * 2 / 9))
 
 

@@ -114,7 +114,7 @@ def test_late_stamps_move_no_true_mark():
     ({'gyro_matrix': (1, 2)}, 'required: 9 numbers'), ({'squat': (1, 2)}, 'required: one number'),
     ({'gyro_bias': 1.0}, 'required: 3 numbers'), ({'vibration': -1}, 'required: 0 or more'),
     ({'speed_rounding': 'up'}, 'required: one of floor, round'), ({'drops': 1.0}, 'below 1'),
-    ({'told_grade': 'best'}, 'required: one of consumer'),
+    ({'configured_grade': 'best'}, 'required: one of consumer'),
     ({'slow_errors': (1, 60)}, 'required: pairs'),
     ({'slow_errors': ((1, 0),)}, 'required: pairs'),
     ({'warm_time': 0.0}, 'required: above 0'), ({'squat': float('nan')}, 'required: finite'),
