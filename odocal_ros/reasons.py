@@ -214,7 +214,8 @@ class Code(Enum):
     SCALE_NOT_DETERMINED = REJECT, 'Drive farther, faster, or with better fixes.'
     YAW_NOT_DETERMINED = CAUTION, ('Drive with stops, starts and turns: the yaw is estimated '
                                    'from accelerations.')
-    PARAMETER_NOT_DETERMINED = NOTE, 'Drive with left and right turns, stops and starts.'
+    PARAMETER_NOT_DETERMINED = NOTE, ('No action needed if the configured values were measured. '
+                                      'Turns, stops and starts determine more of them.')
     MODEL_MISMATCH = CAUTION, ('The residuals are larger than the noise model predicts; '
                                'uncertainties were increased. Check slip, lever arms, delays, '
                                'sky view and the unit of heights.')

@@ -65,4 +65,4 @@ def assumed(problem: Problem, levels: Levels) -> list[Reason]:
                    f'{np.rad2deg(problem.turned):.0f} deg, too little to estimate sideslip '
                    f'(limit {np.rad2deg(2 * NO_TURN):.0f} deg): '
                    f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed, and the uncertainties of the '
-                   'mounting angles depend on it')]
+                   'mounting angles depend on it', 'Drive with left and right turns.')]
