@@ -55,7 +55,7 @@ class Rosbag1File(Recording):
     def _unreadable(self, error: Exception) -> BadBag:
         # an error of rosbags may contain the one that it is raised from, as a tuple
         why = ' '.join(str(error.__cause__ or error).split()).rstrip('.')[:200]
-        why = why or type(error).__name__
+        why = why if ' ' in why else 'damaged records'      # a key, or nothing
         return BadBag(f"{self.path}: cannot be read ({why}); try 'rosbag reindex' on it")
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:

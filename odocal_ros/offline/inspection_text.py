@@ -164,10 +164,10 @@ def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
         yield (f'recorded {abs(late):.3f} s {where} its header stamp '
                f'(spread {timing["header_to_bag_spread"]:.3f} s)')
     odd = [f'{timing[key]} {what}' for key, what in (
-        ('zero_stamps', 'have no stamp'), ('repeated_stamps', 'repeat the previous stamp'),
-        ('backward_steps', 'have an earlier stamp than the one before')) if timing[key]]
+        ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the previous stamp'),
+        ('backward_steps', 'with a stamp before the previous one')) if timing[key]]
     if odd:
-        yield f'warning: of {topic["count"]} messages {", ".join(odd)}'
+        yield f'warning: messages {", ".join(odd)} (of {topic["count"]})'
     if timing['gap_count']:
         longest = max(timing['gaps'], key=lambda gap: gap['length'])
         yield (f'warning: {counted(timing["gap_count"], "gap")}, the '
