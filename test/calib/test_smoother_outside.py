@@ -97,7 +97,7 @@ def test_velocity_errors_that_stay_promise_no_more():
     method = fitted(with_velocity(drive, slow), config)
     # neighbours have a correlation of 0.95: (1 + 0.95) / (1 - 0.95) = 39 count as one, less those
     # that the smoothing takes for motion
-    assert 10 < method.details['outside']['velocity']['rows_per_effective'] < 80
+    assert 10 < method.details['outside']['velocity']['alike'] < 80
     assert off(method, drive, *BOTH) < 3.3
 
 

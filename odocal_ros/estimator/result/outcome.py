@@ -270,6 +270,6 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
 def _outside(problem: Problem, fit: Fit, sigma: Floats) -> dict[str, dict[str, Any]]:
     """Return details of the sensors besides IMU, odometer and fixes."""
     return {part.name: {'messages': len(sent.t),
-                        'rows_per_effective': problem.per_effective.get(part.name, 1.0),
+                        'alike': problem.per_effective.get(part.name, 1.0),
                         **part.details(sent, fit.state.constants, sigma)}
             for part in OUTSIDE if (sent := problem.outside.get(part.name)) is not None}
