@@ -37,7 +37,8 @@ drive_pattern = partial(_run, 'drive_pattern', 'odocal_ros.live.drive_pattern')
 def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('node', nargs='?', default='/calibrator',
                         help='full name of the node (default: /calibrator)')
-    parser.add_argument('--once', action='store_true', help='print the first status and exit')
+    parser.add_argument('--once', action='store_true',
+                        help='wait for the first status, print it and exit')
 
 
 def run(args: Namespace) -> int:

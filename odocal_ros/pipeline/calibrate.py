@@ -132,7 +132,8 @@ def missing_data(leg: Leg, inputs: Inputs) -> list[Reason]:
     """Return the reasons for data that every method needs and that a leg lacks."""
     missing = []
     if leg.stop_ns <= leg.start_ns:
-        missing.append(Reason(Code.LEG_TOO_SHORT, 'the stop mark is not after the start mark'))
+        missing.append(Reason(Code.LEG_TOO_SHORT, 'the stop mark is not after the start mark',
+                              'Set the start mark first, then the stop mark.'))
     for n, least, code, what in (
             (len(inputs.t_imu), 4, Code.NO_IMU, 'IMU'),
             (len(inputs.travel.t), 2, Code.NO_ODOMETER, 'odometer')):
