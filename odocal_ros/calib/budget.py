@@ -29,9 +29,10 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import A
 from odocal_ros.nav.rotations import matrix_from_quat, quat_conjugate, quat_multiply, skew
 
-# m, 1 sigma of the height of fixes without one, which are set on the ellipsoid. Physical: roads
-# are up to 2 km above it, most below 500 m; its effect on the scale is 80 ppm
-HEIGHT_UNKNOWN = 500.0
+# m, 1 sigma of the height of fixes without one, which are set on the ellipsoid. Physical: 6.4 % of
+# people live above 1500 m, 1.0 % above 2500 m (Tremblay and Ainslie, PNAS 118, 2021): beyond 1.9
+# and 3.1 sigma. Its effect on the scale is 125 ppm
+HEIGHT_UNKNOWN = 800.0
 PARAMETERS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
 

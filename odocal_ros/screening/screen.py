@@ -17,7 +17,7 @@ from odocal_ros.data.inputs import INPUTS, OUTSIDE
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_row, median
-from odocal_ros.data.samples import FixSamples, ImuSamples, VelocitySamples
+from odocal_ros.data.samples import FixSamples, ImuSamples, LOCAL, VelocitySamples
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
@@ -121,7 +121,7 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
     found += why
     found += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
     t_fix = rows.t_fix[use]
-    geodetic = np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
+    geodetic = np.stack([fix.latitude, fix.longitude, _heights(fix)], -1)[use]
     rounding, rounded = rounding_of(geodetic, covariance[use])
     covariance = covariance[use] + rounding[:, :, None] * np.eye(3)
     found += rounded
@@ -133,6 +133,12 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
             'rounding_n': rounding, 'outside': outside,
             'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}
+
+
+def _heights(fix: FixSamples) -> Floats:
+    """Return the heights of fixes, (n,) m: NaN if all are exactly 0, so that there are none."""
+    none = not fix.height.any() and not (fix.status == LOCAL).any()
+    return np.full(len(fix.height), np.nan) if none else fix.height
 
 
 def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:

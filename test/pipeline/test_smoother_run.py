@@ -60,6 +60,26 @@ def test_fixes_without_altitude_give_all_three(made):
     assert max(found[name].sigma for name in ANGLES) < np.deg2rad(0.25)
 
 
+@pytest.mark.parametrize('height', [np.nan, 0.0])
+def test_unknown_heights_leave_the_size_of_the_earth_below_uncertain(height):
+    made = drive(**TOWN, height=1600.0)
+    leg = made.leg()
+    none = replace(leg, fix=replace(leg.fix, height=np.full(len(leg.fix.height), height)))
+    result = calibrate(none, settings(made, **ASKED)).methods['smoother']
+    # on the ellipsoid below a road of 1600 m, distances are 1600 m / 6378 km shorter
+    assert off(result.estimates, made, 'scale_factor', *ANGLES) < SIGMAS
+    assert {s.name: s.effects for s in result.sources}['height'][0, 0] > 1e-4
+
+
+def test_fixes_without_altitude_at_the_start_are_at_the_altitude_of_the_others():
+    made = drive(**TOWN, height=1600.0)
+    leg = made.leg()
+    height = np.where(np.arange(len(leg.fix.height)) < 300, np.nan, leg.fix.height)
+    result = calibrate(replace(leg, fix=replace(leg.fix, height=height)), settings(made, **ASKED))
+    assert result.origin[2] == pytest.approx(1600.0, abs=60.0)
+    assert off(result.methods['smoother'].estimates, made, 'scale_factor', *ANGLES) < SIGMAS
+
+
 def test_heights_stated_far_worse_than_the_level_part_leave_a_result():
     rough = drive(**TOWN, fix_sigma=1.0)
     leg = rough.leg()

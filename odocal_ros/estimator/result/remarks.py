@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from odocal_ros.calib.budget import HEIGHT_UNKNOWN
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals
@@ -23,6 +24,7 @@ from odocal_ros.estimator.result.filters import (
     lag_reasons,
     odometer_reasons,
 )
+from odocal_ros.nav.earth import A
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
@@ -115,10 +117,15 @@ def wheels_in_map(problem: Problem, c: Floats, sigma: Floats) -> float:
 def beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[tuple[int, str, float]]:
     """Return errors beside those of the fit: the index of a constant, a source and its sigma."""
     by_map = wheels_in_map(problem, fit.state.constants, sigma)
+    leg = problem.leg
+    by_height = 0.0 if leg.origin.local or not np.isnan(leg.fixes_n[:, 2]).all() \
+        else HEIGHT_UNKNOWN / A
     # which of the two values a later drive has is unknown
     moved = [(step.constant, 'change_of_mounting', abs(step.size)) for step in fit.steps
              if step.constant != layout.LN_K and step.certain]
-    return [(layout.LN_K, 'wheels_in_positions', by_map)] * bool(by_map) + moved
+    of_scale = [(layout.LN_K, name, own) for name, own in (
+        ('wheels_in_positions', by_map), ('height', by_height)) if own]
+    return of_scale + moved
 
 
 def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
