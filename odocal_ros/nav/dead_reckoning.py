@@ -151,7 +151,7 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float,
         return scale
     # third differences of white noise have 20 times its variance
     noise = robust_sigma(np.diff(p, 3, axis=0)) / np.sqrt(20)
-    short = section_ratio(s, s[:, None], p, max(SHORT_SECTION, 8 * sigma, 8 * noise))
+    short = section_ratio(s, s[:, None], p, max(SHORT_SECTION, 8 * noise))
     return short if short is not None and short > FOLDED * scale else scale
 
 
