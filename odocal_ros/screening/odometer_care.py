@@ -29,14 +29,16 @@ STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
                        found: list[Reason],
                        name: str = 'odometer') -> tuple[OdometerSamples, Floats]:
-    """Return rows without false counts, or with false increments interpolated."""
+    """Return rows without false or held counts, or with false increments interpolated."""
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)
         if false.any():
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
                                 'counts are frozen or isolated outliers, first at t = '
                                 f'{t[np.argmax(false)]:.2f} s; dropped'))
-        return take(samples, ~false), t[~false]
+        samples, t = take(samples, ~false), t[~false]
+        held = held_counts(samples.value, form.modulus)
+        return take(samples, ~held), t[~held]
     if form.quantity == 'increment':
         false = speed_glitches(t, samples.value.astype(float))
         if false.any():
@@ -87,6 +89,33 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
                 done = b
                 break
     return false
+
+
+def held_counts(value: Values, modulus: int) -> Bools:
+    """
+    Return a mask of counter rows that repeat a value until the next update.
+
+    A counter that is published faster than it is read repeats each value, and its travel is known
+    at the updates only. Rows of a standstill are kept at the mean interval of updates, counted
+    back from the next one.
+
+    value : (n,) raw.   Returns (n,) bool.
+    """
+    size = np.abs(counter_steps(value, modulus))
+    update = np.flatnonzero(size) + 1
+    apart = np.diff(update)
+    # an update of several counts after rows without one: judgement, fewer are rounding
+    fewest_counts = 3.0
+    if len(update) < FEWEST_STEPS or np.median(apart) < 2 or (
+            np.median(size[update - 1]) < fewest_counts * size[update - 1].min()):
+        return np.zeros(len(value), bool)
+    moving = apart < 2 * np.median(apart)
+    row = np.arange(len(value))
+    k = np.searchsorted(update, row)
+    interval = np.floor((np.append(update, row[-1])[k] - row) / np.mean(apart[moving]))
+    interval[np.r_[False, moving, False][k]] = 0.0
+    out: Bools = np.append(False, size == 0) & np.append(interval[1:] == interval[:-1], False)
+    return out
 
 
 def _continues(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
