@@ -12,6 +12,7 @@ import pytest
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.drive import not_moving
 from odocal_ros.calib.turning import turn_ratio
+from odocal_ros.data.leg import part_of
 from odocal_ros.data.samples import take
 from odocal_ros.estimator.fit import CONVERGENCE
 from odocal_ros.estimator.leg import drift_time, SmootherLeg
@@ -90,6 +91,17 @@ def test_heights_stated_far_worse_than_the_level_part_leave_a_result():
     scale, yaw = found['scale_factor'], found['yaw_mounting_angle']
     assert abs(scale.value / rough.truth.scale - 1) < SIGMAS * scale.sigma / scale.value
     assert abs(yaw.value - rough.truth.yaw) < SIGMAS * yaw.sigma
+
+
+def test_a_late_odometer_loses_no_travel_at_a_mark_in_motion():
+    made = drive(scenario='motorway', duration=300.0, imu_grade='industrial', fix_noise='rtk',
+                 odometer_delay=0.08)
+    stop = made.truth.start_ns + 200 * 10**9
+    leg = part_of(made.leg(), made.truth.start_ns, stop, None)
+    assert made.motion.speed(200.0) > 10.0      # 0.8 m in the delay
+    result = calibrate(leg, settings(made, **ASKED))
+    assert not {Code.WHEEL_SLIP, Code.TRAVEL_MISSING} & set(everything_said(result))
+    assert off(result.methods['smoother'], made, 'scale_factor', *ANGLES) < SIGMAS
 
 
 def test_a_start_within_a_gap_of_the_odometer_is_no_slip(made):
