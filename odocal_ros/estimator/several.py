@@ -66,6 +66,8 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     found = _joint(borders, steps, days == 0)
     at = [found.names.index(name) for name in CONSTANTS]
     C = floored(found.covariance[np.ix_(at, at)])
+    common = _common(legs)
+    C[:WANTED, :WANTED] += sum(s.effects @ s.effects.T for s in common)
     sigma = np.sqrt(np.diag(C))
     ratio = sigma / found.factor / found.sigma[at]
     scale = legs[-1].estimates['scale_factor']
@@ -81,7 +83,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
     if unsaid:
         why.append(not_observable(f'these {len(legs)} drives', unsaid))
-    sources = _sources(found.used[at] * found.factor, C)
+    sources = _sources(found.used[at] * found.factor, C, common)
     # by any leg with an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None
     said = [_changed(change, np.asarray(times_ns)[order], names) for change in changes]
@@ -169,12 +171,26 @@ def _largest(found: Joint, numbers: list[int]) -> str:
     return text if abs(z[j, i]) > REMARK_SIGMAS else f'no parameter alone explains it: {text}'
 
 
-def _sources(used: Floats, C: Floats) -> tuple[Source, ...]:
-    """Return the budget: shared priors of the vehicle, and the effects of each leg."""
+def _common(legs: Sequence[MethodResult]) -> list[Source]:
+    """
+    Return the errors beside those of the fits that are the same in all legs.
+
+    They do not average: the part that the combination has averaged is added again.
+    """
+    effects: dict[str, list[Floats]] = {}
+    for source in (s for leg in legs for s in leg.sources if s.shared and s.name not in SHARED):
+        effects.setdefault(source.name, []).append(source.effects)
+    return [Source(name, np.sqrt(1 - 1 / len(of)) * max(of, key=lambda e: float(np.abs(e).max())),
+                   True) for name, of in effects.items() if len(of) > 1]
+
+
+def _sources(used: Floats, C: Floats, common: Sequence[Source]) -> tuple[Source, ...]:
+    """Return the budget: shared errors of the vehicle, and the effects of each leg."""
     sigmas = np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))
     correlation = np.abs(C[:WANTED] / sigmas).max(axis=0)
     shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
               if correlation[i].max() > 1e-9]      # of a correlation: rounding
+    shared += common
     apart = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
     return (*shared, Source('legs', root_of(C[:WANTED, :WANTED] - apart)),
             Source('model', np.diag(MODEL_FLOOR)))

@@ -72,6 +72,21 @@ def test_unknown_heights_leave_the_size_of_the_earth_below_uncertain(height):
     assert {s.name: s.effects for s in result.sources}['height'][0, 0] > 1e-4
 
 
+def test_unknown_heights_of_several_legs_do_not_average():
+    legs = []
+    for seed in (4, 5, 6):
+        made = drive(**TOWN | {'seed': seed}, height=1600.0, start_ns=seed * 10**12,
+                     fix_noise='rtk')
+        leg = made.leg()
+        legs.append(calibrate(replace(leg, fix=replace(
+            leg.fix, height=np.full(len(leg.fix.height), np.nan))), settings(made, **ASKED)))
+    whole = combine(legs, settings(made, **ASKED))
+    found = whole.estimates['scale_factor']
+    assert found.sigma > 800.0 / 6378137.0 * made.truth.scale
+    assert off(whole.estimates, made, 'scale_factor') < SIGMAS
+    assert whole.methods['smoother'].details['budget'].get('height', {}).get('shared')
+
+
 def test_fixes_without_altitude_at_the_start_are_at_the_altitude_of_the_others():
     made = drive(**TOWN, height=1600.0)
     leg = made.leg()
