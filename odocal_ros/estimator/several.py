@@ -172,16 +172,12 @@ def _largest(found: Joint, numbers: list[int]) -> str:
 
 
 def _common(legs: Sequence[MethodResult]) -> list[Source]:
-    """
-    Return the errors beside those of the fits that are the same in all legs.
-
-    They do not average: the part that the combination has averaged is added again.
-    """
-    effects: dict[str, list[Floats]] = {}
+    """Return the errors beside those of the fits that are the same in all legs: the largest."""
+    of: dict[str, Source] = {}
     for source in (s for leg in legs for s in leg.sources if s.shared and s.name not in SHARED):
-        effects.setdefault(source.name, []).append(source.effects)
-    return [Source(name, np.sqrt(1 - 1 / len(of)) * max(of, key=lambda e: float(np.abs(e).max())),
-                   True) for name, of in effects.items() if len(of) > 1]
+        of[source.name] = max(source, of.get(source.name, source),
+                              key=lambda s: float(np.abs(s.effects).max()))
+    return list(of.values())
 
 
 def _sources(used: Floats, C: Floats, common: Sequence[Source]) -> tuple[Source, ...]:

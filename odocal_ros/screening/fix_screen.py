@@ -171,10 +171,9 @@ def origin_amid(t_fix: Floats, geodetic: Floats) -> Origin:
     near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:about_start])
     r_e = ecef_from_geodetic(geodetic[near, 0], geodetic[near, 1], 0.0)
     amid = near[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
-    latitude, longitude, height = geodetic[amid]
-    known = geodetic[~np.isnan(geodetic[:, 2]), 2]
-    usual = float(np.median(known)) if len(known) else 0.0
-    return Origin(float(latitude), float(longitude), float(np.nan_to_num(height, nan=usual)))
+    latitude, longitude, height = geodetic[amid].tolist()
+    known = geodetic[~np.isnan(geodetic[:, 2]), 2] if np.isnan(height) else [height]
+    return Origin(latitude, longitude, float(np.median(known)) if len(known) else 0.0)
 
 
 def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,

@@ -95,9 +95,10 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
                Source('model', np.diag(remarks.MODEL_FLOOR))]
     border = border_of(fit, configured(leg)).widened(widen)
     for i, name, own in beyond:
-        # heights are unknown on one road as on the next
-        sources.append(Source(name, own * np.eye(WANTED)[:, [i]], name == 'height'))
-        border = border.loosened({layout.CONSTANTS[i]: own})
+        shared = name == 'height'      # unknown on one road as on the next
+        sources.append(Source(name, own * np.eye(WANTED)[:, [i]], shared))
+        if not shared:
+            border = border.loosened({layout.CONSTANTS[i]: own})
     grade = problem.grade if leg.has_accelerometer else None
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
