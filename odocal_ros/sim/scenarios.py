@@ -3,7 +3,7 @@
 
 """Simulate a drive: a named route, its sensors, and the truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -201,8 +201,10 @@ def _truth(motion: Motion, options: SimOptions, imu: samples.ImuSamples) -> Trut
     start = int(np.searchsorted(t, _first_move(motion) + 1e-9, side='right')) - 1
     C_vb = matrix_from_rpy([options.roll, options.pitch, options.yaw])
     x_n = (attitude(motion.at(t[start:start + 1])) @ C_vb)[0, :, 0]
-    # a sum in steps of 0.02 s is the true scale of growing tyres
-    factor = leg_factor(motion.at(np.arange(0.0, motion.duration, 0.02)), options.real)
+    # a sum in steps of 0.02 s is the true scale of tyres that grow, or slip at each start
+    state = motion.at(np.arange(0.0, motion.duration, 0.02))
+    at_starts = sensors.slip(state, replace(options, slip_walk=0.0, slip_events=0.0))
+    factor = leg_factor(state, options.real, at_starts)
     scale = options.scale * factor
     yaw, pitch, yaw_housing, pitch_housing = _angles(options)
     return Truth(

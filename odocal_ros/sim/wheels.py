@@ -152,16 +152,17 @@ def tyre_slip(state: State, real: Real) -> Floats:
     return np.cumsum(slip_share(state, real) * np.diff(state.travel, prepend=state.travel[:1]))
 
 
-def leg_factor(state: State, real: Real) -> float:
+def leg_factor(state: State, real: Real, spun: Floats) -> float:
     """
     Return the true path divided by that of the count with the scale of a cold wheel.
 
-    state : between the marks of the leg. The mean is by travel in both directions.
+    state : between the marks of the leg. The mean is by travel in both directions.   spun :
+    accumulated slip at each start, m.
     """
-    if not (real.speed_law or real.warming or real.tyre_slip):
+    if not (real.speed_law or real.warming or real.tyre_slip or spun.any()):
         return 1.0
     path_length = np.diff(state.travel)
-    spun = np.diff(tyre_slip(state, real)) if real.tyre_slip else 0.0
+    spun = np.diff(spun + tyre_slip(state, real) if real.tyre_slip else spun)
     grown = growth(state, real) + np.zeros_like(state.t)
     counted = (path_length + spun) / (1 + (grown[1:] + grown[:-1]) / 2)
     return float(np.abs(path_length).sum() / np.abs(counted).sum())

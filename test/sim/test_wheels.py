@@ -174,7 +174,7 @@ def test_up_a_slope_tyres_slip_by_its_share_of_the_load():
 @pytest.mark.parametrize('odometer', ['counts', 'speed', 'angle'])
 def test_the_true_scale_is_metres_over_counts_between_the_marks(odometer):
     real = Real(speed_law=0.01, warming=0.01, warming_time=50.0, tyre_slip=1 / 30)
-    drive = simulate(SimOptions(**RUN, odometer=odometer, real=real))
+    drive = simulate(SimOptions(**RUN, odometer=odometer, real=real, start_slip=0.01))
     t, value = (drive.odometer.stamp_ns - drive.options.start_ns) * 1e-9, drive.odometer.value
     way = ((value[1:] + value[:-1]) / 2 * np.diff(t)).sum()
     counted = way if odometer == 'speed' else value[-1] - value[0]
