@@ -23,7 +23,6 @@ from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.start import standing
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.odometer import Travel
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of, imu_as_seen, turn_on_bias
@@ -55,7 +54,7 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
     t_begin = min(0.0, float(before[-1][0])) if before else 0.0
     return SmootherLeg(
         origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
-        w_b=inputs.w_b, f_b=inputs.f_b, travel=continued(inputs.travel), t_fix=inputs.t_fix,
+        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel.smoothed(), t_fix=inputs.t_fix,
         fixes_n=fixes_n, covariance_n=inputs.covariance_n, rounding_n=inputs.rounding_n,
         standstills=np.asarray(spans), rough_scale=float(rough_scale),
         nominal_scale=nominal_scale(config, inputs.scale_unit),
@@ -66,22 +65,7 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
         outside={part.name: sent for part in OUTSIDE
                  if (sent := part.prepared(inputs, config, origin)) is not None},
         has_accelerometer=inputs.has_accelerometer,
-        wheels=tuple(map(continued, inputs.travels)))
-
-
-def continued(travel: Travel) -> Travel:
-    """
-    Return travel with one more row, at the speed of the last ones.
-
-    At a mark in motion a late odometer has no row for the travel before the mark.
-    """
-    span, onward = 0.2, 0.3      # s, judgement: rows for the speed; the delay of an odometer
-    if len(travel.t) < 2:
-        return travel
-    end = travel.t[-1]
-    moved = travel.s[-1] - travel.at(np.array([end - span]))[0]
-    return replace(travel, t=np.append(travel.t, end + onward),
-                   s=np.append(travel.s, travel.s[-1] + moved * onward / span))
+        wheels=tuple(inputs.travels))
 
 
 def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:

@@ -18,6 +18,8 @@ from odocal_ros.reasons import Code, Reason
 
 # judgement: a step this many times the 95th percentile of the moving rate is not motion
 RESET_FACTOR = 5.0
+# s to each side of a row. Judgement: in which a vehicle accelerates evenly
+SMOOTHED = 0.2
 FEWEST_STEPS = 20     # judgement: least number of steps for a search for resets
 
 
@@ -45,6 +47,24 @@ class Travel:
     def at(self, t: Floats) -> Floats:
         """Return travel at times t, linear between rows, constant outside."""
         return np.interp(t, self.t, self.s)
+
+    def smoothed(self) -> 'Travel':
+        """
+        Return travel with the rounding of counts averaged, by parabolas over SMOOTHED.
+
+        The slope between two rounded rows is no speed: each step of the delay would give other
+        rounding errors, and a fit with few other errors would not converge. Rows beside gaps and
+        at the ends are kept.
+        """
+        step = float(np.median(np.diff(self.t))) if self.quantum and len(self.t) > 1 else np.inf
+        m = int(SMOOTHED / step)        # rows to each side
+        if m < 2 or len(self.t) <= 2 * m:
+            return self
+        weights = 3.0 * (3 * m**2 + 3 * m - 1 - 5 * np.arange(-m, m + 1)**2)
+        even = self.t[2 * m:] - self.t[:-2 * m] < 1.5 * 2 * m * step
+        t, s = (np.concatenate([x[:m], np.where(even, np.convolve(
+            x, weights / weights.sum(), 'valid'), x[m:-m]), x[-m:]]) for x in (self.t, self.s))
+        return replace(self, t=t, s=s) if (np.diff(t) > 0).all() else self
 
     def mirrored(self, spans: Floats) -> 'Travel':
         """Return the travel with the counts in spans, (m, 2) s, reversed."""

@@ -3,6 +3,8 @@
 
 """Odometer rows to travel: every counter width, both ways over the edge, resets, bursts."""
 
+from dataclasses import replace
+
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from numpy.testing import assert_allclose
@@ -204,3 +206,20 @@ def test_steps_too_small_for_a_speed_are_no_resets():
     t = np.arange(100) * 1e9
     step = np.full(99, 5e-324)
     assert not _resets(t, step, False).any()
+
+
+def test_rounding_of_a_counter_is_averaged_by_parabolas():
+    t = np.delete(np.arange(0, 60, 0.02), slice(1500, 1800))      # 30 to 36 s are missing
+    true = 5.3 * t + 0.4 * t**2
+    raw = Travel(t, np.round(true), 1.0)
+    smooth = raw.smoothed()
+    off = smooth.s - np.interp(smooth.t, t, true)
+    # value in the middle of a parabola through n values with independent errors
+    n = 21
+    share = np.sqrt(3 * (3 * n**2 - 7) / (4 * n * (n**2 - 4)))
+    far = np.abs(t - 33.0) > 3.0 + 0.4
+    # of 2600 values in groups of 21: 124 independent ones
+    assert off[far].std() * np.sqrt(12) < share * (1 + 4 / np.sqrt(2 * 124))
+    assert np.array_equal(smooth.s[1490:1510], raw.s[1490:1510])
+    for few in (replace(raw, t=50 * raw.t), replace(raw, quantum=0.0)):
+        assert few.smoothed() is few

@@ -188,7 +188,7 @@ def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
 
 
 def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
-    """Return variances of the motion within gaps: (K, 18)."""
+    """Return variances of the motion within gaps and beside the rows: (K, 18)."""
     sums, T = motion.sums, motion.T[:, 0]
     extra = np.zeros((len(T), ROWS))
     # s: motion within a longer step between IMU samples is unknown
@@ -200,7 +200,7 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     extra[:, P] = (force * gap * T)[:, None]**2
     t, travel = motion.state.t, leg.travel
     stamp = stamp_of(t, motion.state.constants)
-    outside = (stamp[:-1] < travel.t[0] - 0.1) | (stamp[1:] > travel.t[-1] + 0.1)
+    outside = (stamp[:-1] < travel.t[0]) | (stamp[1:] > travel.t[-1])
     extra[outside, D] = ABSENT_VARIANCE
     extra[:, D] += _in_gaps(stamp, travel, motion.state.scale)[:, None]
     for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
