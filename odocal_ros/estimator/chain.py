@@ -24,7 +24,11 @@ from odocal_ros.errors import OdocalError
 
 
 class NotPositive(OdocalError):
-    """The normal matrix is not positive definite: an unknown is not constrained."""
+    """The normal matrix is not positive definite; block : its first such block, -1: border."""
+
+    def __init__(self, text: str, block: int = -1) -> None:
+        super().__init__(text)
+        self.block = block
 
 
 class Normal:
@@ -267,7 +271,7 @@ def _eliminate(normal: Normal, corner: Floats) -> Floats:
     for k in stepping(range(N)):
         root, info = dpotrf(D, lower=1)
         if info:
-            raise NotPositive(f'the data do not constrain keyframe {k} of {N}')
+            raise NotPositive(f'the data do not determine block {k} of {N}', k)
         W = wide[k]
         X, _ = dpotrs(root, W, lower=1)
         roots[k] = root.diagonal()

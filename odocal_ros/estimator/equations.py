@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.chain import JointMarginals, Normal, Solved
+from odocal_ros.estimator.chain import JointMarginals, Normal, NotPositive, solve, Solved
 from odocal_ros.estimator.factors.factor import Factor, LinearisationPoint
 from odocal_ros.estimator.factors.fixes import Fixes
 from odocal_ros.estimator.factors.heading import HeadingRows
@@ -97,6 +97,16 @@ class Weighted:
         for part in self.parts.values():
             part.add(out)
         return out
+
+    def solved(self) -> Solved:
+        """Return the step; raises NotPositive: the data do not determine the unknowns."""
+        try:
+            return solve(self.normal())
+        except NotPositive as error:
+            if error.block < 0:
+                raise
+            raise NotPositive('the data do not determine the motion at t = '
+                              f'{self.state.t[error.block]:.1f} s') from None
 
     def after(self, solved: Solved) -> 'Weighted':
         """Apply the step to the residuals, to first order; return self."""

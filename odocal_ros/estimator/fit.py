@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.chain import JointMarginals, solve, Solved
+from odocal_ros.estimator.chain import JointMarginals, Solved
 from odocal_ros.estimator.changes import changes, Step
 from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.factors import factor
@@ -145,7 +145,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
         weighted = Equations(problem, state, priors, spread, fitted).at(levels)
         if fitted and not was_fitted:      # this step may take back all of the one before
             taken = np.zeros(M)
-        solved = damped(solve(weighted.normal()), taken)
+        solved = damped(weighted.solved(), taken)
         taken = solved.step_border
         sigma = np.sqrt(np.diag(solved.covariance))
         weight = np.where(sigma < flat, of_all, 0.0)

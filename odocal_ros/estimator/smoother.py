@@ -9,7 +9,7 @@ import numpy as np
 
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
-from odocal_ros.estimator.chain import NotPositive, solve
+from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.estimator.fit import Fit, fit, Trace
@@ -150,7 +150,7 @@ def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
     if imperfect is not None:
         problem.priors = with_imperfect(problem.priors, imperfect)
     equations = Equations(problem, truth, fitted=True)
-    return solve(equations.at(levels).normal()).covariance
+    return equations.at(levels).solved().covariance
 
 
 def keyframe_times(leg: SmootherLeg, config: Config) -> Floats:

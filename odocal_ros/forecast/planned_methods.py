@@ -9,7 +9,7 @@ import numpy as np
 
 from odocal_ros.calib.choice import choose, deciding, relevant_reasons
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.estimator.chain import NotPositive, solve
+from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.factor import SPREAD
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
@@ -51,7 +51,8 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     try:
         fit = fit_at(problem, made, levels)
     except (NotPositive, np.linalg.LinAlgError) as error:
-        return refused([Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}')],
+        return refused([Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}. '
+                               'Likely cause: too little data for the unknowns')],
                        '1')
     return outcome(made.leg, problem, fit, sigmas.config)
 
@@ -94,7 +95,7 @@ def fit_at(problem: Problem, made: Ideal, levels: Levels) -> Fit:
     state, priors = made.state, problem.priors
     weighted = Equations(problem, state, priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, SPREAD)), True, False, 0,
-               np.nan, weighted, solve(weighted.normal()), np.zeros((M, 0)))     # none estimated
+               np.nan, weighted, weighted.solved(), np.zeros((M, 0)))     # none estimated
 
 
 @dataclass(frozen=True, eq=False)

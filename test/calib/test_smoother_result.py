@@ -14,7 +14,8 @@ import pytest
 from smoother_legs import leg_of, made, truth
 
 from odocal_ros.calib.budget import total_covariance
-from odocal_ros.estimator import bound, smooth
+from odocal_ros.estimator import bound, keyframe_times, smooth
+from odocal_ros.estimator.equations import Weighted
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
@@ -218,6 +219,21 @@ def test_a_fit_that_makes_the_imu_what_no_imu_is_gives_nothing(monkeypatch):
     reason, = method.reasons
     assert reason.code is Code.NOT_CONVERGED
     assert 'accelerometer scale y -21 %' in reason.text
+
+
+def test_equations_without_a_solution_say_the_time(monkeypatch):
+    _, config, leg = made(duration=100.0)
+    normal = Weighted.normal
+
+    def undetermined(weighted):
+        out = normal(weighted)
+        out.diagonal[40] *= 1e-9
+        return out
+    monkeypatch.setattr(Weighted, 'normal', undetermined)
+    reason, = smooth(leg, config).reasons
+    assert reason.code is Code.NOT_CONVERGED
+    assert (f'do not determine the motion at t = {keyframe_times(leg, config)[40]:.1f} s. Likely '
+            'cause: ') in reason.text
 
 
 @pytest.mark.parametrize(('times', 'said'), [(30.0, False), (200.0, True)])
