@@ -196,7 +196,8 @@ def departing(**ratios):
 
 def test_the_wheel_that_departs_is_named():
     text = departing(fl=1.0, fr=0.98, rl=1.002, rr=1.001)
-    assert text.startswith('the factor of wheel fr is 2.10 % smaller than that of the others')
+    assert text.startswith('the factor of wheel fr is 2.10 % smaller than that of the others '
+                           '(limit 1 %). Likely cause: ')
     assert departing(fl=1.0, fr=0.995, rl=1.002, rr=1.001) == ''
     # two axles with wheels of their own: none departs
     assert departing(fl=1.03, fr=1.031, rl=1.0, rr=1.001) == ''

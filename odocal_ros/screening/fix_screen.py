@@ -210,11 +210,14 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
         return ()
     z = complex((V.conj() * D).sum() / power)
     sigma = float(np.sqrt(2 * np.median(covariance[:, 0, 0]) / power))
-    if abs(z - 1) < MOST_UNLIKE + REMARK_SIGMAS * sigma:
+    limit = MOST_UNLIKE + REMARK_SIGMAS * sigma
+    if abs(z - 1) < limit:
         return ()
     return (Reason(Code.VELOCITY_UNUSABLE, 'GNSS velocity contradicts the fixes and is not '
                    f'used: displacements between fixes are {abs(z):.2f} times those from the '
-                   f'velocity, rotated by {np.degrees(np.angle(z)):+.0f} deg'),)
+                   f'velocity, rotated by {np.degrees(np.angle(z)):+z.0f} deg: a difference of '
+                   f'{100 * abs(z - 1):.0f} % (limit {100 * limit:.0f} %). Likely cause: another '
+                   'unit, swapped axes, or vehicle axes'),)
 
 
 def reckoned(t_fix: Floats, fixes_n: Floats, sigma: Floats,

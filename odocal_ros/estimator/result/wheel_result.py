@@ -91,12 +91,13 @@ def _departing(wheels: Mapping[str, Wheel]) -> list[Reason]:
     off = {}
     for name, wheel in wheels.items():
         usual = float(np.median([w.ratio for other, w in wheels.items() if other != name]))
-        if abs(wheel.ratio / usual - 1) > max(DEPARTS, levels.FAULT_SIGMAS * wheel.ratio_sigma):
-            off[name] = wheel.ratio / usual - 1
+        limit = max(DEPARTS, levels.FAULT_SIGMAS * wheel.ratio_sigma)
+        if abs(wheel.ratio / usual - 1) > limit:
+            off[name] = wheel.ratio / usual - 1, limit
     return [Reason(Code.WHEEL_DEPARTS, f'the factor of wheel {name} is {100 * abs(x):.2f} % '
-                   f'{"larger" if x > 0 else "smaller"} than that of the others. Likely cause: '
-                   'tyre pressure, another tyre, or continuous slip')
-            for name, x in off.items()] if len(off) == 1 else []
+                   f'{"larger" if x > 0 else "smaller"} than that of the others (limit '
+                   f'{100 * limit:.2g} %). Likely cause: tyre pressure, another tyre, or '
+                   'continuous slip') for name, (x, limit) in off.items()] if len(off) == 1 else []
 
 
 def _track_width(left: Wheel, right: Wheel, given: float) -> tuple[Estimate, list[Reason]]:
