@@ -215,16 +215,27 @@ def frame_of(msgtype: str, raw: bytes) -> str | None:
     return raw[FRAME_AT:FRAME_AT + max(length - 1, 0)].decode()
 
 
+def damaged_field(msgtype: str, raw: bytes) -> str:
+    """Return the field in which a message ends or has an impossible length; '' if unknown."""
+    walk = _Walk(raw)
+    try:
+        walk.fields(SCHEMAS.get(msgtype, ()) if raw[:2] == b'\x00\x01' else (), '')
+    except (struct.error, ValueError):
+        return walk.path
+    return ''
+
+
 class _Walk:
     """Sequential scan of one message that stores the offsets of all fields."""
 
     def __init__(self, raw: bytes) -> None:
-        self.raw = raw
+        self.raw, self.path = raw, ''
         self.layout = Layout()
 
     def fields(self, schema: Sequence[str], prefix: str) -> None:
         for line in schema:
             kind, path = line.split()
+            self.path = prefix + path
             base, _, size = kind.partition('[')
             count = 1 if not size else self.length() if size == ']' else int(size[:-1])
             self.value(base, prefix + path, count, listed=bool(size))

@@ -9,6 +9,7 @@ others are read by ``deserialize``, with bitwise equal rows.
 """
 
 from collections.abc import Callable, Sequence
+import struct
 from typing import Any, Protocol
 
 import numpy as np
@@ -196,8 +197,12 @@ class Reader:
         except OdocalError:
             raise
         except Exception as error:   # rclpy and rosbags raise different errors
-            why = ' '.join(str(error).split())[:200]
-            self.trouble = f'cannot be deserialised as {self.msgtype}: {why}'
+            field = cdr.damaged_field(self.msgtype, raw)
+            why = f'too short or damaged from {field} on' if field else (
+                'too short or damaged' if isinstance(error, struct.error | ValueError | IndexError)
+                else ' '.join(str(error).split())[:200])
+            self.trouble = (f'a message of {len(raw)} bytes cannot be read as {self.msgtype}: '
+                            f'{why}')
             return None
 
     def _one(self, out: list[NDArray[Any]], i: int, raw: bytes, deserialize: Deserialize) -> bool:

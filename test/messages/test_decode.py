@@ -301,12 +301,18 @@ def test_short_type_name_is_understood():
 
 def test_damaged_messages_are_left_out_and_counted():
     good = make.cdr(make.imu(1))
-    for bad in (good[:-9], b'', b'\x00\x01\x00\x00\xff\xff', good[:12] + b'\xff' * 4 + good[16:]):
+    text = 'a message of {} bytes cannot be read as sensor_msgs/msg/Imu: {}'.format
+    stamp, frame = (f'too short or damaged from header.{x} on' for x in ('stamp.sec', 'frame_id'))
+    for bad, why in (
+            (good[:-9], 'too short or damaged from linear_acceleration_covariance on'),
+            (b'', 'Invalid or unsupported CDR encapsulation.'),
+            (b'\x00\x01\x00\x00\xff\xff', stamp), (good[:12] + b'\xff' * 4 + good[16:], frame)):
         reader = make_reader('imu', 'sensor_msgs/msg/Imu', Config())
         (_, block), = reader.rows([good, bad, good], [1, 2, 3],
                                   make.deserializer('sensor_msgs/msg/Imu'))
         assert block.received_ns.tolist() == [1, 3]
         assert reader.unreadable == 1
+        assert reader.trouble == text(len(bad), why)
     assert reader.rows([], [], None) == []
     assert reader.rows([bad], [1], make.deserializer('sensor_msgs/msg/Imu')) == []
 
