@@ -150,7 +150,8 @@ def _counter_steps(t: Floats, value: Values, modulus: int,
         first = int(np.argmax(resets))
         step, count = _bridged(t, step, resets), int(resets.sum())
         jump = value[first + 1].item() - value[first].item()
-        reasons += (Reason(Code.COUNTER_RESET, f'{name} jumps by {jump:+.6g} at t = '
+        by = f'{jump:+}' if whole else f'{jump:+.6g}'
+        reasons += (Reason(Code.COUNTER_RESET, f'{name} jumps by {by} at t = '
                            f'{t[first + 1]:.2f} s ({count} such step{"s" * (count > 1)}): a '
                            'reset, not motion; interpolated from the adjacent speed'),)
     rolled &= ~resets

@@ -127,7 +127,7 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats, name: str, *,
     size = round(span.size) if np.issubdtype(samples.value.dtype, np.integer) else span.size
     value: NDArray[Any] = samples.value + size * np.cumsum(turns)
     times = len(span.rows)
-    about = f'about {span.size:.0f} (± {span.sigma:.2g})' if span.sigma else NAMED_SPANS.get(
+    about = f'about {span.size:.0f} (± {span.sigma:.0f})' if span.sigma else NAMED_SPANS.get(
         span.size, f'{span.size:.0f}')
     angle = span.size in NAMED_SPANS     # exact, and no modulus of odometer.wrap, which is whole
     code = Code.COUNTER_ROLLOVER if of_one or angle else Code.WHEEL_COUNTERS_DIFFER
