@@ -110,8 +110,8 @@ class Bag:
         readers : topic -> reader of its messages.   feed : called with (slot, block) of samples,
         in order of bag time.   progress : called with the fraction done.
 
-        Raises BadUsage, BadData: a topic is not in the bag; none of a topic's messages can be
-        used.
+        Raises BadUsage, BadBag, BadData: a topic is not in the bag; none of the messages can be
+        read; none of a topic's can be used.
         """
         for topic in readers.keys() - self.topics.keys():
             raise BadUsage(f'{self.name}: no topic {topic}; topics: {", ".join(self.topics)}')
@@ -126,6 +126,7 @@ class Bag:
             if progress:
                 newest = int(max(times[-1] for times, _ in batch.values()))
                 progress((newest - self.start_ns) / max(self.end_ns - self.start_ns, 1))
+        _check_content(self.name, self._source, self._parts)     # reading finds damaged chunks
         for topic, reader in readers.items():
             self._add_notes(topic, reader, used[topic])
 
@@ -227,14 +228,21 @@ def _opened(path: Path, stack: ExitStack) -> Bag:
     if formats and not formats & {'cdr', 'ros1'}:
         raise BadBag(f'{path}: its serialization format is {", ".join(formats)!r}, '
                      'only cdr is supported; convert the bag with ros2 bag convert')
-    if not any(part.count for part in parts):
-        damage = ' or '.join({part.damage for part in parts if part.damage})
-        topics = sum(len(part.channels) for part in parts)
-        raise BadBag(f'{path}: the bag is empty, 0 messages on {topics} topics in '
-                     f'{names(source.files)}'
-                     + (f' ({damage}); copy it again from its source' if damage else
-                        '; record again'))
+    _check_content(path, source, parts)
     return Bag(replace(source, notes=source.notes + bag_notes), parts, types)
+
+
+def _check_content(path: Path | str, source: Source, parts: list[Part]) -> None:
+    """Raise BadBag if no message can be read."""
+    if any(part.count for part in parts):
+        return
+    damage = ' or '.join({part.damage for part in parts if part.damage})
+    if damage:
+        raise BadBag(f'{path}: the messages of {names(source.files)} cannot be read ({damage}); '
+                     'copy it again from its source')
+    topics = sum(len(part.channels) for part in parts)
+    raise BadBag(f'{path}: the bag is empty, 0 messages on {topics} topics in '
+                 f'{names(source.files)}; record again')
 
 
 def bag_sha256(bag: Bag) -> str:

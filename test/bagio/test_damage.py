@@ -69,6 +69,17 @@ def test_a_chunk_that_is_damaged_costs_itself(tmp_path, mcap, which, where):
     assert notes or where == 'data'       # eight bytes of one value show only by a checksum
 
 
+def test_a_bag_without_a_sound_chunk_is_refused(tmp_path, mcap):
+    path = shutil.copytree(mcap, tmp_path / 'bag')
+    data = bytearray((path / 'bag.mcap').read_bytes())
+    for at, size in chunks_of(data):
+        data[at + size // 2] ^= 0xA5
+        data[at + 33:at + 37] = b'crc!'
+    (path / 'bag.mcap').write_bytes(data)
+    with pytest.raises(BadBag, match=r'cannot be read \(a damaged chunk\); copy it'):
+        read(path)
+
+
 def test_a_checksum_finds_what_nothing_else_shows(tmp_path, mcap):
     path = shutil.copytree(mcap, tmp_path / 'bag')
     with open_bag(path) as bag:
