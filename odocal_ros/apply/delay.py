@@ -59,7 +59,7 @@ class DelaySearch:
             return False
         self._notes.append(f'IMU stamps are {abs(delay):.2f} s (± {sigma:.2f} s) '
                            f'{"late" if delay > 0 else "early"} relative to the odometer: add '
-                           f'{-delay:+.2f} to imu.time_offset; sigma increased')
+                           f'{-delay:+z.2f} to imu.time_offset; sigma increased')
         self._found_s = abs(delay) + 2 * sigma
         self.sigma_s = max(self.sigma_s, self._found_s)
         return True

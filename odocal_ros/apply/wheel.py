@@ -151,7 +151,7 @@ class Wheel:
         shown = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s
         off = abs(shown - self.speed) * dt
         if self._is_false(t, dt, step, shown, off):
-            self.notes.append(f'the counter jumps by {step:+.1f} m in {dt:.2f} s: a reset or an '
+            self.notes.append(f'the counter jumps by {step:+z.1f} m in {dt:.2f} s: a reset or an '
                              f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
             if abs(shown * dt) <= self._most(dt):      # else it is certainly not travel
                 self._refused_error += shown * dt - self.speed * dt

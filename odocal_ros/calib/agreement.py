@@ -47,7 +47,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
             apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))
             if abs(apart) > REMARK_SIGMAS * sigma:
                 off = (share(apart / a.value, '+') if name == 'scale_factor' else
-                       f'{math.degrees(apart):+.3f} deg')
+                       f'{math.degrees(apart):+z.3f} deg')
                 found.append(Reason(
                     Code.METHODS_DISAGREE, f'{word}: {other.name} and {better.name} differ by '
                     f'{off}, {abs(apart) / sigma:.1f} sigma; likely cause: '

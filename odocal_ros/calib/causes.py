@@ -18,5 +18,5 @@ def cause_of_change(relative: float) -> str:
 def change_in_words(relative: float) -> str:
     """Return a relative change as text, in ppm or per cent."""
     if abs(relative) < 1e-3:
-        return f'{1e6 * relative:+.0f} ppm'
+        return f'{1e6 * relative:+z.0f} ppm'
     return f'{100 * relative:+.3g} %'

@@ -76,7 +76,7 @@ def far_from_nominal(scale: float, unit: str, nominal: float, config: Config) ->
         return []
     why, do = _unit(off + 1, unit, nominal)
     of = '' if unit == '1' else f' {unit}'
-    return [Reason(Code.SCALE_FAR_FROM_NOMINAL, f'scale {scale:.6g}{of} is {100 * off:+.1f} % '
+    return [Reason(Code.SCALE_FAR_FROM_NOMINAL, f'scale {scale:.6g}{of} is {100 * off:+z.1f} % '
                    f'from the nominal value {nominal:.6g}{why}', do)]
 
 

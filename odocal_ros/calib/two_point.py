@@ -226,10 +226,10 @@ def _judge_angles(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
     if alignment.heading_separable and far > BACKWARDS_YAW:
         reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs opposite to the fixes: '
                            'positive counts mean backwards, or the IMU x axis points backwards '
-                           f'(yaw {np.rad2deg(yaw):+.1f} deg)'),)
+                           f'(yaw {np.rad2deg(yaw):+z.1f} deg)'),)
     elif alignment.heading_separable and far > FAR_YAW:
         reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'heading ({alignment.heading_source}) and '
-                           f'course give a yaw mounting of {np.rad2deg(yaw):+.1f} deg, '
+                           f'course give a yaw mounting of {np.rad2deg(yaw):+z.1f} deg, '
                            f'{np.rad2deg(far):.1f} deg from its nominal value; the limit is '
                            f'{np.rad2deg(FAR_YAW):.0f} deg'),)
     if not vertical_known:

@@ -148,7 +148,7 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
         if name not in PARAMETERS and abs(z[k]) < max(FAULT_SIGMAS, worst):
             continue
         # two legs have the same deviation from each other
-        who = f'; {_name(numbers[k])} differs most ({z[k]:+.1f} sigma from the others)' * (J > 2)
+        who = f'; {_name(numbers[k])} differs most ({z[k]:+z.1f} sigma from the others)' * (J > 2)
         said.append(Reason(
             Code.LEGS_DISAGREE, f'{name}: the scatter of {J} legs is {np.sqrt((z**2).mean()):.1f} '
             f'times their uncertainties{who}', DELAY_DIFFERS if 'delay' in name else ''))

@@ -224,8 +224,8 @@ def _cell(row: dict[str, Any], name: str, factor: float) -> str:
 def remarks(row: dict[str, Any]) -> list[str]:
     out = [row['decision'] or row['verdict']]
     for change in json.loads(row['changes']):
-        size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else
-                f'{DEG * change["size"]:+.2f} deg')
+        size = (f'{100 * change["size"]:+z.2f} %' if change['value'] == 'scale_factor' else
+                f'{DEG * change["size"]:+z.2f} deg')
         odometer = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
         out.append(f'{change["value"].replace("_", " ")} changed by {size} between '
                    f'{change["after"][:10]} and {change["by"][:10]}'

@@ -60,5 +60,5 @@ def _cell(change: 'Change', difference: 'Difference | None', stored: 'tuple[Stor
     from odocal_ros.library.compare import amount
     if difference is None:
         return '-'
-    sigmas = '' if difference.sigmas is None else f' ({difference.sigmas:+.1f} sigma)'
+    sigmas = '' if difference.sigmas is None else f' ({difference.sigmas:+z.1f} sigma)'
     return amount(change, difference, stored) + sigmas

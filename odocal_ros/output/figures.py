@@ -40,7 +40,7 @@ def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
     if sigma >= 100:
         value, sigma = round(value, places), round(sigma, places)
     places = max(0, min(12, places))
-    return f'{value:{"+" if signed else ""}.{places}f} ± {sigma:.{places}f}'
+    return f'{value:{"+" if signed else ""}z.{places}f} ± {sigma:.{places}f}'
 
 
 def two_digits(x: float) -> str:

@@ -144,9 +144,7 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
 
 def rotation_text(calibration: result.Calibration) -> str:
     """Return roll, pitch and yaw of the IMU on the vehicle, deg, empty without them."""
-    # + 0.0: no minus before a zero
-    return ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
-                     for angle in calibration.imu_rotation_rpy or ())
+    return ', '.join(f'{angle * DEG:z.3f}' for angle in calibration.imu_rotation_rpy or ())
 
 
 def _angles_of(estimates: dict[str, result.Estimate]) -> dict[str, str]:
@@ -180,7 +178,7 @@ def _path_ratio(calibration: result.Calibration, scale: result.Estimate,
     unit = '' if scale.unit == '1' else f' {scale.unit}'
     plain = f'{ratio:.{max(0, 3 - int(np.floor(np.log10(ratio))))}f}'  # 4 digits
     return _line('  path ratio', f'{plain}{unit}   fixes / odometer, '
-                 f'{100 * (ratio / factor.value - 1):+.1f} % from the {word}')
+                 f'{100 * (ratio / factor.value - 1):+z.1f} % from the {word}')
 
 
 def _gyro_scale(calibration: result.Calibration) -> str:

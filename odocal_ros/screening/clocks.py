@@ -53,7 +53,7 @@ def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
         ahead += offset[slot]
         if abs(ahead) > CLOCK_APART:
             found.append(Reason(
-                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {ahead:+.3f} s '
+                Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {ahead:+z.3f} s '
                 f'from IMU stamps that arrive at the same time; the limit is {CLOCK_APART:g} s'
                 f'{_offset_hint(slot, ahead)}', remedy(ahead)))
     return found
@@ -102,7 +102,7 @@ def _offset_hint(slot: str, ahead: float) -> str:
     group = INPUTS[slot].clock
     if not group or abs(ahead) > OFFSET_REACH:
         return ''
-    return f'; if this is not transport delay, add {-ahead:+.3f} to {group}.time_offset'
+    return f'; if this is not transport delay, add {-ahead:+z.3f} to {group}.time_offset'
 
 
 def _may_be_odd(stamp_ns: Ints) -> Bools:
@@ -132,7 +132,7 @@ def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
         stamp_ns = whole.stamp_ns.copy()
         stamp_ns[stamp_ns > 0] -= shift[piece]
         rows[slot] = replace(whole, stamp_ns=stamp_ns)
-        found += [Reason(Code.CLOCK_SET, f'the {INPUTS[slot].label} clock was set by {by:+.3f} s '
+        found += [Reason(Code.CLOCK_SET, f'the {INPUTS[slot].label} clock was set by {by:+z.3f} s '
                          f'at t = {(sent.stamp_ns[k] - leg.start_ns) * 1e-9:.2f} s; '
                          f'{"earlier" if shift[piece[k]] else "later"} stamps were corrected')
                   for k, by in zip(at, moved, strict=True)]

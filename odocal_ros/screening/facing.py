@@ -166,9 +166,9 @@ def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]
     nominal = 0.0 if np.isnan(nominal_yaw) else nominal_yaw
     off = abs(float(wrap(found.yaw - nominal)))
     direction = WAYS[round(found.yaw / (np.pi / 2)) % 4]
-    seen = f'{np.rad2deg(found.yaw):+.0f} deg, ± {max(np.rad2deg(found.sigma), 1):.0f}'
+    seen = f'{np.rad2deg(found.yaw):+z.0f} deg, ± {max(np.rad2deg(found.sigma), 1):.0f}'
     if nominal:
-        seen += f', nominal {np.rad2deg(nominal):+.0f}'
+        seen += f', nominal {np.rad2deg(nominal):+z.0f}'
     reversed_orientation = np.deg2rad(150.0)    # a reversed odometer looks the same
     if off > reversed_orientation:
         return (Reason(Code.ODOMETER_REVERSED, f'accelerations point {direction} in the IMU frame '

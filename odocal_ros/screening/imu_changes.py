@@ -89,7 +89,7 @@ def turned_about(found: Accelerations | None) -> tuple[Reason, ...]:
     if not seen:
         return ()
     sigma, apart, begin, end = min(seen)
-    return (_moved(f'the forward direction turns by {apart:+.0f} ± {max(sigma, 1.0):.0f} deg',
+    return (_moved(f'the forward direction turns by {apart:+z.0f} ± {max(sigma, 1.0):.0f} deg',
                    begin, end),)
 
 

@@ -53,6 +53,7 @@ def test_figures_have_the_digits_signs_and_units_asked_for():
     assert [time_span(t) for t in (59.96, 600.0, 3600.0, 7325.0)] == [
         '60.0 s', '10 min 00 s', '1 h 00 min', '2 h 02 min']
     assert with_sigma(-32050.0, 15191.0) == '-32000 ± 15000'
+    assert with_sigma(-1e-4, 0.5) == '0.00 ± 0.50'
     assert with_sigma(1234.5, 560.0) == '1230 ± 560'
     assert beyond_one(0.968, 0.0152) == '-3.2 ± 1.5 %'
     assert beyond_one(1.065044, 78e-6) == '+65044 ± 78 ppm'

@@ -179,8 +179,9 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
         how = (f'determine the difference of the wheels only to {sigma:.2g} %' if sigma < 100 else
                'do not separate left and right wheel')
         found.append(Reason(Code.WHEELS_NOT_SEPARABLE, f'positions {how} (condition number '
-                            f'{free.condition:.2g}, correlation {free.correlation[0, 1]:+.6f}): '
-                            'the search changed both factors together'))
+                            f'{free.condition:.2g}, correlation '
+                            f'{free.correlation[0, 1]:+z.6f}): the search changed both factors '
+                            'together'))
     if refined.widened:
         grown = [f'{name} ± {_amount(k, a)} to ± {_amount(k, b)}' for k, (name, a, b) in enumerate(
             zip(NAMES, ranges.half, refined.half, strict=True)) if b > a]

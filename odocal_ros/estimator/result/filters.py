@@ -32,7 +32,7 @@ def odometer_reasons(share: float, sigma: float, log_time: float,
     if not follows_odometer(share, sigma):
         return ()
     return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes contain an odometer with a scale error '
-                   f'of {100 * share:+.2f} % ± {100 * sigma:.2f} % (time constant '
+                   f'of {100 * share:+z.2f} % ± {100 * sigma:.2f} % (time constant '
                    f'{np.exp(log_time):.0f} s), as positions fused with a wheel speed do; '
                    'accounted for' + (f', with an uncertainty of the scale of {100 * by_map:.2g} %'
                                       if by_map else '')),)

@@ -218,9 +218,9 @@ def _undetermined(sigma: Floats, usual: float, doubt: float, config: Config, yaw
     elif off > np.deg2rad(135.0):       # more than any mounting: reversed
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
                               'directions: positive counts mean backwards, or the IMU x axis '
-                              f'points backwards (yaw {np.rad2deg(yaw):+.1f} deg)'))
+                              f'points backwards (yaw {np.rad2deg(yaw):+z.1f} deg)'))
     elif off > FAR_YAW:
-        reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+.1f} '
+        reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+z.1f} '
                               f'deg differs by {np.rad2deg(off):.1f} deg from its nominal value; '
                               f'the limit is {np.rad2deg(FAR_YAW):.0f} deg'))
     if sigma[layout.PITCH] > limit:

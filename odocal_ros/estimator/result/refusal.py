@@ -35,7 +35,7 @@ def no_imu(fit: Fit) -> list[Reason]:
     if abs(c[worst]) <= 0.2:        # twenty times the error of a consumer IMU
         return []
     return [Reason(Code.NOT_CONVERGED, 'the fit converged to '
-                   f'{CONSTANTS[worst].replace("_", " ")} {100 * c[worst]:+.0f} %, impossible '
+                   f'{CONSTANTS[worst].replace("_", " ")} {100 * c[worst]:+z.0f} %, impossible '
                    'for an IMU: a local minimum, or wrong units, axes or time offsets')]
 
 

@@ -157,7 +157,7 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
     if off[worst] > ANOTHER_IMU:
         name = layout.CONSTANTS[worst].replace('_', ' ')
         said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {name} '
-                           f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
+                           f'is {100 * c[worst]:+z.1f} % off, {off[worst]:.0f} times the sigma of '
                            f'the {config.imu.grade} grade (limit {ANOTHER_IMU:g}); '
                            'accounted for'))
     return said + _arms(c, sigma, ratio, config)
@@ -183,7 +183,7 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
                           (layout.BY_TIME, motion.from_mean[:, 1], 'from start to end')):
         change, doubt = np.array([c[i], sigma[i]]) * np.ptp(span)
         if abs(change) > max(REMARK_SIGMAS * doubt, LEAST_CHANGE):
-            said.append(f'{100 * change:+.2f} ± {100 * doubt:.2f} % {what}')
+            said.append(f'{100 * change:+z.2f} ± {100 * doubt:.2f} % {what}')
     if not said:
         return []
     less = said[0].startswith('-') and 'speed' in said[0]
@@ -214,8 +214,8 @@ def _changes(fit: Fit) -> list[Reason]:
     for step in fit.steps:
         if step.certain and abs(step.size) > LEAST_CHANGE:
             what = layout.CONSTANTS[step.constant].replace('_', ' ')
-            size = f'{100 * step.size:+.2f} %' if step.constant == layout.LN_K else \
-                f'{np.rad2deg(step.size):+.2f} deg'
+            size = f'{100 * step.size:+z.2f} %' if step.constant == layout.LN_K else \
+                f'{np.rad2deg(step.size):+z.2f} deg'
             said.append(f'the {what} changes by about {size} near t = {step.t:.0f} s '
                         f'({abs(step.size) / step.sigma:.0f} sigma)')
     return [Reason(Code.CHANGE_IN_LEG, '; '.join(said))] if said else []
@@ -240,14 +240,14 @@ def _arms(c: Floats, sigma: Floats, ratio: Floats, config: Config) -> list[Reaso
             if i not in off:
                 continue
             found = value + c[i]
-            text = f'{found:+.2f} ± {sigma[i]:.2f} m'
+            text = f'{found:+z.2f} ± {sigma[i]:.2f} m'
             # not among the estimates
             rough = ' (too uncertain for a result)' * bool(ratio[i] >= INFORMED_SHARE)
             if abs(found) > most:
                 said.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
                 do.append(f'Ignore the estimate of {name} {axis}: another error causes it.')
             elif any(arm):
-                said.append(f'{name} {axis}: set to {value:+.2f} m, estimated {text}{rough}')
+                said.append(f'{name} {axis}: set to {value:+z.2f} m, estimated {text}{rough}')
                 do.append(f'Measure {name} {axis} again.')
             else:
                 said.append(f'{name} {axis}: not set, estimated {text}{rough}')

@@ -85,7 +85,7 @@ def slip_reasons(slips: tuple[Slip, ...], level: str = '') -> list[Reason]:
     """
     said, most = [], 3      # runs listed singly
     if slips:
-        one = [f'{s.metres:+.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
+        one = [f'{s.metres:+z.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
                for s in slips[:most]]
         more = f' and {len(slips) - most} more' if len(slips) > most else ''
         said.append('wheel slip, travel of the wheel minus travel of the vehicle: '
