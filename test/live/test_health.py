@@ -121,6 +121,13 @@ def test_a_stale_stamp_after_a_pause_is_no_time(rows_behind):
     assert (health.newest_ns * 1e-9, health.jumped_back) == (pytest.approx(1002.2), False)
 
 
+@pytest.mark.parametrize('before', [[], [10.0, 10.1]])
+def test_a_stamp_seconds_ahead_within_a_block_is_no_time(before):
+    health = Health()
+    decoded(health, rows([*before, 20.0, 10.2, 10.3, 10.4]))
+    assert (health.newest_ns * 1e-9, health.jumped_back) == (pytest.approx(10.4), False)
+
+
 def test_stamps_that_go_on_far_ahead_are_a_time():
     health = Health()
     decoded(health, rows([10.0, 10.1]))
