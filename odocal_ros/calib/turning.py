@@ -11,11 +11,13 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.integral import integral_at, twice_integral_at
 from odocal_ros.nav.local_frame import GNSS_MOVES
+from odocal_ros.nav.statistics import gaps_longer
 from odocal_ros.reasons import Code, Reason
 
 # statistical: least correlation of the same turns by gyro and by course, and least sigmas of the
 # slope, since a few courses may be correlated by chance
 SAME_TURNS, SLOPE_SIGMAS = 0.9, 8.0
+LONGEST_GAP = 1.0      # s, judgement: of the IMU, turns within a longer one are not measured
 # rad^2, judgement: a chord with a U-turn in it, and the next, are off by 0.35 rad each (0.1 to 0.2
 # for a mower whose rows are 1.6 m apart)
 U_TURN = 0.25
@@ -38,14 +40,18 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     if len(knots) < 5:
         return None
     ends = t_fix[knots]
-    keep = ~_pivots(ends, integral_at(ends, t_imu, w_up))
+    gaps = gaps_longer(t_imu, LONGEST_GAP)
+    since, until = (np.searchsorted(edge, ends) for edge in gaps.T)     # gaps before each end
+    keep = ~_pivots(ends, integral_at(ends, t_imu, w_up)) & (until[1:] == since[:-1]) & (
+        since[1:] == since[:-1])
     step = np.diff(fixes_n[knots, :2], axis=0)[keep]
     t = ((ends[:-1] + ends[1:]) / 2)[keep]
     course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     # the mean angle over each chord; the effect of a bias is linear in time
     gyro = (np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends))[keep]
-    # at a sudden U-turn of the course the vehicle may have reversed: a free step is fitted there
-    about = np.flatnonzero(np.abs(np.diff(course)) > 2.0)
+    # at a sudden U-turn of the course the vehicle may have reversed, and the turn in a gap of the
+    # IMU is unknown: a free step is fitted there
+    about = np.flatnonzero((np.abs(np.diff(course)) > 2.0) | (np.diff(until[1:][keep]) > 0))
     drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > about])
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)

@@ -204,6 +204,17 @@ class TestCheck:
         ratio = turn_ratio(t[rows], sign * np.gradient(course, t)[rows], t[::20], fixes, 0.5)
         assert ratio == pytest.approx(sign, abs=0.03)
 
+    @pytest.mark.parametrize('turn', [0.0, 0.1])
+    def test_a_gap_of_the_imu_is_no_turn(self, turn):
+        """As after a step of its clock: the rate beside the gap is not that within it."""
+        t = np.arange(0.0, 300.0, 0.05)
+        rate = 0.1 * np.sign(np.sin(t / 10)) + turn * (abs(t - 130) < 15)
+        way = np.cumsum(np.exp(1j * np.cumsum(rate) * 0.05)) * 0.5
+        fixes = np.stack([way.real, way.imag], -1)[::10]
+        rows = abs(t - 130) > 25
+        ratio = turn_ratio(t[rows], rate[rows], t[::10], fixes, 0.5)
+        assert ratio == pytest.approx(1.0, abs=0.05)
+
     def test_outliers_have_no_direction(self):
         rng = np.random.default_rng(4)
         residual = rng.standard_normal((500, 3)) + np.linspace(0, 300, 500)[:, None]
