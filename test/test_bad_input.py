@@ -7,7 +7,7 @@ Bad input through the whole pipeline: nothing raises, each fault has its sentenc
 Every test ends in ``sound``: what is given holds within its sigma, what is rejected says why.
 """
 
-from dataclasses import replace
+from dataclasses import fields, replace
 import json
 import re
 
@@ -102,6 +102,18 @@ def test_an_unusable_leg_is_rejected_for_its_cause(made, leg, spoil, code, text,
                                                        method='auto'))
     assert text in said[code]
     assert drives.rejecting(result) == {code}
+
+
+def test_two_counters_on_one_topic_are_a_named_cause(made, leg):
+    one, half_ns = leg.odometer, int(np.diff(leg.odometer.stamp_ns).min()) // 2
+    two = drives.changed(one, value=lambda a: a + 10**6, stamp_ns=lambda a: a + half_ns,
+                         received_ns=lambda a: a + half_ns)
+    order = np.argsort(np.r_[one.stamp_ns, two.stamp_ns], kind='stable')
+    both = OdometerSamples(*(np.concatenate([getattr(some, field.name) for some in (one, two)])[
+        order] for field in fields(one)))
+    result, said = run(replace(leg, odometer=both), drives.settings(made))
+    assert 'two publishers on one topic' in said[Code.COUNTER_ROLLOVER]
+    assert drives.rejecting(result)
 
 
 @pytest.mark.parametrize('keep', [1, 2, 3])

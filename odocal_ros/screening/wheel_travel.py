@@ -132,10 +132,12 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats, name: str, *,
     angle = span.size in NAMED_SPANS     # exact, and no modulus of odometer.wrap, which is whole
     code = Code.COUNTER_ROLLOVER if of_one or angle else Code.WHEEL_COUNTERS_DIFFER
     do = f'Set odometer.wrap to {span.size:.0f}.' if of_one and not angle else ''
+    twice = times > 0.1 * len(step)     # judgement: few counters do so; the steps of two alternate
     found = Reason(code, f'{name} rolls over at {about}, '
                    f'not at the range of its message type: {times} jump{"s" * (times > 1)} of '
                    f'this size against the travel, first at t = {t[span.rows[0] + 1]:.2f} s; '
-                   'corrected', do)
+                   'corrected' + '; if the counter cannot roll over so often, check for two '
+                   'publishers on one topic' * twice, do)
     # one error of the span for all jumps; the budget treats uncertainties as independent
     doubt = np.full(times, span.sigma * np.sqrt(times))
     return (replace(samples, value=value), (found,),
