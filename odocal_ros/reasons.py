@@ -62,7 +62,7 @@ class Code(Enum):
     CLOCKS_DRIFT = NOTE, ('Synchronise the clocks (PTP, PPS, chrony), or stamp all sensors with '
                           'one clock. The drift matters to all software that combines them.')
     DELAY_SEEN = NOTE, ('Apply the same offset in every other program that combines these '
-                        'sensors. Here it improves the two-point method most.')
+                        'sensors. In odocal it improves the two-point method most.')
     ODOMETER_LATE = NOTE, ('Publish the counter with a header stamped at the time of reading, or '
                            'reduce bus or CPU load. The late messages were moved back to their '
                            'estimated times.')

@@ -28,8 +28,8 @@ CAUSES = {
     'yaw': 'the IMU was moved, or the heading comes from another source; calibrate again to be '
            'sure',
     'pitch': 'load, suspension, or the IMU was moved; calibrate again to be sure',
-    'lever': 'a sensor was moved, or its lever arm is wrong',
-    'delay': 'a driver, bus or receiver has other settings'}
+    'lever': 'a sensor was moved, or its lever arm is wrong; measure the lever arm',
+    'delay': 'a driver, bus or receiver has other settings; compare them'}
 
 
 @dataclass(frozen=True)
@@ -227,13 +227,14 @@ def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | Non
 
 def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
     words = change.parameter.split('_')
-    cause = next((text for key, text in CAUSES.items() if key in words), 'calibrate again')
+    cause = next((text for key, text in CAUSES.items() if key in words),
+                 'unknown; calibrate again')
     before = stored[difference.since].value(change.parameter) or 0.0
     if 'scale' in words and abs(difference.change) > ANOTHER_SCALE * before:
         cause = f'{OTHER}; compare calibrations of the same odometer'
     return (f'{label(change.parameter)} changed by {amount(change, difference, stored)} '
             f'({abs(difference.sigmas or 0.0):.1f} sigma) since '
-            f'{stored[difference.since].name}: {cause}')
+            f'{stored[difference.since].name}; likely cause: {cause}')
 
 
 def label(parameter: str) -> str:

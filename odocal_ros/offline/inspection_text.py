@@ -144,7 +144,7 @@ def _of_fix(topic: dict[str, Any]) -> Iterator[str]:
         sigma = 'no covariance'
     partly = f', covariance in {fix["covariance_known"]} of {topic["count"]}' \
         if fix['sigma'] and fix['covariance_known'] < topic['count'] else ''
-    yield f'{status}; {sigma}{partly}'
+    yield f'status: {status}; {sigma}{partly}'
     if fix['positions'] < topic['count']:
         yield f'warning: {topic["count"] - fix["positions"]} of them without a position'
     if fix['position_step'] and fix['position_step'] > 0.05:
@@ -161,13 +161,13 @@ def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
             '' if jitter is None else f'; arrival jitter {1e3 * jitter:.1f} ms')
     elif abs(late := timing['header_to_bag'] or 0.0) > 0.5e-3:     # None: no row has a stamp
         where = 'after' if late > 0 else 'before'
-        yield (f'recorded {abs(late):.3f} s {where} its header stamp '
+        yield (f'messages are recorded {abs(late):.3f} s {where} the time in their header '
                f'(spread {timing["header_to_bag_spread"]:.3f} s)')
     odd = [f'{timing[key]} {what}' for key, what in (
         ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the previous stamp'),
         ('backward_steps', 'with a stamp before the previous one')) if timing[key]]
     if odd:
-        yield f'warning: messages {", ".join(odd)} (of {topic["count"]})'
+        yield f'warning: of {topic["count"]} messages, {", ".join(odd)}'
     if timing['gap_count']:
         longest = max(timing['gaps'], key=lambda gap: gap['length'])
         yield (f'warning: {counted(timing["gap_count"], "gap")}, the '
@@ -184,7 +184,7 @@ def _drive(found: dict[str, Any]) -> list[str]:
                      f'{drive["chord"]:.0f} m from first to last; speed {drive["slowest"]:.1f} to '
                      f'{drive["fastest"]:.1f} m/s')
     if drive['rough_scale'] and drive['scale_unit'] != '1':
-        lines.append(f'  about {drive["rough_scale"]:.4g} {drive["scale_unit"]}')
+        lines.append(f'  scale factor about {drive["rough_scale"]:.4g} {drive["scale_unit"]}')
     stops = found['standstills']
     shown = ', '.join(f'{a:.1f} to {b:.1f}' for a, b in stops[:8]) + ', ...' * (len(stops) > 8)
     lines += wrapped(f'standstills: {shown} s' if stops else 'standstills: none')
@@ -229,7 +229,7 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
     else:
         sure = whole_degrees(mounting['forward_sigma'])
         how = (f'forward direction from accelerations and turns, uncertainty {sure} deg (1 '
-               f'sigma); remaining misalignment {math.degrees(mounting["off"]):.1f} deg')
+               f'sigma); the measured mounting differs by {math.degrees(mounting["off"]):.1f} deg')
     text = 'set imu.mounting_rpy to' if mounting['needed'] else 'imu.mounting_rpy is correct:'
     return wrapped(f'axes: {text} [{rpy}] rad (roll, pitch, yaw {degrees} deg; {how})')
 
@@ -256,7 +256,7 @@ def _findings(found: dict[str, Any]) -> list[str]:
 def _length_text(found: dict[str, Any]) -> list[str]:
     lines = []
     if found['open']:
-        lines += wrapped(f'replay needs options: {found["open"]}', '')
+        lines += wrapped(f'replay without options fails: {found["open"]}', '')
     if found['command']:
         lines += ['suggested command', f'  {found["command"]}']
     return lines

@@ -69,7 +69,7 @@ def _head(before: Plan, sigmas: Sigmas) -> list[str]:
     if 'smoother' in before.methods:
         slip = 1000 * sigmas.slip
         own = ' needs no heading;' if a.heading_source in ('course', 'gyrocompass') else ''
-        white = f'; fixes {100 * WHITE_SHARE:.0f} % white' if tau else ''
+        white = f'; white part of the fix errors {100 * WHITE_SHARE:.0f} %' if tau else ''
         lines.append(f'smoother:{own} wheel slip {slip:.2g} mm/√s, sway {sigmas.sway:.2g} m/s '
                      f'(white at {SWAY_RATE:g} Hz){white}')
     return lines

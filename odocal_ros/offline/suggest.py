@@ -47,7 +47,7 @@ def _rank(slot: str, info: TopicInfo, still: Collection[str]) -> tuple[int | str
 
 # reasons for a topic, by the first element of the ranks that differs
 WHY = ('it grows with the distance between the fixes',
-       'it is a counter, other candidates are speeds', 'it has the usual name',
+       'counts are preferred to joint angles, and angles to speeds', 'it has the usual name',
        'its name is that of an odometer', 'it has the most messages', 'it is the first by name')
 
 
