@@ -210,7 +210,8 @@ def lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> l
                              'odometer'), ('fix', Code.NO_FIX, 'fixes')):
         facts = topics.get(mapping.get(slot, ''), {})
         if not facts and (slot != 'imu' or config.odometer.needs_imu):
-            out.append(Reason(code, f'no topic for the {word}'))
+            out.append(Reason(code, f'no topic for the {word}',
+                              f'Record it, or name it with --{slot}-topic.'))
         elif 'trouble' in facts and 'timing' not in facts:
             out.append(Reason(code, f'{facts["name"]}: no message can be used: '
                               f'{facts["trouble"]}', 'Check the type and the driver of the topic, '

@@ -113,10 +113,10 @@ def _guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) ->
             return work()
     except (OdocalError, MemoryError):
         raise
-    except FloatingPointError as error:
+    except FloatingPointError:
         return MethodRun(UNKNOWN[name](inputs, Reason(
-            Code.NOT_CONVERGED, f'{name} diverged ({error}). Likely cause: invalid or missing '
-            'samples')))
+            Code.NOT_CONVERGED, f'{name} diverged: values grow without limit. Likely cause: '
+            'invalid or missing samples')))
     except Exception as error:      # its reasons may be wrong too and are dropped
         return MethodRun(failed(lambda why: UNKNOWN[name](inputs, why), name, error))
 

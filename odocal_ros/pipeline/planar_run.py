@@ -75,10 +75,10 @@ def _guarded(run: Run, inputs: Inputs, config: settings.Config, progress: Callab
             method = result_of(found, unit, nominal_scale(config, unit), config,
                                shortened_by_slopes(inputs))
             return method, _tracks(run, found)
-    except (FloatingPointError, np.linalg.LinAlgError) as error:
-        return unknown(Reason(Code.NOT_CONVERGED, f'{PLANAR} diverged ({error}). Likely cause: '
-                              'the wheels do not belong to the positions, or the '
-                              'positions are too inaccurate for a drive without an IMU')), {}
+    except (FloatingPointError, np.linalg.LinAlgError):
+        return unknown(Reason(Code.NOT_CONVERGED, f'{PLANAR} diverged. Likely cause: the wheels '
+                              'do not belong to the positions, or the positions are too '
+                              'inaccurate for a drive without an IMU')), {}
     except (OdocalError, MemoryError):
         raise
     except Exception as error:

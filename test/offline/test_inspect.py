@@ -349,8 +349,8 @@ def test_fixes_that_are_none(tmp_path, capsys):
     rows = [row for row in drive() if row[0] != '/fix']
     seen, _ = inspect(ros_bags.write(tmp_path / 'without', rows), capsys)
     assert {'NO_FIX'} <= codes(seen)
-    assert [f['text'] for f in seen['findings'] if f['code'] == 'NO_FIX'] == [
-        'no topic for the fixes']
+    assert [(f['text'], f['remedy']) for f in seen['findings'] if f['code'] == 'NO_FIX'] == [
+        ('no topic for the fixes', 'Record it, or name it with --fix-topic.')]
     assert len(seen['standstills']) == 2            # seen without fixes too
 
 
