@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.outside import Outside
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.odometer import Travel
 
-Floats = NDArray[np.float64]
 # s: a standstill that ended longer before the start mark is another drive. Judgement
 BEFORE_MARK = 30.0
 

@@ -16,9 +16,8 @@ from dataclasses import fields
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Ints
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.mapped import let_go
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.imu_steps import ImuSteps
@@ -34,7 +33,6 @@ from odocal_ros.nav.rotations import (
 )
 from odocal_ros.nav.strapdown import prefix_product
 
-Floats = NDArray[np.float64]
 # judgement: steps whose arrays stay in the cache; with 256, a pass takes twice the time
 STEPS_AT_A_TIME = 2048
 # definition: signals of a step that the errors of gyro and accelerometer multiply, of (1, w, f, f

@@ -15,12 +15,11 @@ from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
-from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.rotations import exp_so3
 
-Floats = NDArray[np.float64]
 # unknowns of a block in order, and their sizes
 BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
          'accelerometer bias': 3, 'travel error': 1, 'slow fix error, ENU, where there is one': 3}

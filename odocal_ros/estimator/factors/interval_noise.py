@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator.factors.factor import IMU, IMU_NOISE, JUMP, SPREAD
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer_filter import stamp_of
@@ -26,7 +26,6 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import skew
 from odocal_ros.nav.statistics import gaps_in_rhythm
 
-Floats = NDArray[np.float64]
 # levels of the road, variance per second as those of IMU, and the axis of the vehicle
 ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2, 'pitching': 2}
 INTERVAL = (*IMU, *ROAD)
