@@ -22,6 +22,9 @@ from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file, Written
 from odocal_ros.outside.whole import disk, write_text
 
 JOURNAL = 'journal.yaml'     # marks the folder as a journal, and has its settings
+# status of the node, by which a replay finds the marks; events of legs that it leaves out
+STATUS_NAME, STATUS_TYPE = 'calibrator: calibration', 'diagnostic_msgs/msg/DiagnosticArray'
+DROPPED = ('cancelled', 'undone')
 NUMBERED = re.compile(r'part_(\d+)(?:-(\d+))?\.mcap')
 TOGETHER = 60        # judgement: files joined while the bag grows: an hour has then 60 + 60
 

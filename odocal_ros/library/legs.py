@@ -9,6 +9,7 @@ from typing import Any, TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from odocal_ros.bagio.read import Bag
+from odocal_ros.bagio.segments import DROPPED, STATUS_NAME, STATUS_TYPE
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import LegRecorder
@@ -30,11 +31,8 @@ Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
 Stops = tuple[Ints, tuple[Floats, float] | None]     # result of ``stops_of``
 OPENING = 0.2                 # judgement: of the distance; a later first stop does not start a leg
 CUT_SHORT_NS = 10 * 10**9     # judgement: drivers and recorders start and stop within it
-STATUS_NAME = 'calibrator: calibration'
-DROPPED = ('cancelled', 'undone')
 OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: it ends at the '
             'last sample that all topics have')
-STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 
 
 def marked_legs(bag: Bag) -> list[tuple[int, int]]:

@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 
 from odocal_ros import __version__
+from odocal_ros.bagio.segments import DROPPED, STATUS_TYPE
 from odocal_ros.live.filing import output_root
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_writer import JournalWriter, Received
@@ -29,8 +30,6 @@ from odocal_ros.settings.config import Config, flat
 
 BATCH_NS = 800_000_000    # judgement: including the writing, a kill loses about a second
 JOURNAL_GRACE_S = 2.0     # judgement: for the last batch, once the node must stop
-STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
-DROPPED = ('cancelled', 'undone')
 HEAD = """\
 # Journal of a leg: 'odocal replay' on this folder computes it again with the settings below,
 # which are those in force when the leg was started. They are a ROS parameter file too:

@@ -8,6 +8,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from odocal_ros.bagio.segments import STATUS_NAME
 from odocal_ros.calib.result import wheel_factors
 from odocal_ros.forecast import quantities
 from odocal_ros.forecast.forecast import as_keys
@@ -19,7 +20,6 @@ from odocal_ros.pipeline.prepared import Stage
 from odocal_ros.reasons import Code, Verdict
 
 SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # short moves are not a fault
-NAME = 'calibrator: calibration'  # replay finds marks by this name
 # judgement: significant decimals
 PLACES = dict.fromkeys((
     'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
@@ -67,7 +67,7 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
         'journal': now.journal, 'journal_trouble': now.journal_trouble,
     } | _computing(now) | quantities.as_keys(ok) | as_keys(now.forecast, now.forecast_age_s)
     return DiagnosticStatus(
-        level=level(now), name=NAME, message=sentence(now, text, ok), hardware_id='odocal',
+        level=level(now), name=STATUS_NAME, message=sentence(now, text, ok), hardware_id='odocal',
         values=[KeyValue(key=k, value=_bare(v, PLACES.get(k))) for k, v in keys.items()])
 
 
