@@ -18,12 +18,12 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
 from odocal_ros.library import export_pictures
+from odocal_ros.library.calibration import TABLES
 from odocal_ros.library.series import Left, left_in, residuals, Series, stacked, states, trajectory
 from odocal_ros.output.drawing import PICTURES
 from odocal_ros.outside.whole import whole_file
 
 RERUN = 'pip install rerun-sdk'
-TABLES = 'pip install pandas pyarrow'
 IN_NAMES = {'m': 'm', 'rad/s': 'rad_per_s', 'm/s^2': 'm_per_s2'}     # units in names of joints
 KML = 'http://www.opengis.net/kml/2.2'
 

@@ -9,6 +9,7 @@ import math
 import textwrap
 from typing import Any
 
+from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import (
     Calibration,
@@ -28,7 +29,6 @@ from odocal_ros.settings.config import Config
 LEGS = 'legs.csv'
 SHOWN = {'scale_factor': '', 'scale_ratio': '1'}
 ANGLES = {'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad'}
-COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
           'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body motion',
           'fix_latency': 'fix delay', 'gnss_delay': 'fix delay'}
@@ -161,20 +161,20 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
     """
     if not table:
         return []
-    factor = {COLUMNS[0]: 1e6 / scale}
-    wholes = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in COLUMNS]
+    factor = {PARAMETERS[0]: 1e6 / scale}
+    wholes = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in PARAMETERS]
     lines = [table_row(HEAD, WIDTHS)]
     small = []
     shared = '   shared by all legs' if width > 90 else '  shared'
     for name, row in table.items():
         shares = [row.get(p, 0.0)**2 / whole if whole and p not in hidden else 0.0
-                  for p, whole in zip(COLUMNS, wholes, strict=True)]
+                  for p, whole in zip(PARAMETERS, wholes, strict=True)]
         if max(shares) < shown:
             small.append(source_label(name))
             continue
         cells = ['-' if share < shown else
                  f'{two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
-                 for p, share in zip(COLUMNS, shares, strict=True)]
+                 for p, share in zip(PARAMETERS, shares, strict=True)]
         lines.append(table_row([source_label(name), *cells], WIDTHS)
                      + (shared if row.get('shared') else ''))
     if not (small and small_too):
