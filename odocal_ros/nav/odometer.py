@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Bools, Floats, Values
 from odocal_ros.data.pieces import runs
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed
-from odocal_ros.nav.held_speed import held_speed, HeldSpeed
+from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, held_speed, HeldSpeed
 from odocal_ros.reasons import Code, Reason
 
 # judgement: a step this many times the 95th percentile of the moving rate is not motion

@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.data.samples import OdometerForm
-from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, grid
-from odocal_ros.nav.held_speed import held_speed
+from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, grid, held_speed
 from odocal_ros.nav.odometer import travel
 from odocal_ros.screening.odometer_care import with_uncertainty
 from odocal_ros.sim.real import Real
