@@ -12,16 +12,15 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
-from odocal_ros.estimator.fit import Fit, fit, Trace
+from odocal_ros.estimator.fit import AGAIN_PASSES, Fit, fit, Trace
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of, with_imperfect
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.outcome import outcome
 from odocal_ros.estimator.result.refusal import no_imu, refused
-from odocal_ros.estimator.speed_offset import judge_offset
 from odocal_ros.estimator.start import first_state, Start
-from odocal_ros.estimator.state import State, YAW
+from odocal_ros.estimator.state import Priors, SPEED_OFFSET, State, YAW
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -72,7 +71,42 @@ def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fi
     a few passes continues. The offset of a quantised speed is then tested for two usual values.
     """
     # not stored in a variable: one fit in memory at a time
-    return judge_offset(problem, _fit(problem, config, trace), trace)
+    return _with_known_offset(problem, _fit(problem, config, trace), trace)
+
+
+def _with_known_offset(problem: Problem, now: Fit, trace: Trace | None) -> Fit:
+    """
+    Return a fit with the offset of a coarse speed fixed to that of truncation or of rounding.
+
+    Unchanged if the likelihood ratio is below 1000 to 1, or if the nearer one is 3.5 sigmas off
+    (one correct drive in 2000).
+    """
+    coarse = problem.leg.travel.coarse
+    if coarse is None or not coarse.truncation:
+        return now
+    sigma = float(np.sqrt(now.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
+    found = float(now.state.constants[SPEED_OFFSET])
+    known = coarse.truncation if found > coarse.truncation / 2 else 0.0
+    off, other = (abs(found - x) / sigma for x in (known, coarse.truncation - known))
+    if off > 3.5 or other**2 - off**2 < 2 * np.log(1e3):
+        return now
+    constants = now.state.constants.copy()
+    constants[SPEED_OFFSET] = known
+    summary = now.summary()
+    del now             # the equations of one fit at a time
+    sure = 1e-3 * coarse.step       # practically fixed
+    about = replace(summary, priors=_held(summary.priors, known, sure),
+                    first=_held(summary.first, known, sure))
+    last = fit(problem, replace(about.state, constants=constants), about.levels, AGAIN_PASSES,
+               about=about, frozen=True, trace=trace)
+    return replace(last, iterations=about.iterations + last.iterations)
+
+
+def _held(priors: Priors, value: float, sigma: float) -> Priors:
+    """Return priors with the offset known."""
+    constants, centre = priors.constants.copy(), priors.centre.copy()
+    constants[SPEED_OFFSET], centre[SPEED_OFFSET] = sigma, value
+    return replace(priors, constants=constants, centre=centre)
 
 
 def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
