@@ -13,8 +13,8 @@ import pytest
 from smoother_legs import leg_of, made
 
 from odocal_ros.estimator import smooth
+from odocal_ros.estimator.level_steps import long_run
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.long_run import long_run
 from odocal_ros.estimator.state import BY_SIGMA, CONSTANTS, HEIGHT_DRIFT
 from odocal_ros.reasons import Code
 from odocal_ros.sim.noise import gauss_markov
