@@ -16,9 +16,8 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.estimator import growing
-from odocal_ros.estimator.growing import LOOK_PASSES
+from odocal_ros.estimator.growing import carried, LOOK_PASSES, steps_of
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.estimator.warm_start import carried, steps_of
 from odocal_ros.forecast.forecast import Abandoned, as_keys, Forecast, Prospect
 from odocal_ros.forecast.foresight import forecast_of
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
