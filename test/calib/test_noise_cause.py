@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import AS_SENT
-from odocal_ros.estimator.result.noise_cause import noise_remedy, quantised, steps
+from odocal_ros.estimator.result.mismatch import noise_remedy, quantised, steps
 from odocal_ros.estimator.result.twist_noise import twist_noise
 from odocal_ros.estimator.several import _disputed
 from odocal_ros.pipeline.calibrate import calibrate
