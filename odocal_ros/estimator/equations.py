@@ -27,8 +27,7 @@ from odocal_ros.estimator.factors.slow_error import SlowError
 from odocal_ros.estimator.factors.speed_steps import SpeedSteps
 from odocal_ros.estimator.factors.travel_error import TravelError
 from odocal_ros.estimator.factors.velocity import VelocityRows
-from odocal_ros.estimator.level_information import LevelInformation, LevelSides
-from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.levels import LevelInformation, Levels, LevelSides
 from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW

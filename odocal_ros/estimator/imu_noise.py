@@ -9,9 +9,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.pieces import by_step, median
-from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.imu_steps import ImuSteps
 from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.levels import LEAST
 from odocal_ros.screening.leg_kind import TILT_SIGMA
 from odocal_ros.settings.grades import G, Grade
 

@@ -1,13 +1,49 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noise levels: the variance components of a fit, docs/method.md (S26)."""
+"""
+Noise levels: the variance components of a fit, docs/method.md (S26), and their lower limits.
 
-from dataclasses import dataclass
+Their uncertainty (S27b) is by the average information. V_i is the derivative of the covariance R
+of all rows by the logarithm of level i, u = R^-1 r the weighted residuals. With q_i = V_i u and
+g_i = J' R^-1 q_i, Gilmour, Thompson and Cullis (1995):
+
+    A_ij = (q_i' R^-1 q_j - g_i' H^-1 g_j) / 2,        dc / d(ln level_i) = (H^-1 g_i) of constants
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.mapped import room
+
 SLOW_LEVELS = ('slow', 'slow_up')
+
+
+@dataclass(frozen=True)
+class LeastNoise:
+    """
+    Minimum sigma of each variance component.
+
+    Physical: the best receivers of today; for an IMU a tenth of navigation grade, since one with a
+    dead band has no noise at rest.
+    """
+
+    fix: float = 0.005          # m, east or north or up, of white and of slow errors each
+    pose: float = 2e-4          # m, of positions in a local frame: motion capture
+    velocity: float = 0.005     # m/s, of an external velocity
+    heading: float = 5e-4       # rad, of an external heading
+    height: float = 0.02        # m, by air pressure
+    travel: float = 1e-3        # m, of a reading of the odometer
+    road: float = 2e-4          # m/sqrt(s) along the path: texture of the road under a tyre
+    # gyro rad/s/sqrt(Hz), accelerometer m/s^2/sqrt(Hz), their walks rad/s/sqrt(s), m/s^2/sqrt(s)
+    imu: dict[str, float] = field(default_factory=lambda: {
+        'gyro': 3e-8, 'accel': 1e-5, 'gyro_walk': 2e-11, 'accel_walk': 1e-7})
+
+
+LEAST = LeastNoise()
 
 
 @dataclass(frozen=True)
@@ -44,3 +80,48 @@ class Levels:
         time = roots['correlation_time']
         return cls({k: v**2 / (time / 2 if time and k in SLOW_LEVELS else 1.0)
                     for k, v in roots.items()} | {'correlation_time': time})
+
+
+class LevelSides:
+    """
+    The right-hand sides of L levels, at first all zero.
+
+    names : of the levels.   chain : (N, n, L) g_i by the keyframes.   border : (m, L) by the
+    constants.   square : (L, L) q_i' R^-1 q_j.
+    """
+
+    def __init__(self, N: int, n: int, m: int, names: Iterable[str]) -> None:
+        self.names = tuple(names)
+        self.chain = room(N, n, len(self.names))
+        self.border = np.zeros((m, len(self.names)))
+        self.square = np.zeros((len(self.names),) * 2)
+
+    def at(self, names: Iterable[str]) -> list[int]:
+        """Return the columns of some levels."""
+        return [self.names.index(name) for name in names]
+
+
+@dataclass(frozen=True, eq=False)
+class LevelInformation:
+    """
+    Information of the data on the levels, and the effect of the levels on the constants.
+
+    names : of the L levels.   average : (L, L) information on their logarithms.   moves : (m, L)
+    derivatives of the constants by these logarithms.
+    """
+
+    names: tuple[str, ...]
+    average: Floats
+    moves: Floats
+
+    def effects(self, precision: Mapping[str, float]) -> Floats:
+        """
+        Return the effects of independent unit errors of the levels on the constants: (m, L).
+
+        A column is the error of its level that is independent of the levels before it.
+
+        precision : information of the prior on each logarithm, by the name of the level.
+        """
+        own = np.diag([precision[name] for name in self.names])
+        root = np.linalg.cholesky(np.linalg.inv(self.average + own))
+        return self.moves @ root

@@ -12,12 +12,12 @@ from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.equations import FACTORS, OUTSIDE
 from odocal_ros.estimator.factors.axle import rates_at, WARM_TIME
 from odocal_ros.estimator.factors.fixes import whitener
-from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.priors import SHARED
 from odocal_ros.estimator.factors.slide import turned
 from odocal_ros.estimator.imu_noise import at_rest, vibrating, without_accelerometer
 from odocal_ros.estimator.imu_steps import ImuSteps
 from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, SmootherLeg
+from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.outside import Outside
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.start import standing

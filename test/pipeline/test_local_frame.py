@@ -13,7 +13,7 @@ import pytest
 
 from odocal_ros.data.samples import LOCAL
 from odocal_ros.estimator import prepare, smoother_leg
-from odocal_ros.estimator.factors.least import LEAST
+from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.prepare import _priors
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, OMEGA, PartlyKnownRate, rate_without_north

@@ -21,8 +21,7 @@ from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import blocks
 from odocal_ros.estimator.chain import JointMarginals, Normal
-from odocal_ros.estimator.level_information import LevelSides
-from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.levels import Levels, LevelSides
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, Priors, State, WITH_SLOW
 from odocal_ros.estimator.sums import Intervals, Points

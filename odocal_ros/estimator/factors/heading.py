@@ -15,8 +15,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
-from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
+from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.outside import convergence, Outside, thinned
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, BG, GYRO, HEADING, M, PHI

@@ -13,7 +13,6 @@ from odocal_ros.data.mapped import blocks, room
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor, IMU, LinearisationPoint
 from odocal_ros.estimator.factors.interval_noise import INTERVAL, interval_noise
-from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.signals import Signals
 from odocal_ros.estimator.factors.slide import (
@@ -25,8 +24,7 @@ from odocal_ros.estimator.factors.slide import (
 )
 from odocal_ros.estimator.factors.speed_steps import SpeedSteps
 from odocal_ros.estimator.imu_noise import at_rest, sensor_noise
-from odocal_ros.estimator.level_information import LevelSides
-from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.levels import LEAST, Levels, LevelSides
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BG, State
 

@@ -18,8 +18,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import blocks, room
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import Factor
-from odocal_ros.estimator.level_information import LevelSides
-from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.levels import Levels, LevelSides
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import SLOW, State, WITH_SLOW
 from odocal_ros.estimator.sums import Points

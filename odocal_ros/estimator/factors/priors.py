@@ -12,8 +12,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint, WANTED
-from odocal_ros.estimator.level_information import LevelSides
-from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.levels import Levels, LevelSides
 from odocal_ros.estimator.problem import Problem
 
 # sizes of imperfections, by the square of the usual one: names of the levels, and their median.

@@ -11,8 +11,7 @@ from scipy.linalg import solveh_banded
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors import factor
-from odocal_ros.estimator.level_information import LevelSides
-from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.levels import Levels, LevelSides
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import SLOW
 

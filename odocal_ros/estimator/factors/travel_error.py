@@ -10,9 +10,7 @@ import numpy as np
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.estimator.chain import JointMarginals, Normal
 from odocal_ros.estimator.factors.factor import add_prior, Factor, LinearisationPoint
-from odocal_ros.estimator.factors.least import LEAST
-from odocal_ros.estimator.level_information import LevelSides
-from odocal_ros.estimator.levels import Levels
+from odocal_ros.estimator.levels import LEAST, Levels, LevelSides
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import E
 

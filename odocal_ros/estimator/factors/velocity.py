@@ -16,9 +16,9 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.fixes import antenna
-from odocal_ros.estimator.factors.least import LEAST
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
+from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.outside import from_place, Outside, thinned
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import Origin
