@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.drive import rate_over_second
 from odocal_ros.calib.marks import MarkFix, Path
-from odocal_ros.calib.sections import Sections, sections
+from odocal_ros.calib.sections import NO_WINDOWS, Sections, sections, window_scale
 from odocal_ros.calib.speed_scale import NO_BINS, speed_scale, SpeedScale
-from odocal_ros.calib.window_scale import NO_WINDOWS, window_scale
 from odocal_ros.data.arrays import Bools, Complexes, Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row, chunks

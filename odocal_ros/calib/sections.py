@@ -1,7 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scale by section of the path, each with a sigma by the residuals of its fixes."""
+"""
+Scale of the fixes relative to dead reckoning, by section of the path and by length of a window.
+
+The scale of sections shows a change of the odometer scale during the drive. If fix errors do not
+depend on the motion, the scale is the same for windows of all lengths. A receiver that filters,
+dead-reckons or uses an odometer, and fixes with late stamps, have errors that depend on the motion
+over seconds but not over minutes: short windows then differ.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Complexes, Floats
+from odocal_ros.nav.statistics import robust_sigma
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import REMARK_SIGMAS, TYRE_SPREAD
 
 # lags of the correlation of residuals, in blocks: judgement, the next block and one at which
 # additional white noise does not hide it
@@ -18,6 +28,10 @@ BLOCK_LAGS = (1, 3)
 Similarity = tuple[np.complexfloating, Complexes, float]
 # judgement: grid of the correlation from block to block, finer where the sigma of a scale grows
 MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])
+SIDE_SCATTER = 0.25    # judgement: share of the change by which sections on one side may differ
+WINDOWS = 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0     # s, definition
+PARTS, FEWEST_WINDOWS = 8, 12      # judgement: parts of the leg for a sigma; windows for a result
+NO_WINDOWS = np.empty((0, 4))    # definition
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,3 +136,68 @@ def _process(n: int) -> Floats:
         table.append((np.trace(left) / n, x[:, 1] @ R @ x[:, 1],
                       *(np.trace(left, lag) / np.trace(left) for lag in BLOCK_LAGS)))
     return np.array(table).T
+
+
+def counter_change(parts: Sections, t_fix: Floats, fix_distance: Floats) -> tuple[Reason, ...]:
+    """
+    Return TRACK_MISMATCH if the scale of sections changes once and is constant otherwise.
+
+    parts : scale by section.   t_fix, fix_distance : (k,) times of the fixes, s, and path length
+    there, m. The section with the change may have any scale.
+    """
+    known = np.flatnonzero(np.isfinite(parts.ratio) & (parts.ratio > 0))
+    log, sigma = np.log(parts.ratio[known]), parts.sigma[known]
+    found = []
+    for k in range(1, len(known) - 1):
+        sides = [log[:k], log[k + 1:]]
+        before, after = (np.median(side) for side in sides)
+        apart = max(np.ptp(side) for side in sides)
+        doubt = np.hypot(*(sigma[rows].max() for rows in (slice(k), slice(k + 1, None))))
+        if abs(after - before) > max(TYRE_SPREAD, REMARK_SIGMAS * doubt, apart / SIDE_SCATTER):
+            found.append((apart / abs(after - before), k, float(np.exp(before - after))))
+    if not found:
+        return ()
+    _, k, factor = min(found)
+    begin, end = np.interp([parts.begin[known[k]], parts.end[known[k]]], fix_distance, t_fix)
+    return (Reason(Code.TRACK_MISMATCH, 'the odometer scale changes: it counts '
+                   f'{factor:.2f} times as much per metre after t = {begin:.0f} to {end:.0f} s as '
+                   'before', 'Check the driver for a change of decoding (x1, x2, x4), unit or '
+                   'gear. Mark a leg on one side of the change with --leg.'),)
+
+
+def window_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats) -> Floats:
+    """
+    Return length of the windows, s, scale - 1 of the fixes, its sigma, and windows: (w, 4).
+
+    t_fix : (k,) times of fixes, s, rising.   fix_n, dead_n : (k, 2 or more) positions by fixes and
+    by dead reckoning, m. The sigma is by the scatter over parts of the leg (jackknife); it is too
+    small if errors last longer than such a part.
+    """
+    rows = [(length, *found) for length in WINDOWS
+            if (found := _scale(t_fix, fix_n[:, :2], dead_n[:, :2], length))]
+    return np.array(rows) if rows else NO_WINDOWS
+
+
+def _scale(t: Floats, fix: Floats, dead: Floats, length: float) -> tuple[float, float, int] | None:
+    """Return scale - 1, its sigma and the number of windows of a length, half a length apart."""
+    begin = np.arange(t[0], t[-1] - length, length / 2) if len(t) else np.empty(0)
+    # without the last fix: by rounding, the end of the last window may be after it
+    i, j = np.searchsorted(t, begin), np.searchsorted(t[:-1], begin + length)
+    near = np.abs(t[j] - t[i] - length) < length / 4     # judgement: else fixes are missing
+    i, j = i[near], j[near]
+    chord = dead[j] - dead[i]
+    size = np.hypot(*chord.T)
+    i, j, chord, size = (x[size > 0] for x in (i, j, chord, size))
+    if len(i) < FEWEST_WINDOWS:
+        return None
+    along = (chord * (fix[j] - fix[i] - chord)).sum(axis=1) / size
+    most = 4 * max(robust_sigma(along), 1e-9)       # statistical: one in 16,000
+    along = np.clip(along, -most, most)
+    block = np.minimum((PARTS * (t[i] - t[0]) / (t[-1] - t[0])).astype(int), PARTS - 1)
+    top, bottom = (np.bincount(block, x, PARTS) for x in (size * along, size**2))
+    # no block may have more than half of the weight
+    if (bottom > 0).sum() < PARTS / 2 or bottom.max() > bottom.sum() / 2:
+        return None
+    left = (top.sum() - top) / (bottom.sum() - bottom)
+    sigma = np.sqrt((PARTS - 1) / PARTS * ((left - left.mean())**2).sum())
+    return float(top.sum() / bottom.sum()), float(sigma), len(i)

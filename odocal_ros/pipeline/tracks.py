@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.check import track_check, track_residuals
-from odocal_ros.calib.counter_change import counter_change
+from odocal_ros.calib.check import check_worse, per_distance, track_check, track_residuals
 from odocal_ros.calib.evidence import evidence, KEPT_ROWS
 from odocal_ros.calib.marks import MarkFix, Path
-from odocal_ros.calib.per_distance import check_worse, per_distance
 from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.sections import counter_change
 from odocal_ros.calib.slip import find_slips, rounding, Slips, SPIN_WINDOW
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Track

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made
 
-from odocal_ros.calib.counter_change import counter_change
-from odocal_ros.calib.sections import Sections
+from odocal_ros.calib.sections import counter_change, Sections
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.chain import Normal, solve
 from odocal_ros.estimator.changes import changes, Step

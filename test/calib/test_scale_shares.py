@@ -7,9 +7,9 @@ from drives import drive, settings
 import numpy as np
 import pytest
 
-from odocal_ros.calib.per_distance import check_worse, per_distance
+from odocal_ros.calib.check import check_worse, per_distance
+from odocal_ros.calib.sections import window_scale, WINDOWS
 from odocal_ros.calib.speed_scale import speed_scale
-from odocal_ros.calib.window_scale import window_scale, WINDOWS
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
