@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.drive import not_moving
-from odocal_ros.calib.turning import turn_ratio
+from odocal_ros.calib.gyro_axes import turn_ratio
 from odocal_ros.data.leg import part_of
 from odocal_ros.data.samples import take
 from odocal_ros.estimator.fit import CONVERGENCE
