@@ -10,7 +10,7 @@ from drives import changed, drive, everything_said, settings
 import numpy as np
 import pytest
 
-from odocal_ros.calib.failed import traces
+from odocal_ros.calib.result import traces
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline import methods as leg_methods
 from odocal_ros.pipeline.calibrate import calibrate, combine

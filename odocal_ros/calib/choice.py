@@ -1,12 +1,21 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Selection of the method for each value: the first in order that is not rejected."""
+"""
+Selection of the method for each value: the first in order that is not rejected.
+
+The methods on one leg are compared: differences beyond the sigmas, with their likely cause.
+"""
 
 from collections.abc import Iterable, Mapping
+from itertools import combinations
+import math
 
+from odocal_ros.calib.judge import share
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
+from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
 ORDER = ('smoother', 'two_point')
 PLANAR = 'planar'        # the only method of legs that the others cannot compute
@@ -25,6 +34,13 @@ ABOUT = {
     Code.WHEELS_NOT_SEPARABLE: 'scale_factor_left',
     Code.TRACK_WIDTH_NOT_DETERMINED: 'track_width',
 }
+# compared as if methods were independent: methods that share data differ less
+# each value as a word, and the likely cause in two_point, the later method of ORDER
+COMPARED = {
+    'scale_factor': ('scale', 'slip or bad fixes at one of the marks'),
+    'yaw_mounting_angle': ('yaw', 'an error of the configured heading (alignment.heading_source) '
+                           'of about this size'),
+    'pitch_mounting_angle': ('pitch', 'heights at the marks, hills, or an accelerometer bias')}
 
 
 def deciding(asked: str | tuple[str, ...], shown: bool = False) -> tuple[str, ...]:
@@ -97,3 +113,36 @@ def relevant_reasons(reasons: Iterable[Reason], method: str,
     """Return a method's reasons, without those about values that another method gives."""
     return tuple(r for r in reasons if r.code not in ABOUT or (
         given := estimates.get(ABOUT[r.code])) is None or given.method == method)
+
+
+def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
+    """
+    Compare the estimates of the methods on one leg.
+
+    methods : by name; rejected ones are left out.
+
+    Returns
+    -------
+    METHODS_DISAGREE for each parameter of a pair that differs by more than three times the root
+    of the sum of both variances, with the likely cause.
+
+    """
+    sound = [methods[n] for n in ORDER if n in methods
+             and methods[n].verdict is not Verdict.REJECTED]
+    found = []
+    for name, (word, cause) in COMPARED.items():
+        for better, other in combinations(sound, 2):
+            a, b = (m.estimates.get(name) for m in (better, other))
+            if a is None or b is None or a.value is None or b.value is None \
+                    or a.sigma is None or b.sigma is None:
+                continue
+            sigma = math.hypot(a.sigma, b.sigma)
+            apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))
+            if abs(apart) > REMARK_SIGMAS * sigma:
+                off = (share(apart / a.value, '+') if name == 'scale_factor' else
+                       f'{math.degrees(apart):+z.3f} deg')
+                found.append(Reason(
+                    Code.METHODS_DISAGREE, f'{word}: {other.name} and {better.name} differ by '
+                    f'{off}, {abs(apart) / sigma:.1f} sigma; likely cause: '
+                    f'{cause}'))
+    return found

@@ -5,24 +5,27 @@
 Joint estimate of a vehicle's constants from several legs, equal to one fit of all their rows.
 
 Each leg is given by its border. The constants are the same in every leg, except ln K, a random
-walk from leg to leg; priors count once: docs/method.md (S35).
+walk from leg to leg; priors count once: docs/method.md (S35). New tyres or a load change the scale
+beyond the random walk.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.border import Border, SCATTER_POINTS
 from odocal_ros.calib.linked_legs import LinkedLegs
+from odocal_ros.data.arrays import Floats
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
-Floats = NDArray[np.float64]
 # statistical, limits of the chi-square's normal deviate for disagreement: by chance once in 20
 # sets of sound legs; in one constant once in 300, with some 15 tested again one set in 20
 Z95, DISPUTED_DEVIATES = 1.6449, 2.7
 # judgement: grid of ln (sigma between legs / usual sigma), for means over it
 SCATTER_GRID = np.linspace(-2.5, 5.0, SCATTER_POINTS)
+# 1 sigma of a permanent change of ln K, by any tyre, gear or counter: physical
+FREE_STEP = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,3 +195,39 @@ def _bend(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
         legs.take([b.loosened(dict.fromkeys(curved, size))
                    for b, size in zip(first, bent, strict=True)])
     return bent
+
+
+@dataclass(frozen=True)
+class ScaleStep:
+    """A change of ln K from border ``leg`` - 1 to border ``leg``, and its size in sigmas."""
+
+    leg: int
+    change: float
+    sigmas: float
+
+
+def scale_steps(borders: Sequence[Border], steps: Sequence[float] | Floats, drifting: str,
+                angles: Sequence[str] = ()) -> list[ScaleStep]:
+    """
+    Compare the scale of each leg with its prediction by the earlier legs.
+
+    borders : by time.   steps : (J - 1,) sigma of the change of ``drifting`` from leg to leg.
+    drifting, angles : as for ``joint``.
+
+    Returns
+    -------
+    Changes beyond REMARK_SIGMAS, in order. After a change, only later legs predict the scale.
+
+    """
+    steps, found = np.array(steps, float), []
+    for j in range(1, len(borders)):
+        legs = LinkedLegs(borders[:j + 1], drifting, steps[:j], angles)
+        sigmas = float(legs.deviations()[j, legs.drifting])
+        if abs(sigmas) <= REMARK_SIGMAS:
+            continue
+        steps[j - 1] = FREE_STEP
+        legs = LinkedLegs(borders[:j + 1], drifting, steps[:j], angles)
+        x, _ = legs.solve()
+        before, now = (x[legs.place(k)[legs.drifting]] for k in (j - 1, j))
+        found.append(ScaleStep(j, float(now - before), sigmas))
+    return found

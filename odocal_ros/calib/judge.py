@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Comparison of values with their limits, for each leg and again for the combination."""
+"""Comparison of values with their limits, for each leg and the combination, and causes."""
 
 from collections.abc import Mapping
 
@@ -10,7 +10,7 @@ import numpy as np
 from odocal_ros.calib.result import Estimate
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.levels import SCALE_LIMIT
+from odocal_ros.settings.levels import SCALE_LIMIT, TYRE_SPREAD
 
 # definition: m/s of units of speed
 SPEED_UNITS = {1.0: 'm/s', 1 / 3.6: 'km/h', 0.44704: 'mph', 1852 / 3600: 'knots', 0.3048: 'ft/s',
@@ -23,6 +23,9 @@ MISTAKEN = {
     'm/pulse': {0.25: 'counting four edges per pulse (x4)',
                 0.5: 'counting two edges per pulse (x2)'}}
 PER_CENT_FROM = 0.01    # definition: relative values from this size are shown in per cent
+ANOTHER_SCALE = 2 * TYRE_SPREAD    # relative change larger than tyres cause: physical
+TYRES = 'tyre pressure, wear, load or another tyre'
+OTHER = 'another vehicle, gear, counter or unit: tyres do not change this much'
 
 
 def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
@@ -84,3 +87,15 @@ def share(relative: float, sign: str = '') -> str:
     """Return a relative value as text: in ppm, or in per cent if at least 1 %."""
     return f'{100 * relative:{sign}.1f} %' if abs(relative) >= PER_CENT_FROM else (
         f'{1e6 * relative:{sign}.0f} ppm')
+
+
+def cause_of_change(relative: float) -> str:
+    """Return the likely cause of a relative change of the scale."""
+    return OTHER if abs(relative) > ANOTHER_SCALE else TYRES
+
+
+def change_in_words(relative: float) -> str:
+    """Return a relative change as text, in ppm or per cent."""
+    if abs(relative) < 1e-3:
+        return f'{1e6 * relative:+z.0f} ppm'
+    return f'{100 * relative:+.3g} %'

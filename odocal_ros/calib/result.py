@@ -1,11 +1,12 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Results: estimates with sigmas and units, per method, per leg and combined."""
+"""Results: estimates with sigmas and units, per method, per leg and combined; exceptions."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+import traceback
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.evidence import Evidence
-from odocal_ros.reasons import GRAVITY, Reason, Verdict, verdict_of
+from odocal_ros.reasons import Code, GRAVITY, Reason, Verdict, verdict_of
 
 # keys of a result in calibration.json that are not estimates
 BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
@@ -24,6 +25,7 @@ BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
 
 AS_SENT = 'scale_factor_as_sent'
 FACTOR = 'scale_factor_'      # format: prefix of a wheel's name
+TRACE = 'trace'      # key of the details: for a developer
 
 
 @dataclass(frozen=True)
@@ -172,3 +174,27 @@ class Calibration:
     def verdict(self) -> Verdict:
         """Return the gravest verdict of the reasons."""
         return verdict_of(self.reasons)
+
+
+def raised_if_wild() -> np.errstate:
+    """Return a context in which overflow raises FloatingPointError instead of a warning."""
+    return np.errstate(over='raise', divide='raise', invalid='raise')
+
+
+def failed(unknown: Callable[[Reason], MethodResult], name: str,
+           error: Exception) -> MethodResult:
+    """Return the result of a method that raised: no values, the reason, and the trace."""
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    said = ' '.join(str(error).split())[:200]
+    reason = Reason(Code.METHOD_FAILED, f'method {name} failed with an internal error: '
+                    f'{type(error).__name__}{f" ({said})" if said else ""} in {where.name}, line '
+                    f'{where.lineno}')
+    return replace(unknown(reason), details={TRACE: ''.join(traceback.format_exception(error))})
+
+
+def traces(legs: Iterable[LegResult]) -> Iterator[tuple[str, str]]:
+    """Yield (method, trace) of each method that raised."""
+    for leg in legs:
+        for name, method in leg.methods.items():
+            if TRACE in method.details:
+                yield name, method.details[TRACE]

@@ -17,9 +17,8 @@ import numpy as np
 
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import PARAMETERS
-from odocal_ros.calib.failed import raised_if_wild
 from odocal_ros.calib.linked_legs import LinkedLegs
-from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.result import MethodResult, raised_if_wild
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.estimator.chain import NotPositive

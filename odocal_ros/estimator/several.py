@@ -11,11 +11,10 @@ import numpy as np
 
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS, root_of
-from odocal_ros.calib.causes import cause_of_change, change_in_words
 from odocal_ros.calib.combine import newest
-from odocal_ros.calib.joint import Joint, joint
+from odocal_ros.calib.joint import FREE_STEP, Joint, joint, scale_steps, ScaleStep
+from odocal_ros.calib.judge import cause_of_change, change_in_words
 from odocal_ros.calib.result import MethodResult, Source
-from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps, ScaleStep
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.estimator.factors.factor import WANTED
 from odocal_ros.estimator.factors.priors import SHARED, SIZE

@@ -9,10 +9,10 @@ import math
 
 from odocal_ros.calib.choice import ABOUT, PLANAR
 from odocal_ros.calib.result import Calibration, Estimate
-from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.forecast.forecast import Forecast
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import TRACK_WIDTH
 
 YES, NO, UNKNOWN = 'yes', 'no', 'unknown'
 

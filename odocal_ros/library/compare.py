@@ -9,7 +9,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from odocal_ros.calib.causes import ANOTHER_SCALE, change_in_words, OTHER, TYRES
+from odocal_ros.calib.judge import ANOTHER_SCALE, change_in_words, OTHER, TYRES
 from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.calibration import Calibration

@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         from odocal_ros.library.export import check_names
         check_names(series)
     output = output_folder(args.output, args.bags[0], args.force)
-    from odocal_ros.calib.failed import traces
+    from odocal_ros.calib.result import traces
     from odocal_ros.library.calibrate_bag import calibrate_bag
     from odocal_ros.offline.cli import trace_file
     calibration = calibrate_bag(args.bags, asked_topics(args), config, args.leg,

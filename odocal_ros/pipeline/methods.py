@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.agreement import disagreements
-from odocal_ros.calib.choice import choose, deciding, passed_over
+from odocal_ros.calib.choice import choose, deciding, disagreements, passed_over
 from odocal_ros.calib.drive import path_and_chord
-from odocal_ros.calib.failed import failed, raised_if_wild
-from odocal_ros.calib.result import AS_SENT, LegResult, MethodResult
+from odocal_ros.calib.result import AS_SENT, failed, LegResult, MethodResult, raised_if_wild
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg

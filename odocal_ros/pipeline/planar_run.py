@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.choice import PLANAR
-from odocal_ros.calib.failed import failed, raised_if_wild
 from odocal_ros.calib.planar.drive import MECANUM_ROWS, of_sides, rows_of, Wheels
 from odocal_ros.calib.planar.problem import Fit, Known, Run
 from odocal_ros.calib.planar.result import refused, result_of
-from odocal_ros.calib.result import LegResult, MethodResult
+from odocal_ros.calib.result import failed, LegResult, MethodResult, raised_if_wild
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError

@@ -11,6 +11,7 @@ frequency by chance; tuned, with the benchmark; judgement, if nothing was measur
 specification; or definition: a unit, a layout, a quadrature, a convention of a source.
 """
 
+from dataclasses import dataclass
 import math
 
 REMARK_SIGMAS = 3.0     # statistical: for a reason: once in 370
@@ -34,3 +35,22 @@ CLOCK_APART = 0.5      # s between the stamps of two topics, judgement: drivers 
 # definition: units
 DAY_NS = 86_400 * 10**9
 RAD_PER_DEG = math.pi / 180
+
+
+@dataclass(frozen=True)
+class TrackWidth:
+    """
+    Track widths and their prior sigmas, m; shares are of the width itself.
+
+    Physical: cars have 1.3 to 1.8 m, small robots 0.2 m, mining trucks 7 m.
+    """
+
+    of_a_car: float = 1.6       # first value, if not configured
+    least: float = 0.1          # smaller values are not a track width
+    any_sigma: float = 10.0     # of any vehicle, if the drive determines it
+    first_sigma: float = 3.0    # of any vehicle, if only wheels and gyro are compared
+    taped_share: float = 0.02   # 1 sigma of a configured one: by tape, between wide tyres
+    determined_share: float = 0.05    # largest sigma of a determined width: judgement
+
+
+TRACK_WIDTH = TrackWidth()

@@ -8,11 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odocal_ros.calib.agreement import disagreements
-from odocal_ros.calib.choice import choose, deciding, passed_over, relevant_reasons
-from odocal_ros.calib.one_vehicle import unlike_legs
+from odocal_ros.calib.choice import choose, deciding, disagreements, passed_over, relevant_reasons
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
-from odocal_ros.pipeline.combination import combine
+from odocal_ros.pipeline.combination import combine, unlike_legs
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.levels import REMARK_SIGMAS

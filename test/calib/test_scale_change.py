@@ -12,8 +12,7 @@ from smoother_legs import made
 from test_legs_on_border import apart, leg_result, NO_SCATTER, Toy, TRUTH
 
 from odocal_ros.calib.carried import carried_from
-from odocal_ros.calib.joint import joint
-from odocal_ros.calib.scale_steps import scale_steps
+from odocal_ros.calib.joint import joint, scale_steps
 from odocal_ros.errors import BadUsage
 from odocal_ros.estimator import several, smooth
 from odocal_ros.output.files import as_json

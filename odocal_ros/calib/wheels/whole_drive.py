@@ -11,10 +11,10 @@ a ratio that changes during the drive.
 
 import numpy as np
 
-from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_pair import Pair, robust_fit
+from odocal_ros.settings.levels import TRACK_WIDTH
 
 # statistical: sigmas of a significant difference of wheels: by chance once in 500 million windows;
 # a leg has tens of thousands, whose noise is not quite normal

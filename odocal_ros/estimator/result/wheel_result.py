@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.result import Estimate, FACTOR, MethodResult
-from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.estimator.result.wheels import Wheel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.axles import axles_of
 from odocal_ros.settings import levels
 from odocal_ros.settings.config import Config, SIDES
+from odocal_ros.settings.levels import TRACK_WIDTH
 
 Found = tuple[dict[str, Estimate], list[Reason]]
 FEWEST_ALIKE = 3        # definition: with fewer, the wheel that differs is unknown

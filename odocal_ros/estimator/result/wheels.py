@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import by_row
 from odocal_ros.estimator import state as layout
@@ -36,6 +35,7 @@ from odocal_ros.estimator.result.wheel_noise import fit_line, Increments, Line
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.rotations import rotvec
 from odocal_ros.screening.axles import STEER_GRID, steering_path
+from odocal_ros.settings.levels import TRACK_WIDTH
 
 OWN_DELAY = 0.02        # s, 1 sigma of a wheel's stamps against the others'. Judgement
 FIRST_WALK = 2e-3**2    # m^2/s, definition: first levels
