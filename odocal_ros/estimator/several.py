@@ -15,7 +15,7 @@ from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import FREE_STEP, Joint, joint, scale_steps, ScaleStep
 from odocal_ros.calib.judge import cause_of_change, change_in_words
 from odocal_ros.calib.result import MethodResult, Source
-from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.factor import WANTED
 from odocal_ros.estimator.factors.priors import SHARED, SIZE
 from odocal_ros.estimator.result.as_sent import as_sent_of
@@ -62,7 +62,8 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED]) \
         if config.leg.automatic else []
     steps[[change.leg - 1 for change in changes]] = FREE_STEP
-    found = _joint(borders, steps, days == 0)
+    found = joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED], CONSTANTS[:WANTED],
+                  dict(zip(CONSTANTS[:WANTED], SCATTER, strict=True)), (days == 0).tolist())
     at = [found.names.index(name) for name in CONSTANTS]
     C = floored(found.covariance[np.ix_(at, at)])
     common = _common(legs)
@@ -115,12 +116,6 @@ def _of_one_vehicle(borders: Sequence[Border]) -> list[Border]:
         sizes[name] = float(np.exp(np.average(log, weights=weight)))
     return [replace(border, used=np.array([sizes.get(name, used) for name, used in zip(
         border.names, border.used, strict=True)])) for border in borders]
-
-
-def _joint(borders: list[Border], steps: Floats, same: Bools) -> Joint:
-    usual = dict(zip(CONSTANTS[:WANTED], SCATTER, strict=True))
-    return joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED], CONSTANTS[:WANTED],
-                 usual, same.tolist())
 
 
 def _changed(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:

@@ -75,7 +75,6 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.fleet.jobs import bag_jobs, writable
     from odocal_ros.fleet.kpi import limits_of, write_kpi
     from odocal_ros.fleet.outcome import asked, exit_code, said, write_outcome
-    from odocal_ros.offline.cli import OK, REJECTED
     from odocal_ros.output.figures import counted
     if not args.task_timeout > 0:
         raise BadUsage(f'--task-timeout {args.task_timeout:g}: required: seconds above 0')
@@ -100,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         shown = 20    # vehicles that are named on the terminal
         say(said(vehicles, output, shown) + kpi)
-    return OK if exit_code(vehicles, args.strict) == 0 else REJECTED
+    return exit_code(vehicles, args.strict)
 
 
 def _computed(client: Any, jobs: 'list[BagJob]', args: argparse.Namespace) -> list[str]:

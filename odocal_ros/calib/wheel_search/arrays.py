@@ -59,7 +59,7 @@ def field_tables(q: int) -> tuple[Ints, Ints]:
     if power is None:
         raise BadUsage(f'{q} levels: no finite field has this many elements; give a prime power')
     p, m = power
-    digits = np.array([_digits(k, p, m) for k in range(q)])
+    digits = np.array([[k // p**i % p for i in range(m)] for k in range(q)])
     weight = p**np.arange(m)
     add = ((digits[:, None] + digits) % p) @ weight
     whole = np.zeros((q, q, 2 * m - 1), np.int64)
@@ -89,10 +89,6 @@ def _divides(factor: tuple[int, ...], polynomial: tuple[int, ...], p: int) -> bo
         for i, f in enumerate(factor):
             rest[k - d + i] = (rest[k - d + i] - head * f) % p
     return not any(rest[:d])
-
-
-def _digits(k: int, p: int, m: int) -> list[int]:
-    return [k // p**i % p for i in range(m)]
 
 
 def bose(q: int, columns: int) -> Ints:

@@ -50,9 +50,10 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
     sigma = 2 * max((wheel.ratio_sigma for wheel in wheels.values()), default=np.inf)
     if sigma > limit:
         known = f'has an uncertainty of {100 * sigma:.2g} %' if wheels else 'is not known'
-        return found, [Reason(Code.WHEELS_NOT_SEPARABLE, f'the ratio of {_pair(names)} '
-                              f'{known}; the limit is {100 * limit:.2g} %. The factors of the '
-                              'wheels are not stated')]
+        pair = 'right to left wheel' if tuple(names) == SIDES else 'the wheels'
+        return found, [Reason(Code.WHEELS_NOT_SEPARABLE, f'the ratio of {pair} {known}; the '
+                              f'limit is {100 * limit:.2g} %. The factors of the wheels are not '
+                              'stated')]
     for name, wheel in wheels.items():
         value = scale.value * wheel.ratio
         relative = np.hypot(scale.sigma / scale.value, wheel.ratio_sigma)
@@ -64,10 +65,6 @@ def wheel_estimates(names: Iterable[str], wheels: Mapping[str, Wheel], scale: Es
         if (left, right) != SIDES and found[width].value is not None:
             found |= _places({name: wheels[name] for name in (left, right)})
     return found, reasons
-
-
-def _pair(names: Sequence[str]) -> str:
-    return 'right to left wheel' if tuple(names) == SIDES else 'the wheels'
 
 
 def _widths(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
