@@ -16,8 +16,7 @@ import time
 from harness import parsed
 import numpy as np
 
-from odocal_ros.calib.wheel_search.criteria import score
-from odocal_ros.calib.wheel_search.planar import course_pieces, PlanarLeg
+from odocal_ros.calib.wheel_search.planar import course_pieces, PlanarLeg, score
 from odocal_ros.calib.wheel_search.search import search
 from odocal_ros.calib.wheel_search.space import ranges_of
 from odocal_ros.settings.config import WheelsConfig

@@ -11,8 +11,12 @@ from drives import drive, settings, two_point
 import numpy as np
 import pytest
 
-from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
-from odocal_ros.nav.rotations import matrix_from_quat, rpy_from_matrix
+from odocal_ros.nav.rotations import (
+    heading_from_yaw,
+    matrix_from_quat,
+    rpy_from_matrix,
+    yaw_from_heading,
+)
 from odocal_ros.screening.screen import screen
 
 PAGE = (Path(__file__).resolve().parent.parent / 'docs' / 'conventions.md').read_text()

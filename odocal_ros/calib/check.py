@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from odocal_ros.calib.marks import MarkFix, Path
+from odocal_ros.calib.marks import MarkFix, Path, window_means
 from odocal_ros.calib.result import PerDistance, TrackCheck
-from odocal_ros.calib.slow_errors import window_means
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.reasons import Code, Reason

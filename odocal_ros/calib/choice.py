@@ -13,7 +13,7 @@ import math
 
 from odocal_ros.calib.judge import share
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.levels import REMARK_SIGMAS
 

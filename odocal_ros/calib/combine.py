@@ -15,7 +15,7 @@ from odocal_ros.calib.budget import known_budget
 from odocal_ros.calib.joint import deviate, Z95
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 
 DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: changes with each power-up

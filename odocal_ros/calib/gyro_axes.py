@@ -19,9 +19,9 @@ from odocal_ros.calib.check import ONE_MOTION_RATIO
 from odocal_ros.calib.drive import knots_of
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import by_row
-from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.integral import integral_at, twice_integral_at
 from odocal_ros.nav.local_frame import GNSS_MOVES
+from odocal_ros.nav.rotations import arctan2
 from odocal_ros.nav.statistics import gaps_longer
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import Facing

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.border import Border
-from odocal_ros.calib.carried import Carried
+from odocal_ros.calib.border import Border, Carried
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.reasons import Code, GRAVITY, Reason, Verdict, verdict_of
 

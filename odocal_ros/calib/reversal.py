@@ -18,7 +18,7 @@ import numpy as np
 from odocal_ros.calib.check import ONE_MOTION_RATIO
 from odocal_ros.calib.drive import knots_of
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.nav.angles import arctan2, wrap
+from odocal_ros.nav.rotations import arctan2, wrap
 from odocal_ros.nav.statistics import robust_sigma
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FAULT_SIGMAS

@@ -24,9 +24,9 @@ from odocal_ros.calib.result import Estimate, MethodResult, Source, unknown_valu
 from odocal_ros.calib.slip import slip_source
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
 from odocal_ros.nav.projection import geodesic_chord, plane_chord
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_yaw

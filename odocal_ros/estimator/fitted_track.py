@@ -10,7 +10,7 @@ from odocal_ros.calib.reversal import pieces
 from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.sums import Intervals
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 
 
 class FittedTrack:

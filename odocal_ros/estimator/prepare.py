@@ -16,9 +16,8 @@ from odocal_ros.estimator.factors.priors import SHARED
 from odocal_ros.estimator.factors.slide import turned
 from odocal_ros.estimator.imu_noise import at_rest, vibrating, without_accelerometer
 from odocal_ros.estimator.imu_steps import ImuSteps
-from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, SmootherLeg
+from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, Outside, SmootherLeg
 from odocal_ros.estimator.levels import LEAST
-from odocal_ros.estimator.outside import Outside
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.start import standing
 from odocal_ros.nav.coarse_speed import CoarseSpeed

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from odocal_ros.estimator.imu_steps import ImuSteps
-from odocal_ros.estimator.leg import SmootherLeg
+from odocal_ros.estimator.leg import Outside, SmootherLeg
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.outside import Outside
 from odocal_ros.estimator.state import Priors
 from odocal_ros.settings.grades import Grade
 

@@ -21,7 +21,7 @@ from odocal_ros.estimator.result.outcome import outcome
 from odocal_ros.estimator.result.refusal import no_imu, refused
 from odocal_ros.estimator.start import first_state, Start
 from odocal_ros.estimator.state import Priors, SPEED_OFFSET, State, YAW
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_yaw

@@ -22,7 +22,7 @@ from odocal_ros.fleet.rows import DONE, legs_from, Row, rows_of
 from odocal_ros.fleet.statistics import covariance, History, history
 from odocal_ros.fleet.tables import leg_row, utc, VALUES
 from odocal_ros.library.calibrate_bag import unique_names
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.output.figures import accept_line, iso
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.acceptance import accept, Decision

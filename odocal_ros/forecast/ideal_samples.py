@@ -11,8 +11,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.heading import GIVEN_NOISE, Heading
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.imu_steps import ImuSteps, keyframes
-from odocal_ros.estimator.leg import BEFORE_MARK, SmootherLeg
-from odocal_ros.estimator.outside import Outside, OUTSIDE_RATE
+from odocal_ros.estimator.leg import BEFORE_MARK, Outside, OUTSIDE_RATE, SmootherLeg
 from odocal_ros.estimator.state import M, State
 from odocal_ros.forecast.planned_drive import PlannedDrive
 from odocal_ros.forecast.predict import Sigmas

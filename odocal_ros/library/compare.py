@@ -13,7 +13,7 @@ from odocal_ros.calib.judge import ANOTHER_SCALE, change_in_words, OTHER, TYRES
 from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.calibration import Calibration
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.output.stored import read_stored, Stored, stored_from
 from odocal_ros.settings.levels import REMARK_SIGMAS
 

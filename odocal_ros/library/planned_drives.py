@@ -13,8 +13,8 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, from_rates, marked, PlannedDrive
-from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.rotations import arctan2
 from odocal_ros.outside.limits import read_bytes
 from odocal_ros.settings.config import Config
 

@@ -8,7 +8,7 @@ from enum import Enum
 from math import nan
 from typing import Any
 
-from odocal_ros.calib.carried import Carried
+from odocal_ros.calib.border import Carried
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast.ability import Ability

@@ -17,7 +17,7 @@ from nav_msgs.msg import Path as PathMessage
 from rclpy.task import Future
 from std_msgs.msg import Header
 
-from odocal_ros.calib.carried import Carried
+from odocal_ros.calib.border import Carried
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import gravity, OMEGA
-from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
+from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose, wrap
 
 # limits of the alignment of a leg, recorded or planned
 MOTION_LEVEL = 30.0       # s, judgement: of driving that determines a level without standstill

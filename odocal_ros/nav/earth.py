@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from odocal_ros.data.arrays import FloatOrFloats, Floats
-from odocal_ros.nav.angles import arctan2
+from odocal_ros.nav.rotations import arctan2
 
 # physical: all of WGS 84 (NIMA TR8350.2)
 A = 6378137.0                  # m, semi-major axis

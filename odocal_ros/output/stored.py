@@ -9,7 +9,7 @@ import math
 from pathlib import Path
 from typing import Any, TypeVar
 
-from odocal_ros.calib.carried import Carried, carried_from
+from odocal_ros.calib.border import Carried, carried_from
 from odocal_ros.calib.result import BESIDE, Estimate, wheel_factors
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.figures import with_sigma, with_unit

@@ -17,7 +17,7 @@ from typing import Any
 
 from odocal_ros.calib.choice import ABOUT
 from odocal_ros.calib.result import Calibration, Estimate
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 

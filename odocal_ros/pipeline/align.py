@@ -24,10 +24,16 @@ from odocal_ros.nav.alignment import (
     off_the_earth,
     REST_EDGE,
 )
-from odocal_ros.nav.angles import wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin
 from odocal_ros.nav.earth import C_en
-from odocal_ros.nav.rotations import matrix_from_quat, quat_at, quat_from_matrix, transpose
+from odocal_ros.nav.rotations import (
+    matrix_from_quat,
+    quat_at,
+    quat_from_matrix,
+    transpose,
+    wrap,
+    yaw_from_heading,
+)
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs

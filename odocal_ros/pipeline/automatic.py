@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.carried import Carried
+from odocal_ros.calib.border import Carried
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, Samples

@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from odocal_ros.calib.carried import Carried
+from odocal_ros.calib.border import Carried
 from odocal_ros.calib.choice import choose, leg_estimates, relevant_reasons
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.angles import wrap
-from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix
+from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix, wrap
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, TYRE_SPREAD

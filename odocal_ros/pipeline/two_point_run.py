@@ -12,10 +12,9 @@ from odocal_ros.calib import check
 from odocal_ros.calib.budget import displacement, drift_sources, epochs_between
 from odocal_ros.calib.drive import white_noise
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.marks import MarkFix
+from odocal_ros.calib.marks import MarkFix, marks_with_slow_errors
 from odocal_ros.calib.reversal import against_travel, pieces
 from odocal_ros.calib.slip import slip_reasons
-from odocal_ros.calib.slow_errors import marks_with_slow_errors
 from odocal_ros.calib.two_point import (
     Chord,
     fit,

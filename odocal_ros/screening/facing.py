@@ -15,9 +15,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.data.pieces import bin_means, by_row, chunks, lengths, medians
-from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import ImuConfig

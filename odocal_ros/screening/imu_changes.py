@@ -7,7 +7,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import medians
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import Accelerations, facing_of
 from odocal_ros.screening.inputs import Inputs

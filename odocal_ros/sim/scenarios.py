@@ -12,10 +12,9 @@ from odocal_ros.data import samples
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.inputs import WHEELS
 from odocal_ros.data.leg import Leg
-from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.local_frame import local_fixes
-from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_rpy, yaw_from_heading
 from odocal_ros.settings.config import HOLONOMIC
 from odocal_ros.sim import body, sensors
 from odocal_ros.sim.motion import attitude, Motion, Start, STEADY

@@ -10,8 +10,8 @@ from odocal_ros.calib.check import bent, fix_noise_factor, mismatch, steady, tra
 from odocal_ros.calib.drive import knots_of
 from odocal_ros.calib.gyro_axes import gyro_reasons, turn_ratio
 from odocal_ros.calib.judge import judge
+from odocal_ros.calib.marks import slow_variance
 from odocal_ros.calib.result import Estimate
-from odocal_ros.calib.slow_errors import slow_variance
 from odocal_ros.reasons import Code
 from odocal_ros.screening.facing import imu_sanity
 from odocal_ros.settings.config import Config, ImuConfig, with_settings

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.check import fix_noise_factor
-from odocal_ros.calib.marks import fix_at, MarkFix, mean_fix, standing_at
-from odocal_ros.calib.slow_errors import slow_share, slow_variance, with_slow_errors
+from odocal_ros.calib.marks import (
+    fix_at,
+    MarkFix,
+    mean_fix,
+    slow_share,
+    slow_variance,
+    standing_at,
+    with_slow_errors,
+)
 
 pytestmark = pytest.mark.core
 STATED = np.diag([1.0, 1.0, 4.0])

@@ -11,7 +11,7 @@ import pytest
 from smoother_legs import made
 from test_legs_on_border import apart, leg_result, NO_SCATTER, Toy, TRUTH
 
-from odocal_ros.calib.carried import carried_from
+from odocal_ros.calib.border import carried_from
 from odocal_ros.calib.joint import joint, scale_steps
 from odocal_ros.errors import BadUsage
 from odocal_ros.estimator import several, smooth

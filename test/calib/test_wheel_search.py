@@ -12,9 +12,17 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.calib.wheel_search import planar
-from odocal_ros.calib.wheel_search.criteria import HUBER, loss, score, weights
 from odocal_ros.calib.wheel_search.direct import least_squares, repeats
-from odocal_ros.calib.wheel_search.planar import course_pieces, planar_leg, PlanarLeg, positions
+from odocal_ros.calib.wheel_search.planar import (
+    course_pieces,
+    HUBER,
+    loss,
+    planar_leg,
+    PlanarLeg,
+    positions,
+    score,
+    weights,
+)
 from odocal_ros.calib.wheel_search.search import MOST_ROWS, search
 from odocal_ros.calib.wheel_search.space import Ranges, ranges_of, sets_of, Space
 from odocal_ros.calib.wheel_search.surface import fit_surface, minimum_in_box, refine

@@ -10,10 +10,9 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.nav.alignment import complete, gyrocompass, level_at_rest, level_frame, REST_EDGE
-from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
-from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix
+from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix, wrap
 from odocal_ros.settings.grades import GRADES
 
 pytestmark = pytest.mark.core

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.angles import arctan2, heading_from_yaw, wrap, yaw_from_heading
 from odocal_ros.nav.rotations import (
+    arctan2,
     exp_so3,
+    heading_from_yaw,
     matrix_from_quat,
     matrix_from_rpy,
     quat_conjugate,
@@ -23,6 +24,8 @@ from odocal_ros.nav.rotations import (
     rpy_from_matrix,
     skew,
     transpose,
+    wrap,
+    yaw_from_heading,
     yaw_from_quat,
 )
 

@@ -11,10 +11,10 @@ import pytest
 
 from odocal_ros.data.samples import HeadingSamples, take
 from odocal_ros.nav import rotations
-from odocal_ros.nav.angles import heading_from_yaw, wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.rotations import heading_from_yaw, wrap, yaw_from_heading
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.align import align, choose_standstill, with_observed_walk
 from odocal_ros.pipeline.prepared import attitude_of

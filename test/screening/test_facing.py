@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from reversing_drives import made, there_and_back, three_point_turn, without_direction
 
-from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.nav.rotations import matrix_from_rpy, wrap
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.facing import accelerations, axes_reasons, Facing, facing, toward

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.angles import heading_from_yaw, wrap
-from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy
+from odocal_ros.nav.rotations import heading_from_yaw, matrix_from_quat, matrix_from_rpy, wrap
 from odocal_ros.settings.grades import Grade, GRADES
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, inertial_v, Motion, Start

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.wheel_search.criteria import loss, weights
-from odocal_ros.calib.wheel_search.planar import coefficients, PlanarLeg
+from odocal_ros.calib.wheel_search.planar import coefficients, loss, PlanarLeg, weights
 from odocal_ros.calib.wheel_search.space import sets_of, Space
 from odocal_ros.data.arrays import Floats
 

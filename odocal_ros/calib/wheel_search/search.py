@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.wheel_search.arrays import Design, design_for
-from odocal_ros.calib.wheel_search.criteria import score, Scores
 from odocal_ros.calib.wheel_search.direct import least_squares, LeastSquares
-from odocal_ros.calib.wheel_search.planar import PlanarLeg
+from odocal_ros.calib.wheel_search.planar import PlanarLeg, score, Scores
 from odocal_ros.calib.wheel_search.space import NAMES, Ranges, sets_of, Space
 from odocal_ros.calib.wheel_search.surface import refine, Refined
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 
 HEADING_MEANS = ('counter-clockwise rotation of the track: error of the configured heading minus '

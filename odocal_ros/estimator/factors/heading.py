@@ -16,14 +16,13 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
+from odocal_ros.estimator.leg import convergence, Outside, thinned
 from odocal_ros.estimator.levels import LEAST
-from odocal_ros.estimator.outside import convergence, Outside, thinned
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, BG, GYRO, HEADING, M, PHI
 from odocal_ros.nav.alignment import HEADING_LIMIT
-from odocal_ros.nav.angles import arctan2, wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.rotations import matrix_from_quat, transpose
+from odocal_ros.nav.rotations import arctan2, matrix_from_quat, transpose, wrap, yaw_from_heading
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
 

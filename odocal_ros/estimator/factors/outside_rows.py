@@ -15,7 +15,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.point_rows import PointRows
-from odocal_ros.estimator.outside import Outside
+from odocal_ros.estimator.leg import Outside
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.state import BARE, CONSTANTS
 from odocal_ros.nav.dead_reckoning import Origin

@@ -18,8 +18,8 @@ from odocal_ros.estimator.factors.factor import LinearisationPoint
 from odocal_ros.estimator.factors.fixes import antenna
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.outside_rows import OutsideRows, Rows
+from odocal_ros.estimator.leg import from_place, Outside, thinned
 from odocal_ros.estimator.levels import LEAST
-from odocal_ros.estimator.outside import from_place, Outside, thinned
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.receiver_filter import smoothing

@@ -18,8 +18,7 @@ from odocal_ros.estimator.factors.fixes import Fixes
 from odocal_ros.estimator.factors.heading import Heading
 from odocal_ros.estimator.fit import CONVERGENCE, Fit
 from odocal_ros.estimator.imu_noise import of_samples, sensor_noise
-from odocal_ros.estimator.leg import SmootherLeg
-from odocal_ros.estimator.outside import Outside
+from odocal_ros.estimator.leg import Outside, SmootherLeg
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.slip import SLIP_VARIANCE
 from odocal_ros.estimator.state import HEADING

@@ -37,7 +37,7 @@ from odocal_ros.estimator.result.refusal import OPTIONAL, UNITS, unknown
 from odocal_ros.estimator.result.shares import shares
 from odocal_ros.estimator.result.wheel_result import wheel_details, wheel_estimates
 from odocal_ros.estimator.result.wheels import wheels_beside
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import INFORMED_SHARE, SCALE_LIMIT

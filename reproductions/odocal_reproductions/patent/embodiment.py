@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.wheel_search.arrays import bose, full_factorial, next_prime_power
-from odocal_ros.calib.wheel_search.criteria import score
 from odocal_ros.calib.wheel_search.direct import least_squares, LeastSquares
-from odocal_ros.calib.wheel_search.planar import PlanarLeg
+from odocal_ros.calib.wheel_search.planar import PlanarLeg, score
 from odocal_ros.calib.wheel_search.space import sets_of, Space
 from odocal_ros.calib.wheel_search.surface import refine, Refined
 from odocal_ros.data.arrays import Floats, Ints
