@@ -12,13 +12,7 @@ covariance without a fit.
 from odocal_ros.estimator.growing import GrowingFit, Running
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.prepare import smoother_leg
-from odocal_ros.estimator.smoother import (
-    bound,
-    keyframe_times,
-    smooth,
-    too_little,
-    too_little_of,
-)
+from odocal_ros.estimator.smoother import bound, smooth, too_little, too_little_of
 
-__all__ = ['GrowingFit', 'Running', 'SmootherLeg', 'bound', 'keyframe_times', 'smooth',
-           'smoother_leg', 'too_little', 'too_little_of']
+__all__ = ['GrowingFit', 'Running', 'SmootherLeg', 'bound', 'smooth', 'smoother_leg', 'too_little',
+           'too_little_of']

@@ -170,8 +170,8 @@ def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
     """
     Return the covariance of the constants at a given state, covariance only.
 
-    leg, config : as for ``smooth``.   truth : values of all unknowns, at the times of
-    ``keyframe_times``.   levels : noise levels.   imperfect : (k,) sigmas of the imperfections,
+    leg, config : as for ``smooth``.   truth : values of all unknowns, at the keyframes of
+    ``problem_of``.   levels : noise levels.   imperfect : (k,) sigmas of the imperfections,
     ordered as IMPERFECT; None: as usual.
 
     Returns
@@ -185,9 +185,3 @@ def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
         problem.priors = with_imperfect(problem.priors, imperfect)
     equations = Equations(problem, truth, fitted=True)
     return equations.at(levels).solved().covariance
-
-
-def keyframe_times(leg: SmootherLeg, config: Config) -> Floats:
-    """Return the times of the keyframes of a leg, s: (N,)."""
-    problem = problem_of(leg, config)
-    return problem.imu.t[problem.imu.key]

@@ -8,7 +8,8 @@ from drives import cached, settings
 import numpy as np
 
 from odocal_ros.data.samples import VelocitySamples
-from odocal_ros.estimator import keyframe_times, smoother_leg
+from odocal_ros.estimator import smoother_leg
+from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
 from odocal_ros.nav.dead_reckoning import mounting_from_forward
 from odocal_ros.nav.earth import C_en
@@ -59,7 +60,8 @@ def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
 def truth(drive, config, leg) -> State:
     """Return the true state at the keyframes of a leg, on level ground."""
     o = drive.options
-    t = keyframe_times(leg, config)
+    imu = problem_of(leg, config).imu
+    t = imu.t[imu.key]
     since = t + (drive.truth.start_ns - o.start_ns) * 1e-9
     state = drive.motion.at(since)
     to_n = C_en(leg.origin.latitude, leg.origin.longitude).T @ C_en(state.latitude,

@@ -231,7 +231,7 @@ def _drift_rows(state: Floats, forgotten: Floats, w: int, student: Floats) -> Ro
 def _position_rows(run: Run, state: Floats, c: Floats, m: int, student: Floats) -> Rows:
     """Return rows of the positions."""
     k, count = run.node, len(run.node)
-    x, y, psi = state[k, :3].T
+    psi = state[k, 2]
     (a, b, delay), cos, sin = c[m:m + 3], np.cos(psi), np.sin(psi)
     speed = np.gradient(state[:, :2], run.t, axis=0)[k]
     arm = np.stack([cos * a - sin * b, sin * a + cos * b], -1)

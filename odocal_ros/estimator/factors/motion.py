@@ -213,8 +213,7 @@ class Motion:
         if coarse is None:
             return None
         moved_s = coarse.time_in_motion(self.state.t)
-        out: Floats = (self.f_n + self.f_n_end) / 2 * moved_s[:, None]
-        return out
+        return (self.f_n + self.f_n_end) / 2 * moved_s[:, None]
 
     def _by_odometer_filter(self) -> Floats:
         """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
