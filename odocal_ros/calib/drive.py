@@ -91,7 +91,7 @@ def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
 
 
 def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
-               t_stop: float, least: float = GNSS_MOVES) -> tuple[Reason, ...]:
+               t_stop: float, least: float) -> tuple[Reason, ...]:
     """
     Return the reasons if wheels or fixes show no motion, empty if both do.
 

@@ -87,11 +87,11 @@ def _line(t: Floats, y: Floats) -> tuple[float, float]:
     return float(np.median(y - slope * (t - t[0]))), slope
 
 
-def _smooth(t: Floats, t_fix: Floats, y: Floats, window: float = 20.0) -> Floats:
-    """Return medians over windows, interpolated to t, without the effect of outliers."""
+def _smooth(t: Floats, t_fix: Floats, y: Floats) -> Floats:
+    """Return medians over windows of 20 s, interpolated to t, without the effect of outliers."""
     if not len(y):
         return np.zeros(len(t))
-    cells = np.floor((t_fix - t_fix[0]) / window).astype(int)
+    cells = np.floor((t_fix - t_fix[0]) / 20.0).astype(int)
     at = np.unique(cells)
     middle = [np.median(t_fix[cells == c]) for c in at]
     out: Floats = np.interp(t, middle, [np.median(y[cells == c]) for c in at])

@@ -185,7 +185,7 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
     return kept
 
 
-def as_results(calibration: Calibration, stamp: str, vehicle: str = '') -> dict[str, Any]:
+def as_results(calibration: Calibration, stamp: str, vehicle: str) -> dict[str, Any]:
     values = dict(RESULTS)
     for name in ESTIMATES:
         estimate = calibration.estimates.get(name) or Estimate(None, None, '')

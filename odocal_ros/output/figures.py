@@ -191,7 +191,7 @@ def bag_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
     return wrapped(listed, '  ', '   ', width)
 
 
-def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool = False) -> list[str]:
+def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool) -> list[str]:
     """Return reasons with their remedies for a terminal; brief: only the codes of notes."""
     lines = []
     for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'warnings'),

@@ -128,7 +128,7 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
 
 
 def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
-              carried: Carried | None = None) -> MethodResult:
+              carried: Carried | None) -> MethodResult:
     """Return a method's combination of the legs without rejection; of all if all have one."""
     good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(good or driven), strict=True)

@@ -27,8 +27,7 @@ STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
 def without_false_rows(samples: OdometerSamples, t: Floats, form: OdometerForm,
-                       found: list[Reason],
-                       name: str = 'odometer') -> tuple[OdometerSamples, Floats]:
+                       found: list[Reason], name: str) -> tuple[OdometerSamples, Floats]:
     """Return rows without false or held counts, or with false increments interpolated."""
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)

@@ -90,7 +90,7 @@ def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: fl
 
 
 def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
-            signed: bool = True) -> tuple[Reason, ...]:
+                      signed: bool) -> tuple[Reason, ...]:
     """
     Return REVERSING_UNSIGNED with the reversed sections, () if there are none.
 

@@ -36,7 +36,7 @@ class First(NamedTuple):
     swapped: bool
 
 
-def first_values(run: Run, width: float = 0.0) -> First:
+def first_values(run: Run, width: float) -> First:
     """
     Return the first values of a run; width : m, as configured, 0 unknown.
 

@@ -108,7 +108,7 @@ class IntervalNoise:
 
 
 def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
-                   spread: Floats | None = None) -> IntervalNoise:
+                   spread: Floats | None) -> IntervalNoise:
     """
     Return the noises of a motion.
 

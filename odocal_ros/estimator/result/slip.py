@@ -39,7 +39,7 @@ def along(fit: Fit, marginals: JointMarginals) -> Floats:
     return -estimate[:, 0] * rows.along_size()
 
 
-def find_slips(fit: Fit, turned: Floats, count: float = 0.0) -> tuple[Slip, ...]:
+def find_slips(fit: Fit, turned: Floats, count: float) -> tuple[Slip, ...]:
     """
     Return the runs with outliers along the path beyond a count, m, largest first.
 
@@ -59,7 +59,7 @@ def find_slips(fit: Fit, turned: Floats, count: float = 0.0) -> tuple[Slip, ...]
     return tuple(sorted(slips, key=lambda s: -abs(s.metres)))
 
 
-def level_when_changing(fit: Fit, marginals: JointMarginals, count: float = 0.0) -> str:
+def level_when_changing(fit: Fit, marginals: JointMarginals, count: float) -> str:
     """Return the slip level at changes of speed as text, '' if it is not observable."""
     level = fit.levels.roots()
     # the noise of the difference of two readings, over a phase of 10 s
@@ -77,7 +77,7 @@ def level_when_changing(fit: Fit, marginals: JointMarginals, count: float = 0.0)
             f'{1e3 * level["along_hard"]:.0f} mm/√s{beside}')
 
 
-def slip_reasons(slips: tuple[Slip, ...], level: str = '') -> list[Reason]:
+def slip_reasons(slips: tuple[Slip, ...], level: str) -> list[Reason]:
     """
     Return WHEEL_SLIP with places and sizes of slip, empty without slip.
 
