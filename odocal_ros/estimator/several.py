@@ -18,7 +18,7 @@ from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.estimator.factors.factor import WANTED
 from odocal_ros.estimator.factors.priors import SHARED, SIZE
-from odocal_ros.estimator.result.as_sent import as_sent_of
+from odocal_ros.estimator.result.exported import as_sent_of
 from odocal_ros.estimator.result.outcome import determined, floored, not_observable, SCALES
 from odocal_ros.estimator.result.refusal import OPTIONAL
 from odocal_ros.estimator.result.remarks import beside, MODEL_FLOOR

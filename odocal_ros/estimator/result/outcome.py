@@ -27,14 +27,12 @@ from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result import remarks, slip
-from odocal_ros.estimator.result.as_sent import as_sent
-from odocal_ros.estimator.result.border import border_of
-from odocal_ros.estimator.result.exported import exported
+from odocal_ros.estimator.result.border import border_of, shares
+from odocal_ros.estimator.result.exported import as_sent, exported
 from odocal_ros.estimator.result.filters import filter_reasons
 from odocal_ros.estimator.result.left_over import bias_sigmas, correlation, left_over, normalised
 from odocal_ros.estimator.result.mismatch import mismatch
 from odocal_ros.estimator.result.refusal import OPTIONAL, UNITS, unknown
-from odocal_ros.estimator.result.shares import shares
 from odocal_ros.estimator.result.wheel_result import wheel_details, wheel_estimates
 from odocal_ros.estimator.result.wheels import wheels_beside
 from odocal_ros.nav.rotations import wrap
