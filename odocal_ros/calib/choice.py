@@ -34,8 +34,8 @@ ABOUT = {
     Code.WHEELS_NOT_SEPARABLE: 'scale_factor_left',
     Code.TRACK_WIDTH_NOT_DETERMINED: 'track_width',
 }
-# compared as if methods were independent: methods that share data differ less
-# each value as a word, and the likely cause in two_point, the later method of ORDER
+# methods are compared as if they were independent: those that share data differ less. Each value
+# as a word, and the likely cause in two_point, the later method of ORDER
 COMPARED = {
     'scale_factor': ('scale', 'slip or bad fixes at one of the marks'),
     'yaw_mounting_angle': ('yaw', 'an error of the configured heading (alignment.heading_source) '

@@ -20,8 +20,6 @@ from odocal_ros.reasons import Code, GRAVITY, Reason, Verdict, verdict_of
 BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
                     'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
                     'pitch_mounting_angle_housing_sigma'})
-
-
 AS_SENT = 'scale_factor_as_sent'
 FACTOR = 'scale_factor_'      # format: prefix of a wheel's name
 TRACE = 'trace'      # key of the details: for a developer
