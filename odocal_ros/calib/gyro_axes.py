@@ -166,12 +166,14 @@ def by_gravity(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, axes: F
     found: Found = []
     if fit is None:
         return found
+    nearest = TURNED[np.abs(TURNED - fit.coefficient[:, None]).argmin(axis=1)]
+    close, first = np.abs(nearest - fit.coefficient) < NEAR_TURNED, nearest.imag == 0
     for k, c in enumerate(fit.coefficient):
-        nearest = TURNED[np.argmin(np.abs(TURNED - c))]
-        if (nearest == SOUND[k] or abs(c - nearest) > NEAR_TURNED
+        # two gyro axes that measure one axis are no mirrored or swapped ones
+        if (nearest[k] == SOUND[k] or not close[k] or (close & (first == first[k])).sum() > 1
                 or fit.chance(k, SOUND[k]) > LARGEST_CHANCE):
             continue
-        along, part = (names[0], c.real) if nearest.imag == 0 else (names[1], c.imag)
+        along, part = (names[0], c.real) if first[k] else (names[1], c.imag)
         sent, true = _measured(names[k], along, float(part))
         found.append((sent, true, f'angular_velocity.{sent} measures the turn of gravity about '
                       f'{true} (coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
