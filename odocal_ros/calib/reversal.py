@@ -11,6 +11,7 @@ half a turn from one piece of the drive to the next, and the fixes remain behind
 its length; a fix error opposite to the travel disappears again.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -79,9 +80,9 @@ def backwards(found: Pieces) -> Bools:
     Return True for pieces that are driven backwards: (k,) bool.
 
     The heading offset is a random walk: its variance grows with the time between pieces, and its
-    size is by the median of its changes. A change beyond FLIP is a flip. Where FAULT_SIGMAS of the
-    walk exceed FLIP, the drive is divided; each part has its own forward direction, that of most
-    of its pieces.
+    size is by the median of its changes. A piece beyond FLIP from the mean of those before is
+    opposite to them. Where FAULT_SIGMAS of the walk exceed FLIP, the drive is divided; each part
+    has its own forward direction, that of most of its pieces.
 
     A piece whose path length by track and by fixes differs too much, as on the spot or with a
     jump of the fixes, has no direction.
@@ -96,7 +97,7 @@ def backwards(found: Pieces) -> Bools:
     usual = robust_sigma(step)
     sigma = usual * np.sqrt(np.maximum(dt / np.median(dt), 1.0))
     unknown = np.flatnonzero(FAULT_SIGMAS * sigma > FLIP) + 1
-    state = np.cumsum(np.append(False, np.abs(step) > FLIP)) % 2 == 1
+    state = _opposite(found.off[moves])
     for part in np.split(np.arange(len(moves)), unknown):
         flipped = state[part] != (np.mean(state[part]) > 0.5)
         for run in np.split(np.arange(len(part)), np.flatnonzero(np.diff(flipped)) + 1):
@@ -104,6 +105,15 @@ def backwards(found: Pieces) -> Bools:
                     found, moves[part[run]], moves[part[~flipped]]):
                 back[moves[part[run]]] = True
     return back
+
+
+def _opposite(off: Floats) -> Bools:
+    """Return True for offsets, rad, opposite to the mean of those before, which follows: (k,)."""
+    mean, out = float(off[0]), np.zeros(len(off), bool)
+    for k, angle in enumerate(off.tolist()):
+        out[k] = abs(wrap(angle - mean)) > FLIP
+        mean += float(wrap(angle - mean - math.pi * out[k])) / 2
+    return out
 
 
 def _without_bias(found: Pieces) -> Pieces:
