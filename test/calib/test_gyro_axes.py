@@ -5,13 +5,14 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 from drives import changed, drive, everything_said, rejecting, settings
 import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 
-from odocal_ros.calib.gyro_axes import sensor_axes
+from odocal_ros.calib.gyro_axes import by_gravity, sensor_axes
 from odocal_ros.calib.mounting import mounting
 from odocal_ros.calib.reversal import against_travel, backwards, level_track, Pieces, pieces
 from odocal_ros.data.samples import take
@@ -90,6 +91,17 @@ def test_the_chance_of_a_coefficient_is_that_of_f(segments, found, nearest):
     fit = GravityFit(np.array([found]), np.array([0.1]), np.array([segments]))
     assert fit.chance(0, 1.0) == pytest.approx(
         f_distribution.sf(abs(found - nearest)**2 / 0.1**2, 2, 2 * (segments - 1)), rel=1e-9)
+
+
+@pytest.mark.parametrize(('x', 'y', 'named'), [
+    (-1.36j, 0.98j, []), (-1.0, 0.98j, ['x']), (1j, 0.9, ['x', 'y'])])
+def test_two_gyro_axes_that_measure_one_axis_are_no_fault_of_the_axes(monkeypatch, x, y, named):
+    """The first are those of a zoo drive with correct axes, whose chance is 7e-6."""
+    fit = GravityFit(np.array([x, y, 0.0]), np.array([0.1, 0.05, 0.02]), np.full(3, 12.0))
+    monkeypatch.setattr('odocal_ros.calib.gyro_axes.gravity_fit', lambda *_: fit)
+    inputs = SimpleNamespace(t_imu=None, travel=None)
+    found = by_gravity(inputs, SimpleNamespace(rough=1.0), None, None, None, ['x', 'y', 'z'])
+    assert [sent for sent, *_ in found] == named
 
 
 @pytest.mark.parametrize('axis', ['x', 'y'])
@@ -244,6 +256,13 @@ def test_a_stretch_driven_backwards_is_found(begin, end, drift):
     assert f'in {back.sum()} of {len(back)} sections' in reason.text
     assert 'the counter does not count down' in reason.text
     assert 'odometer.signed is false' in against_travel(found, signed=False)[0].text
+
+
+def test_a_false_course_of_two_pieces_does_not_turn_the_rest_around():
+    """Its begin changes the direction by 136 deg, its end by less, as in a zoo drive."""
+    off = np.deg2rad(np.repeat([-86.0, 138.0, -93.0], [60, 2, 50]))
+    t = np.arange(len(off)) * 1.0
+    assert not np.delete(backwards(Pieces(t, off, *np.ones((2, len(t))))), [60, 61]).any()
 
 
 def test_a_gyro_that_drifts_by_turns_is_no_reversing():
