@@ -19,7 +19,8 @@ import numpy as np
 
 BEFORE_S, AFTER_S = 15.0, 3.0      # s, sent before the start mark and after the stop mark
 BLOCK_S = 10.0                     # s of the drive sent at once
-MOST_AHEAD = 4000                  # IMU messages that the node has not taken yet
+MOST_AHEAD_S = 20.0                # s of the drive that the node has not taken yet, each topic
+SHOWN = {'fix': 'gnss'}            # names of inputs in the diagnostics
 GOAL_S, LONGEST_S = 5.0, 3600.0    # s, of the answer; of the final result, given up then
 
 
@@ -34,7 +35,9 @@ class Sender:
                         'odometer': encode.twist('odometer', drive.odometer),
                         'fix': encode.fix('fix', drive.fix)}
         self._player = Player(client.node, {slot: t.msgtype for slot, t in self._topics.items()})
-        self._client, self._sent = client, 0
+        self._client = client
+        self._sent = dict.fromkeys(self._topics, 0)
+        self._seconds = int(drive.imu.stamp_ns[-1] - drive.imu.stamp_ns[0]) * 1e-9
         self._first_ns = int(drive.imu.stamp_ns[0])
 
     def received(self) -> bool:
@@ -56,12 +59,15 @@ class Sender:
                 topic.time_ns[some], topic.pack(some), strict=True)]
         for _, slot, raw in sorted(rows, key=lambda row: row[0]):
             self._player.publishers[slot].publish(raw)
-            self._sent += slot == 'imu'
-        wait_for(lambda: self._taken() > self._sent - MOST_AHEAD, 'what was sent', LONGEST_S)
+            self._sent[slot] += 1
+        wait_for(lambda: max(map(self._ahead_s, self._sent)) < MOST_AHEAD_S, 'what was sent',
+                 LONGEST_S)
 
-    def _taken(self) -> int:
-        seen = self._client.health.get('calibrator: imu', {})
-        return int(seen.get('messages', 0)) + int(seen.get('dropped', 0))
+    def _ahead_s(self, slot: str) -> float:
+        """Return the time, s, of what was sent on a topic and not taken."""
+        seen = self._client.health.get(f'calibrator: {SHOWN.get(slot, slot)}', {})
+        taken = int(seen.get('messages', 0)) + int(seen.get('dropped', 0))
+        return (self._sent[slot] - taken) * self._seconds / len(self._topics[slot].time_ns)
 
 
 def measure(client, node, drive, seconds: float) -> None:
