@@ -14,7 +14,7 @@ import pytest
 from smoother_legs import leg_of, made, truth
 
 from odocal_ros.calib.budget import total_covariance
-from odocal_ros.estimator import bound, keyframe_times, smooth
+from odocal_ros.estimator import bound, smooth
 from odocal_ros.estimator.equations import Weighted
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
@@ -232,8 +232,9 @@ def test_equations_without_a_solution_say_the_time(monkeypatch):
     monkeypatch.setattr(Weighted, 'normal', undetermined)
     reason, = smooth(leg, config).reasons
     assert reason.code is Code.NOT_CONVERGED
-    assert (f'do not determine the motion at t = {keyframe_times(leg, config)[40]:.1f} s. Likely '
-            'cause: ') in reason.text
+    imu = problem_of(leg, config).imu
+    assert (f'do not determine the motion at t = {imu.t[imu.key[40]]:.1f} s. Likely cause: '
+            in reason.text)
 
 
 @pytest.mark.parametrize(('times', 'said'), [(30.0, False), (200.0, True)])

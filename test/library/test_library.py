@@ -124,7 +124,9 @@ def test_residuals_of_each_sensor_have_stamp_sigma_and_unit(calibration):
             assert set(one['unit']) == {unit}
             assert len(one['stamp_ns']) == rows
             assert np.all(np.diff(one['stamp_ns']) > 0)
-            assert 0.05 < np.sqrt(((one['value'] / one['sigma'])**2).mean()) < 1.1
+            # the sigma of counts is that of a single rounded one; they are averaged
+            least = 0.01 if sensor == 'odometer' else 0.05
+            assert least < np.sqrt(((one['value'] / one['sigma'])**2).mean()) < 1.1
     one = of(found, 'gyro', 'z')
     np.testing.assert_array_equal(one['stamp_ns'], calibration.states()['stamp_ns'][1:])
 
