@@ -64,7 +64,7 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
         outside={part.name: sent for part in OUTSIDE
                  if (sent := part.prepared(inputs, config, origin)) is not None},
         has_accelerometer=inputs.has_accelerometer,
-        wheels=tuple(inputs.travels))
+        wheels=inputs.travels)
 
 
 def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> Problem:

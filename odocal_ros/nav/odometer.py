@@ -60,7 +60,7 @@ class Travel:
         if m < 2 or len(self.t) <= 2 * m:
             return self
         weights = 3.0 * (3 * m**2 + 3 * m - 1 - 5 * np.arange(-m, m + 1)**2)
-        even = self.t[2 * m:] - self.t[:-2 * m] < 1.5 * 2 * m * step
+        even = self.t[2 * m:] - self.t[:-2 * m] < 3 * m * step      # longer by half: a gap
         t, s = (np.concatenate([x[:m], np.where(even, np.convolve(
             x, weights / weights.sum(), 'valid'), x[m:-m]), x[-m:]]) for x in (self.t, self.s))
         return replace(self, t=t, s=s) if (np.diff(t) > 0).all() else self

@@ -109,9 +109,8 @@ def sigma_limit(sigma: Floats, max_sigma: float) -> float:
 
 
 def placed(fix: FixSamples) -> Bools:
-    """Return a mask of fixes on the Earth whose angles are not both zero: (n,) bool."""
+    """Return a mask of fixes on the Earth, not NaN, whose angles are not both zero: (n,) bool."""
     nowhere = (fix.latitude == 0) & (fix.longitude == 0)
-    # NaN compares false
     there: Bools = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi) & ~nowhere
     return there
 
@@ -146,8 +145,7 @@ def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
 def _proper(matrices: Floats) -> Bools:
     """Return a mask of invertible covariance matrices: (n, k, k) to (n,) bool."""
     variance = np.diagonal(matrices, axis1=1, axis2=2)
-    largest_sigma = 1e8    # m, larger ones are invalid
-    # products and roots of larger values would overflow
+    largest_sigma = 1e8    # m, larger ones are invalid: products and roots would overflow
     small = np.abs(matrices) < largest_sigma**2
     sane: Bools = np.all(np.isfinite(matrices) & small, axis=(1, 2))
     smallest_sigma = 1e-6    # m, smaller ones are invalid
@@ -195,11 +193,10 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
     pick = np.unique(np.searchsorted(t_fix[:-1], np.arange(t_fix[0], t_fix[-1],
                                                            DISPLACEMENT_WINDOW)))
     meridian, normal = radii(geodetic[0, 0])
-    east, north = (geodetic[pick, 1] * normal * np.cos(geodetic[0, 0]),
-                   geodetic[pick, 0] * meridian)
-    path = running_integral(t, velocity_n[:, :2])
-    V = np.diff(np.interp(t_fix[pick], t, path[:, 0]) + 1j * np.interp(t_fix[pick], t, path[:, 1]))
-    D = np.diff(east + 1j * north)
+    D = np.diff(geodetic[pick, 1] * normal * np.cos(geodetic[0, 0])
+                + 1j * geodetic[pick, 0] * meridian)
+    path = running_integral(t, velocity_n[:, :2]) @ [1, 1j]
+    V = np.diff(np.interp(t_fix[pick], t, path))
     # motion in a gap of the velocity, or of the fixes, is not measured
     gaps, at = np.append(0, np.cumsum(np.diff(t) > VELOCITY_GAP)), t_fix[pick]
     begin, end = np.searchsorted(t, at[:-1], side='right') - 1, np.searchsorted(t, at[1:])
