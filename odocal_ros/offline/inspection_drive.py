@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.bagio.read import Bag
-from odocal_ros.calib.drive import path_and_chord
+from odocal_ros.calib.drive import not_moving, path_and_chord
 from odocal_ros.calib.gyro_axes import turning
 from odocal_ros.calib.judge import far_from_nominal
 from odocal_ros.calib.mounting import mounting, with_axes
@@ -67,6 +67,12 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
     drive = survey.survey_drive(inputs, config)
+    still = [reason for reason in not_moving(
+        inputs.travel, drive.t_fix, drive.fixes_n, drive.sigma, inputs.t_stop, inputs.least_motion)
+        if reason.code is Code.ODOMETER_STILL]
+    if still:       # scale, speeds, standstills and axes are computed from the counts
+        findings += still
+        return options
     path_length, chord = path_and_chord(drive.t_fix, drive.fixes_n, inputs.least_motion)
     driven = _driven(inputs, drive)
     long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %

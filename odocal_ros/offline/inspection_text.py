@@ -230,7 +230,8 @@ def _mounting(mounting: dict[str, Any]) -> list[str]:
         sure = whole_degrees(mounting['forward_sigma'])
         how = (f'forward direction from accelerations and turns, uncertainty {sure} deg (1 '
                f'sigma); the measured mounting differs by {math.degrees(mounting["off"]):.1f} deg')
-    text = 'set imu.mounting_rpy to' if mounting['needed'] else 'imu.mounting_rpy is correct:'
+    text = 'set imu.mounting_rpy to' if mounting['needed'] else \
+        'imu.mounting_rpy is correct to the nearest quarter turn:'
     return wrapped(f'axes: {text} [{rpy}] rad (roll, pitch, yaw {degrees} deg; {how})')
 
 

@@ -189,7 +189,7 @@ def test_a_good_drive_lacks_only_a_heading(tmp_path, capsys):
     assert seen['mounting'] == seen['mounting'] | {'rpy': [0, 0, 0], 'needed': False}
     assert seen['command'] == f'odocal replay {tmp_path / "bag"}'
     assert seen['open'] == ''
-    assert 'imu.mounting_rpy is correct: [0, 0, 0] rad' in text
+    assert 'imu.mounting_rpy is correct to the nearest quarter turn: [0, 0, 0]' in text
 
 
 @pytest.mark.parametrize('rpy', [
