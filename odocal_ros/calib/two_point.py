@@ -58,11 +58,13 @@ class Chord:
         return self.track.at(self.end.t) - self.track.at(self.start.t)
 
 
-def solve(chord: Chord, up_scale: float = 1.0) -> tuple[Floats, bool]:
+def solve(chord: Chord, up_scale: float = 1.0,
+          limit: float = PITCH_LIMIT) -> tuple[Floats, bool]:
     """
     Solve M f = c for f = K forward_b: docs/method.md (T3), (T4).
 
-    up_scale : factor on the stated height sigmas; np.inf: heights are not used.
+    up_scale : factor on the stated height sigmas; np.inf: heights are not used.   limit : rad;
+    heights that give a larger pitch are not used.
 
     Returns
     -------
@@ -83,7 +85,7 @@ def solve(chord: Chord, up_scale: float = 1.0) -> tuple[Floats, bool]:
         c = antenna - turn @ _C_bv(yaw, pitch) @ chord.lever_b
         if vertical_known:
             f = np.linalg.solve(M, c)
-            if abs(np.arctan2(f[2], np.hypot(f[0], f[1]))) > PITCH_LIMIT:
+            if abs(np.arctan2(f[2], np.hypot(f[0], f[1]))) > limit:
                 return solve(chord, np.inf)
         else:
             f = np.append(np.linalg.solve(M[:2, :2], c[:2]), 0.0)
@@ -135,7 +137,8 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
     sigma = np.sqrt(np.diag(covariance))
     K = float(np.linalg.norm(f))
     yaw, pitch = (float(a) for a in mounting_from_forward(f / K))
-    reasons = _judge_angles(chord.alignment, yaw, sources, vertical_known, config)
+    reasons = _judge_angles(chord.alignment, yaw, sources, config)
+    reasons += () if vertical_known else (_without_heights(chord, fix_scale[2]),)
     separable = Code.YAW_NOT_SEPARABLE not in {r.code for r in reasons}
     estimates = {
         'scale_factor': Estimate(K, K * float(sigma[0]), scale_unit),
@@ -206,9 +209,24 @@ def _blind_height(mark: MarkFix, sigma: float = 0.0) -> MarkFix:
     return replace(mark, covariance_n=covariance)
 
 
+def _without_heights(chord: Chord, up_scale: float) -> Reason:
+    """Return the reason for a pitch that the heights do not determine."""
+    f, known = solve(chord, up_scale, np.inf)
+    if known:
+        _, pitch = mounting_from_forward(f / np.linalg.norm(f))
+        return Reason(Code.TRACK_MISMATCH, 'the heights of the marks give a pitch of '
+                      f'{np.rad2deg(float(pitch)):+.0f} deg; the limit is '
+                      f'{np.rad2deg(PITCH_LIMIT):.0f} deg', 'Set imu.mounting_rpy to the '
+                      'approximate pitch of the IMU, or check the heights and their unit.')
+    why = ('are too inaccurate for the pitch' if chord.start.height_known
+           and chord.end.height_known else 'are unknown')
+    return Reason(Code.PITCH_NOT_DETERMINED, f'the heights of the marks {why}; '
+                  f'0 ± {np.rad2deg(PITCH_PRIOR):.1f} deg is assumed')
+
+
 def _judge_angles(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
-                  vertical_known: bool, config: Config) -> tuple[Reason, ...]:
-    """Return the reasons about yaw (rad) and pitch, from heading and heights."""
+                  config: Config) -> tuple[Reason, ...]:
+    """Return the reasons about yaw (rad), from the heading."""
     asked = config.verdict.max_yaw_sigma
     by_heading = next(s for s in sources if s.name == 'initial_heading')
     share = float(np.linalg.norm(by_heading.effects[1]))
@@ -232,10 +250,6 @@ def _judge_angles(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
                            f'course give a yaw mounting of {np.rad2deg(yaw):+z.1f} deg, '
                            f'{np.rad2deg(far):.1f} deg from its nominal value; the limit is '
                            f'{np.rad2deg(FAR_YAW):.0f} deg'),)
-    if not vertical_known:
-        reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the heights of the fixes are too '
-                           f'inaccurate for the pitch; 0 ± {np.rad2deg(PITCH_PRIOR):.1f} deg is '
-                           'assumed'),)
     return reasons
 
 
