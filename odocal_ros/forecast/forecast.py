@@ -47,11 +47,15 @@ class Prospect:
     now: str = ''
     lack: str = ''
 
-    def words(self, name: str, unit: str, factor: float) -> str:
-        """Return the forecast as text, sigmas times ``factor`` in ``unit``."""
+    def words(self, name: str, unit: str, factor: float, since: float = 0.0) -> str:
+        """
+        Return the forecast as text, sigmas times ``factor`` in ``unit``.
+
+        since : distance driven since the forecast, m.
+        """
         if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
             unit, factor = '%', 100.0
-        asked = three_digits(self.asked * factor)
+        asked = three_digits(float(f'{self.asked * factor:.2g}'))
         sigma = None if self.sigma is None else three_digits(self.sigma * factor)
         known = name if sigma is None else f'{name} {sigma} {unit}'
         if self.now and sigma is not None:
@@ -63,7 +67,9 @@ class Prospect:
             return f'{known}: {self.why}'
         if self.metres == 0.0:
             return f'OK: {known} (limit {asked})'
-        more = f'drive {_rounded_up(self.metres)} m more to reach the limit of {asked} {unit}'
+        left = self.metres - since
+        more = (f'drive {_rounded_up(left)} m more' if left > 0 else 'drive on') + (
+            f' to reach the limit of {asked} {unit}')
         if sigma is None:
             return f'{name} is not determined yet; {more}'
         return f'{known} so far; {more}' if self.now else (
@@ -85,7 +91,8 @@ class Forecast:
 
     pitch : rad, sigma.   wheels : None with one counter, and before the first estimate.
     methods : results of methods that need no end point.   estimates : the running estimate, each
-    value from the method that will provide it.   until_ns : stamp of the newest sample used.
+    value from the method that will provide it.   until_ns, distance_m : stamp of the newest sample
+    used, and path length of the leg there.
     faults : reasons for which a method will reject the leg at any length.
     """
 
@@ -96,6 +103,7 @@ class Forecast:
     methods: dict[str, MethodResult] = field(default_factory=dict)
     estimates: dict[str, Estimate] = field(default_factory=dict)
     until_ns: int = 0
+    distance_m: float = 0.0
     faults: tuple[Reason, ...] = ()
 
     def sigma(self, quantity: str) -> float | None:
@@ -104,10 +112,15 @@ class Forecast:
         return {'scale': self.scale.sigma, 'yaw': self.yaw.sigma, 'pitch': self.pitch,
                 'left_right': of_wheels.left_right, 'track_width': of_wheels.track_width}[quantity]
 
-    def words(self) -> str:
-        """Return it as a sentence: reached limits, remaining distances, unreachable limits."""
-        return '; '.join([self.scale.words('scale', 'ppm', 1e6),
-                          self.yaw.words('yaw', 'deg', math.degrees(1))])
+    def words(self, distance_m: float = 0.0) -> str:
+        """
+        Return it as a sentence: reached limits, remaining distances, unreachable limits.
+
+        distance_m : path length of the leg by now, m.
+        """
+        since = max(0.0, distance_m - self.distance_m)
+        return '; '.join([self.scale.words('scale', 'ppm', 1e6, since),
+                          self.yaw.words('yaw', 'deg', math.degrees(1), since)])
 
     @property
     def complete(self) -> bool:

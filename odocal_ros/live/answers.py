@@ -21,6 +21,8 @@ KMH = 3.6    # definition: km/h per m/s
 FORECAST_OLD_S = 15.0    # judgement: age from which the forecast is reported as old
 FEWEST_MARKS = 2         # judgement: marks after which the hint omits ~/mark
 DRIVE = 'drive '
+DRIVE_ON = ('then drive on, with stops and left and right turns, until this hint shows OK for '
+            'scale and yaw')
 STRAIGHT = 'drive straight at normal speed until left and right scale are separable'
 TURNS = 'for the track width: turn by 90 deg in total or more'
 SPOT_TURNS = ('for the track width: turn on the spot in both directions, and drive straight for a '
@@ -192,12 +194,11 @@ def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
     if metres > 0 or slow:
         if metres > 0:
             wants = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in wants)]
-        end = _end(now) if now.session.by_itself else (
-            f'then stand still {REST_FORESEEN_S:.0f} s and call ~/stop_leg')
+        end = _end(now) if now.session.by_itself else DRIVE_ON
         return [', '.join(wants), end], facts
     if now.forecast is None:
         return [*wants, _end(now)], facts
-    facts.append(now.forecast.words())
+    facts.append(now.forecast.words(now.distance_m))
     if now.forecast_age_s > FORECAST_OLD_S:
         facts.append(f'estimate is {now.forecast_age_s:.0f} s old')
     ends = now.forecast.complete or now.session.by_itself

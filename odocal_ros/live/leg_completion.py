@@ -80,7 +80,7 @@ class LegCompletion:
         if self._at_stop is not None and self.session.state is State.COMPUTING:
             self._computing.answer_late(partial(answers.provisional, self._at_stop))
         if self.session.state is State.RECORDING:
-            self._watch.look(self._recording.newest_ns)
+            self._watch.look(self._recording.newest_ns, self._recording.progress.distance_m())
             self._report_silence()
         self._journal.tick(self._config(), self.session.busy)
 

@@ -3,6 +3,7 @@
 
 """The running estimate: updated in the worker every few seconds while a leg is recorded."""
 
+from dataclasses import replace
 from functools import partial
 import threading
 import time
@@ -116,8 +117,8 @@ class RunningEstimate:
         first = {r.code: r for r in reversed(seen)}
         return tuple(gravest_first(first.values()))
 
-    def look(self, newest_ns: int) -> None:
-        """Submit an update to the worker if one is due."""
+    def look(self, newest_ns: int, distance_m: float = 0.0) -> None:
+        """Submit an update of the leg to a stamp, with its length, m, to the worker if due."""
         if (self._thinned is None or self._looking or newest_ns < self._due_ns
                 or time.monotonic() < self._pause_until):
             return
@@ -127,13 +128,15 @@ class RunningEstimate:
         self._worker.submit(
             partial(_look, self._thinned, before, fresh, self._start_ns, self._config, self._over,
                     self._smoother),
-            partial(self._take, self._over))
+            partial(self._take, self._over, distance_m))
 
-    def _take(self, over: threading.Event, look: Look | None, error: Exception | None) -> None:
+    def _take(self, over: threading.Event, distance_m: float, look: Look | None,
+              error: Exception | None) -> None:
         if over.is_set():
             return
         self._looking = False
-        self._newest, self._faults, seconds, failure = look or (None, (), 0.0, error)
+        newest, self._faults, seconds, failure = look or (None, (), 0.0, error)
+        self._newest = newest and replace(newest, distance_m=distance_m)
         # the first update loads the pre-roll and modules, a one-time cost
         self._pause_until = time.monotonic() + seconds / LOOK_SHARE if self._warm else 0.0
         self._warm = True

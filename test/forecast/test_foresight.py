@@ -451,25 +451,33 @@ def said(forecast, **more):
     (None, 0.0, 'stand still 10 s at the end point, then call ~/stop_leg'),
     (None, 5.0, 'stand still 5 s more, then call ~/stop_leg'),
     (None, 10.0, 'call ~/stop_leg'),
-    (Forecast(MORE, YAW), 5.0, 'scale uncertainty so far: 1820 ppm; drive 240 m more to reach the '
-     'limit of 1000 ppm; OK: yaw 0.286 deg (limit 0.498)'),
+    (Forecast(MORE, YAW, distance_m=300.0), 5.0,
+     'scale uncertainty so far: 1820 ppm; drive 240 m more to reach the limit of '
+     '1000 ppm; OK: yaw 0.286 deg (limit 0.5)'),
     (Forecast(GOOD, YAW), 10.0, 'OK: scale 430 ppm (limit 1000); OK: yaw 0.286 deg (limit '
-     '0.498); call ~/stop_leg'),
+     '0.5); call ~/stop_leg'),
     (Forecast(GOOD, NO_YAW), 0.0, 'OK: scale 430 ppm (limit 1000); yaw: limited by the heading '
      'uncertainty (1 deg); stand still 10 s at the end point, then call ~/stop_leg'),
     (Forecast(replace(MORE, metres=None, why=UNREACHABLE), YAW), 10.0,
      'scale 1820 ppm: the limit is not reached within another 20 km; OK: yaw 0.286 deg (limit '
-     '0.498); call ~/stop_leg'),
-    (Forecast(replace(MORE, sigma=None), NO_YAW), 0.0, 'scale is not determined yet; drive 240 m '
-     'more to reach the limit of 1000 ppm; yaw: limited by the heading uncertainty (1 deg)')])
+     '0.5); call ~/stop_leg'),
+    (Forecast(replace(MORE, sigma=None), NO_YAW, distance_m=300.0), 0.0,
+     'scale is not determined yet; drive 240 m more to reach the limit of 1000 ppm; yaw: '
+     'limited by the heading uncertainty (1 deg)')])
 def test_the_hint_says_what_is_enough_and_what_more_it_takes(forecast, still_s, text):
     assert said(forecast, still_s=still_s) == text
 
 
 def test_the_least_leg_comes_first():
     assert said(Forecast(GOOD, YAW), distance_m=60.0, max_speed=1.0) == (
-        'drive 40 m more, faster than leg.min_speed, 2.78 m/s (10 km/h); then stand still 10 s '
-        'and call ~/stop_leg')
+        'drive 40 m more, faster than leg.min_speed, 2.78 m/s (10 km/h); then drive on, with '
+        'stops and left and right turns, until this hint shows OK for scale and yaw')
+
+
+def test_the_distance_decreases_between_updates():
+    forecast = Forecast(MORE, YAW, distance_m=300.0)
+    assert 'drive 140 m more' in said(forecast, distance_m=400.0)
+    assert 'drive on to reach the limit of 1000 ppm' in said(forecast, distance_m=600.0)
 
 
 def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():

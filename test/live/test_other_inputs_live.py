@@ -209,7 +209,7 @@ def test_the_start_says_what_to_drive_and_what_it_can_tell(session):
     assert re.search(r'drive 1?\d\d m more, faster than leg.min_speed, 2.78 m/s \(10 km/h\), ',
                      text)
     assert TURNS in text
-    assert 'then stand still 10 s and call ~/stop_leg' in text
+    assert 'until this hint shows OK for scale and yaw' in text
     assert text.endswith(
         'With these settings, observable: the scale, the yaw (from stops, starts and turns), '
         'the pitch, left and right wheel and the track width (in turns)')
