@@ -6,10 +6,13 @@
 from argparse import ArgumentParser, Namespace
 from functools import partial
 from importlib import import_module
+import math
 import sys
 
 from odocal_ros.errors import BadUsage
 
+WAIT_S = 10.0      # judgement: s in which a node sends a status, or its latched one arrives
+START_IT = 'start the node, or check its name (ros2 node list) and ROS_DOMAIN_ID'
 NEEDS = {'rich': 'pip install rich (or apt install python3-rich)',
          'rclpy': "source ROS 2 Jazzy, or install odocal_ros with the extra 'ros'"}
 
@@ -38,13 +41,14 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('node', nargs='?', default='/calibrator',
                         help='full name of the node (default: /calibrator)')
     parser.add_argument('--once', action='store_true',
-                        help='wait for the first status, print it and exit')
+                        help=f'print the first status and exit; 2 if none arrives in {WAIT_S:g} s')
 
 
 def run(args: Namespace) -> int:
     """Show the panel until Ctrl-C."""
     try:
         from rich.live import Live
+        from rich.panel import Panel
 
         from odocal_ros.live.panel import panel
         from odocal_ros.live.status_listener import StatusListener
@@ -52,11 +56,14 @@ def run(args: Namespace) -> int:
         name = (error.name or '').partition('.')[0]
         raise BadUsage(f'odocal watch needs the package {name}: '
                        f'{NEEDS.get(name, NEEDS["rclpy"])}') from None
-    waiting = panel(b'\x03', args.node, {'state': f'no status on {args.node}/status yet'},
-                    'start the node, or check its name (ros2 node list) and ROS_DOMAIN_ID')
-    with StatusListener(args.node) as listener, Live(waiting, auto_refresh=False) as shown:
+    waiting = Panel(f'no status on {args.node}/status yet: {START_IT}', title=args.node)
+    wait_s = WAIT_S if args.once else math.inf
+    with StatusListener(args.node, wait_s) as listener, Live(
+            waiting, auto_refresh=False) as shown:
         for level, status, hint in listener:
             shown.update(panel(level, args.node, status, hint), refresh=True)
             if args.once:
-                break
+                return 0
+    if args.once:
+        raise BadUsage(f'no status on {args.node}/status for {WAIT_S:g} s: {START_IT}')
     return 0

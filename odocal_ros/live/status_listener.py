@@ -4,6 +4,8 @@
 """Listens to a calibrator's latched status and hint, which are untrusted."""
 
 from collections.abc import Iterator
+import math
+import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
@@ -23,7 +25,9 @@ HINT_S = 0.1      # judgement: s in which a hint that was sent with a status arr
 class StatusListener:
     """A separate node that receives statuses; a context manager and an iterator over them."""
 
-    def __init__(self, node_name: str) -> None:
+    def __init__(self, node_name: str, wait_s: float = math.inf) -> None:
+        """End the iteration if no status has come for ``wait_s`` s."""
+        self._until = time.monotonic() + wait_s
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node('odocal_watch', context=self._context)
@@ -53,13 +57,13 @@ class StatusListener:
     def __iter__(self) -> Iterator[tuple[bytes, dict[str, str], str]]:
         """Yield (level, key -> value, hint) of each status, until the context ends."""
         try:
-            while self._context.ok():
+            while self._context.ok() and time.monotonic() < self._until:
                 self._executor.spin_once(timeout_sec=0.5)
                 if self._status is not None:      # the hint sent with it may still be in its queue
                     self._executor.spin_once(timeout_sec=HINT_S)
                 if self._status is not None and self._hint is not None:
                     status = self._status.status[0]
-                    self._status = None
+                    self._status, self._until = None, math.inf
                     yield (status.level, {brief_line(kv.key): brief_line(kv.value)
                                           for kv in status.values[:MOST_VALUES]}, self._hint)
         except ExternalShutdownException:

@@ -15,8 +15,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import pytest
 from std_msgs.msg import Float64, String
 
+from odocal_ros.live import start as commands
 from odocal_ros.live.start import NEEDS
 from odocal_ros.live.status_listener import LATCHED, StatusListener
+from odocal_ros.offline.cli import main
 
 ODOCAL = [sys.executable, '-m', 'odocal_ros.offline.cli', 'watch', '--once']
 
@@ -74,6 +76,15 @@ def test_while_a_leg_is_computed_the_panel_shows_its_running_estimate():
     done = shown(state='calibrated')
     assert 'provisional' not in done
     assert 'scale factor 0.03000 ± 0.00010' in done
+
+
+def test_once_without_a_node_ends(monkeypatch, capsys):
+    pytest.importorskip('rich')
+    monkeypatch.setattr(commands, 'WAIT_S', 0.5)
+    assert main(['watch', '/nobody', '--once']) == 2
+    out, err = capsys.readouterr()
+    assert 'no status on /nobody/status yet' in out
+    assert 'no status on /nobody/status for 0.5 s: start the node' in err
 
 
 def test_the_bars_are_shares_of_what_is_asked():
