@@ -80,8 +80,9 @@ class Code(Enum):
                             'drive farther: quantisation averages out with distance.')
     REVERSING_UNSIGNED = CAUTION, ('Do not reverse during a leg, or use an odometer that counts '
                                    'down in reverse and set odometer.signed.')
-    ODOMETER_REVERSED = REJECT, ('Invert odometer.reversed. If the IMU x axis points backwards, '
-                                 'set imu.mounting_rpy or imu.nominal_yaw instead.')
+    ODOMETER_REVERSED = REJECT, ('Set odometer.reversed to true, or to false if it is true. If '
+                                 'the IMU x axis points backwards, set imu.mounting_rpy to [0, 0, '
+                                 '3.141592654] or imu.nominal_yaw instead.')
     ODOMETER_STILL = REJECT, ('Check the wheel sensor and the odometer topic: the fixes move, '
                               'but the counter does not.')
     SEVERAL_IMUS = REJECT, ('Set imu.frame_id to the IMU to calibrate, or publish each IMU on '
@@ -113,17 +114,19 @@ class Code(Enum):
                          'together.')
     GYRO_AXES = REJECT, ('Correct the axes of angular_velocity in the IMU driver. '
                          'imu.mounting_rpy cannot: it rotates gyro and accelerometer together.')
-    BAG_TRUNCATED = CAUTION, ('All readable messages were used. Stop recordings with Ctrl-C. A '
-                              'damaged chunk is an error of storage or transfer: copy the file '
-                              'again.')
+    BAG_TRUNCATED = CAUTION, ('Stop recordings with Ctrl-C. A damaged chunk is an error of '
+                              'storage or transfer: copy the file again. All readable messages '
+                              'were used.')
     STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg. Data up to the '
                                   'end of the recording was used.')
     FRAME_REPLACED = NOTE, ('Set frames.imu to the TF frame of the IMU, or correct frame_id in '
                             'its driver.')
     COVARIANCE_UNKNOWN = NOTE, ('Set gnss.default_sigma to the real horizontal accuracy of the '
                                 'receiver.')
-    FIXES_NOISIER_THAN_SAID = NOTE, ('Uncertainties were increased to match the residuals. Check '
-                                     'the receiver and its sky view.')
+    FIXES_NOISIER_THAN_SAID = NOTE, ('Check the receiver and its sky view. Uncertainties were '
+                                     'increased to match the residuals.')
+    FIX_OUTLIERS = NOTE, ('Check the sky view and the antenna. The comparison of track and fixes '
+                          'includes these fixes.')
     VELOCITY_UNUSABLE = NOTE, ('Publish east, north, up in m/s on fix_velocity, or set '
                                'gnss.use_velocity to false. The leg is estimated without it.')
     # the drive
@@ -133,8 +136,8 @@ class Code(Enum):
                               'without GNSS reference.min_distance.')
     CHORD_TOO_SHORT = REJECT, ('End the leg far from its start, or mark a straight section with '
                                '--leg. The two-point method only uses the line from start to end.')
-    SPEED_TOO_LOW = CAUTION, ('Drive faster than leg.min_speed in part of the leg. For a slow '
-                              'vehicle, lower leg.min_speed.')
+    SPEED_TOO_LOW = CAUTION, ('Drive faster than leg.min_speed in part of the leg. If the vehicle '
+                              'is always this slow, set leg.min_speed below its usual speed.')
     LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight section for the two-point method.'
     TRACK_MISMATCH = REJECT, ('Likely causes: wheel slip, a wrong gyro axis or unit, or bad '
                               'fixes. Check them with odocal inspect, then drive again on a firm '
@@ -159,8 +162,8 @@ class Code(Enum):
                                       'switched off. SLAM, AMCL, robot_localization: a source '
                                       'without wheels (scan matching alone, lidar or visual '
                                       'odometry, motion capture). Then drive again.')
-    FIXES_DEAD_RECKONED = CAUTION, ('The other fixes were used. If possible, switch off dead '
-                                    'reckoning in the receiver, or drive a leg without tunnels.')
+    FIXES_DEAD_RECKONED = CAUTION, ('Switch off dead reckoning in the receiver, or drive a leg '
+                                    'without tunnels. The other fixes were used.')
     # the estimate
     YAW_NOT_SEPARABLE = CAUTION, ('Provide a heading that is independent of the odometer: '
                                   'alignment.heading with alignment.heading_sigma, a '
@@ -173,13 +176,15 @@ class Code(Enum):
                                        'odometer. The limit is odometer.max_scale_deviation.')
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
                                      'source.')
-    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, use more accurate positions (such '
-                                      'as RTK), stand longer at both marks, or combine more '
-                                      'legs. The limit is verdict.max_scale_sigma.')
+    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, or combine more legs. If the fixes are '
+                                      'the largest error, use RTK; if it is travel noise or slip, '
+                                      'use a wheel that is not driven. The limit is '
+                                      'verdict.max_scale_sigma.')
     YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, provide a better '
                                     'heading, or combine legs. The limit is '
                                     'verdict.max_yaw_sigma.')
-    PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
+    PLANES_DISAGREE = CAUTION, ('Check the fixes and heights at the marks. If they are right, '
+                                'please report this with the trace file.')
     # left and right wheel
     ODOMETER_CHOSEN = NOTE, ('If correct, ignore. Otherwise set odometer.left and '
                              'odometer.right, or select one value with odometer.field.')
@@ -212,19 +217,19 @@ class Code(Enum):
     NOT_CONVERGED = REJECT, ('Check units, axes and clocks with odocal inspect, and look for two '
                              'publishers on one topic. Then drive a leg with stops and turns. '
                              'The other methods may still have a result.')
-    SCALE_NOT_DETERMINED = REJECT, 'Drive farther, faster, or with better fixes.'
+    SCALE_NOT_DETERMINED = REJECT, 'Drive farther, or use more accurate fixes (such as RTK).'
     YAW_NOT_DETERMINED = CAUTION, ('Drive with stops, starts and turns: the yaw is estimated '
                                    'from accelerations.')
     PARAMETER_NOT_DETERMINED = NOTE, ('No action needed if the configured values were measured. '
                                       'Turns, stops and starts determine more of them.')
-    MODEL_MISMATCH = CAUTION, ('The residuals are larger than the noise model predicts; '
-                               'uncertainties were increased. Check slip, lever arms, delays, '
-                               'sky view and the unit of heights.')
+    MODEL_MISMATCH = CAUTION, ('Check slip, lever arms, delays, sky view and the unit of heights. '
+                               'The residuals are larger than the noise model predicts; '
+                               'uncertainties were increased.')
     METHOD_REJECTED = CAUTION, ('See docs/reasons.md for the code named. The values come from '
                                 'another method, which may not detect this problem.')
     METHOD_FAILED = REJECT, ('Please report this with the trace file. The other methods are not '
                              'affected.')
-    METHODS_DISAGREE = CAUTION, ('Check the likely cause named above. Drive again with stops at '
+    METHODS_DISAGREE = CAUTION, ('Check the likely cause in the text. Drive again with stops at '
                                  'both marks and turns in between.')
     # several legs, several calibrations
     LEGS_DISAGREE = CAUTION, ('Find the leg that differs. Likely causes: tyre pressure, load or '

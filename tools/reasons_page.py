@@ -168,6 +168,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.FIXES_NOISIER_THAN_SAID: 'The fixes deviate from the track more than their '
         'covariance states, or are rounded to steps that it does not include (float32, NMEA with '
         '4 decimals of a minute). Their sigma was increased to match.',
+        Code.FIX_OUTLIERS: 'At least 2 % of the fixes are more than 4.2 sigmas from the track, '
+        'where the weight of a fix is one half; it falls with the distance.',
         Code.VELOCITY_UNUSABLE: 'Displacements from the GNSS velocity were compared with the '
         'displacements between fixes, 10 s apart. They differ by more than 10 % in size or '
         'direction. Usual causes: north and east swapped, vehicle axes, a speed without '

@@ -37,7 +37,7 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     if not (math.isfinite(standstill) and standstill >= 0):
         raise BadUsage(f'--standstill {standstill:g}: required: 0 s or more')
     top = min(speed, math.sqrt(distance * acceleration))
-    ramp, cruise = top / acceleration, distance / top - top / acceleration
+    ramp, cruise = top / acceleration, max(0.0, distance / top - top / acceleration)
     whole = 2 * (standstill + ramp) + cruise
     most_metres = 1e6
     if distance > most_metres or whole > MOST_SECONDS:
@@ -46,7 +46,8 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     turn_time = 8.0    # s of a turn of 90 deg
     if turns < 0 or turns * turn_time > cruise:
         raise BadUsage(f'--turns {turns}: required: 0 to {int(cruise / turn_time)}; each turn '
-                       f'takes {turn_time:g} s of the {cruise:.0f} s at full speed')
+                       f'takes {turn_time:g} s of the {cruise:.0f} s at full speed. Use a longer '
+                       '--distance or fewer turns')
     t = np.linspace(0.0, whole, max(2, math.ceil(whole / max(DRIVE_STEP, whole / 20_000)) + 1))
     knots = standstill + np.array([0.0, ramp, ramp + cruise, 2 * ramp + cruise])
     t = np.union1d(t, knots)        # kinks on the grid: the trapezoid sum is then exact

@@ -138,13 +138,21 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
         shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
         lines.append(_line('gyro bias x, y, z', f'{shown} deg/h'))
     if rpy := rotation_text(calibration):
-        lines.append(_line('IMU on the vehicle', f'roll, pitch, yaw {rpy} deg'))
+        lines.append(_line('IMU on the vehicle', rpy))
     return [line for line in lines if line]
 
 
 def rotation_text(calibration: result.Calibration) -> str:
-    """Return roll, pitch and yaw of the IMU on the vehicle, deg, empty without them."""
-    return ', '.join(f'{angle * DEG:z.3f}' for angle in calibration.imu_rotation_rpy or ())
+    """Return roll, pitch and yaw of the IMU on the vehicle, empty without them."""
+    angles = ', '.join(f'{angle * DEG:z.3f}' for angle in calibration.imu_rotation_rpy or ())
+    return angles and (f'roll, pitch, yaw {angles} deg   ({as_configured(calibration)} as '
+                       'configured)')
+
+
+def as_configured(calibration: result.Calibration) -> str:
+    """Return the mounting angles that are not estimated; the roll never is."""
+    pitch = known(calibration.estimates, 'pitch_mounting_angle').value
+    return 'roll and pitch' if pitch is None else 'roll'
 
 
 def _angles_of(estimates: dict[str, result.Estimate]) -> dict[str, str]:

@@ -26,6 +26,9 @@ LABEL = {slot: one.label for slot, one in INPUTS.items()}
 NOTHING = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
            **dict.fromkeys(WHEELS, Code.NO_ODOMETER)}
 
+NO_RECEPTION = ('Drive under open sky if possible: the likely cause is a tunnel, buildings or '
+                'trees. The leg stays valid; missing data increases the uncertainties.')
+
 
 def topic_gap(slot: str, t: Floats) -> tuple[Reason, ...]:
     """Return TOPIC_GAP for the longest gap of a topic, far longer than its median interval."""
@@ -34,7 +37,8 @@ def topic_gap(slot: str, t: Floats) -> tuple[Reason, ...]:
         return ()
     begin, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]
     return (Reason(Code.TOPIC_GAP, f'{INPUTS[slot].label} gap of {end - begin:.2f} s at '
-                   f't = {begin:.2f} s (median interval {np.median(np.diff(t)):.3f} s)'),)
+                   f't = {begin:.2f} s (median interval {np.median(np.diff(t)):.3f} s)',
+                   NO_RECEPTION if slot == 'fix' else ''),)
 
 
 def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:

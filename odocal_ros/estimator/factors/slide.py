@@ -60,9 +60,9 @@ def assumed(problem: Problem, levels: Levels) -> list[Reason]:
     if least < 2e-3**2 or all(      # m^2/s, smallest that is reported
             levels[name] > 1.01 * least for name in SIDEWAYS):
         return []
-    return [Reason(Code.PARAMETER_NOT_DETERMINED, 'turns faster than '
-                   f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to '
-                   f'{np.rad2deg(problem.turned):.0f} deg, too little to estimate sideslip '
-                   f'(limit {np.rad2deg(2 * NO_TURN):.0f} deg): '
-                   f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed, and the uncertainties of the '
-                   'mounting angles depend on it', 'Drive with left and right turns.')]
+    return [Reason(
+        Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: sideslip; turns faster than '
+        f'{np.rad2deg(TURNING_RATE):.0f} deg/s add up to {np.rad2deg(problem.turned):.0f} deg, '
+        f'less than the limit of {np.rad2deg(2 * NO_TURN):.0f} deg. '
+        f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed; the uncertainties of the mounting angles '
+        'depend on it', 'Drive with left and right turns.')]

@@ -12,6 +12,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals
 from odocal_ros.estimator.factors.factor import ACCEL_STEP, GYRO_STEP
+from odocal_ros.estimator.factors.fixes import Fixes
 from odocal_ros.estimator.factors.motion_rows import MotionRows
 from odocal_ros.estimator.fit import Fit
 from odocal_ros.estimator.levels import Levels
@@ -47,6 +48,8 @@ FALLS_WITH_SPEED = ('Possible causes: truncated speed values, a dead band, or sl
 STEP_VARIANCE = 100.0
 # relative, rad, judgement: smaller changes of the scale or of an angle are not reported
 LEAST_CHANGE = 3e-4
+# share and number of outliers among the fixes that are reported. Judgement
+OUTLYING, FEWEST_OUTLYING = 0.02, 3
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
 OF_POSES = ('Uncertainties were increased to match the residuals. Check the map, and the '
             'covariance that this source of positions states.')
@@ -136,7 +139,8 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
     sigma : (M,) of the constants.   ratio : (M,) posterior sigma by that of the prior.
     """
     c = fit.state.constants
-    said = [*_noisy(problem, fit.levels), *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
+    said = [*_noisy(problem, fit.levels), *_outlying(fit),
+            *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),
             *odometer_reasons(c[layout.FIX_BY_MOTION], sigma[layout.FIX_BY_MOTION],
                               c[layout.FIX_TIME], wheels_in_map(problem, c, sigma)),
             *(reason for name, i in CLOCKS.items()
@@ -173,6 +177,18 @@ def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
                    f'{factor:.1f} times as large as their covariance states (limit '
                    f'{FIX_NOISE_LIMIT:g})',
                    OF_POSES if problem.leg.origin.local else '')]
+
+
+def _outlying(fit: Fit) -> list[Reason]:
+    """Return the reason for fixes that are outliers."""
+    fixes = fit.weighted[Fixes]
+    outlier = fixes.weight[:, 0] < 0.5
+    count, of = int(outlier.sum()), len(outlier)
+    if count < max(FEWEST_OUTLYING, OUTLYING * of):
+        return []
+    far = np.hypot(*fixes.raw[outlier, :2].T).max()
+    return [Reason(Code.FIX_OUTLIERS, f'{count} of {of} fixes ({100 * count / of:.0f} %) are '
+                   f'outliers, up to {far:.1f} m from the track; they were down-weighted')]
 
 
 def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
