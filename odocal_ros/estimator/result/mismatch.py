@@ -65,10 +65,12 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
             (fit.state.accel_bias, problem.priors.accel_bias, accel_sold)),
             sensors.values(), strict=False)
         if np.max(np.abs(now[0]) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE]
+    noisy = over_grade > WORSE_THAN_GRADE      # vibration is not white, its spectrum is unknown
     if worse:
         reasons.append(Reason(
             Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the {config.imu.grade} grade '
-            f'(limit {WORSE_THAN_GRADE:g}); the estimate from this drive is used', remedy))
+            f'(limit {WORSE_THAN_GRADE:g}); the estimate from this drive is used'
+            + '. The noise may not be white; uncertainties were increased' * noisy, remedy))
     reasons += _outliers(fit)
     odd, move = [], 0.0
     if fit.creeping or not fit.settled:
@@ -77,11 +79,9 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
             f'the estimates still changed by {move:.2g} sigma'
             if move > CONVERGENCE.nearly else 'the noise levels still changed'))
     odd_share = 0.15        # share of outliers among the fixes, of intervals with slip: judgement
-    noisy = []
-    if over_grade > WORSE_THAN_GRADE:      # vibration is not white, and its spectrum is unknown
-        noisy = [f'IMU noise is {over_grade:.1f} times that of its grade and may not be white; '
-                 'uncertainties were increased']
-    odd += noisy
+    if noisy and not worse:
+        odd.append(f'IMU noise is {over_grade:.1f} times that of its grade (limit '
+                   f'{WORSE_THAN_GRADE:g}) and may not be white')
     for what, mask in (('of the fixes are outliers', fit.weighted[Fixes].weight[:, 0] < 0.5),
                        ('of the time the wheel slips', fit.spread[:, 0] > SLIP_VARIANCE)):
         share = float(mask.mean())
@@ -97,11 +97,11 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
                    f'(limit {most:.0f} m)')
     reasons += _heading(problem.outside.get('heading'), float(fit.state.constants[HEADING]))
     if odd:
-        known = 'See IMU_WORSE_THAN_GRADE.' if worse else remedy
-        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd), known if odd == noisy else ''))
+        alone = noisy and not worse and len(odd) == 1
+        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd), remedy if alone else ''))
     # judgement: the size of a model error is unknown; a fit that has not converged may be off by
     # several times its last step
-    return max(1.0, 2.0 * bool(odd), 4.0 * move), reasons
+    return max(1.0, 2.0 * bool(odd or noisy), 4.0 * move), reasons
 
 
 def _outliers(fit: Fit) -> list[Reason]:

@@ -201,7 +201,7 @@ def _undetermined(sigma: Floats, usual: float, doubt: float, config: Config, yaw
     limit = usual / doubt
     reasons, wanted = [], f'; the limit is {np.rad2deg(limit):.2g} deg'
     if doubt > 1:
-        wanted += f' ({np.rad2deg(usual):.2g} deg / {doubt:.2g} because of MODEL_MISMATCH)'
+        wanted += f' ({np.rad2deg(usual):.2g} deg / {doubt:.2g}, the factor on uncertainties)'
     if sigma[layout.LN_K] > SCALE_LIMIT:
         reasons.append(Reason(Code.SCALE_NOT_DETERMINED, 'scale uncertainty is '
                               f'{100 * sigma[layout.LN_K]:.0f} %, too large to state a value; the '
