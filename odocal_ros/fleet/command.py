@@ -87,9 +87,10 @@ def run(args: argparse.Namespace) -> int:
     writable(output)
     with engine(args.scheduler, args.workers, args.task_memory, args.tries) as client:
         if not args.quiet:
+            address = dashboard(client)
             warn(f'odocal: {counted(len(jobs), "bag")} of '
-                 f'{counted(len({b.vehicle for b in bags}), "vehicle")}; '
-                 f'dashboard: {dashboard(client)}')
+                 f'{counted(len({b.vehicle for b in bags}), "vehicle")}'
+                 + f'; dashboard: {address}' * bool(address))
         rows = _computed(client, jobs, args)
         vehicles = write_outcome(client, jobs, rows, output, args)
     kpi = write_kpi(vehicles, limits, output) if args.kpi else ''

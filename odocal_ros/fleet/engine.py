@@ -76,11 +76,8 @@ def _workers(memory: int) -> int:
 
 
 def dashboard(client: Any) -> str:
-    """Return the address of the dashboard, and its requirements."""
-    if not client.dashboard_link:
-        return 'none'
-    hint = '' if find_spec('bokeh') else ' (pip install bokeh to see it)'
-    return f'{client.dashboard_link}{hint}'
+    """Return the address of the dashboard, '' without one or without bokeh, which draws it."""
+    return client.dashboard_link if find_spec('bokeh') else ''
 
 
 def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: str,

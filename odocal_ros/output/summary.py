@@ -131,14 +131,14 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
                 text = _angle_text(estimate, 0) + (
                     '   heading error minus yaw mounting' if width >= WIDTH else '')
             lines.append(_line(tables.source_label(name), text))
-    lines += [_arm(estimates, name, word) for name, word in ARMS.items()]
+    lines += [_arm(estimates, name, word, width) for name, word in ARMS.items()]
     lines.append(_gyro_scale(calibration))
     biases = [known(estimates, name) for name in BIASES]
     if all(bias.value is not None for bias in biases):
         shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
         lines.append(_line('gyro bias x, y, z', f'{shown} deg/h'))
     if rpy := rotation_text(calibration):
-        lines.append(_line('IMU on the vehicle', rpy))
+        lines.append(_line('IMU on the vehicle', rpy if width >= WIDTH else rpy.partition('   ')[0]))
     return [line for line in lines if line]
 
 
@@ -199,12 +199,14 @@ def _gyro_scale(calibration: result.Calibration) -> str:
     return _line('gyro scale z', with_sigma(1 - error['value'], error['sigma']))
 
 
-def _arm(estimates: dict[str, result.Estimate], arm: str, word: str) -> str:
+def _arm(estimates: dict[str, result.Estimate], arm: str, word: str, width: int) -> str:
     """Return the coordinates of a lever arm that are known, '' without any."""
     found = {axis: known(estimates, f'{arm}_{axis}') for axis in 'xyz'}
     found = {axis: e for axis, e in found.items() if e.value is not None}
     shown = ', '.join(with_sigma(e.value, e.sigma, signed=True) for e in found.values())
-    return _line(f'{word} {", ".join(found)}', f'{shown} m') if found else ''
+    # a wheel that slides in turns seems to be elsewhere (docs/report.md)
+    where = '   (without sliding)' * (arm.startswith('odometer') and width >= WIDTH)
+    return _line(f'{word} {", ".join(found)}', f'{shown} m{where}') if found else ''
 
 
 def _largest_errors(calibration: result.Calibration, width: int) -> list[str]:
