@@ -138,7 +138,8 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
         shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
         lines.append(_line('gyro bias x, y, z', f'{shown} deg/h'))
     if rpy := rotation_text(calibration):
-        lines.append(_line('IMU on the vehicle', rpy if width >= WIDTH else rpy.partition('   ')[0]))
+        lines.append(_line('IMU on the vehicle',
+                           rpy if width >= WIDTH else rpy.partition('   ')[0]))
     return [line for line in lines if line]
 
 
