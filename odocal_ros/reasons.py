@@ -125,7 +125,7 @@ class Code(Enum):
                                 'receiver.')
     FIXES_NOISIER_THAN_SAID = NOTE, ('Check the receiver and its sky view. Uncertainties were '
                                      'increased to match the residuals.')
-    FIX_OUTLIERS = NOTE, ('Check the sky view and the antenna. The comparison of track and fixes '
+    FIX_OUTLIERS = NOTE, ('Check the antenna and its sky view. The comparison of track and fixes '
                           'includes these fixes.')
     VELOCITY_UNUSABLE = NOTE, ('Publish east, north, up in m/s on fix_velocity, or set '
                                'gnss.use_velocity to false. The leg is estimated without it.')

@@ -215,7 +215,7 @@ def _without_heights(chord: Chord, up_scale: float) -> Reason:
     if known:
         _, pitch = mounting_from_forward(f / np.linalg.norm(f))
         return Reason(Code.TRACK_MISMATCH, 'the heights of the marks give a pitch of '
-                      f'{np.rad2deg(float(pitch)):+.0f} deg; the limit is '
+                      f'{np.rad2deg(float(pitch)):+z.0f} deg; the limit is '
                       f'{np.rad2deg(PITCH_LIMIT):.0f} deg', 'Set imu.mounting_rpy to the '
                       'approximate pitch of the IMU, or check the heights and their unit.')
     why = ('are too inaccurate for the pitch' if chord.start.height_known

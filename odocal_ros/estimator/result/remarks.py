@@ -49,7 +49,7 @@ STEP_VARIANCE = 100.0
 # relative, rad, judgement: smaller changes of the scale or of an angle are not reported
 LEAST_CHANGE = 3e-4
 # share and number of outliers among the fixes that are reported. Judgement
-OUTLYING, FEWEST_OUTLYING = 0.02, 3
+OUTLIER_SHARE, FEWEST_OUTLYING = 0.02, 3
 VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
 OF_POSES = ('Uncertainties were increased to match the residuals. Check the map, and the '
             'covariance that this source of positions states.')
@@ -184,7 +184,7 @@ def _outlying(fit: Fit) -> list[Reason]:
     fixes = fit.weighted[Fixes]
     outlier = fixes.weight[:, 0] < 0.5
     count, of = int(outlier.sum()), len(outlier)
-    if count < max(FEWEST_OUTLYING, OUTLYING * of):
+    if count < max(FEWEST_OUTLYING, OUTLIER_SHARE * of):
         return []
     far = np.hypot(*fixes.raw[outlier, :2].T).max()
     return [Reason(Code.FIX_OUTLIERS, f'{count} of {of} fixes ({100 * count / of:.0f} %) are '
