@@ -105,10 +105,6 @@ def test_gravity_far_up_falls_with_the_square():
     assert earth.gravity(0.0, h) == pytest.approx(9.780 - 0.0613, abs=2e-3)
 
 
-def test_the_earth_turns_once_in_a_sidereal_day_of_86164_s():
-    assert_allclose(earth.OMEGA, 2 * np.pi / 86164.09, rtol=2e-7)
-
-
 @given(lat=st.floats(-1.4, 1.4), lon=st.floats(-3, 3))
 def test_earth_rate_is_the_axis_seen_from_anywhere(lat, lon):
     assert_allclose(earth.C_en(lat, lon) @ earth.earth_rate_n(lat), [0, 0, earth.OMEGA],

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import norm, rayleigh
 
-from odocal_ros.data.pieces import runs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import REST_TRAVEL, standstills
 from odocal_ros.nav.statistics import NORMAL_MEDIAN, RAYLEIGH_MEDIAN, robust_sigma
@@ -186,11 +185,3 @@ def test_a_tenth_of_wild_values_changes_little():
     assert robust_sigma(x) == pytest.approx(0.3, rel=0.024)
     x[::10] = 1e6
     assert robust_sigma(x) < 0.36
-
-
-def test_runs_are_the_begin_and_the_end_of_each():
-    flags = np.array([True, True, False, False, True, False, True])
-    assert runs(flags).tolist() == [[0, 2], [4, 5], [6, 7]]
-    assert runs(np.zeros(3, bool)).shape == (0, 2)
-    assert runs(np.zeros(0, bool)).shape == (0, 2)
-    assert runs(np.ones(3, bool)).tolist() == [[0, 3]]
