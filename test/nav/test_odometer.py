@@ -201,6 +201,13 @@ def test_the_mean_of_two_rounded_wheels_errs_as_its_quantum_says():
     assert error.std() == pytest.approx(found.quantum / np.sqrt(12), rel=0.05)
 
 
+def test_steps_too_small_for_a_speed_are_no_resets():
+    found, reasons = travel(np.arange(100) * 1e9, np.arange(100) * 5e-324,
+                            OdometerForm('cumulative', 0, 'm/rad'))
+    assert reasons == ()
+    assert np.array_equal(found.s, np.arange(100) * 5e-324)
+
+
 def test_rounding_of_a_counter_is_averaged_by_parabolas():
     t = np.delete(np.arange(0, 60, 0.02), slice(1500, 1800))      # 30 to 36 s are missing
     true = 5.3 * t + 0.4 * t**2

@@ -10,7 +10,7 @@ import pytest
 from odocal_ros.sim import body
 from odocal_ros.sim.motion import attitude, Motion, Start, velocity_n
 from odocal_ros.sim.options import resolved, SimOptions
-from odocal_ros.sim.profile import chain, hermite, Hills, hold, ramp, turn
+from odocal_ros.sim.profile import chain, Hills, hold, ramp, turn
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import motion_of, simulate
 from odocal_ros.sim.zoo import G
@@ -92,14 +92,6 @@ def test_an_oval_turns_left_by_half_a_turn_at_each_end_and_closes():
 
 
 SQUAT, ROLL = 0.003, 0.009     # rad per m/s^2
-
-
-def test_hermite_has_its_values_and_slopes():
-    t = np.array([0.0, 0.5, 2.0])
-    cubic = hermite(t, t**3 - t, 3 * t**2 - 1)
-    x = np.linspace(0, 2, 41)
-    assert_allclose(cubic(x), x**3 - x, atol=1e-14)
-    assert_allclose(cubic.derivative()(x), 3 * x**2 - 1, atol=1e-13)
 
 
 def test_springs_answer_a_ramp_as_the_equation_does():

@@ -87,21 +87,6 @@ def test_the_papers_drive_is_11200_m_of_loxodrome():
     assert east * A == pytest.approx(0, abs=2e-8)
 
 
-def test_travel_speed_and_position_belong_together():
-    """Central differences of the Earth-fixed place are the velocity."""
-    motion, h = lively(), 1e-3
-    t = np.arange(0.05, 19.9, 0.1)     # between the kinks
-    before, state, after = motion.at(t - h), motion.at(t), motion.at(t + h)
-    v_n = true_motion.velocity_n(state)
-    r_e = [ecef_from_geodetic(s.latitude, s.longitude, s.height) for s in (before, after)]
-    v_e = np.einsum('nji,nj->ni', C_en(state.latitude, state.longitude),
-                    (r_e[1] - r_e[0]) / (2 * h))
-    # h^2 / 6 * jerk (w^2 v = 2 m/s^3) = 4e-7; rounding of 6e6 m: 1e-9 / 2e-3 = 5e-7
-    assert_allclose(v_e, v_n, atol=2e-6)
-    assert_allclose(np.linalg.norm(v_n, axis=1), state.speed, atol=1e-14)
-    assert_allclose((after.travel - before.travel) / (2 * h), state.speed, atol=1e-6)
-
-
 def integrate(motion, rate, arm):
     """
     Return how far an Earth-fixed strapdown strays from the truth over the drive, m and rad.

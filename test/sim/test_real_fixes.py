@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A real receiver: filters, time-correlated errors, bursts, stated sigmas, and its velocity."""
+"""A receiver: noise, outliers, filters, bursts, stated sigmas, and its velocity."""
 
 from dataclasses import replace
 
@@ -17,6 +17,7 @@ from odocal_ros.sim.scenarios import motion_of, simulate
 
 pytestmark = pytest.mark.core
 PAPER = SimOptions(scenario='paper', duration=600.0, imu_rate=20.0, heading=0.0)
+ROAD = SimOptions(scenario='town', duration=200.0, imu_rate=20.0)
 TAU = 0.8
 
 
@@ -170,3 +171,67 @@ def test_errors_have_their_size_and_time():
         assert (sent.variance_n == pytest.approx(0.01))
     far = simulate(replace(TOWN, velocity_outliers=0.1)).velocity.velocity_n - clean
     assert (np.abs(far).max(axis=1) > 0).mean() == pytest.approx(0.1, abs=0.04)
+
+
+@pytest.mark.parametrize(('noise', 'sigma'), [('white', 1.5), ('rtk', 0.02), ('white', 0.7)])
+def test_fix_errors_are_what_the_covariance_says(noise, sigma):
+    options = resolved(replace(ROAD, fix_noise=noise, fix_sigma=sigma))
+    errors = sensors.fix_errors(np.arange(20_000) * 0.2, options)
+    stated = simulate(options).fix
+    for axis in range(3):
+        assert errors[:, axis].var() == pytest.approx(
+            stated.covariance_n[0, axis, axis], rel=5 * np.sqrt(2 / 20_000))
+    assert stated.covariance_n[0, 0, 0] == pytest.approx(sigma**2)
+    assert stated.covariance_n[0, 2, 2] == pytest.approx(4 * sigma**2)
+    assert set(stated.status.tolist()) == {2 if noise == 'rtk' else 0}
+
+
+def test_fix_errors_go_east_north_and_up():
+    noisy, bare = (simulate(replace(ROAD, fix_sigma=sigma)) for sigma in (5.0, 0.0))
+    t = (bare.fix.stamp_ns - bare.options.start_ns) * 1e-9
+    errors = sensors.fix_errors(t, noisy.options)
+    east = (noisy.fix.longitude - bare.fix.longitude) * np.cos(bare.fix.latitude)
+    north = noisy.fix.latitude - bare.fix.latitude
+    # radii of WGS 84 at 40 deg, to the 20 m that height and latitude change them, of 20 m
+    assert_allclose(east * 6_386_976, errors[:, 0], atol=2e-3)
+    assert_allclose(north * 6_361_816, errors[:, 1], atol=2e-3)
+    assert_allclose(noisy.fix.height - bare.fix.height, errors[:, 2], atol=1e-8)
+
+
+def test_correlated_fixes_keep_their_power_and_forget_slowly():
+    options = resolved(replace(ROAD, fix_noise='correlated', fix_correlation_time=10.0))
+    t = np.arange(100_000) * 0.2
+    errors = sensors.fix_errors(t, options)[:, :2]
+    spread = 5 * np.sqrt(2 * 10.0 / t[-1] / 2)
+    total = simulate(options).fix.covariance_n[0, 0, 0]
+    assert errors.var() == pytest.approx(total, rel=spread)
+    together = (errors[50:] * errors[:-50]).mean()     # 10 s apart: the white part is gone
+    assert together == pytest.approx(1.5**2 * np.exp(-1), abs=1.5**2 * spread)
+
+
+def test_fixes_lie_about_the_antenna():
+    drive = simulate(replace(ROAD, fix_sigma=0.0, antenna_lever_arm=(2.0, 0.5, 1.5)))
+    bare = simulate(replace(ROAD, fix_sigma=0.0))
+    assert_allclose(drive.fix.height - bare.fix.height, 1.5, atol=1e-6)
+    north = (drive.fix.latitude - bare.fix.latitude)[0] * 6.36e6
+    east = (drive.fix.longitude - bare.fix.longitude)[0] * 6.386e6 * np.cos(np.radians(40))
+    # heading 45 deg: forward 2 and left 0.5; radii to 0.2 %
+    assert [east, north] == pytest.approx([1.5 / np.sqrt(2), 2.5 / np.sqrt(2)], rel=2e-3)
+    assert drive.fix.covariance_n[0, 0, 0] == sensors.SIGMA_FLOOR**2   # no receiver says zero
+
+
+def test_outliers_are_as_many_and_as_far_as_said():
+    options = resolved(replace(ROAD, outliers=0.1, fix_sigma=0.0))
+    far = np.hypot(*sensors.fix_errors(np.arange(20_000) * 0.2, options)[:, :2].T)
+    # 5 sigma of a binomial share
+    assert (far > 0).mean() == pytest.approx(0.1, abs=5 * np.sqrt(0.1 * 0.9 / 20_000))
+    assert far[far > 0].min() >= 10
+    assert far.max() <= 30
+
+
+def test_an_outage_has_no_fixes():
+    drive = simulate(replace(ROAD, outages=((50.0, 60.0), (100.0, 101.0))))
+    t = (drive.fix.stamp_ns - drive.options.start_ns) * 1e-9
+    assert not ((t >= 50) & (t < 60)).any()
+    assert not ((t >= 100) & (t < 101)).any()
+    assert len(t) == len(simulate(ROAD).fix.stamp_ns) - 55

@@ -14,7 +14,7 @@ from odocal_ros.sim import real_sensors
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.real import Real
-from odocal_ros.sim.real_sensors import angles, own_angles, turn_and_push
+from odocal_ros.sim.real_sensors import turn_and_push
 from odocal_ros.sim.scenarios import simulate
 
 pytestmark = pytest.mark.core
@@ -129,11 +129,6 @@ def cross(x, y, z):
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def test_forward_tells_the_angles_of_the_conventions():
-    yaw, pitch = 0.3, -0.2
-    assert angles(matrix_from_rpy([0, pitch, yaw])[0]) == pytest.approx((yaw, pitch), abs=1e-15)
-
-
 @pytest.mark.parametrize('seed', range(5))
 def test_in_the_own_frame_turn_and_push_are_felt_as_said(seed):
     gyro, accel = stream(seed, 'test').normal(0, 0.02, (2, 3, 3))
@@ -145,18 +140,6 @@ def test_in_the_own_frame_turn_and_push_are_felt_as_said(seed):
     # to first order; products of two entries are left out, five sigma each
     theta = gyro[1, 2], -gyro[0, 2], -accel[1, 0]
     assert_allclose(R, np.eye(3) + cross(*theta), atol=3 * (5 * 0.02)**2)
-
-
-def test_angles_of_a_turned_mounting_are_those_of_its_matrices_in_b():
-    rng = stream(1, 'test')
-    gyro, accel = rng.normal(0, 1e-4, (2, 3, 3))
-    C_bi, C_vb = matrix_from_rpy([0.0, 0.0, np.pi / 2]), matrix_from_rpy([0.0, 0.01, 0.03])
-    g, a = (C_bi @ M @ C_bi.T for M in (gyro, accel))
-    d = C_vb[0] - np.cross([g[1, 2], -g[0, 2], -a[1, 0]], C_vb[0])
-    yaw, pitch, yaw_housing, pitch_housing = own_angles(C_vb, C_bi, gyro, accel)
-    # second order: two entries of five sigma, 5e-4 each
-    assert (yaw, pitch) == pytest.approx((-np.arcsin(d[1]), np.arctan2(d[2], d[0])), abs=1e-6)
-    assert (yaw_housing, pitch_housing) == pytest.approx((0.03, 0.01), abs=1e-15)
 
 
 def test_an_instrument_turned_in_its_housing_is_one_mounted_so():

@@ -123,18 +123,6 @@ def test_a_perfect_imu_reads_the_motion_through_its_mounting():
     assert np.isnan(drive.imu.yaw_variance).all()
 
 
-def test_a_yaw_mounting_angle_turns_the_imu_to_the_left():
-    drive = simulate(replace(TOWN, imu_grade='perfect', yaw=0.1, pitch=0.0))
-    t = (drive.imu.stamp_ns - drive.options.start_ns) * 1e-9
-    state = drive.motion.at(t)
-    pulling = (state.acceleration > 1.0) & (state.yaw_rate == 0)
-    # forward acceleration is seen to the right of an x axis that points left; Coriolis at
-    # 14 m/s: 2 w v sin(L) = 1.3e-3 m/s^2 beside 1 m/s^2
-    seen = drive.imu.f_i[pulling]
-    assert_allclose(-seen[:, 1] / seen[:, 0], np.tan(0.1), atol=1.5e-3)
-    assert drive.truth.heading == pytest.approx(drive.options.heading - 0.1)
-
-
 def test_orientation_and_heading_have_one_error_for_the_drive():
     errors = []
     for seed in range(60):
@@ -223,70 +211,6 @@ def test_a_wheel_slips_after_each_start_and_not_elsewhere():
         stop = at + 251 + np.flatnonzero(~moving[at + 251:])[0]
         assert np.ptp(spun[at + 250:stop]) == 0.0
     assert spun[0] == 0.0
-
-
-@pytest.mark.parametrize(('noise', 'sigma'), [('white', 1.5), ('rtk', 0.02), ('white', 0.7)])
-def test_fix_errors_are_what_the_covariance_says(noise, sigma):
-    options = resolved(replace(TOWN, fix_noise=noise, fix_sigma=sigma))
-    errors = sensors.fix_errors(np.arange(20_000) * 0.2, options)
-    stated = simulate(options).fix
-    for axis in range(3):
-        assert errors[:, axis].var() == pytest.approx(
-            stated.covariance_n[0, axis, axis], rel=sure(20_000))
-    assert stated.covariance_n[0, 0, 0] == pytest.approx(sigma**2)
-    assert stated.covariance_n[0, 2, 2] == pytest.approx(4 * sigma**2)
-    assert set(stated.status.tolist()) == {2 if noise == 'rtk' else 0}
-
-
-def test_fix_errors_go_east_north_and_up():
-    noisy, bare = (simulate(replace(TOWN, fix_sigma=sigma)) for sigma in (5.0, 0.0))
-    t = (bare.fix.stamp_ns - bare.options.start_ns) * 1e-9
-    errors = sensors.fix_errors(t, noisy.options)
-    east = (noisy.fix.longitude - bare.fix.longitude) * np.cos(bare.fix.latitude)
-    north = noisy.fix.latitude - bare.fix.latitude
-    # radii of WGS 84 at 40 deg, to the 20 m that height and latitude change them, of 20 m
-    assert_allclose(east * 6_386_976, errors[:, 0], atol=2e-3)
-    assert_allclose(north * 6_361_816, errors[:, 1], atol=2e-3)
-    assert_allclose(noisy.fix.height - bare.fix.height, errors[:, 2], atol=1e-8)
-
-
-def test_correlated_fixes_keep_their_power_and_forget_slowly():
-    options = resolved(replace(TOWN, fix_noise='correlated', fix_correlation_time=10.0))
-    t = np.arange(100_000) * 0.2
-    errors = sensors.fix_errors(t, options)[:, :2]
-    spread = 5 * np.sqrt(2 * 10.0 / t[-1] / 2)
-    total = simulate(options).fix.covariance_n[0, 0, 0]
-    assert errors.var() == pytest.approx(total, rel=spread)
-    together = (errors[50:] * errors[:-50]).mean()     # 10 s apart: the white part is gone
-    assert together == pytest.approx(1.5**2 * np.exp(-1), abs=1.5**2 * spread)
-
-
-def test_fixes_lie_about_the_antenna():
-    drive = simulate(replace(TOWN, fix_sigma=0.0, antenna_lever_arm=(2.0, 0.5, 1.5)))
-    bare = simulate(replace(TOWN, fix_sigma=0.0))
-    assert_allclose(drive.fix.height - bare.fix.height, 1.5, atol=1e-6)
-    north = (drive.fix.latitude - bare.fix.latitude)[0] * 6.36e6
-    east = (drive.fix.longitude - bare.fix.longitude)[0] * 6.386e6 * np.cos(np.radians(40))
-    # heading 45 deg: forward 2 and left 0.5; radii to 0.2 %
-    assert [east, north] == pytest.approx([1.5 / np.sqrt(2), 2.5 / np.sqrt(2)], rel=2e-3)
-    assert drive.fix.covariance_n[0, 0, 0] == sensors.SIGMA_FLOOR**2   # no receiver says zero
-
-
-def test_outliers_are_as_many_and_as_far_as_said():
-    options = resolved(replace(TOWN, outliers=0.1, fix_sigma=0.0))
-    far = np.hypot(*sensors.fix_errors(np.arange(20_000) * 0.2, options)[:, :2].T)
-    # 5 sigma of a binomial share
-    assert (far > 0).mean() == pytest.approx(0.1, abs=5 * np.sqrt(0.1 * 0.9 / 20_000))
-    assert far[far > 0].min() >= 10
-    assert far.max() <= 30
-
-
-def test_an_outage_has_no_fixes():
-    drive = simulate(replace(TOWN, outages=((50.0, 60.0), (100.0, 101.0))))
-    t = (drive.fix.stamp_ns - drive.options.start_ns) * 1e-9
-    assert not ((t >= 50) & (t < 60)).any()
-    assert not ((t >= 100) & (t < 101)).any()
-    assert len(t) == len(simulate(TOWN).fix.stamp_ns) - 55
 
 
 def same(a, b):
