@@ -24,6 +24,7 @@ import tempfile
 import time
 import warnings
 
+from damage import file_of
 import mutations
 import semantic
 
@@ -33,8 +34,6 @@ from odocal_ros.sim.scenarios import simulate
 
 SECONDS = 60.0           # of a case, at most
 MEMORY = 2**30           # bytes over what a clean bag takes, at most
-SIGMAS = 5.0
-NAMES = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 BASES = {'mcap': ('mcap', 'none', 'counts'), 'zstd': ('mcap', 'storage', 'counts'),
          'messages': ('mcap', 'message', 'speed'), 'file': ('mcap', 'file', 'counts'),
          'sqlite3': ('sqlite3', 'none', 'counts'), 'angle': ('sqlite3', 'none', 'angle'),
@@ -86,7 +85,7 @@ def bases(folder: Path) -> Bases:
         write_bag(path, drive_topics(made), storage, compression)
         if name == 'journal':
             (path / 'journal.yaml').write_text(JOURNAL)
-        truth[name] = {n: float(getattr(made.truth, short)) for n, short in NAMES.items()}
+        truth[name] = made.truth
     # a heading, and limits within which the two ends alone are accepted: so the cheapest method
     # has something to be wrong about
     options = [f'alignment.heading={made.truth.heading}', 'alignment.heading_sigma=0.002',
@@ -152,7 +151,7 @@ def case(seed: int, clean: Bases, work: Path, number: int, ran) -> Outcome:
     code, seconds, memory = ran(argv, place)
     said = (place / 'stderr').read_text(errors='replace')
     wrong = judged(place, before, code, seconds, memory, said,
-                   ranges(clean.truth[base], factors) if not options else None)
+                   semantic.ranges(clean.truth[base], factors) if not options else None)
     shutil.rmtree(place)
     method = argv[3] if argv[0] == 'replay' else ''
     return Outcome(number, f'{base} {done} {argv[0]} {method}'.rstrip(), code, seconds, memory,
@@ -183,17 +182,10 @@ def mutated(rng, base, bag):
         return 'journal_text', [], None
     if BASES[base][0] == 'sqlite3' and rng.random() < 0.5:
         change = rng.choice(semantic.ALL)
-        return change.__name__, [], semantic.change_sqlite(rng, mutations.file_of(bag), change)
+        return change.__name__, [], semantic.change_sqlite(rng, file_of(bag), change)
     change = rng.choice(mutations.OF.get(base) or mutations.OF[BASES[base][0]])
     change(rng, bag)
     return change.__name__, [], None
-
-
-def ranges(truth, factors) -> dict:
-    """Return the least and largest true value of each name."""
-    least, largest = factors or semantic.SAME
-    return {name: (true, true) if name != 'scale_factor' else (least * true, largest * true)
-            for name, true in truth.items()}
 
 
 def tree(place: Path) -> dict:
@@ -265,16 +257,10 @@ def judged(place, before, code, seconds, memory, said, truth) -> str:
 
 
 def false_value(content, truth) -> str:
-    """Return the values that are accepted without a word and are not true."""
+    """Return the worst value that is accepted without a word and is not true."""
     if content['verdict'] != 'accepted':
         return ''
-    off = []
-    for name, (least, largest) in truth.items():
-        entry = content['result'].get(name) or {}
-        if entry.get('value') is None:
-            continue
-        far = max(least - entry['value'], entry['value'] - largest)
-        if not far <= SIGMAS * entry['sigma']:
-            true = f'{least:.6g}' + f' to {largest:.6g}' * (largest > least)
-            off.append(f'{name} {entry["value"]:.6g} +- {entry["sigma"]:.2g}, {true} is true')
-    return '; '.join(off)
+    sigmas, what = semantic.worst_error({
+        name: (entry.get('value'), entry.get('sigma'))
+        for name, entry in content['result'].items() if isinstance(entry, dict)}, truth)
+    return '' if sigmas <= semantic.SIGMAS else what

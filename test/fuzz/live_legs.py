@@ -30,9 +30,8 @@ from odocal_ros.messages.sensor_types import FIX, IMU
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
-SIGMAS, DRIVES, PIECE_NS, START_NS, SECOND = 5.0, 4, 500_000_000, 15 * 10**9, 10**9
-COUNTER, JOINTS = semantic.COUNTER, semantic.JOINTS
-NAMES = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
+DRIVES, PIECE_NS, START_NS, SECOND = 4, 500_000_000, 15 * 10**9, 10**9
+COUNTER, JOINTS, SIGMAS = semantic.COUNTER, semantic.JOINTS, semantic.SIGMAS
 ODD = (math.nan, math.inf, -math.inf, 1e150, 1e300, -1e300, 5e-324)
 FIELDS = {IMU: (*semantic.RATES, *semantic.FORCES), JOINTS: ('position[0]',), COUNTER: ('data',),
           FIX: ('latitude', 'longitude', 'altitude', 'position_covariance[0]')}
@@ -228,20 +227,9 @@ def leg(seed, number):
             return Outcome(number, tuple(done), 'refused', 0.0, '', (str(error),), '')
         except Exception as error:      # that none comes is what is tested
             return Outcome(number, tuple(done), '', 0.0, '', (), repr(error))
-    return judged(number, done, computed.calibration, drive.truth, truth, raised)
-
-
-def judged(number, faults, calibration, truth, factors, raised):
-    """Hold the values of a calibration against the truth."""
-    worst, what = 0.0, ''
-    for name, short in NAMES.items():
-        estimate, true = calibration.estimates.get(name), getattr(truth, short)
-        if estimate is None or estimate.value is None or not estimate.sigma:
-            continue
-        low, high = sorted((true * factors[0], true * factors[1])) if short == 'scale' else (
-            true, true)
-        off = max(low - estimate.value, estimate.value - high, 0.0) / estimate.sigma
-        if not off <= worst:
-            worst, what = off, f'{name} {estimate.value:.6g} +- {estimate.sigma:.2g}, {true:.6g}'
-    return Outcome(number, tuple(faults), calibration.verdict.value, worst, what,
+    calibration = computed.calibration
+    worst, what = semantic.worst_error({
+        name: (e.value, e.sigma) for name, e in calibration.estimates.items()},
+        semantic.ranges(drive.truth, truth))
+    return Outcome(number, tuple(done), calibration.verdict.value, worst, what,
                    tuple(r.code.name for r in calibration.reasons), '; '.join(raised))

@@ -19,10 +19,32 @@ from odocal_ros.messages.cdr import FRAME_AT, layout_of
 from odocal_ros.messages.sensor_types import FIX, IMU
 
 SAME = (1.0, 1.0)
+SIGMAS = 5.0
+NAMES = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 COUNTER, JOINTS = 'std_msgs/msg/Int64', 'sensor_msgs/msg/JointState'
 RATES = [f'angular_velocity.{axis}' for axis in 'xyz']
 FORCES = [f'linear_acceleration.{axis}' for axis in 'xyz']
 DEG, G = 180 / math.pi, 9.80665
+
+
+def ranges(truth, factors=None):
+    """Return the least and largest true value of each name; factors: of the scale."""
+    return {name: sorted(getattr(truth, short) * x for x in (
+        factors if factors and short == 'scale' else SAME)) for name, short in NAMES.items()}
+
+
+def worst_error(found, true):
+    """Return the largest error over sigma of values, name to (value, sigma), and a text."""
+    worst, what = 0.0, ''
+    for name, (least, largest) in true.items():
+        value, sigma = found.get(name, (None, None))
+        if value is None or not sigma:
+            continue
+        off = max(least - value, value - largest, 0.0) / sigma
+        if not off <= worst:
+            worst, what = off, (f'{name} {value:.6g} +- {sigma:.2g}, {least:.6g} to '
+                                f'{largest:.6g} is true')
+    return worst, what
 
 
 def change_sqlite(rng, file, mutation):
