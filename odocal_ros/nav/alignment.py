@@ -107,11 +107,7 @@ class Grade(Protocol):
 
 
 def level_frame(up_b: Floats) -> Floats:
-    """
-    Return C_Lb for the up direction in b: x of L is b's x axis projected on the level.
-
-    If b's x axis is vertical, b's y axis is that of L.
-    """
+    """Return C_Lb for up in b: x of L is b's x axis on the level; if vertical, y is b's."""
     u = up_b / np.linalg.norm(up_b)
     level = np.hypot(u[1], u[2])
     y = np.array([0.0, u[2], -u[1]]) / level if level else np.array([0.0, 1.0, 0.0])
@@ -189,11 +185,7 @@ def gyrocompass(level: Level, latitude: float, grade: Grade) -> tuple[float, flo
 
 
 def off_the_earth(level: Level, latitude: float, grade: Grade) -> float:
-    """
-    Return the deviation of the rate at rest from the Earth's in sigmas: larger of level and up.
-
-    Neither depends on the heading, so a bias beyond the grade is detected.
-    """
+    """Return the deviation of the rate at rest from the Earth's, level or up, in sigmas."""
     rate_L = level.C_Lb @ level.mean_rate_b
     level_rate, up_rate = OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)
     off = np.array([np.hypot(rate_L[0], rate_L[1]) - level_rate, rate_L[2] - up_rate])

@@ -121,11 +121,7 @@ def forward_b(yaw: float | Floats, pitch: float | Floats) -> Floats:
 
 
 def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
-    """
-    Return yaw and pitch mounting angle, rad, of a forward axis in b: docs/method.md (T5).
-
-    Yaw in [-pi, pi], pitch within 90 deg: an odometer that counts backwards is a yaw of pi.
-    """
+    """Return yaw and pitch mounting, rad, of an axis in b; backwards: yaw of pi (T5)."""
     d_b = np.asarray(d_b, dtype=float)
     x, y, z = d_b[..., 0], d_b[..., 1], d_b[..., 2]
     side = np.where(x < 0, -1.0, 1.0)

@@ -34,11 +34,7 @@ def running_integral(t: Floats, x: Floats) -> Floats:
 
 
 def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
-    """
-    Return the integral of x, (n, ...), from t[0] to times, linear between rows.
-
-    times : (m,) array, rising.   t : (n,) array, n > 1.   Returns (m, ...).
-    """
+    """Return the integral of x, (n, ...), from t[0] to rising times (m,): (m, ...)."""
     return integrals_at([times], t, x)[0]
 
 

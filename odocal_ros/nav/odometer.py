@@ -127,11 +127,7 @@ def mean_travel(travels: Sequence[Travel]) -> Travel:
 
 
 def without_rollover(step: Values, modulus: int) -> Values:
-    """
-    Return steps of a counter, (n,), with rollovers corrected.
-
-    modulus : span of the counter in counts, 0 for floats. 64 bits wrap in the subtraction.
-    """
+    """Return steps (n,) without rollovers; modulus: counts, 0: floats; 64 bits wrap already."""
     half = modulus // 2
     return (step + half) % modulus - half if 0 < modulus < 2**63 else step
 

@@ -65,11 +65,7 @@ def plane_for(projection: Projection, longitude: float) -> Plane:
 
 def plane_chord(plane: Plane, start: Sequence[float] | Floats,
                 end: Sequence[float] | Floats) -> tuple[float, float]:
-    """
-    Return length, m, and bearing from grid north, rad, of a chord in the plane (eq. 6, 7, 10).
-
-    start, end : (2 or 3,) latitude, longitude, rad.
-    """
+    """Return length, m, and grid bearing, rad, of a chord between latitudes, longitudes, rad."""
     (n0, n1), (e0, e1) = plane.forward(np.array([start[0], end[0]]), np.array([start[1], end[1]]))
     return float(np.hypot(n1 - n0, e1 - e0)), float(np.arctan2(e1 - e0, n1 - n0))
 

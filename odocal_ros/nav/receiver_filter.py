@@ -111,11 +111,7 @@ class _Track:
 
 
 def _tracked(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
-    """
-    Return the error at ``at`` of a filter of position and velocity, (k, 3).
-
-    On a cubic it is tau^2 (-p'' + sqrt(2) tau p''') plus a decaying oscillation.
-    """
+    """Return the error at ``at`` of a filter of position and velocity, (k, 3)."""
     T, bend, twist = _bends(t, place, velocity)
 
     def forced(k: Ints | slice, s: Floats) -> Floats:

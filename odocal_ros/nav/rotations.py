@@ -124,11 +124,7 @@ def quat_conjugate(q: ArrayLike) -> Floats:
 
 
 def quat_at(t_new: Floats, t: Floats, q: Floats) -> Floats:
-    """
-    Return attitudes interpolated to times, for small rotations between rows: (k, 4).
-
-    t, q : (m,) rising, (m, 4).   Outside of t, attitude is constant.
-    """
+    """Return attitudes (k, 4) at times by (m, 4) rows with small rotations; constant outside."""
     sides = np.einsum('ki,ki->k', q[1:], q[:-1])
     q = q * np.cumprod(np.append(1.0, np.where(sides < 0, -1.0, 1.0)))[:, None]
     found: Floats = np.stack([np.interp(t_new, t, column) for column in q.T], -1)

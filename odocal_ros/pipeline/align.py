@@ -101,11 +101,7 @@ def choose_standstill(spans: Iterable[Span]) -> Span | None:
 
 def _from_place(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes_n: Floats,
                 origin: Origin) -> Floats:
-    """
-    Return C_np at the position of a standstill, where east, north and up differ from the origin's.
-
-    They rotate by 0.16 mrad per kilometre between the two.
-    """
+    """Return C_np at a standstill, rotated from the origin by 0.16 mrad per kilometre."""
     if span is None or not len(fixes_n):
         return np.eye(3)
     near = (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])

@@ -90,11 +90,7 @@ class LegSearch:
         self._decide()
 
     def restart(self, after_ns: int, at_rest: bool) -> None:
-        """
-        Remove the legs; the next one begins after a stamp.
-
-        at_rest : at the next start from a standstill, otherwise as soon as the vehicle moves.
-        """
+        """Remove the legs; the next begins after a stamp, at a start from rest or in motion."""
         self.spans.clear()
         self._from_ns, self._needs_rest = after_ns, at_rest
 

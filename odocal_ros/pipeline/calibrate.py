@@ -196,11 +196,7 @@ def _near(stamps: Ints, first_ns: int, stop_ns: int) -> Ints:
 def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
                     holdout: bool = False,
                     progress: Callable[[Stage], None] | None = None) -> list[LegResult]:
-    """
-    Return the results of a leg: one, or one for each part that can be calibrated.
-
-    Arguments as for ``calibrate``. If no part can be calibrated, the result is that of the leg.
-    """
+    """Return the results of a leg's parts that can be calibrated, otherwise that of the leg."""
     def good_of(parts: list[Leg]) -> list[LegResult]:
         results = []
         for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):

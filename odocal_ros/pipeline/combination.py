@@ -109,11 +109,7 @@ def driven_twice(legs: Sequence[LegResult]) -> list[LegResult]:
 
 def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
              numbers: Sequence[int] | None = None, carried: Carried | None = None) -> MethodResult:
-    """
-    Return the result of a method for several legs, including carried ones if possible.
-
-    results : one a leg.   times_ns, numbers : as for ``combine_legs``.
-    """
+    """Return the result of a method for several legs, including carried ones if possible."""
     if carried and all(r.border for r in results):
         unknown = {n: Estimate(None, None, e.unit) for n, e in results[0].estimates.items()}
         results = [MethodResult(name, (), unknown, border=carried.border), *results]
@@ -195,11 +191,7 @@ def _imu_rotation(estimates: Mapping[str, Estimate],
 
 
 def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]:
-    """
-    Return LEGS_UNLIKE if scale or yaw of legs differ by more than those of one vehicle.
-
-    numbered : the combined legs, with their numbers.
-    """
+    """Return LEGS_UNLIKE if scale or yaw of legs differ by more than those of one vehicle."""
     found = []
     estimates = [(n, leg_estimates(leg)) for n, leg in numbered]
     scales = [scale for scale in _values('scale_factor', estimates) if scale.value]

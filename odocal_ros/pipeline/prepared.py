@@ -142,22 +142,14 @@ class PreparedLeg(Placed):
 
     @cached_property
     def path_ratio(self) -> float | None:
-        """
-        Return metres per unit of travel by the fixes against ``level_path``, None if they stand.
-
-        Its distances turn and reverse as those of the fixes do, unlike the rough scale's.
-        """
+        """Return metres per unit of travel by fixes along ``level_path``, None if they stand."""
         t, travel = self.inputs.t_fix, self.inputs.travel
         k = (t >= max(travel.t[0], self.track.t[0])) & (t <= min(travel.t[-1], self.track.t[-1]))
         return section_ratio(travel.at(t[k]), self.level_path(t[k]), self.fixes_n[k, :2],
                              max(self.inputs.least_motion, 8 * self.fix_sigma))
 
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
-        """
-        Return the antenna's position at t, None if there is none.
-
-        It is by the fixes around t, or the surveyed point of the mark 'start' or 'end'.
-        """
+        """Return the antenna's position at t by fixes or surveyed mark, None without either."""
         point = self._surveyed(name, t)
         if point:
             position = np.array([np.deg2rad(point[0]), np.deg2rad(point[1]), point[2]])

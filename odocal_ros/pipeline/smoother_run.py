@@ -77,11 +77,7 @@ def _with_search(method: MethodResult, ready: PreparedLeg) -> MethodResult:
 
 
 def _attitude(ready: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, Floats]:
-    """
-    Return the smoother's attitude at the IMU's rate: t (m,) s, q_nb (m, 4).
-
-    It is by the gyros, corrected at keyframes; beyond the fitted fixes by the gyros alone.
-    """
+    """Return the smoother's attitude at the IMU's rate: t (m,) s, q_nb (m, 4)."""
     t_key, C_nb = details['key_t'], details['key_C_nb']
     t, q_nb = attitude_of(ready.inputs, ready.origin, t_key[0], quat_from_matrix(C_nb[0]),
                           details['gyro_bias'])
@@ -117,11 +113,7 @@ def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
 
 
 def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
-    """
-    Return a leg as input of the patent's search: two tracks in the plane, and fixes.
-
-    pitch : mounting angle, rad. None without two wheels, or without a fix at the start.
-    """
+    """Return a leg as input of the patent's search, None without two wheels or a first fix."""
     inputs = ready.inputs
     if len(inputs.travels) != 2:
         return None

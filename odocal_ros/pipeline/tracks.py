@@ -121,11 +121,7 @@ def driven(ready: PreparedLeg) -> tuple[Floats, Floats]:
 
 
 def slip_check(ready: PreparedLeg, track: Track, f: Floats, between: tuple[float, float]) -> Slips:
-    """
-    Return the slips of the mean of the wheels, without those already attributed to one wheel.
-
-    track : of a method.   f : (3,) scale times forward axis.   between : s.
-    """
+    """Return the slips of the mean wheel between two times, s, except those of one wheel."""
     if not ready.inputs.has_accelerometer:
         return Slips(np.empty(0), np.empty(0))
     slips = find_slips(ready.inputs.t_imu, ready.inputs.f_b, track, f, ready.origin.latitude,

@@ -38,12 +38,7 @@ LEAST_LOG_ODDS = 20.0
 
 
 def screen_aligned(leg: Leg, config: Config) -> tuple[Leg, Inputs, tuple[Reason, ...]]:
-    """
-    Screen a leg with odometer and fixes on the clock of the IMU.
-
-    Returns the leg, its stamps moved where offsets are found; its inputs; reasons, among them
-    DELAY_SEEN of each offset.
-    """
+    """Return a leg with all stamps on the clock of the IMU, its inputs, and reasons of both."""
     inputs, reasons = screen(leg, config)
     found, late_by = [], dict(_offsets(inputs, place(inputs, config)))
     for clock, late in late_by.items():
@@ -99,11 +94,7 @@ def _quick(x: Floats, slow: float) -> Floats:
 
 
 def _late(y: Floats, x: Floats, x_late: float = 0.0) -> float:
-    """
-    Return the delay of y relative to the IMU, s; 0 if it is not clearly above OFFSET_REACH.
-
-    y : (n, 1), compared with its best fit by x, (n, k), whose delay is x_late.
-    """
+    """Return the delay, s, of y (n, 1) by its fit with x (n, k); 0: not above OFFSET_REACH."""
     reach = round(FARTHEST_OFFSET / OFFSET_CELL)
     size = 2 * max(len(x), reach)
     both = np.fft.irfft(np.fft.rfft(y, size, axis=0) * np.fft.rfft(x, size, axis=0).conj(), axis=0)

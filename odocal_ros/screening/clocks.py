@@ -33,12 +33,7 @@ def offsets(config: Config) -> dict[str, float]:
 
 
 def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
-    """
-    Return reasons for clocks that differ from the IMU's at equal times of arrival.
-
-    leg : unchanged.   Positions of marks are not compared: they have IMU stamps and arrive late,
-    by up to WITHIN.
-    """
+    """Return reasons for clocks that differ from the IMU's at equal times of arrival."""
     topics = [slot for slot in TOPICS if not (slot == 'fix' and config.reference.points)]
     offset = offsets(config)
     found: list[Reason] = []
@@ -111,12 +106,7 @@ def _may_be_odd(stamp_ns: Ints) -> Bools:
 
 
 def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
-    """
-    Return a leg with the steps of clocks that were set during it removed, and CLOCK_SET of each.
-
-    leg : unchanged. The stamps with the smallest lag of arrival are kept; the marks are corrected
-    as those of the IMU.
-    """
+    """Return a leg without the steps of clocks that were set during it; CLOCK_SET of each."""
     rows: dict[str, Samples] = {}
     found: list[Reason] = []
     for slot in ('imu', *TOPICS):

@@ -106,11 +106,7 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
 
 
 def accelerations(inputs: Inputs, metres_per_unit: float) -> Accelerations | None:
-    """
-    Return the changes of the accelerations of a leg, None if it is too short.
-
-    inputs : in the configured body frame.   metres_per_unit : as for ``pushes``.
-    """
+    """Return the changes of the accelerations of a leg, None if it is too short."""
     mean = inputs.usual_f_b
     size = float(np.linalg.norm(mean))
     found = pushes(inputs.t_imu, inputs.w_b, inputs.f_b, mean / size, inputs.travel,

@@ -49,11 +49,7 @@ SPANS_SAID = 3           # judgement: number of spans in a reason
 
 def usable_fixes(fix: FixSamples, sent: int,
                  gnss: GnssConfig) -> tuple[Bools, Floats, tuple[Reason, ...]]:
-    """
-    Return a mask of usable fixes, (n,), all covariances, (n, 3, 3) m^2, and reasons.
-
-    fix : with stamps in order.   sent : number of received fixes.   gnss : limits.
-    """
+    """Return a mask of usable fixes, (n,), all covariances, (n, 3, 3) m^2, and reasons."""
     no_fix = fix.status < gnss.min_status
     most_height = 1e4    # m, physical: no ground is higher; 10 km make the scale 0.16 % larger
     lost = ~placed(fix) | (abs(fix.height) > most_height)
@@ -98,11 +94,7 @@ def _invalid(fix: FixSamples, lost: Bools) -> str:
 
 
 def sigma_limit(sigma: Floats, max_sigma: float) -> float:
-    """
-    Return the limit of the stated sigmas of fixes, m, inf: none.
-
-    sigma : (n,) stated horizontal sigmas, m.   max_sigma : gnss.max_sigma.
-    """
+    """Return the limit of the horizontal sigmas of fixes, (n,) m; inf: none."""
     if np.isnan(max_sigma):
         return max(USUAL_LIMIT, 2 * float(np.median(sigma))) if len(sigma) else USUAL_LIMIT
     return max_sigma or np.inf
@@ -277,11 +269,7 @@ def _spans(t: Floats, place: Complexes, sigma: Floats,
 
 
 def _without_delay(off: Complexes, by_second: Complexes) -> Floats:
-    """
-    Return the sizes of deviations, m, without the part by a delay or low-pass filter: (n,).
-
-    off : (n,) m.   by_second : (n,) m, by an odometer that is late by a second.
-    """
+    """Return sizes of deviations (n,), m, without the part by a delay, m per s of it."""
     size = np.maximum(np.abs(by_second), 1e-9)
     delays = (off * by_second.conj()).real / size**2
     order = np.argsort(delays)

@@ -197,11 +197,7 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
 
 
 def saturated(t_imu: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> tuple[Reason, ...]:
-    """
-    Return IMU_SATURATED for the axis that is at its limit most often.
-
-    t_imu : (n,) s.   w_i, f_i : (n, 3) raw turn rates and specific forces.
-    """
+    """Return IMU_SATURATED for the axis of (n, 3) raw rates or forces most often at its limit."""
     found = []
     for sensor, x_i, scale, unit, least in (
             ('gyro', w_i, imu.gyro_scale, 'rad/s', LEAST_GYRO),

@@ -33,11 +33,7 @@ def tenths(inputs: Inputs) -> Ints:
 
 
 def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
-    """
-    Return IMU_UNITS if gravity in a tenth of the leg differs from the Earth's.
-
-    The median force over a tenth of a leg differs less from gravity by accelerations.
-    """
+    """Return IMU_UNITS if gravity in a tenth of the leg differs from the Earth's."""
     edges = tenths(inputs)
     size = [float(np.linalg.norm(medians(inputs.f_b[a:b])))
             for a, b in zip(edges[:-1], edges[1:], strict=True)]

@@ -30,11 +30,7 @@ SURE_SIGMAS = 4.0         # statistical: significance of smoother rows: by chanc
 
 
 def on_rhythm(t: Floats, w: Floats, f: Floats) -> Floats:
-    """
-    Return the sampling times of rows: (n,) s, increasing.
-
-    t : (n,) s by stamps, rising.   w, f : (n, 3) turn rate and specific force, in any unit.
-    """
+    """Return the sampling times (n,), s, of rows by stamps t; w, f: (n, 3), in any unit."""
     usual = _interval(t)
     per = int(BLOCK_TIME / usual) if usual > 0 else 0
     if per < 10 or len(t) < WINDOW_BLOCKS * per:
@@ -114,11 +110,7 @@ class _Rhythm:
 
 
 def _evener(sent: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
-    """
-    Return True if rows are significantly smoother at other times than at their stamps.
-
-    sent, even : (m, 5) s, of rows and adjacent ones.   columns : (m, 5) each, measured values.
-    """
+    """Return True if (m, 5) values are significantly smoother at other times than at stamps."""
     weights = _weights(sent), _weights(even)
     gain = np.zeros(len(sent))
     for near in columns:

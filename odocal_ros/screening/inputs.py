@@ -103,11 +103,7 @@ class Placed:
 
 
 def place(inputs: Inputs, config: Config) -> Placed:
-    """
-    Return the fix positions of screened inputs and the metres per count.
-
-    inputs : Inputs.   config : Config, for the nominal scale and the latitude of a local frame.
-    """
+    """Return the fix positions of screened inputs and the metres per count."""
     nominal = nominal_scale(config, inputs.scale_unit)
     if not len(inputs.t_fix):
         return Placed(Origin(0.0, 0.0, 0.0), np.empty((0, 3)), np.nan, nominal, nominal)

@@ -31,11 +31,7 @@ ROUNDING_COUNTS = 2.5     # judgement: largest deviation of a row by rounding
 
 def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
             name: str = 'odometer') -> Floats:
-    """
-    Return the sampling times of rows: (n,) s, late ones moved back.
-
-    samples : OdometerSamples, usable.   t : (n,) s by stamps.   found : list, reasons are added.
-    """
+    """Return the sampling times of rows stamped at t, (n,) s: late ones are moved back."""
     if len(t) < 4 * EVEN_BESIDE:
         return t
     whole = np.issubdtype(samples.value.dtype, np.integer)
@@ -133,12 +129,7 @@ def _fitting(t: Floats, even: Floats, travel: Floats, late: Bools,
 
 
 def _rhythm(t: Floats, travel: Floats) -> tuple[float, Floats, bool]:
-    """
-    Return the interval, times on the rhythm with the smoothest travel, True if it is smoother.
-
-    Rows deviate from a rhythm by delays of a busy machine, which are positive, or by a coarse
-    clock of the sender, to both sides.
-    """
+    """Return the interval, times on the smoothest rhythm, True if travel is smoother on it."""
     # of two equally smooth ones, that of the median rows: the earliest rows have steps
     found = [(_unevenness(t, even, travel), usual, even) for usual in reversed(intervals(t))
              for even in (*_middle(t, usual), _soonest(t, usual))]

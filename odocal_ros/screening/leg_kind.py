@@ -65,11 +65,7 @@ def lacking(imu: samples.ImuSamples, accel_scale: float = 1.0) -> str:
 
 
 def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
-    """
-    Return a leg, upright on level ground if its IMU has no usable force, and the reason.
-
-    No force is published if each value is zero or NaN (as read if REP-145's covariance[0] is -1).
-    """
+    """Return a leg, upright on level ground if its IMU has no usable force, and the reason."""
     why = lacking(leg.imu, config.imu.accel_scale)
     if not why:
         return leg, ()

@@ -56,11 +56,7 @@ def counter_steps(value: Values, modulus: int) -> Floats:
 
 
 def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
-    """
-    Return a mask of false counter rows: frozen before a catch-up jump, or a jump and its reverse.
-
-    t : (n,) s.   value : (n,) raw.   Returns (n,) bool.
-    """
+    """Return a mask of false counter rows (n,): frozen before a jump, or a jump and back."""
     false = np.zeros(len(t), bool)
     step = counter_steps(value, modulus)
     if len(step) < FEWEST_STEPS or not step.any():
@@ -220,11 +216,7 @@ class Steps:
         return STILL_TRAVEL.get(self.form.scale_unit, 0.02)
 
     def of(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
-        """
-        Return the step of each row since the row before, its stamp, ns, and its duration, s.
-
-        Rows with impossible values are skipped.
-        """
+        """Return step, stamp, ns, and duration, s, of each possible row since the one before."""
         good = ~beyond('value', block.value)
         stamps, values = block.stamp_ns[good], block.value[good]
         if self._last is not None:

@@ -58,11 +58,7 @@ def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[
 
 def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
                 found: list[Reason]) -> tuple[Any, Floats]:
-    """
-    Return the usable rows of a topic, and their times from the start mark, s: (n,).
-
-    offset : s, added to the stamps.   found : list, to which reasons for others are appended.
-    """
+    """Return the usable rows of a topic, and their times from the start mark, s: (n,)."""
     sent = leg.rows(slot)
     if slot in WHEELS:
         sent = _stood(sent)

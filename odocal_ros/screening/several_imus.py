@@ -49,11 +49,7 @@ def other_imus(leg: Leg, imu: ImuConfig) -> tuple[Reason, ...]:
 
 
 def alternating(w_i: Floats, f_i: Floats) -> tuple[Reason, ...]:
-    """
-    Return SEVERAL_IMUS if every second row is from another IMU.
-
-    w_i, f_i : (n, 3) turn rates and specific forces, in any unit.
-    """
+    """Return SEVERAL_IMUS if every second row is from another IMU; (n, 3) in any unit."""
     share = max(_share_of_two(w_i), _share_of_two(f_i))
     if not share:
         return ()

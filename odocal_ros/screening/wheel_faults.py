@@ -64,12 +64,7 @@ def broken_wheels(axle: Sequence[Travel], imu: Imu,
 
 
 def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
-    """
-    Return the fit of the right wheel by left wheel, turn and time, and its covariance.
-
-    Two starts, since many cells may be faulty: least squares, and the median ratio of the wheels
-    without a turn; the fit with fewer outliers is used.
-    """
+    """Return the fit of the right wheel by left wheel, turn and time, and its covariance."""
     rolls = A[:, 0] != 0
     usual = float(np.median(y[rolls] / A[rolls, 0])) if rolls.any() else 1.0
     # share of the top speed: gyro bias times track width, 1 sigma

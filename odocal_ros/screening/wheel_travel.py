@@ -41,11 +41,7 @@ class Span:
 
 
 def hidden_span(value: Values, step: Floats) -> Span | None:
-    """
-    Return the span of a counter with uncorrected rollovers, None if there are none.
-
-    value : (n,) raw.   step : (n - 1,) its steps, known rollovers corrected.
-    """
+    """Return the span of a counter's uncorrected rollovers, by rows (n,) and steps (n - 1,)."""
     if len(step) < FEWEST_STEPS or not step.any():
         return None
     usual = _running_median(step)
@@ -185,11 +181,7 @@ class Wheels:
 
 def wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
            found: list[Reason]) -> Wheels:
-    """
-    Return the travel of the wheels of a leg.
-
-    rows : function of a slot to its usable rows and times, s.   found : list, reasons are added.
-    """
+    """Return the travel of the wheels of a leg; rows: of a slot the usable rows and times, s."""
     slots = leg.wheel_slots
     names = config.odometer.names(len(slots))
     samples, t = rows(slots[0])

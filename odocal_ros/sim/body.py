@@ -77,11 +77,7 @@ def leaning(speed: Profile, yaw_rate: Profile, real: Real) -> Profile:
 
 
 def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:
-    """
-    Return value and rate of ``y'' + 2 z w y' + w^2 y = w^2 u`` for piecewise linear u.
-
-    push : (n,) u at equal steps; constant before the first.
-    """
+    """Return value and rate of ``y'' + 2 z w y' + w^2 y = w^2 u``, u linear between rows (n,)."""
     w, z = FREQUENCY, DAMPING
     wd = w * np.sqrt(1 - z**2)
     decay, s, c = np.exp(-z * w * step), np.sin(wd * step), np.cos(wd * step)
@@ -114,11 +110,7 @@ def rotation(motion: Motion, t: Floats) -> Floats:
 
 def measured(motion: Motion, state: State,
          lever_arm: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
-    """
-    Return turn rate (rad/s) and specific force (m/s^2) in the body's axes: (n, 3) each.
-
-    lever_arm : of the IMU in base_link with the body level, m.
-    """
+    """Return turn rate, rad/s, specific force, m/s^2, in body axes; arm m, body level."""
     w_v, f_v = inertial_v(state, lever_arm)
     if not motion.tilt:
         return w_v, f_v

@@ -224,11 +224,7 @@ def _gravity_change(state: State, d_n: Floats, gamma: Floats) -> Floats:
 
 def point(state: State, lever_arm_v: tuple[float, float, float],
           tilt: Floats | None = None) -> tuple[Floats, Floats, Floats]:
-    """
-    Return latitude, longitude (rad), height (m) of a point fixed to the vehicle: (n,) each.
-
-    tilt : (n, 3, 3) rotation from the body, to which the point is fixed, to the vehicle.
-    """
+    """Return latitude, longitude (rad), height (m) of a point of the body, which is tilted."""
     C = earth.C_en(state.latitude, state.longitude) @ attitude(state)
     C = C if tilt is None else C @ tilt
     r_e = earth.ecef_from_geodetic(state.latitude, state.longitude, state.height)
@@ -237,11 +233,7 @@ def point(state: State, lever_arm_v: tuple[float, float, float],
 
 def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float],
                    lean: Floats | float = 0.0) -> Floats:
-    """
-    Return the path rolled by a wheel with its contact point at lever_arm_v, m: (n,).
-
-    lean : rad, (n,) roll of the road, which rotates the arm about the vehicle's x axis.
-    """
+    """Return the path of a wheel with contact at lever_arm_v, m; lean: of the road, rad."""
     _, y, z = lever_arm_v
     if not np.any(lean):
         return state.travel - y * state.turned - z * state.slope

@@ -35,11 +35,7 @@ def random_walk(rng: np.random.Generator, root_rate: float, rate: float,
 
 
 def gauss_markov(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
-    """
-    Return a first-order Gauss-Markov process in three axes: (n,) s to (n, 3).
-
-    Stationary from the first sample: sigma everywhere, correlation exp(-dt / tau).
-    """
+    """Return a stationary first-order Gauss-Markov process in three axes: (n,) s to (n, 3)."""
     decay = np.exp(-np.diff(t, prepend=t[:1]) / tau)
     drive = sigma * np.sqrt(1 - decay**2)[:, None] * rng.standard_normal((len(t), 3))
     drive[:1] = sigma * rng.standard_normal((1, 3))

@@ -97,11 +97,7 @@ def chain(pieces: Iterable[Piece]) -> Profile:
 
 
 def ramp(duration: float, gain: float, blend: float = 1.0) -> list[Piece]:
-    """
-    Return the acceleration pieces that change speed by ``gain`` within ``duration``.
-
-    The acceleration rises and falls linearly in ``blend`` s (0: at once, as in the paper).
-    """
+    """Return acceleration pieces that gain m/s; blend: s of linear rise and fall, 0: at once."""
     peak = gain / (duration - blend)
     return [line(blend, 0.0, peak), line(duration - 2 * blend, peak, peak), line(blend, peak, 0.0)]
 

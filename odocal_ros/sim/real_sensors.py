@@ -126,11 +126,7 @@ def vibration(rng: np.random.Generator, rms: float, rate: float, n: int) -> Floa
 
 def stamped(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
             batch: int = 1) -> Ints:
-    """
-    Return stamps (ns) of samples measured at ``ns``: late, in order, and in batches.
-
-    The jitter has zero mean, but no stamp is before its sample.
-    """
+    """Return stamps, ns, of samples at ``ns``: late (none early), in order, in batches."""
     late = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
     stamp = ns + np.rint(late * 1e9).astype(np.int64)
     apart = APART_NS * np.arange(len(ns))
@@ -206,11 +202,7 @@ def burst_errors(t: Floats, options: SimOptions) -> Floats:
 
 
 def reckoned(t: Floats, error: Floats, place: Floats, options: SimOptions) -> Floats:
-    """
-    Return errors of a receiver that dead-reckons in tunnels, without effect after them.
-
-    error, place : (n, 3) m, ENU; the error at the entry is kept in the tunnel.
-    """
+    """Return (n, 3) m errors of a receiver that dead-reckons in tunnels from the entry."""
     real, out = options.real, error.copy()
     for begin, length in real.tunnels:
         inside = np.flatnonzero((t >= begin) & (t < begin + length))

@@ -46,11 +46,7 @@ REFERENCES = {
 
 
 def drift(t: Floats, travel: Floats, options: Any) -> Floats | float:
-    """
-    Return errors that change with the path, and jump as loops are closed: (n, 3) m ENU, or 0.0.
-
-    travel : (n,) m, at t.
-    """
+    """Return errors (n, 3) m, ENU, that change with travel (n,), m, and jump at loop closures."""
     if not options.reference_drift:
         return 0.0
     rng, length = stream(options.seed, 'reference drift'), options.drift_length

@@ -151,11 +151,7 @@ def _kerbs(route: Route, options: SimOptions) -> tuple[tuple[float, float], ...]
 
 
 def _sway(route: Route, options: SimOptions, lean: Profile | None) -> tuple[Profile, Profile]:
-    """
-    Return velocities to the side and up: linear between draws, smaller below 1 m/s.
-
-    On a leaning road the axle's centre rotates about the wheels' contact below it.
-    """
+    """Return velocities to the side and up; on a leaning road the axle turns about its contact."""
     step = 0.1      # s between draws
     breaks = np.round(np.arange(0.0, route.speed.end + step, step), 9)
     size = options.sway * np.clip(np.abs(route.speed(breaks)), 0.0, 1.0)

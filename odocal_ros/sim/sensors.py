@@ -99,11 +99,7 @@ def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.Headin
 
 
 def pressure(motion: Motion, options: SimOptions) -> samples.ScalarSamples:
-    """
-    Return the air pressure, Pa; none without a sigma.
-
-    Weather, the wind of driving and the temperature of the air are drawn for each drive.
-    """
+    """Return the air pressure, Pa, with weather, wind and warmth; none without a sigma."""
     rate, scale_height, ground = 20.0, 8435.0, 101_325.0    # Hz, m, Pa: standard atmosphere
     sigma = options.pressure_sigma
     if sigma is None:

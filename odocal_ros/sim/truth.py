@@ -98,12 +98,7 @@ def _configured_arm(options: SimOptions, name: str) -> list[float]:
 
 
 def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict[str, dict[str, Any]]:
-    """
-    Return the settings an operator of this vehicle would give, by group.
-
-    ``known_heading_sigma`` (rad): the heading at the start mark is known too, with a random error
-    of this sigma.
-    """
+    """Return an operator's settings by group; a known heading has a random error, rad."""
     options = drive.options
     grade = options.real.configured_grade or options.imu_grade
     odometer: dict[str, Any] = {'nominal_scale': float(options.nominal_scale),
