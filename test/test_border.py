@@ -24,7 +24,7 @@ ROS = {'rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_m
 ROOMS = {
     'outside': '', 'data': '',
     'settings': 'data outside',
-    'nav': 'data',
+    'nav': 'data settings',
     'messages': 'data nav settings',
     'bagio': 'data messages outside',
     'screening': 'data nav settings',

@@ -8,7 +8,6 @@ An ``Alignment`` is an input of the pure pipeline, so that a simulation can put 
 """
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose, wrap
+from odocal_ros.settings.grades import Grade
 
 # limits of the alignment of a leg, recorded or planned
 MOTION_LEVEL = 30.0       # s, judgement: of driving that determines a level without standstill
@@ -82,28 +82,6 @@ class Level:
     rate_sigma: float                   # rad/s, of the mean as bias at t
     standstill: tuple[float, float] | None
     C_np: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
-
-
-class Grade(Protocol):
-    """Errors of an IMU (``settings.grades.Grade``), 1 sigma, SI."""
-
-    @property
-    def level_bias(self) -> float: ...
-
-    @property
-    def accel_noise(self) -> float: ...
-
-    @property
-    def gyro_bias(self) -> float: ...
-
-    @property
-    def gyro_bias_walk(self) -> float: ...
-
-    @property
-    def gyro_scale_error(self) -> float: ...
-
-    @property
-    def axis_error(self) -> float: ...
 
 
 def level_frame(up_b: Floats) -> Floats:

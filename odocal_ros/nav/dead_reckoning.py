@@ -97,12 +97,7 @@ class Track:
 
 
 def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
-    """
-    Return the track, the sum of attitude over travel: docs/method.md (T1).
-
-    t, q_nb : (m,), (m, 4) epochs, s, and attitude at them.   travel : odometer travel,
-    interpolated to the epochs. Trapezoid rule, of second order in the turn per epoch.
-    """
+    """Return the track, attitude over travel by the trapezoid rule: docs/method.md (T1)."""
     s = travel.at(t)
     half, P = (np.diff(s) / 2)[:, None, None], room(len(t), 3, 3)
     for rows in chunks(len(t) - 1):

@@ -78,12 +78,7 @@ def ecef_from_geodetic(latitude: ArrayLike, longitude: ArrayLike, height: ArrayL
 
 
 def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """
-    Return latitude, longitude (rad), height (m) from Earth-fixed coordinates, m: (..., 3).
-
-    Bowring's start and Newton-like steps on the reduced latitude: within 1e-9 m up to 100 km
-    of height, including the poles.
-    """
+    """Return latitude, longitude, rad, height, m, of (..., 3) m (Bowring; within 1e-9 m)."""
     x, y, z = np.moveaxis(np.asarray(r_e, dtype=float), -1, 0)
     b = A * (1 - F)
     p = np.hypot(x, y)

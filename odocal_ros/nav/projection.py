@@ -5,11 +5,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.settings.config import ProjectionConfig
 
 # semi-major axis m, inverse flattening
 ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
@@ -39,20 +39,7 @@ class Plane:
         return np.asarray(northing), np.asarray(easting)
 
 
-class Projection(Protocol):
-    """The settings ``projection``."""
-
-    @property
-    def kind(self) -> str: ...
-
-    @property
-    def ellipsoid(self) -> str: ...
-
-    @property
-    def central_meridian(self) -> float: ...
-
-
-def plane_for(projection: Projection, longitude: float) -> Plane:
+def plane_for(projection: ProjectionConfig, longitude: float) -> Plane:
     """Return the plane by the projection settings for a longitude, rad."""
     degrees = float(np.rad2deg(longitude))
     meridian = projection.central_meridian

@@ -86,13 +86,7 @@ def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
 
 
 def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> Bools:
-    """
-    Return a mask of windows in which the gyro measures the rate of the standstill.
-
-    If a vehicle turns on the spot at a constant rate, gyro and wheels (their mean) are as steady
-    as at rest. The steady interval with the lowest rate is the standstill: its rate is the bias,
-    and the others must agree with it.
-    """
+    """Return a mask of windows with the lowest steady turn rate, which is the bias at rest."""
     means = [np.median(rate[(edges[:-1] >= a) & (edges[1:] <= b)], axis=0)
              for a, b in _spans(quiet, edges, shortest)]
     if not means:

@@ -48,12 +48,7 @@ Found = tuple[tuple[float, float] | None, str]      # (yaw, sigma) rad, or None 
 
 def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats, origin: Origin,
           config: Config) -> tuple[Alignment, tuple[Reason, ...]]:
-    """
-    Return the alignment of a leg, and reasons.
-
-    inputs : screened leg.   spans : (k, 2) standstills, s.   metres_per_unit : approximate scale.
-    fixes_n : (n, 3) fixes in n, m.   origin : of n.   config : heading source, grade.
-    """
+    """Return the alignment of a leg, and reasons; spans: (k, 2) s, fixes_n: (n, 3) m."""
     span = choose_standstill(spans)
     noise = {} if span is None else _noise_at_rest(inputs, span)
     grade = with_turn_on_level(imu_as_seen(config.imu, {

@@ -40,12 +40,7 @@ class Span:
 
 
 class LegSearch:
-    """
-    Search for legs in rows as they arrive; found legs are in ``spans``, the open one last.
-
-    Rows of the odometer are evaluated once there are later rows of the IMU. The division into
-    blocks has no effect.
-    """
+    """Search for legs in rows, in blocks of any size; ``spans`` are found, the open one last."""
 
     def __init__(self, config: Config) -> None:
         self._steps: Steps | None = None

@@ -57,12 +57,7 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
 
 
 def with_wheel_change(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
-    """
-    Return a method's result with the change of one wheel, if any, in its sigmas.
-
-    If a wheel starts to slip continuously, or loses air, the estimated scale is between those
-    before and after; the fixes do not determine which of them is the vehicle's.
-    """
+    """Return a method's result with the change of one wheel, if any, in its sigmas."""
     change = abs(prepared.wheel_slips.change)
     if not change:
         return method
@@ -88,12 +83,7 @@ def with_hills(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
 
 
 def half_step(inputs: Inputs) -> float:
-    """
-    Return half a step of the speed relative to the mean speed, 0.0 without steps.
-
-    Speeds are on average too low by this share if the sender truncates, and correct if it rounds;
-    the grid does not determine which.
-    """
+    """Return half a step relative to the mean speed, the bias if truncated; 0.0 without steps."""
     coarse = _coarse(inputs)
     if coarse is None:
         return 0.0
@@ -147,12 +137,7 @@ def _coarse(inputs: Inputs) -> CoarseSpeed | None:
 
 def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
                 scale: float) -> list[Reason]:
-    """
-    Return DELAY_SEEN for each delay that is significant and matters at the speed driven.
-
-    prepared : the leg.   seen : 'gnss' or 'odometer' -> delay of its stamps with the configured
-    offset, s, and sigma.   scale : of the method that estimated them.
-    """
+    """Return DELAY_SEEN for each (delay, sigma), s, that is significant and has an effect."""
     speed = _speed(prepared) * scale
     notes = []
     least_delay_path = 0.1    # m, as the required accuracy of a lever arm

@@ -84,12 +84,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
 
 
 def faults(seen: Screened, config: Config) -> tuple[Reason, ...]:
-    """
-    Return the reasons of a leg as in ``calibrate``, without those of its methods.
-
-    The leg, with ``screened`` of it, may be incomplete: reasons that disappear with more driving
-    are left out.
-    """
+    """Return reasons as in ``calibrate``, but of methods and what more driving removes."""
     reasons = seen.reasons
     if seen.usable:
         config = settings_by_frame(seen.leg.fix, config)

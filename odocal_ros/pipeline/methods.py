@@ -58,12 +58,7 @@ UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
 
 def run_methods(names: Iterable[str], prepared: PreparedLeg,
                 begun: Callable[[str], Passed]) -> dict[str, MethodRun]:
-    """
-    Return the runs of methods on a leg; an error in one rejects this method, not the leg.
-
-    names : in any order.   begun : called with the name of each method before it runs; returns
-    the function to call after each pass of its fit.
-    """
+    """Return the runs of methods on a leg; an error in one rejects this method, not the leg."""
     runs = {}
     for name in names:
         passed = begun(name)

@@ -28,12 +28,7 @@ from odocal_ros.settings.config import Config
 
 
 def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
-    """
-    Run the smoother on a leg.
-
-    The paths have the smoother's attitude; the calibrated one uses all estimated values, including
-    delays and lever arms. Their times are stamps of the fixes.
-    """
+    """Run the smoother on a leg; the times of its paths are stamps of the fixes."""
     leg = smoother_leg(ready.inputs, ready.config, ready.origin, ready.fixes_n, ready.spans,
                        ready.rough, ready.t_fit)
     t_slip, metres = ready.wheel_slips.doubts()

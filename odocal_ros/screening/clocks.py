@@ -133,12 +133,7 @@ def without_sets(leg: Leg) -> tuple[Leg, list[Reason]]:
 
 
 def _sets(samples: Samples) -> tuple[Ints, Floats]:
-    """
-    Return the rows after which a clock was set, and its steps, s: stamps step permanently.
-
-    Their arrivals do not (if only these step, the recorder's clock was set), and adjacent stamps
-    do not decrease. Rows out of order or with a false stamp step twice.
-    """
+    """Return the rows after which a clock was set, and its steps, s: arrivals do not step."""
     if len(samples.stamp_ns) < 2 * LAG_NEIGHBOURS or not by_step(
             _may_be_odd, samples.stamp_ns).any():
         return np.empty(0, np.int64), np.empty(0)

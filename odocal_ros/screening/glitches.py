@@ -84,8 +84,6 @@ def about_clumps(wild: Bools) -> Bools:
 
     In a damaged recording only some false rows are impossible values. The mask contains each
     group, and on each side twice as many rows as the largest distance of its impossible rows.
-
-    wild : (n,) bool, impossible rows.
     """
     suspect = np.zeros(len(wild), bool)
     at = np.flatnonzero(wild)

@@ -154,12 +154,7 @@ def _unevenness(t: Floats, even: Floats, travel: Floats) -> float:
 
 
 def _soonest(t: Floats, usual: float) -> Floats:
-    """
-    Return the rhythm of the rows with the smallest delays, shifted by the median delay of all.
-
-    By the morphological opening of the delays over ON_TIME_WINDOW: a shorter increase is a delay;
-    a permanent increase is a lost row, or another interval.
-    """
+    """Return the rhythm of the rows with the smallest delays, by morphological opening."""
     rows = usual * np.arange(len(t))
     window = min(int(ON_TIME_WINDOW / usual) + 1, len(t))
     least = _least_of_next(t - rows, window)

@@ -93,8 +93,6 @@ def held_counts(value: Values, modulus: int) -> Bools:
     A counter that is published faster than it is read repeats each value, and its travel is known
     at the updates only. Rows of a standstill are kept at the mean interval of updates, counted
     back from the next one.
-
-    value : (n,) raw.   Returns (n,) bool.
     """
     size = np.abs(counter_steps(value, modulus))
     update = np.flatnonzero(size) + 1
@@ -168,13 +166,7 @@ def with_uncertainty(travel: Travel, value: Values,
 
 
 def _hidden(travel: Travel, value: Values) -> Floats:
-    """
-    Return the travel in each step at speeds published as zero: (n - 1,).
-
-    In a dead band the speed continues to zero, or starts from zero, at its adjacent rate: the
-    travel is v^2 / 2a, of which the mean of the two rows contains half a step. A robot in a yard
-    that stops every ten metres would lose several per cent.
-    """
+    """Return the travel at speeds published as zero, v^2 / 2a at stops and starts: (n - 1,)."""
     hidden, size = np.zeros(len(value) - 1), np.abs(value)
     least = 2 * travel.coarse.step if travel.coarse else 0.0
     # least ratio to the counted travel in a dead band

@@ -91,12 +91,7 @@ def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: fl
 
 def reversing_reasons(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
                       signed: bool) -> tuple[Reason, ...]:
-    """
-    Return REVERSING_UNSIGNED with the reversed sections, () if there are none.
-
-    metres_per_unit : of travel, approximate, None unknown.   seen : BY_IMU or BY_FIT.
-    signed : True if the counter is configured as signed.
-    """
+    """Return REVERSING_UNSIGNED with the reversed sections; seen: BY_IMU or BY_FIT."""
     if not len(spans):
         return ()
     how = 'the counter does not count down' if signed else 'odometer.signed is false'

@@ -206,12 +206,7 @@ def _rising(samples: Samples, slot: str, leg: Leg, found: list[Reason]) -> Ints 
 
 
 def _longest_rising(stamp: Ints) -> Ints:
-    """
-    Return the indices of a longest strictly rising subsequence (patience sorting).
-
-    The largest number of rows is kept: for one stamp in the future one row is dropped, for a clock
-    that is set back the shorter side.
-    """
+    """Return the indices of a longest strictly rising subsequence (patience sorting)."""
     tails: list[int] = []
     ends: list[int] = []
     before = np.full(len(stamp), -1)

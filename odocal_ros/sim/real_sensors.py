@@ -104,11 +104,7 @@ def _wander(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Fl
 
 
 def vibration(rng: np.random.Generator, rms: float, rate: float, n: int) -> Floats:
-    """
-    Return accelerations of a vibrating body, (n, 3): around its resonances, zero at 0 Hz.
-
-    Below them the power falls as f^4, as for a bounded displacement.
-    """
+    """Return accelerations of a vibrating body, (n, 3): around its resonances, zero at 0 Hz."""
     f = np.fft.rfftfreq(n, 1 / rate)
     power = np.zeros_like(f)
     for middle, width, share in RESONANCES:

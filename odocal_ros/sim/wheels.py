@@ -153,12 +153,7 @@ def tyre_slip(state: State, real: Real) -> Floats:
 
 
 def leg_factor(state: State, real: Real, spun: Floats) -> float:
-    """
-    Return the true path divided by that of the count with the scale of a cold wheel.
-
-    state : between the marks of the leg. The mean is by travel in both directions.   spun :
-    accumulated slip at each start, m.
-    """
+    """Return the true path over that of the count with a cold wheel; spun: slip at starts, m."""
     if not (real.speed_law or real.warming or real.tyre_slip or spun.any()):
         return 1.0
     path_length = np.diff(state.travel)
