@@ -160,7 +160,11 @@ def _beside(leg: Leg, gaps: Ints) -> list[Leg]:
 def _gaps(leg: Leg, limit_s: float) -> Ints:
     """Return begin and end of the gaps of the IMU, ns: (k, 2), including those at the marks."""
     near_start_ns = 60 * 10**9    # before the start mark, for the search for gaps
-    near = _near(leg.imu.stamp_ns, leg.start_ns - near_start_ns, leg.stop_ns)
+    near, first_ns = leg.imu.stamp_ns, leg.start_ns - near_start_ns
+    if by_step(lambda stamps: np.diff(stamps) > 0, near).all():      # a view of them
+        near = near[slice(*np.searchsorted(near, [first_ns, leg.stop_ns + 1]))]
+    else:
+        near = np.unique(near[(near >= first_ns) & (near <= leg.stop_ns)])
     if len(near) < 2:
         return np.empty((0, 2), np.int64)
     gap_margin_ns = 1000    # below the limit: larger than the rounding of seconds
@@ -179,13 +183,6 @@ def _carried(leg: Leg, config: Config) -> Ints:
     placed = place(inputs, settings_by_frame(leg.fix, config))
     spans = carried(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma)
     return leg.start_ns + np.round(spans * 1e9).astype(np.int64)
-
-
-def _near(stamps: Ints, first_ns: int, stop_ns: int) -> Ints:
-    """Return the stamps between two, in rising order; a view if all of them are rising."""
-    if by_step(lambda stamps: np.diff(stamps) > 0, stamps).all():
-        return stamps[slice(*np.searchsorted(stamps, [first_ns, stop_ns + 1]))]
-    return np.unique(stamps[(stamps >= first_ns) & (stamps <= stop_ns)])
 
 
 def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),

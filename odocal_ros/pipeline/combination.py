@@ -45,7 +45,11 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     good = [leg for leg in good if leg not in twice]
     used = good or legs
     names = dict.fromkeys(n for leg in used for n in leg.methods)
-    carried = carried if carried and _belongs(carried, used) else None
+    smoothed = [leg.methods[SMOOTHER] for leg in used if SMOOTHER in leg.methods]
+    # earlier legs with another scale unit, or not earlier, are of no use
+    if carried and (min(leg.start_ns for leg in used) <= carried.last_ns or any(
+            m.estimates['scale_factor'].unit != carried.unit for m in smoothed)):
+        carried = None
     # of other legs than those that determined the IMU constants
     before = carried or (imu if imu and not any(
         imu.first_ns <= leg.start_ns <= imu.last_ns for leg in used) else None)
@@ -74,13 +78,6 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)
     return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy,
                        _carried_on(methods, good, carried))
-
-
-def _belongs(carried: Carried, legs: Sequence[LegResult]) -> bool:
-    """Return True if legs have the scale unit of earlier ones and were driven after them."""
-    smoothed = [leg.methods[SMOOTHER] for leg in legs if SMOOTHER in leg.methods]
-    return all(m.estimates['scale_factor'].unit == carried.unit for m in smoothed) \
-        and min(leg.start_ns for leg in legs) > carried.last_ns
 
 
 def _carried_on(methods: Mapping[str, MethodResult], good: Sequence[LegResult],

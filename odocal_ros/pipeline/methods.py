@@ -14,7 +14,6 @@ from odocal_ros.calib.choice import choose, deciding, disagreements, passed_over
 from odocal_ros.calib.drive import path_and_chord
 from odocal_ros.calib.result import AS_SENT, failed, LegResult, MethodResult, raised_if_wild
 from odocal_ros.calib.two_point import unsolved
-from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
@@ -118,23 +117,17 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
                methods: dict[str, MethodResult] | None = None, **more: Any) -> LegResult:
     """Return the result of a leg: counts, reasons, methods, and further fields of LegResult."""
     between = (inputs.t_fix >= -0.5) & (inputs.t_fix <= inputs.t_stop + 0.5)
-    if 'distance' not in more:
-        more['distance'] = _path_of(inputs.t_fix[between], inputs.geodetic[between],
-                                    inputs.least_motion)
+    if 'distance' not in more:      # of a leg that is refused: by the fixes
+        t_fix, geodetic = inputs.t_fix[between], inputs.geodetic[between]
+        more['distance'] = path_and_chord(
+            t_fix, origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic)),
+            inputs.least_motion)[0] if len(t_fix) else 0.0
     return LegResult(
         start_ns=leg.start_ns, stop_ns=leg.stop_ns, duration=inputs.t_stop,
         imu_samples=len(inputs.t_imu),
         pulses=len(inputs.travel.t), fixes=int(between.sum()),
         rejected_fixes=inputs.fixes_rejected, reasons=tuple(reasons), methods=methods or {},
         C_bi=inputs.C_bi, **more)
-
-
-def _path_of(t_fix: Floats, geodetic: Floats, least: float) -> float:
-    """Return the path length by the fixes, m, for a leg that is refused."""
-    if not len(t_fix):
-        return 0.0
-    fixes_n = origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic))
-    return path_and_chord(t_fix, fixes_n, least)[0]
 
 
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
@@ -164,15 +157,12 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
                 check, said = check_of(prepared, run.paths.after)
                 methods[name] = replace(run.result, details=run.result.details | check)
                 found += said
-    return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
+    # outlier fixes are reported once, by the first method or track
+    far = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
+    found = [r for k, r in enumerate(found) if k not in far[1:]]
+    return leg_result(leg, inputs, (*prepared.reasons, *found), methods,
                       distance=prepared.distance, deciding=deciding(asked),
                       path_ratio=prepared.path_ratio, **shown)
-
-
-def _once(found: Sequence[Reason]) -> list[Reason]:
-    """Return the reasons of methods and tracks; those on outlier fixes only from the first."""
-    far = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
-    return [r for k, r in enumerate(found) if k not in far[1:]]
 
 
 def _effort(names: Iterable[str]) -> int:

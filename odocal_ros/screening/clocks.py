@@ -47,10 +47,12 @@ def clock_reasons(leg: Leg, config: Config) -> list[Reason]:
         ahead = median(_lag_at(samples.received_ns, imu) - _lag(samples))
         ahead += offset[slot]
         if abs(ahead) > CLOCK_APART:
+            group = INPUTS[slot].clock
+            hint = f'; if this is not transport delay, add {-ahead:+z.3f} to {group}.time_offset'
             found.append(Reason(
                 Code.CLOCKS_DIFFER, f'{INPUTS[slot].label} stamps differ by {ahead:+z.3f} s '
                 f'from IMU stamps that arrive at the same time; the limit is {CLOCK_APART:g} s'
-                f'{_offset_hint(slot, ahead)}', remedy(ahead)))
+                f'{hint if group and abs(ahead) <= OFFSET_REACH else ""}', remedy(ahead)))
     return found
 
 
@@ -90,14 +92,6 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
         found[order[where]] = np.interp(seconds(times_ns[where]), seconds(imu.received_ns[rows]),
                                         _lag(take(imu, rows)))
     return found
-
-
-def _offset_hint(slot: str, ahead: float) -> str:
-    """Return the offset that aligns a topic's stamps with the IMU, if a setting allows it."""
-    group = INPUTS[slot].clock
-    if not group or abs(ahead) > OFFSET_REACH:
-        return ''
-    return f'; if this is not transport delay, add {-ahead:+z.3f} to {group}.time_offset'
 
 
 def _may_be_odd(stamp_ns: Ints) -> Bools:

@@ -61,21 +61,6 @@ class GravityFit:
         return float((1 + ratio)**-freedom)
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """
-    A drive in rows of ROW_S seconds.
-
-    w, f : (m, 3) rad/s and m/s^2, in e1, e2, up.   s : (m + 1,) m, travel at their edges.
-    full : (m,) True if the IMU has samples there.
-    """
-
-    w: Floats
-    f: Floats
-    s: Floats
-    full: Bools
-
-
 def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
                 metres_per_unit: float) -> GravityFit | None:
     """
@@ -96,14 +81,19 @@ def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
         return None
     w = np.where(full[:, None], w - np.median(w[full], axis=0), 0.0)
     f = np.where(full[:, None], f, np.median(f[full], axis=0))
-    return _fit(*_segments(Rows(w @ axes.T, f @ axes.T, travel.at(edges) * metres_per_unit, full)))
+    return _fit(*_segments(w @ axes.T, f @ axes.T, travel.at(edges) * metres_per_unit, full))
 
 
-def _segments(rows: Rows) -> tuple[Complexes, Complexes]:
-    """Return observables, (k, m, p), and forces, (k, m), of k segments of m seconds."""
+def _segments(w: Floats, f: Floats, s: Floats, full: Bools) -> tuple[Complexes, Complexes]:
+    """
+    Return observables, (k, m, p), and forces, (k, m), of k segments of m seconds.
+
+    w, f : (n, 3) in rows of ROW_S, in e1, e2, up.   s : (n + 1,) m, at their edges.   full : (n,)
+    True if the IMU has samples there.
+    """
     half = ROWS_A_SECOND // 2
-    speed = np.zeros(len(rows.s))
-    speed[half:-half] = rows.s[ROWS_A_SECOND:] - rows.s[:-ROWS_A_SECOND]
+    speed = np.zeros(len(s))
+    speed[half:-half] = s[ROWS_A_SECOND:] - s[:-ROWS_A_SECOND]
     speed = speed[::ROWS_A_SECOND]
     driven_s = np.count_nonzero(np.abs(speed) > MOVING_SPEED)
     length = int(np.clip(driven_s // SEGMENTS, SHORTEST_S, LONGEST_S))
@@ -111,22 +101,22 @@ def _segments(rows: Rows) -> tuple[Complexes, Complexes]:
     def cut(x: NDArray[Any]) -> NDArray[Any]:
         k = len(x) // length
         return x[:k * length].reshape(k, length, *x.shape[1:])
-    psi = np.concatenate([[0.0], np.cumsum(rows.w[:, 2]) * ROW_S])
+    psi = np.concatenate([[0.0], np.cumsum(w[:, 2]) * ROW_S])
     turned = np.exp(0.5j * (psi[1:] + psi[:-1]))
-    tilts = [_seconds(_integral(1j * G * rate * turned)) for rate in rows.w.T]
+    tilts = [_seconds(_integral(1j * G * rate * turned)) for rate in w.T]
     drift = _seconds(_integral(turned))         # of a bias of the gyro
-    force = _seconds((rows.f[:, 0] + 1j * rows.f[:, 1]) * turned)
+    force = _seconds((f[:, 0] + 1j * f[:, 1]) * turned)
     course = np.exp(1j * psi[::ROWS_A_SECOND])
     onward = np.diff(speed) * (course[1:] + course[:-1]) / 2
     inward = np.diff(course) * (speed[1:] + speed[:-1]) / 2
-    turn_rate, heading = _seconds(rows.w[:, 2]), _seconds(turned)
+    turn_rate, heading = _seconds(w[:, 2]), _seconds(turned)
     # the derivatives model delays, the last two a lever arm of the IMU
     pushes = [onward, inward, np.gradient(onward), np.gradient(inward),
               np.gradient(turn_rate) * heading, turn_rate**2 * heading]
     observables = cut(np.stack([*tilts, *pushes], -1))
     constant = np.stack([np.ones_like(drift), drift], -1)
     basis, _ = np.linalg.qr(cut(constant) - [0.0, 1.0] * cut(constant).mean(1, keepdims=True))
-    use = cut(_seconds(rows.full) == 1).all(axis=1) & (
+    use = cut(_seconds(full) == 1).all(axis=1) & (
         np.abs(cut((speed[1:] + speed[:-1]) / 2)).mean(axis=1) > MOVING_SPEED)
 
     def without_offsets(x: Complexes) -> NDArray[Any]:

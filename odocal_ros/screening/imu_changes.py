@@ -26,17 +26,19 @@ TENTHS, TENTH_ROWS = 10, 20       # judgement: of a leg; rows of one
 LEAST_RATIO, MOST_RATIO = 0.6, 1.6
 
 
-def tenths(inputs: Inputs) -> Ints:
-    """Return the edges of the tenths of the accelerometer's rows, (11,); (0,) without enough."""
+def _tenths(inputs: Inputs) -> tuple[Ints, Floats]:
+    """Return the edges of the tenths of the rows, (11,), their median force, (10, 3), or none."""
     edges = np.linspace(0, len(inputs.t_imu), TENTHS + 1).astype(int)
-    return edges if inputs.has_accelerometer and edges[1] >= TENTH_ROWS else edges[:0]
+    if not inputs.has_accelerometer or edges[1] < TENTH_ROWS:
+        return edges[:0], np.empty((0, 3))
+    return edges, np.array([medians(inputs.f_b[a:b])
+                            for a, b in zip(edges[:-1], edges[1:], strict=True)])
 
 
 def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
     """Return IMU_UNITS if gravity in a tenth of the leg differs from the Earth's."""
-    edges = tenths(inputs)
-    size = [float(np.linalg.norm(medians(inputs.f_b[a:b])))
-            for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    edges, force = _tenths(inputs)
+    size = [float(np.linalg.norm(one)) for one in force]
     odd = [k for k, one in enumerate(size) if not LEAST_RATIO * G < one < MOST_RATIO * G]
     if not odd or len(odd) == len(size):      # all tenths: the unit of the whole leg
         return ()
@@ -49,11 +51,7 @@ def unit_changes(inputs: Inputs) -> tuple[Reason, ...]:
 
 def turned_over(inputs: Inputs) -> tuple[Reason, ...]:
     """Return IMU_AXES if the direction of gravity changes between two tenths of the leg."""
-    edges = tenths(inputs)
-    if not len(edges):
-        return ()
-    force = np.array([medians(inputs.f_b[a:b])
-                      for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    edges, force = _tenths(inputs)
     for k in range(1, len(force) - 1):
         sides = force[:k], force[k + 1:]
         before, after = (side.mean(axis=0) for side in sides)

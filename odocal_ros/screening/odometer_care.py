@@ -79,7 +79,9 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
         ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= excursion_time]
         for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in ends]:
             net = counter_steps(value[[a, b + 1]], modulus)[0]     # exact, unlike a sum of steps
-            if _continues(t, net, rate, a, b) or a == j and _is_reverted(t, net, step, a, b, top):
+            reach = 1.2 * top * (t[b + 1] - t[a]) + 3      # of motion between jump and reverse
+            if _continues(t, net, rate, a, b) or a == j and (
+                    abs(net) <= reach and min(abs(step[a]), abs(step[b])) > 2 * reach):
                 false[a + 1:b + 1] = True
                 done = b
                 break
@@ -119,12 +121,6 @@ def _continues(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
     continuation_share = 0.5    # of the expected travel: limit for a counter that continues
     slack = continuation_share * max(abs(w) for w in travels) + 3
     return bool(min(travels) - slack <= net <= max(travels) + slack)
-
-
-def _is_reverted(t: Floats, net: float, step: Floats, a: int, b: int, top: float) -> bool:
-    """Return True if step b reverts a far jump at step a, except for possible motion."""
-    reach = 1.2 * top * (t[b + 1] - t[a]) + 3
-    return bool(abs(net) <= reach and min(abs(step[a]), abs(step[b])) > 2 * reach)
 
 
 def with_uncertainty(travel: Travel, value: Values,

@@ -14,7 +14,7 @@ from odocal_ros.data.inputs import INPUTS, WHEELS
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import by_step, chunks
-from odocal_ros.data.samples import OdometerForm, Samples, take
+from odocal_ros.data.samples import Samples, take
 from odocal_ros.nav.local_frame import LARGEST_FRAME
 from odocal_ros.nav.statistics import gaps_in_rhythm
 from odocal_ros.reasons import Code, Reason
@@ -71,7 +71,11 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     t = room(len(clean.stamp_ns))
     for some in chunks(len(t)):
         t[some] = (clean.stamp_ns[some] - leg.start_ns) * 1e-9 + offset
-    spikes = _spikes(slot, clean, t, leg.form_of(slot), config)
+    spikes = np.zeros(len(t), bool)
+    if slot == 'imu':
+        spikes = glitches.imu_glitches(t, clean.w_i, clean.f_i, config.imu)
+    elif slot in WHEELS and leg.form_of(slot).quantity == 'rate':
+        spikes = glitches.speed_glitches(t, clean.value.astype(float))
     if spikes.any():
         found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
                             f'{LABEL[slot]} messages are isolated outliers, first at t = '
@@ -85,14 +89,6 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
         found.append(Reason(NOTHING[slot], f'none of the {len(sent.stamp_ns)} {LABEL[slot]} '
                             'messages is usable'))
     return clean, t
-
-
-def _spikes(slot: str, samples: Any, t: Floats, form: OdometerForm, config: Config) -> Bools:
-    if slot == 'imu':
-        return glitches.imu_glitches(t, samples.w_i, samples.f_i, config.imu)
-    if slot in WHEELS and form.quantity == 'rate':
-        return glitches.speed_glitches(t, samples.value.astype(float))
-    return np.zeros(len(t), bool)
 
 
 def _where(samples: Samples, index: int, leg: Leg) -> str:

@@ -121,7 +121,10 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
     found += why
     found += topic_gap('fix', rows.t_fix)       # of received ones: a rejected fix is not a gap
     t_fix = rows.t_fix[use]
-    geodetic = np.stack([fix.latitude, fix.longitude, _heights(fix)], -1)[use]
+    # heights that are all exactly 0 are not sent
+    height = fix.height if fix.height.any() or (fix.status == LOCAL).any() else np.full(
+        len(fix.height), np.nan)
+    geodetic = np.stack([fix.latitude, fix.longitude, height], -1)[use]
     rounding, rounded = rounding_of(geodetic, covariance[use])
     covariance = covariance[use] + rounding[:, :, None] * np.eye(3)
     found += rounded
@@ -133,12 +136,6 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
     return {'t_fix': t_fix, 'geodetic': geodetic, 'covariance_n': covariance,
             'rounding_n': rounding, 'outside': outside,
             'fixes_rejected': len(leg.fix.stamp_ns) - int(use.sum())}
-
-
-def _heights(fix: FixSamples) -> Floats:
-    """Return the heights of fixes, (n,) m: NaN if all are exactly 0, so that there are none."""
-    none = not fix.height.any() and not (fix.status == LOCAL).any()
-    return np.full(len(fix.height), np.nan) if none else fix.height
 
 
 def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:

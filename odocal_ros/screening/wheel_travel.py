@@ -44,7 +44,10 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     """Return the span of a counter's uncorrected rollovers, by rows (n,) and steps (n - 1,)."""
     if len(step) < FEWEST_STEPS or not step.any():
         return None
-    usual = _running_median(step)
+    median_reach = 7    # steps on each side of a jump, whose median is the usual step
+    padded = np.pad(step, median_reach, mode='edge')
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * median_reach + 1),
+                      axis=-1)
     whole = np.issubdtype(value.dtype, np.integer)
     off = step - usual
     top = float(np.percentile(np.abs(usual), 99.9))
@@ -80,13 +83,6 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     if _taken(value, rows) > span + typical:     # rows out of order, two counters
         return None
     return Span(span, sigma, rows, -np.sign(off[rows]).astype(np.int64))
-
-
-def _running_median(step: Floats) -> Floats:
-    median_reach = 7    # steps on each side of a jump, whose median is the usual step
-    padded = np.pad(step, median_reach, mode='edge')
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * median_reach + 1)
-    return np.median(windows, axis=-1)
 
 
 def _taken(value: Values, rows: Ints) -> float:
@@ -191,7 +187,7 @@ def wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
     each = [_one(samples, t, leg.form, config, found, names[0])]
     for slot, name in zip(slots[1:], names[1:], strict=True):
         form = leg.form_of(slot)
-        if _kind(form) != _kind(leg.form):
+        if _words(form) != _words(leg.form):
             found.append(Reason(Code.WHEEL_COUNTERS_DIFFER, f'the {name} wheel publishes '
                                 f'{_words(form)}, the {names[0]} wheel {_words(leg.form)}: they '
                                 f'cannot be averaged, so only the {names[0]} wheel is used'))
@@ -224,10 +220,6 @@ def _one(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config
     found.extend(reasons)
     counts, more_t, more = with_uncertainty(counts, samples.value, form)
     return replace(counts, name=side), np.append(doubt_t, more_t), np.append(doubt, more)
-
-
-def _kind(form: OdometerForm) -> tuple[str, str]:
-    return form.quantity, form.scale_unit
 
 
 def _words(form: OdometerForm) -> str:

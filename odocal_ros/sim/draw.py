@@ -53,7 +53,9 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
         given = {'nominal_scale': given['scale'] * ratio} | given
     options |= given
     if effects is None:
-        names = [n for n in names if n not in ODOMETER_EFFECTS or n == _odometer_of(vehicle, seed)]
+        odometer = ('', 'coarse_pulses', 'coarse_speed')[int(
+            stream(seed, 'vehicle odometer').choice(3, p=vehicle.row('odometers')))]
+        names = [n for n in names if n not in ODOMETER_EFFECTS or n == odometer]
     real: dict[str, Any] = {}
     there = []
     for name in names:
@@ -63,12 +65,6 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
         options |= changes
         real |= figures
     return SimOptions(**options | given, real=Real(**real | own)), tuple(there)
-
-
-def _odometer_of(vehicle: Vehicle, seed: int) -> str:
-    """Return the effect that a drawn vehicle's odometer has, '' for a fine counter."""
-    kind = stream(seed, 'vehicle odometer').choice(3, p=vehicle.row('odometers'))
-    return ('', 'coarse_pulses', 'coarse_speed')[int(kind)]
 
 
 def _clean(seed: int, kind: str, grade: str, alone: bool) -> tuple[Vehicle, dict[str, Any]]:

@@ -232,15 +232,12 @@ def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
     north, east, up = ((after - before) / (2 * HALF_STEP)).T
     true = np.stack([east * (normal + height) * np.cos(latitude), north * (meridian + height), up],
                     -1)
-    sent = true * (1 + options.velocity_scale_error) + _velocity_errors(t, options, sigma)
-    stamp = options.start_ns + ns + round(options.velocity_delay * 1e9)
-    return VelocitySamples(stamp, stamp + round(TRANSPORT['fix'] * 1e9), sent,
-                           np.full(sent.shape, sigma**2))
-
-
-def _velocity_errors(t: Floats, options: SimOptions, sigma: float) -> Floats:
     time, rng = options.velocity_correlation_time, stream(options.seed, 'velocity')
     error = (gauss_markov(rng, sigma, time, t) if time
              else sigma * rng.standard_normal((len(t), 3)))
     far = rng.uniform(size=(len(t), 1)) < options.velocity_outliers
-    return error + far * OUTLIER * rng.standard_normal((len(t), 3))
+    sent = true * (1 + options.velocity_scale_error) + (
+        error + far * OUTLIER * rng.standard_normal((len(t), 3)))
+    stamp = options.start_ns + ns + round(options.velocity_delay * 1e9)
+    return VelocitySamples(stamp, stamp + round(TRANSPORT['fix'] * 1e9), sent,
+                           np.full(sent.shape, sigma**2))

@@ -193,7 +193,8 @@ def simulate(options: SimOptions | None = None) -> Drive:
 def _truth(motion: Motion, options: SimOptions, imu: samples.ImuSamples) -> Truth:
     gyro_bias, accel_bias = sensors.turn_on_biases(options)
     _, t = stamps(motion.duration, options.imu_rate)    # true times, not stamps
-    start = int(np.searchsorted(t, _first_move(motion) + 1e-9, side='right')) - 1
+    first_move = motion.speed.breaks[np.argmax((motion.speed.powers != 0).any(axis=1))]
+    start = int(np.searchsorted(t, first_move + 1e-9, side='right')) - 1
     C_vb = matrix_from_rpy([options.roll, options.pitch, options.yaw])
     x_n = (attitude(motion.at(t[start:start + 1])) @ C_vb)[0, :, 0]
     # a sum in steps of 0.02 s is the true scale of tyres that grow, or slip at each start
@@ -220,8 +221,3 @@ def _angles(options: SimOptions) -> tuple[float, float, float, float]:
     # with a roll the angles are those of forward: docs/conventions.md
     return own_angles(matrix_from_rpy([options.roll, options.pitch, options.yaw]),
                       matrix_from_rpy(options.mounting_rpy), gyro, accel)
-
-
-def _first_move(motion: Motion) -> float:
-    speed = motion.speed
-    return float(speed.breaks[np.flatnonzero((speed.powers != 0).any(axis=1))[0]])

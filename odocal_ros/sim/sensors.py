@@ -75,18 +75,14 @@ def imu(motion: Motion, options: SimOptions) -> samples.ImuSamples:
     if options.orientation_sigma is not None:
         q_ni = _orientation(state, options, options.orientation_sigma, 'orientation')
         variance = np.full(len(t), options.orientation_sigma**2)
-    stamp = options.start_ns + _imu_stamps(ns, options)
+    real = options.real
+    if real.imu_latency or real.imu_jitter or real.imu_batch > 1:
+        ns = real_sensors.stamped(ns, stream(options.seed, 'real imu stamps'), real.imu_latency,
+                                  real.imu_jitter, real.imu_batch)
+    stamp = options.start_ns + ns
     return samples.ImuSamples(
         stamp, stamp + round(TRANSPORT['imu'] * 1e9), w_i + gyro + gyro_drift,
         f_i + accel + accel_drift, q_ni, variance)
-
-
-def _imu_stamps(ns: Ints, options: SimOptions) -> Ints:
-    real = options.real
-    if not (real.imu_latency or real.imu_jitter or real.imu_batch > 1):
-        return ns
-    return real_sensors.stamped(ns, stream(options.seed, 'real imu stamps'), real.imu_latency,
-                                real.imu_jitter, real.imu_batch)
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> samples.HeadingSamples:
