@@ -169,7 +169,6 @@ def test_the_pure_parts_ask_no_clock_and_open_nothing():
 
 
 def test_each_package_has_a_core_test():
-    """A file that has the mark imports it."""
     marked = [path for path in Path(__file__).parent.rglob('test_*.py')
               if 'pytest.mark.core' in path.read_text(encoding='utf-8')]
     assert set(ROOMS) - set().union(*map(_own_parts, marked)) == set()

@@ -119,7 +119,6 @@ def test_the_bag_holds_what_the_folder_held(made, drive):
 
 
 def test_its_calibration_stands_beside_its_truth(made, drive, tmp_path, capsys):
-    """That of the pose, and that of the simulation."""
     truth = yaml.safe_load((made / 'truth.yaml').read_text())
     assert truth['scale']['value'] == pytest.approx(SCALE, abs=3 * truth['scale']['sigma'])
     assert truth['scale']['sigma'] < 2e-3

@@ -69,7 +69,6 @@ def test_one_version_everywhere():
 
 
 def test_each_source_file_says_whose_it_is_and_under_what_licence():
-    """Two lines, which ament_copyright knows by an entry point of this package."""
     own, = SPDX.file_headers
     words = own.format(copyright='Copyright 2026 odocal_ros maintainers')
     head = '\n'.join(f'# {line}' for line in words.splitlines())
@@ -84,7 +83,6 @@ def test_each_source_file_says_whose_it_is_and_under_what_licence():
 
 
 def test_the_changelog_is_as_bloom_reads_it():
-    """catkin_pkg reads it: a title, versions with dates, lists."""
     changelog = pytest.importorskip('catkin_pkg.changelog', reason='no catkin_pkg here')
     found = changelog.get_changelog_from_path(str(ROOT), 'odocal_ros')
     newest, date, content = next(found.foreach_version())

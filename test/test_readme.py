@@ -49,7 +49,6 @@ def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
 
 
 def test_each_setting_has_its_row():
-    """The table is read back as a reader would, by name and default."""
     page = (ROOT / 'docs' / 'settings.md').read_text()
     rows = re.findall(r'^\| `([\w.]+)` \| [\w\[\]]+(?: \(ro\))? \| (.*?) \|', page, re.MULTILINE)
     assert [name for name, _ in rows] == list(SETTINGS)

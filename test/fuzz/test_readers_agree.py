@@ -79,7 +79,6 @@ def test_simulated_bags(clean, monkeypatch, name):
 @pytest.mark.parametrize('form', ['zstd', 'lz4', ''])
 @pytest.mark.parametrize('lengths', [1, 7])
 def test_chunks_that_overlap(tmp_path, monkeypatch, walked, form, lengths):
-    """Messages of equal times stand as in the file, those of other chunks behind them."""
     monkeypatch.setattr(mcap_gather, 'BLOCK', 4000)
     if form != 'zstd':
         monkeypatch.setattr(chunks, '_packed', lambda records: (
@@ -102,7 +101,6 @@ def test_chunks_that_overlap(tmp_path, monkeypatch, walked, form, lengths):
 
 
 def test_sound_chunks_are_not_walked_over(clean, walked):
-    """All but the first, which holds the channels; else every chunk would be, and nobody saw."""
     with open_bag(clean.bag('mcap')) as bag:
         messages = sum(len(raws) for batch in bag._batches(bag.topics)
                        for _, raws in batch.values())
@@ -113,7 +111,6 @@ def test_sound_chunks_are_not_walked_over(clean, walked):
 @pytest.mark.parametrize('large', [False, True])
 @pytest.mark.parametrize('indexed', [False, True])
 def test_rows_of_a_database_of_any_size_and_order(tmp_path, large, indexed):
-    """Written out of order, removed and written again; those beyond a page too."""
     rng = np.random.default_rng(5)
     rows = [('/t', T0 + int(rng.integers(0, 50)), b'\0\1\0\0' + rng.bytes(int(n)))
             for n in rng.integers(0, 60_000 if large else 400, 700)]

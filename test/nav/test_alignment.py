@@ -69,7 +69,6 @@ def test_attitude_and_bias_at_rest_are_found_exactly(rpy):
 
 
 def test_the_ends_of_a_standstill_are_left_out_unless_there_is_nothing_else():
-    """A slow start leans the specific force before the wheels have counted it."""
     C_nb = matrix_from_rpy(RPY)
     t, w, f = rest(C_nb)
     f[(t < REST_EDGE) | (t > SECONDS - REST_EDGE)] += [0.5, 0.0, 0.0]
@@ -91,7 +90,6 @@ def test_level_frame_is_a_rotation_however_the_imu_lies(up):
 
 @pytest.mark.parametrize('nose', [1, -1])
 def test_level_frame_goes_on_smoothly_into_the_upright(nose):
-    """Pitching up to it about y, L's x axis stays where it was."""
     for off in (1e-3, 1e-5, 0.0):
         C_Lb = matrix_from_rpy([0.0, -nose * (np.pi / 2 - off), 0.0])
         assert_allclose(level_frame(C_Lb.T @ [0, 0, 9.8]), C_Lb, atol=1e-9)

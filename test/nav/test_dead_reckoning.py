@@ -24,7 +24,6 @@ from odocal_ros.nav.rotations import (
     matrix_from_rpy,
     quat_from_matrix,
     quat_from_rotvec,
-    quat_multiply,
 )
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.screening.screen import screen
@@ -55,26 +54,7 @@ def test_second_order(n):
 ANGLE = st.floats(-3.0, 3.0)
 
 
-@given(yaw=ANGLE, pitch=ANGLE, roll=ANGLE, scale=st.floats(-2, 2))
-def test_track_turns_and_stretches_with_its_inputs(yaw, pitch, roll, scale):
-    plain = quarter_turn(30)
-    C = matrix_from_rpy([roll, pitch, yaw])
-    turned = dead_reckon(plain.t, quat_multiply(quat_from_matrix(C), plain.q_nb),
-                         Travel(plain.t, scale * plain.s, 0.0))
-    # 31 m in 30 steps: a few ulp of 3.6e-15 each
-    assert_allclose(turned.P, scale * (C @ plain.P), atol=1e-12)
-
-
-def test_odometer_between_epochs_is_interpolated():
-    t = np.array([0.0, 1.0, 2.0])
-    track = dead_reckon(t, np.tile([0, 0, 0, 1.0], (3, 1)), Travel(
-        np.array([-1.0, 0.5, 4.0]), np.array([0.0, 3.0, 10.0]), 1.0))
-    assert_allclose(track.s, [2, 4, 6], atol=1e-14)
-    assert_allclose(track.P[-1], 4 * np.eye(3), atol=1e-14)
-
-
 def test_eleven_kilometres_on_the_ellipsoid():
-    """A geodesic, its points, azimuths and lengths by pyproj alone; the end must be pyproj's."""
     geod = pytest.importorskip('pyproj').Geod(ellps='WGS84')
     s = np.linspace(0, 11_200, 1121)
     lon, lat, back = geod.fwd(np.full_like(s, 116.0), np.full_like(s, 40.0),
@@ -133,15 +113,6 @@ def test_mounting_angles_and_forward_axis_undo_each_other(yaw, pitch, K):
     assert_allclose(forward_b(*found), d, atol=2e-15)
 
 
-@pytest.mark.parametrize('pitch', [0.0, 0.02, -0.02])
-def test_an_odometer_that_counts_backwards_is_a_yaw_of_half_a_turn(pitch):
-    yaw, found = mounting_from_forward(-np.array([np.cos(pitch), 1e-9, np.sin(pitch)]))
-    assert yaw == pytest.approx(np.pi, abs=2e-9)
-    assert found == pytest.approx(-pitch, abs=1e-12) or found == pytest.approx(pitch, abs=1e-12)
-    assert_allclose(forward_b(yaw, found), -np.array([np.cos(pitch), 1e-9, np.sin(pitch)]),
-                    atol=1e-15)
-
-
 def fixes(metres, rng, sigma):
     p = np.zeros((len(metres), 3))
     p[:, 0] = metres
@@ -167,7 +138,6 @@ def test_rough_scale_survives_noise_outliers_standing_and_flicker(seed, metres_p
 
 
 def test_rough_scale_of_a_loop_and_of_a_single_stretch():
-    """Round a block of 100 m for ever the chord of the whole drive says nothing."""
     t = np.arange(0, 400, 0.2)
     turns = 10 * t / (100 / 2 / np.pi)
     p = 100 / 2 / np.pi * np.stack([np.cos(turns), np.sin(turns), 0 * t], -1)
@@ -179,7 +149,6 @@ def test_rough_scale_of_a_loop_and_of_a_single_stretch():
 
 @pytest.mark.parametrize(('noise', 'stated'), [(0.01, 0.01), (0.2, 0.01), (0.01, 2.5)])
 def test_rough_scale_of_lanes_that_fold_back(noise, stated):
-    """Lanes of 18 m as a mower drives: chords of 20 m are far shorter than the path."""
     rng, t = np.random.default_rng(3), np.arange(0, 600, 0.2)
     lane = 0.5 * t / 18
     along = 18 * np.abs((lane + 1) % 2 - 1)

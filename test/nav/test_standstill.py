@@ -87,7 +87,6 @@ def test_what_moves_is_no_standstill(w, way):
 
 @pytest.mark.parametrize('metres', [0.001, 0.02, 0.3])
 def test_a_count_that_flickers_at_rest_is_a_standstill(metres):
-    """A wheel that stands on the edge of a tooth, fine and coarse ones."""
     flicker = Travel(T, np.random.default_rng(2).integers(0, 2, len(T)).astype(float), 1.0)
     found = standstills(T, gyro(T), flicker, metres, 2.0)
     assert found.tolist() == [[0.0, T[-1]]]
@@ -96,7 +95,6 @@ def test_a_count_that_flickers_at_rest_is_a_standstill(metres):
 @pytest.mark.parametrize('bias', [0.0, 0.1, -0.1])
 @pytest.mark.parametrize('spin', [0.3, -0.5, 1.0])
 def test_turning_on_the_spot_is_no_standstill(bias, spin):
-    """Skid steer: the mean of the wheels stands, the gyro is steady, and yet it turns."""
     turn = [0, 10, 10.3, 40, 40.3, 100], [0, 0, spin, spin, 0, 0]
     found = standstills(T, gyro(T, 1e-4, (0.02, 0.0, bias), turn), Travel(T, 0 * T, 0.5), K, 2.0)
     assert len(found) == 2
@@ -125,7 +123,6 @@ def test_the_engine_shakes_and_a_reversed_odometer_counts_backwards():
 
 
 def test_a_gap_of_the_imu_is_no_standstill():
-    """Nothing is known of the turn in it; a shorter one is bridged."""
     for gap, count in ((5.0, 2), (0.3, 1)):
         keep = (T < 50) | (50 + gap < T)
         found = standstills(T[keep], gyro(T)[keep], Travel(T, 0 * T, 1.0), K, 2.0)
@@ -138,7 +135,6 @@ def test_a_gap_of_the_imu_is_no_standstill():
 
 
 def test_an_odometer_silent_at_rest_still_stands():
-    """Some send only while they count."""
     rows = counts(T, DRIVE)
     own = (rows.t == 0) | ((rows.t > 20) & (rows.t < 70)) | (rows.t == rows.t[-1])
     found = standstills(T, gyro(T), Travel(rows.t[own], rows.s[own], 1.0), K, 2.0)

@@ -80,7 +80,6 @@ def test_gyro_at_rest_stays_level_and_pointing_for_hours(latitude, every):
 
 
 def test_earth_rate_turns_n_under_a_gyro_that_does_not_turn():
-    """A star-fixed body seen from n turns westward: from the sky's north axis, backwards."""
     t = np.array([0.0, 3600.0])
     _, q = attitude(t, np.zeros((2, 3)), ONE, earth_rate_n(np.pi / 2))
     assert_allclose(matrix_from_quat(q[-1]), matrix_from_rpy([0, 0, -OMEGA * 3600]), atol=1e-15)

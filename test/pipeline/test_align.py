@@ -57,7 +57,6 @@ def test_level_in_motion_is_within_its_sigma(seed, grade):
 
 @pytest.mark.parametrize('slope', [0.0, 2e-7])
 def test_a_gyro_that_warms_up_walks_as_its_standstills_show(slope):
-    """The bias changes by slope T until a standstill, as a walk of slope sqrt(T) does."""
     case = Case(TURNING)
     alignment, _ = case.align()
     late = np.clip(case.inputs.t_imu - alignment.t, 0.0, None)
@@ -77,7 +76,6 @@ def test_a_gyro_that_warms_up_walks_as_its_standstills_show(slope):
 
 
 def test_an_imu_taken_for_better_than_it_is_has_the_errors_of_its_noise():
-    """The noise at rest is that of the consumer grade; its accelerometer tilts the level."""
     noisy = replace(PLAIN, imu_grade='consumer')
     alignment, _ = Case(noisy, settings(imu__grade='tactical')).align()
     own, _ = Case(noisy, settings(imu__grade='consumer')).align()

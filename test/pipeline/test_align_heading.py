@@ -32,7 +32,6 @@ def plain():
 
 @pytest.mark.parametrize('heading_deg', [43.3, 0.0, 270.0])
 def test_a_fixed_heading_is_a_compass_quantity(heading_deg):
-    """ENU yaw of 46.7 deg is heading 43.3 deg."""
     case = Case(replace(PLAIN, heading=np.deg2rad(heading_deg), yaw=0.0, pitch=0.0))
     a, _ = case.asked(alignment__heading=float(np.deg2rad(heading_deg)),
                  alignment__heading_sigma=0.003).align()
@@ -79,7 +78,6 @@ def test_orientation_of_the_imu_with_its_sigma_or_the_setting(plain, variance, s
 
 
 def test_orientation_is_of_the_imu_frame_not_of_the_body():
-    """An IMU mounted 90 deg to the left sends a yaw that is 90 deg more."""
     nominal = (0.0, 0.0, np.pi / 2)
     case = Case(replace(PLAIN, mounting_rpy=nominal, orientation_sigma=0.0, yaw=0.0, pitch=0.0),
                 config=settings(imu__grade='navigation', imu__mounting_rpy=list(nominal),
@@ -186,7 +184,6 @@ def test_course_sigma_holds():
 
 
 def test_course_of_a_vehicle_that_first_reverses(plain):
-    """Counting down on the way backwards, the track is the same as forwards."""
     t = plain.inputs.travel
     case = plain.asked(alignment__heading_source='course')
     a, _ = case.align(travel=Travel(t.t, -t.s, t.quantum))

@@ -50,7 +50,6 @@ def test_late_and_early_fixes_are_said(late):
 
 
 def test_a_value_far_from_its_setting_is_determined_however_sure_the_setting_is():
-    """An antenna 2 m beside its setting of 5 cm: the drive knows it to 3 cm."""
     made = drive(**ROUTE | {'duration': 300.0}, antenna_lever_arm=(0.0, 2.0, 0.0), fix_sigma=0.5)
     method = calibrate(made.leg(), settings(
         made, method='smoother', heading_sigma=None, gnss__lever_arm=(0.0, 0.0, 0.0),

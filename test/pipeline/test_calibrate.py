@@ -28,7 +28,6 @@ def test_the_same_leg_gives_the_same_result_to_the_last_bit(made):
 
 
 def test_a_recorded_leg_gives_what_the_whole_drive_gives(made):
-    """Pre-roll cut, topics raced, closed late: no digit changes."""
     recorder = LegRecorder()
     for slot in ('fix', 'odometer', 'imu'):
         block = made.leg().rows(slot)
@@ -106,7 +105,6 @@ def test_what_drives_are_like(option, value):
 
 
 def test_moving_the_marks_within_the_standstills_changes_little(made):
-    """Both marks stand: the same travel, the same fixes but for those outside."""
     config = drives.settings(made)
     base = calibrate(made.leg(), config).methods['two_point'].estimates[SCALE]
     for start, stop in ((-10.0, 0.0), (0.0, -15.0), (-40.0, -30.0)):

@@ -72,7 +72,6 @@ def test_poses_give_the_values_of_fixes(options, monkeypatch):
 
 
 def test_with_the_earth_rate_of_the_frame_they_are_those_of_fixes(monkeypatch):
-    """So poses differ by the Earth rate, the first sigma, and errors that change with the path."""
     made = drive(**CAR | {'fix_noise': 'white'})
     latitude, turned = made.options.latitude, math.pi / 2 - made.options.heading
     rate = earth_rate_n(latitude) @ matrix_from_rpy([0.0, 0.0, turned])
@@ -87,7 +86,6 @@ def test_with_the_earth_rate_of_the_frame_they_are_those_of_fixes(monkeypatch):
 
 
 def test_what_is_unknown_of_the_earth_rate_is_in_the_sigma():
-    """A tactical gyro sees the Earth rate: without north it loses the yaw's accuracy by it."""
     made = drive(**CAR | {'imu_grade': 'tactical'})
     config = settings(made, **SMOOTHER)
     by_fix, by_pose = (estimates(leg, config) for leg in (without_covariance(made), posed(made)))
@@ -183,7 +181,6 @@ def test_the_earth_rate_is_in_the_priors_of_the_gyro_bias():
 
 
 def test_the_bias_at_rest_has_the_sigma_of_the_earth_rate():
-    """What a gyro shows at rest is its bias and the Earth rate: in which shares is not known."""
     made = drive(**CAR | {'imu_grade': 'tactical'})
     config = settings(made, imu__gyro_bias=1e-3)
     sigmas = [calibrate(leg, config).methods['two_point'].estimates['gyro_bias_z'].sigma
@@ -192,7 +189,6 @@ def test_the_bias_at_rest_has_the_sigma_of_the_earth_rate():
 
 
 def test_a_pose_that_contains_the_wheels_is_reported():
-    """As AMCL and most SLAM do: the remedy names what to use."""
     made = drive(**CAR | {'scenario': 'yard', 'duration': 300.0, 'seed': 4},
                  real=Real(receiver_odometer=-0.03))
     config = settings(made, **SMOOTHER, leg__min_distance=20.0)

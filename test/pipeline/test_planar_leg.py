@@ -64,7 +64,6 @@ def test_values_are_within_their_sigmas(drive, wheels):
 
 
 def test_skid_steering_with_an_imu_has_a_gyro_scale():
-    """A gyro that reads 2 % too much: its scale is in the result, the width is not affected."""
     made, config = driven('skid', imu=True, gyro_scale_error=0.02, imu_grade='industrial')
     method = calibrate(made.leg(), with_settings(config, {
         'imu.gyro_scale_sigma': 0.02})).methods['planar']
@@ -85,7 +84,6 @@ def test_swapped_wheels_are_rejected():
 
 
 def test_a_run_without_turns_has_a_scale_and_no_width():
-    """The first straight alone: the width is refused, with the run that would determine it."""
     made, config = driven()
     leg = made.leg()
     turns = made.motion.yaw_rate(np.arange(0.0, 60.0, 0.1))
@@ -126,7 +124,6 @@ def test_wheels_of_another_run_are_rejected():
 
 
 def test_controllers_of_each_drive():
-    """Skid steering: width of diff_drive_controller; mecanum: radius and lever of its own."""
     made, config = driven('mecanum')
     text = _controllers(_calibrated(made, config), config)
     assert 'mecanum_drive_controller:' in text

@@ -39,7 +39,6 @@ def result(made):
 
 
 def test_the_mean_of_both_wheels_is_the_scale_factor(result):
-    """Its harmonic one; both sigmas hold the scale's."""
     scale, left, right = (result.methods['smoother'].estimates[name] for name in WHEELS)
     # left and right are computed apart, each to a thousandth of its sigma of 2 ppm
     assert 2 / (1 / left.value + 1 / right.value) == pytest.approx(scale.value, rel=1e-8)

@@ -127,7 +127,6 @@ def test_an_imu_turned_on_purpose_is_calibrated_and_no_wheel_slips():
 
 
 def test_driven_backwards_all_along_by_a_counter_that_counts_down():
-    """The counter of a vehicle that reverses, IMU turned half: it is pushed as the counts say."""
     made = town(180.0)
     leg = made.leg()
     backwards = replace(leg, odometer=changed(leg.odometer, value=lambda n: 20_000 - n))

@@ -81,7 +81,6 @@ def test_noise_alone_tells_no_rhythm(rng, noise):
 
 
 def test_lost_rows_move_no_others(rng):
-    """A row lost every 30 s: those about it keep their stamps, the rest find their rhythm."""
     true = np.arange(4 * SECONDS * RATE) / RATE
     kept = np.ones(len(true), bool)
     kept[rng.integers(500, len(true) - 500, 16)] = False

@@ -119,7 +119,6 @@ def test_arrival_jitter_is_measured(made, lost):
 
 
 def test_rows_of_one_stamp_have_an_arrival_jitter():
-    """Of most windows of rows the mean interval is zero."""
     t = np.append(np.zeros(3000), np.arange(1, 301) / 10)
     assert 0.0 < late_rows.arrival_jitter(t) < 30.0
 
@@ -176,7 +175,6 @@ def test_increments_that_arrive_together_are_all_counted(made):
 
 
 def test_equal_increments_that_arrive_together_are_both_counted(made):
-    """At an even speed they are equal, which is no sign of a row that was sent twice."""
     steps, form = increments(made)
     value = steps.value
     k = int(np.flatnonzero((np.diff(value) == 0) & (value[1:] > 0))[100])
@@ -187,7 +185,6 @@ def test_equal_increments_that_arrive_together_are_both_counted(made):
 
 
 def test_rows_with_a_header_that_repeat_a_stamp_are_said(made):
-    """Arrivals differ: the stamps are those of a clock, and two of them are one."""
     stamps = made.odometer.stamp_ns.copy()
     k = int(np.flatnonzero(np.diff(made.odometer.value))[1000])
     stamps[k + 1] = stamps[k]
@@ -197,7 +194,6 @@ def test_rows_with_a_header_that_repeat_a_stamp_are_said(made):
 
 
 def test_a_sender_that_changes_its_rate_stays_where_it_is(made):
-    """Half of the drive at 25 Hz, half at 50 Hz: no row is late."""
     n = len(made.odometer.stamp_ns)
     changed = take(made.odometer, (np.arange(n) > n // 2) | (np.arange(n) % 2 == 0))
     inputs, found = screened(made, changed)
@@ -236,7 +232,6 @@ def test_rows_that_are_taken_at_uneven_times_stay_where_they_are(made):
 
 @pytest.mark.filterwarnings('error')
 def test_rows_that_come_at_once_are_spread(made):
-    """A queue that is emptied within a tick of the clock: twenty rows of one stamp."""
     t = (made.odometer.stamp_ns - made.odometer.stamp_ns[0]) * 1e-9
     held = t % 15.0 < 0.4
     wait_s = np.where(held, 0.4 - t % 15.0, 0.0)
@@ -262,7 +257,6 @@ def test_a_slip_between_late_rows_is_found(made):
 
 
 def test_lost_rows_within_a_burst(made, true):
-    """A queue that runs over: of a burst some rows are lost, and its rhythm tells nothing."""
     late, held = held_up(made.odometer)
     lost = held & (np.arange(len(held)) % 3 == 0)
     inputs, _ = screened(made, take(late, ~lost))
@@ -274,7 +268,6 @@ def test_lost_rows_within_a_burst(made, true):
 
 
 def test_increments_that_are_late_are_not_lost(made):
-    """Half a second of silence is a lost increment, unless what comes makes up for it."""
     steps, form = increments(made)
     late, _ = held_up(steps, how_long_s=0.5)
     inputs, found = screened(made, late, form=form)
@@ -285,7 +278,6 @@ def test_increments_that_are_late_are_not_lost(made):
 
 
 def test_fresh_counts_at_odd_times_stay_where_they_are(made, true):
-    """A sender that is busy and then reads what the counter is at: stamps and counts agree."""
     t = (made.odometer.stamp_ns - made.odometer.stamp_ns[0]) * 1e-9
     kept = (t % 15.0 > 0.12) | (np.arange(len(t)) % 7 == 0)
     odd = take(made.odometer, kept)
@@ -294,11 +286,3 @@ def test_fresh_counts_at_odd_times_stay_where_they_are(made, true):
     off = np.abs(inputs.travel.s - true.travel.at(inputs.travel.t))
     assert off.max() <= ROUNDING_COUNTS + 0.5
     assert (inputs.travel.t <= sent).all()
-
-
-@pytest.mark.parametrize('count', [1, 2, 7, 100, 101, 5000])
-@pytest.mark.parametrize('n', [1, 100, 1003])
-def test_the_least_of_the_next_values(count, n):
-    x = np.random.default_rng(count).normal(size=n)
-    wanted = [x[i:i + count].min() for i in range(n)]
-    assert late_rows._least_of_next(x, count).tolist() == wanted

@@ -59,7 +59,6 @@ def test_mecanum_wheels_obey_their_kinematics():
 
 @pytest.mark.parametrize('count', [3, 4])
 def test_omni_wheels_obey_their_kinematics(count):
-    """Wheels in a circle: their least squares give the motion, numpy.linalg.lstsq."""
     made = robot(drive='omni', wheels=count)      # its radius is 0.15 m
     state, rolled = paths(made)
     angle = 2 * np.pi * np.arange(count) / count
@@ -116,7 +115,6 @@ def test_wheels_without_steering_differ_by_the_turn_and_their_scale(wheels):
 
 
 def test_a_steered_wheel_rolls_along_its_own_curve():
-    """Its path is that of its contact point in the plane, as a polyline of 1 ms has it."""
     drive = simulate(replace(TOWN, odometer_rate=200.0, latitude=0.0, heading=np.pi / 2))
     t = np.arange(0.0, drive.options.duration, 0.001)
     state = drive.motion.at(t)
