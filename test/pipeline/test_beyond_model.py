@@ -37,16 +37,19 @@ def said(made, method, **changes):
     return what, float(size) * (1 if way == 'late' else -1), float(sigma), name, float(offset)
 
 
-@pytest.mark.parametrize('late', [0.12, -0.12])
-def test_late_and_early_fixes_are_said(late):
-    made = drive(**ROUTE, fix_delay=late)
+@pytest.mark.parametrize(('late', 'sensor', 'setting', 'prior', 'options'), [
+    (0.12, 'fix', 'gnss', 0.05, {'fix_delay': 0.12}),
+    (-0.12, 'fix', 'gnss', 0.05, {'fix_delay': -0.12}),
+    (0.04, 'odometer', 'odometer', 0.01, {'odometer_delay': 0.04, 'fix_noise': 'rtk'})])
+def test_late_and_early_sensors_are_said(late, sensor, setting, prior, options):
+    made = drive(**ROUTE, **options)
     what, size, sigma, name, offset = said(made, 'smoother')
-    assert (what, name) == ('fix', 'gnss')
-    # a belief of 50 ms (gnss.time_sigma) pulls it towards none by (sigma / prior)^2 of itself
-    pull = abs(late) * (sigma / 0.05)**2
+    assert (what, name) == (sensor, setting)
+    # the prior of its delay, time_sigma, pulls it towards none by (sigma / prior)^2 of itself
+    pull = abs(late) * (sigma / prior)**2
     assert abs(size - late) < 4 * sigma + pull + 0.001
     assert offset == pytest.approx(-size, abs=0.001)
-    assert said(made, 'smoother', gnss__time_offset=offset) is None
+    assert said(made, 'smoother', **{f'{name}__time_offset': offset}) is None
 
 
 def test_a_value_far_from_its_setting_is_determined_however_sure_the_setting_is():
@@ -59,12 +62,7 @@ def test_a_value_far_from_its_setting_is_determined_however_sure_the_setting_is(
     assert found.sigma > 0.05 / 2
 
 
-def test_a_late_odometer_is_said_and_of_no_delay_nothing():
-    made = drive(**ROUTE, odometer_delay=0.04, fix_noise='rtk')
-    what, size, sigma, name, offset = said(made, 'smoother')
-    assert (what, name) == ('odometer', 'odometer')
-    assert abs(size - 0.04) < 4 * sigma + 0.04 * (sigma / 0.01)**2 + 0.001
-    assert said(made, 'smoother', odometer__time_offset=offset) is None
+def test_of_no_delay_nothing_is_said():
     assert said(drive(**ROUTE), 'smoother') is None
 
 

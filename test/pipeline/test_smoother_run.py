@@ -52,9 +52,14 @@ def test_the_result_is_its_own_without_a_heading_and_a_standstill(made, held):
     assert 'NO_STANDSTILL' not in {r.code.name for r in whole.reasons}
 
 
-def test_fixes_without_altitude_give_all_three(made):
+def with_height(made, height):
+    """Return the leg of a drive with a height, m, in all fixes, or in each."""
     leg = made.leg()
-    flat = replace(leg, fix=replace(leg.fix, height=np.full(len(leg.fix.height), np.nan)))
+    return replace(leg, fix=replace(leg.fix, height=height + np.zeros(len(leg.fix.height))))
+
+
+def test_fixes_without_altitude_give_all_three(made):
+    flat = with_height(made, np.nan)
     found = calibrate(flat, settings(made, **ASKED)).methods['smoother'].estimates
     assert off(found, made, 'scale_factor', *ANGLES) < SIGMAS
     assert found['scale_factor'].sigma < 1e-3 * made.truth.scale
@@ -64,8 +69,7 @@ def test_fixes_without_altitude_give_all_three(made):
 @pytest.mark.parametrize('height', [np.nan, 0.0])
 def test_unknown_heights_leave_the_size_of_the_earth_below_uncertain(height):
     made = drive(**TOWN, height=1600.0)
-    leg = made.leg()
-    none = replace(leg, fix=replace(leg.fix, height=np.full(len(leg.fix.height), height)))
+    none = with_height(made, height)
     result = calibrate(none, settings(made, **ASKED)).methods['smoother']
     # on the ellipsoid below a road of 1600 m, distances are 1600 m / 6378 km shorter
     assert off(result.estimates, made, 'scale_factor', *ANGLES) < SIGMAS
@@ -77,9 +81,7 @@ def test_unknown_heights_of_several_legs_do_not_average():
     for seed in (4, 5, 6):
         made = drive(**TOWN | {'seed': seed}, height=1600.0, start_ns=seed * 10**12,
                      fix_noise='rtk')
-        leg = made.leg()
-        legs.append(calibrate(replace(leg, fix=replace(
-            leg.fix, height=np.full(len(leg.fix.height), np.nan))), settings(made, **ASKED)))
+        legs.append(calibrate(with_height(made, np.nan), settings(made, **ASKED)))
     config = settings(made, **ASKED)
     earlier = combine(legs[:2], config).carried
     for whole in (combine(legs, config), combine(legs[2:], config, earlier)):
@@ -91,9 +93,9 @@ def test_unknown_heights_of_several_legs_do_not_average():
 
 def test_fixes_without_altitude_at_the_start_are_at_the_altitude_of_the_others():
     made = drive(**TOWN, height=1600.0)
-    leg = made.leg()
-    height = np.where(np.arange(len(leg.fix.height)) < 300, np.nan, leg.fix.height)
-    result = calibrate(replace(leg, fix=replace(leg.fix, height=height)), settings(made, **ASKED))
+    height = made.fix.height.copy()
+    height[:300] = np.nan
+    result = calibrate(with_height(made, height), settings(made, **ASKED))
     assert result.origin[2] == pytest.approx(1600.0, abs=60.0)
     assert off(result.methods['smoother'].estimates, made, 'scale_factor', *ANGLES) < SIGMAS
 
