@@ -177,7 +177,6 @@ def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
 
 
 def _bridged(t: Floats, step: Floats, resets: Bools) -> Floats:
-    """Return steps with the resets replaced by the adjacent rate."""
     dt = np.diff(t)
     step = step.copy()
     good = np.flatnonzero(~resets & (dt > 0))

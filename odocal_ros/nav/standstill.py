@@ -61,7 +61,6 @@ def _spans(quiet: Bools, edges: Floats, shortest: float) -> Floats:
 
 
 def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
-    """Return a mask of windows with travel as at rest."""
     # range of the travel at a few times in the window, so that rocking is detected
     probes = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
     reach = np.max(probes, axis=0) - np.min(probes, axis=0)

@@ -192,7 +192,6 @@ def _fixed(inputs: Inputs, level: Level, config: Config) -> Found:
 
 
 def _turn_since(inputs: Inputs, level: Level) -> float:
-    """Return the rotation of b about the vertical from the epoch of the level to the mark, rad."""
     pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= 0.0)
     if pick.sum() < 2:
         return 0.0

@@ -169,7 +169,6 @@ def _further(method: MethodResult, leg: LegResult) -> list[Reason]:
 
 
 def _why(reasons: Sequence[Reason]) -> str:
-    """Return the rejecting reasons as text."""
     return '; '.join(dict.fromkeys(r.text for r in reasons if r.code.gravity is Verdict.REJECTED))
 
 

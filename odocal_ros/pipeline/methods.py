@@ -89,7 +89,6 @@ def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
 
 
 def _with_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
-    """Return a method's run with the errors beyond its own model."""
     result = run.result
     for add in (with_wheel_change, with_truncation, with_hills):
         result = add(result, prepared)

@@ -85,7 +85,6 @@ def _guarded(run: Run, inputs: Inputs, config: settings.Config, progress: Callab
 
 
 def _run_of(inputs: Inputs, config: settings.Config) -> tuple[Run | None, list[Reason]]:
-    """Return the run on nodes, or None and the reasons."""
     travels, kind = inputs.travels, config.odometer.drive
     if lacking := _lacking_wheels(kind, len(travels)):
         return None, [lacking]
@@ -178,7 +177,6 @@ def known_of(run: Run, config: settings.Config) -> Known:
 
 
 def _tracks(run: Run, found: Fit) -> dict[str, Any]:
-    """Return distance, the path of the fit and the positions, for reports."""
     pose = found.pose
     flat = np.column_stack([pose[:, :2], np.zeros(len(pose))])
     step = np.linalg.norm(np.diff(pose[:, :2], axis=0), axis=1)

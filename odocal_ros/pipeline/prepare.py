@@ -63,7 +63,6 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
 def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed,
               faces: facing.Facing | None, reasons: Sequence[Reason], alignment: Alignment | None,
               holdout: bool) -> PreparedLeg:
-    """Return the leg aligned and dead reckoned, with the reasons of its drive."""
     spans = inputs.standstills(placed.rough, config)
     about: tuple[Reason, ...] = ()
     own = alignment is None

@@ -61,7 +61,6 @@ def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
 
 
 def _with_search(method: MethodResult, ready: PreparedLeg) -> MethodResult:
-    """Return the result with the patent's search in its details, if the leg allows one."""
     found = search_of(ready, method.estimates['pitch_mounting_angle'].value or 0.0)
     if found is None:
         return method

@@ -154,7 +154,6 @@ class TwoPointRun:
 
     def _judge_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
                      drift: float) -> None:
-        """Compare the corrected track with the fixes: reversing, mismatch, bend."""
         ready, (t, p) = self.ready, fixes
         keep, _ = check.steady(residual, ready.fix_sigma)     # track errors count as noise
         sigma = max(ready.fix_sigma, white_noise(p[keep]))

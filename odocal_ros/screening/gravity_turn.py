@@ -158,6 +158,5 @@ def _integral(rate: Complexes) -> Complexes:
 
 
 def _seconds(x: NDArray[Any]) -> Complexes:
-    """Return the mean of each second."""
     mean: Complexes = x.reshape(-1, ROWS_A_SECOND).mean(axis=1)
     return mean

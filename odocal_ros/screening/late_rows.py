@@ -86,7 +86,6 @@ def intervals(t: Floats) -> list[float]:
 
 
 def _put_back(t: Floats, travel: Floats, least: float) -> Floats:
-    """Return times, with late rows moved back."""
     usual, even, evener = _rhythm(t, travel)
     least_late, late_share = 0.004, 0.1    # s, of an interval: the larger is the limit
     late = t - even > (usual if evener else max(least_late, late_share * usual))

@@ -76,7 +76,6 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
 
 
 def _missing(leg: Leg, found: list[Reason]) -> list[Reason]:
-    """Return the reasons for required topics without messages, except those in ``found``."""
     codes = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}
     known = {reason.code for reason in found}      # a missing frame_id
     return [Reason(code, f'no {INPUTS[slot].label} message between the marks')
@@ -97,7 +96,6 @@ class Usable:
 
 
 def _usable(leg: Leg, config: Config, judged: bool, found: list[Reason]) -> Usable:
-    """Return the usable rows of each topic; add the reasons for the others."""
     offset = offsets(config)
 
     def rows(slot: str) -> UsableRows:
@@ -139,7 +137,6 @@ def _fixes(leg: Leg, config: Config, rows: Usable, found: list[Reason]) -> dict[
 
 
 def _in_base(leg: Leg, config: Config, rows: Usable, fixes: dict[str, Any]) -> Inputs:
-    """Return the arrays of a leg, the IMU rotated by its nominal mounting."""
     imu = rows.imu
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     return Inputs(
@@ -167,7 +164,6 @@ def _without_reversing(inputs: Inputs, config: Config, found: list[Reason]) -> I
 
 
 def _without_reckoned(inputs: Inputs, config: Config, found: list[Reason]) -> Inputs:
-    """Return inputs without fixes that the receiver has dead-reckoned."""
     placed = place(inputs, config)
     if not placed.rough or len(inputs.t_imu) < 2 or not len(inputs.travel.t):
         return inputs

@@ -207,7 +207,6 @@ def _together(each: list[tuple[Travel, Floats, Floats]]) -> Wheels:
 
 def _one(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
          found: list[Reason], side: str = '') -> tuple[Travel, Floats, Floats]:
-    """Return the travel of a wheel, and times and sigmas of uncertain travel."""
     name = f"the {side} wheel's counter" if side else 'the counter'
     doubt_t = doubt = np.empty(0)
     if form.quantity == 'cumulative':
@@ -223,6 +222,5 @@ def _one(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config
 
 
 def _words(form: OdometerForm) -> str:
-    """Return the meaning of the values of a form as text."""
     what = {'cumulative': 'a running count', 'increment': 'increments', 'rate': 'a speed'}
     return f'{what[form.quantity]} ({form.scale_unit})'

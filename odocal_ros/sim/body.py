@@ -116,7 +116,9 @@ def measured(motion: Motion, state: State,
         return w_v, f_v
     t, arm = state.t, np.asarray(lever_arm, dtype=float)
     R = rotation(motion, t)
-    roll, dr, ddr, dp, ddp = _angles(motion, t)
+    roll, rates = motion.tilt[0](t), [profile.derivative() for profile in motion.tilt]
+    dr, dp = (rate(t) for rate in rates)
+    ddr, ddp = (rate.derivative().mean(t) for rate in rates)
     s, c = np.sin(roll), np.cos(roll)
     w_r = np.stack([dr, dp * c, -dp * s], -1)
     dw_r = np.stack([ddr, ddp * c - dp * dr * s, -ddp * s - dp * dr * c], -1)
@@ -128,11 +130,3 @@ def measured(motion: Motion, state: State,
            + 2 * np.cross(w_v, turning) + np.cross(np.einsum('nij,nj->ni', R, dw_r), arm_v)
            + np.cross(w_rv, turning))
     return np.einsum('nij,ni->nj', R, w_v) + w_r, np.einsum('nij,ni->nj', R, f_v)
-
-
-def _angles(motion: Motion, t: Floats) -> tuple[Floats, ...]:
-    """Return roll, its rate and acceleration, the pitch's rate and acceleration."""
-    roll, pitch = motion.tilt
-    rates = [p.derivative() for p in motion.tilt]
-    return (roll(t), rates[0](t), rates[0].derivative().mean(t), rates[1](t),
-            rates[1].derivative().mean(t))

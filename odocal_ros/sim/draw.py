@@ -68,7 +68,6 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
 
 
 def _clean(seed: int, kind: str, grade: str, alone: bool) -> tuple[Vehicle, dict[str, Any]]:
-    """Return the vehicle and its options before any effect."""
     rng, which = stream(seed, 'vehicle'), GRADES.index(grade)
     roll, pitch, yaw = (math.radians(s) * rng.standard_normal() for s in ROWS['mounting'][which])
     heading, slope = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.02)

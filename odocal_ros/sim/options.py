@@ -182,7 +182,6 @@ def resolved(options: SimOptions) -> SimOptions:
 
 
 def _filled(options: SimOptions, values: dict[str, Any]) -> SimOptions:
-    """Return options with values for those that are BY_SCENARIO."""
     return replace(options, **{name: value for name, value in values.items()
                                if getattr(options, name) is BY_SCENARIO})
 

@@ -19,41 +19,20 @@ BLEND = 0.4         # s, rise time of an acceleration or a turn rate
 Stretch = tuple[list[Piece], list[Piece]]     # accelerations and turn rates of equal duration
 
 
-def robot_stretches(duration: float, rng: np.random.Generator) -> list[Stretch]:
+def _robot_stretches(duration: float, rng: np.random.Generator, cycles: int = 1) -> list[Stretch]:
     """
     Return cycles of a move and a turn on the spot, 5 s still before and after.
 
     A move of 2 to 8 s at 0.2 to 1.2 m/s is alternately straight or an arc of up to 90 deg. Turns
     on the spot are of 45 to 200 deg at 0.5 to 1.2 rad/s, alternately to the left and the right.
     """
-    found, left, side = [(hold(STILL), hold(STILL))], duration - 2 * STILL, rng.choice([-1.0, 1.0])
-    k = 0
+    left = _rest('indoor', duration, 2 * STILL, least=math.ceil(cycles * LONGEST))
+    found, side, k = [(hold(STILL), hold(STILL))], rng.choice([-1.0, 1.0]), 0
     while left >= LONGEST:
         speed, rate, length = _cycle(rng, side, bool(k % 2), left)
         found.append((speed, rate))
         left, side, k = round(left - length, 9), -side, k + 1
     found.append((hold(STILL + left), hold(STILL + left)))
-    return found
-
-
-def sideways(found: list[Stretch]) -> list[tuple[list[Piece], list[Piece], list[Piece]]]:
-    """Return stretches in which every third move is to the left, with the same turns."""
-    return [(hold(sum(d for d, _ in speed)), rate, speed) if k % 3 == 2 else
-            (speed, rate, hold(sum(d for d, _ in speed))) for k, (speed, rate) in enumerate(found)]
-
-
-def square_stretches() -> list[Stretch]:
-    """
-    Return a square of 4 m to the left, and one to the right, with stops at the corners.
-
-    10 s still; then eight times: 9 s of motion, 3 s still, a turn of 90 deg in 2 s, 3 s still.
-    """
-    found = [(hold(10.0), hold(10.0))]
-    for side in [1.0] * 4 + [-1.0] * 4:
-        # 4 m: a ramp of 1 s is as long as half a second at full speed
-        speed = ramp(1.0, 0.5, BLEND) + hold(7.0) + ramp(1.0, -0.5, BLEND)
-        found.append((speed + hold(8.0), hold(12.0) + turn(2.0, side * math.pi / 2, BLEND)
-                      + hold(3.0)))
     return found
 
 
@@ -199,22 +178,32 @@ def yard(duration: float, rng: np.random.Generator) -> Route:
 
 def indoor(duration: float, rng: np.random.Generator) -> Route:
     """Return the moves and turns on the spot of a small robot, 5 s still before and after."""
-    _rest('indoor', duration, 2 * STILL, least=math.ceil(LONGEST))
-    return _route(robot_stretches(duration, rng))
+    return _route(_robot_stretches(duration, rng))
 
 
 def square(duration: float, rng: np.random.Generator) -> Route:
-    """Return a square of 4 m in both directions, as in UMBmark, with turns on the spot."""
+    """
+    Return a square of 4 m in both directions, as in UMBmark, with stops at the corners.
+
+    10 s still; then eight times: 9 s of motion, 3 s still, a turn of 90 deg in 2 s, 3 s still.
+    """
     rest = _rest('square', duration, 10 + 8 * 17, least=5.0)
-    return _route([*square_stretches(), (hold(rest), hold(rest))])
+    # 4 m: a ramp of 1 s is as long as half a second at full speed
+    speed = ramp(1.0, 0.5, BLEND) + hold(7.0) + ramp(1.0, -0.5, BLEND) + hold(8.0)
+    sides = [(speed, hold(12.0) + turn(2.0, side * math.pi / 2, BLEND) + hold(3.0))
+             for side in [1.0] * 4 + [-1.0] * 4]
+    return _route([(hold(10.0), hold(10.0)), *sides, (hold(rest), hold(rest))])
 
 
 def with_sideways_moves(duration: float, rng: np.random.Generator) -> Route:
     """Return the moves of ``indoor``, every third one sideways."""
-    _rest('indoor', duration, 2 * STILL, least=math.ceil(3 * LONGEST))
-    parts = sideways(robot_stretches(duration, rng))
-    route = _route([(speed, rate) for speed, rate, _ in parts])
-    side = chain([piece for _, _, pieces in parts for piece in pieces])
+    parts = _robot_stretches(duration, rng, cycles=3)
+    still = [hold(sum(d for d, _ in speed)) for speed, _ in parts]
+    aside = [k % 3 == 2 for k in range(len(parts))]
+    route = _route([(rest if there else speed, rate) for (speed, rate), rest, there in zip(
+        parts, still, aside, strict=True)])
+    side = chain([piece for (speed, _), rest, there in zip(parts, still, aside, strict=True)
+                  for piece in (speed if there else rest)])
     return replace(route, side=_clean(side.integral()))
 
 
@@ -251,7 +240,6 @@ def _rest(name: str, duration: float, fixed: float, least: float = 10.0,
 
 
 def _route(stretches: list[tuple[list[Piece], list[Piece]]]) -> Route:
-    """Join stretches of (acceleration pieces, turn-rate pieces) of equal length."""
     acceleration = chain([p for speed, _ in stretches for p in speed])
     yaw_rate = chain([p for _, rate in stretches for p in rate])
     return Route(_clean(acceleration.integral()), yaw_rate)

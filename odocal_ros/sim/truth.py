@@ -72,7 +72,6 @@ def _wheels(drive: Drive) -> dict[str, Any]:
 
 
 def _robot(options: SimOptions) -> dict[str, Any]:
-    """Return the truth of a robot that slides or moves sideways."""
     if options.drive == DIFFERENTIAL:
         return {}
     width = effective_width(options)

@@ -11,7 +11,7 @@ import pytest
 
 from odocal_ros.nav.alignment import complete, gyrocompass, level_at_rest, level_frame, REST_EDGE
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
+from odocal_ros.nav.earth import earth_rate_n, gravity
 from odocal_ros.nav.rotations import matrix_from_rpy, wrap
 from odocal_ros.settings.grades import GRADES
 
@@ -116,14 +116,6 @@ def test_gyrocompass_points_north_in_every_quadrant(latitude, yaw):
     # 1e-16 of 7e-5 rad/s per row, over Omega cos(1.4 rad)
     assert wrap(found - yaw) == pytest.approx(0, abs=1e-9)
     assert -np.pi < found <= np.pi
-
-
-def test_an_east_gyro_bias_turns_the_gyrocompass_by_bias_over_level_earth_rate():
-    bias = 1e-7
-    level = levelled(rest(np.eye(3), gyro_bias=np.array([bias, 0.0, 0.0])))      # b: x east
-    yaw, _ = gyrocompass(level, LATITUDE, EXACT)
-    # north seems turned towards east, so the vehicle towards its left
-    assert yaw == pytest.approx(bias / (OMEGA * np.cos(LATITUDE)), rel=1e-5)
 
 
 @pytest.mark.parametrize(('grade', 'latitude'), [
