@@ -26,20 +26,15 @@ Pose = tuple[float, float, float]   # x, y, m, and heading, rad
 
 @dataclass(frozen=True)
 class Piece:
-    """
-    A line or an arc of less than half a circle.
+    """A line or an arc of less than half a circle."""
 
-    heading : at its start, rad from the x axis, counter-clockwise.   curvature : 1/m, positive to
-    the left.   rests : the robot stops at its end.   side : of a half turn before it, 1: left.
-    """
-
-    x: float
+    x: float                  # m, of its start
     y: float
-    heading: float
-    length: float
-    curvature: float = 0.0
-    rests: bool = True
-    side: int = 1
+    heading: float            # at its start, rad from the x axis, counter-clockwise
+    length: float             # m
+    curvature: float = 0.0    # 1/m, positive to the left
+    rests: bool = True        # the robot stops at its end
+    side: int = 1             # of a half turn before it, 1: left
 
     def located(self, x: float, y: float) -> tuple[float, float]:
         """Return the distance along the piece, m, and the distance to the left of it, m."""

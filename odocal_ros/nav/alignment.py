@@ -29,32 +29,21 @@ REST_EDGE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """
-    Attitude and gyro bias at one epoch.
+    """Attitude and gyro bias at one epoch; sigmas are 1 sigma."""
 
-    t : s since the start mark, epoch of C_nb and start of the strapdown.
-    C_nb : (3, 3) b to n.            gyro_bias : (3,) rad/s, in b.
-    level_sigma, heading_sigma : rad, 1 sigma (level: each of east and north).
-    gyro_bias_sigma : (3,) rad/s.    gyro_noise : rad/s/sqrt(Hz).   gyro_bias_walk : rad/s/sqrt(s)
-    heading_source : source of the heading; that of ``course`` includes the mounting angle.
-    heading_shared : its error is the same in every leg.
-    standstill : begin and end, s, of the standstill used, None if aligned in motion.
-    gyro_scale_sigma : relative error of the gyro's scale.   gyro_axes_sigma : rad, of an axis.
-    """
-
-    t: float
-    C_nb: NDArray[np.float64]
-    gyro_bias: NDArray[np.float64]
-    level_sigma: float
-    heading_sigma: float
-    gyro_bias_sigma: NDArray[np.float64]
-    gyro_noise: float
-    gyro_bias_walk: float
-    heading_source: str
-    heading_shared: bool
-    standstill: tuple[float, float] | None = None
-    gyro_scale_sigma: float = 0.0
-    gyro_axes_sigma: float = 0.0
+    t: float                               # s since the start mark, start of the strapdown
+    C_nb: NDArray[np.float64]              # (3, 3) b to n
+    gyro_bias: NDArray[np.float64]         # (3,) rad/s, in b
+    level_sigma: float                     # rad, each of east and north
+    heading_sigma: float                   # rad
+    gyro_bias_sigma: NDArray[np.float64]   # (3,) rad/s
+    gyro_noise: float                      # rad/s/sqrt(Hz)
+    gyro_bias_walk: float                  # rad/s/sqrt(s)
+    heading_source: str                    # that of ``course`` includes the mounting angle
+    heading_shared: bool                   # its error is the same in every leg
+    standstill: tuple[float, float] | None = None    # begin and end, s; None: in motion
+    gyro_scale_sigma: float = 0.0          # relative
+    gyro_axes_sigma: float = 0.0           # rad, of an axis
 
     @property
     def heading_separable(self) -> bool:

@@ -54,17 +54,12 @@ class SpeedInstants:
 
 @dataclass(frozen=True, eq=False)
 class CoarseSpeed:
-    """
-    A speed on a grid.
+    """A speed on a grid: rows with information, (n,)."""
 
-    step : scale units per s.   t, value : (n,) s and scale units per s, rows with information.
-    interpolated : the sender also publishes interpolated rows between these.
-    """
-
-    step: float
-    t: Floats
-    value: Floats
-    interpolated: bool = False
+    step: float      # scale units per s
+    t: Floats        # s
+    value: Floats    # scale units per s
+    interpolated: bool = False    # the sender also publishes interpolated rows between these
 
     @property
     def truncation(self) -> float:

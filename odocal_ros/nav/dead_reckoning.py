@@ -63,17 +63,12 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """
-    A dead-reckoned leg, before scale and forward axis are chosen.
+    """A dead-reckoned leg, before scale and forward axis are chosen."""
 
-    t : (m,) s, epochs.            q_nb : (m, 4) attitude there.
-    s : (m,) travel, scale units.  P : (m, 3, 3) sum of C_nb over travel from the first epoch.
-    """
-
-    t: NDArray[np.float64]
-    q_nb: NDArray[np.float64]
-    s: NDArray[np.float64]
-    P: NDArray[np.float64]
+    t: NDArray[np.float64]       # (m,) s, epochs
+    q_nb: NDArray[np.float64]    # (m, 4) attitude there
+    s: NDArray[np.float64]       # (m,) travel, scale units
+    P: NDArray[np.float64]       # (m, 3, 3) sum of C_nb over travel from the first epoch
 
     def at(self, t: float | Floats) -> Floats:
         """Return P at times t, linear between epochs, constant outside: (...) to (..., 3, 3)."""

@@ -24,24 +24,14 @@ FEWEST_STEPS = 20     # judgement: least number of steps for a search for resets
 
 @dataclass(frozen=True, eq=False)
 class Travel:
-    """
-    Travel of the odometer's measuring point.
+    """Travel of the odometer's measuring point, in scale units: pulses, rad or configured m."""
 
-    t : (n,) s since the start mark, rising.
-    s : (n,) signed travel from the first row, in scale units (pulses, rad or configured m).
-    quantum : size of one count in s, 0 for speeds and floats.
-    coarse : the measured speeds, if they are on a grid and of one wheel.
-    name : of the wheel, '' for a single one or a mean.
-    ahead : distance of a steered wheel ahead of the axle that does not steer, scale units; 0: the
-    wheel does not steer.
-    """
-
-    t: NDArray[np.float64]
-    s: NDArray[np.float64]
-    quantum: float
-    coarse: CoarseSpeed | None = None
-    name: str = ''
-    ahead: float = 0.0
+    t: NDArray[np.float64]    # (n,) s since the start mark, rising
+    s: NDArray[np.float64]    # (n,) signed travel from the first row
+    quantum: float            # size of one count in s, 0 for speeds and floats
+    coarse: CoarseSpeed | None = None    # measured speeds, if on a grid and of one wheel
+    name: str = ''            # of the wheel, '' for a single one or a mean
+    ahead: float = 0.0        # of a steered wheel, from the axle that does not steer; else 0
 
     def at(self, t: Floats) -> Floats:
         """Return travel at times t, linear between rows, constant outside."""

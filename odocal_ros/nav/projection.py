@@ -19,15 +19,11 @@ ZONE_WIDTH = 6.0       # deg, of UTM and of Gauss-Krueger's wide zones: format
 
 @dataclass(frozen=True)
 class Plane:
-    """
-    A transverse Mercator plane.
+    """A transverse Mercator plane."""
 
-    central_meridian : deg.   scale : on it.   ellipsoid : a name of ELLIPSOIDS.
-    """
-
-    central_meridian: float
-    scale: float = 1.0
-    ellipsoid: str = 'WGS84'
+    central_meridian: float     # deg
+    scale: float = 1.0          # on the central meridian
+    ellipsoid: str = 'WGS84'    # a name of ELLIPSOIDS
 
     def forward(self, latitude: Floats, longitude: Floats) -> tuple[Floats, Floats]:
         """Return northing, easting, m (eq. 1-5 of Shi et al. 2015), from rad: (...)."""

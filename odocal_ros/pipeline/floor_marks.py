@@ -23,15 +23,11 @@ FORGOTTEN = 5.0
 
 @dataclass(frozen=True, order=True)
 class FloorMark:
-    """
-    The robot stands on a point of ``reference.points``.
-
-    point : its number from 0.   received_ns : arrival of a message sent at the end of the mark.
-    """
+    """The robot stands on a point of ``reference.points``."""
 
     stamp_ns: int
-    point: int
-    received_ns: int
+    point: int          # its number from 0
+    received_ns: int    # arrival of a message sent at the end of the mark
 
     def __str__(self) -> str:
         """Return the mark as in the status of the node."""

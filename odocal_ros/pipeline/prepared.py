@@ -45,36 +45,26 @@ class Paths(NamedTuple):
 
 
 class MethodRun(NamedTuple):
-    """
-    A method's result and its other findings.
-
-    paths : None if it refuses.   found : reasons of the leg.   delays : 'gnss' or 'odometer' to
-    delay, s, and sigma; None from a method that estimates none.   odometer : reasons on slip or
-    delay of its track relative to the IMU, used unless a better method has checked; None: not
-    checked.
-    """
+    """A method's result and its other findings."""
 
     result: MethodResult
-    paths: Paths | None = None
-    found: tuple[Reason, ...] = ()
+    paths: Paths | None = None         # None if it refuses
+    found: tuple[Reason, ...] = ()     # of the leg
+    # 'gnss' or 'odometer' to delay, s, and sigma; None from a method that estimates none
     delays: dict[str, tuple[float, float]] | None = None
+    # on slip or delay of its track relative to the IMU, used unless a better method has checked;
+    # None: not checked
     odometer: tuple[Reason, ...] | None = None
 
 
 @dataclass(frozen=True)
 class Stage:
-    """
-    A stage of the work on a leg.
+    """A stage of the work on a leg."""
 
-    name : the running method, or ``tracks``; empty before the first.   done : share of the work
-    in the stages before it, 0 to 1; the end of a fit cannot be predicted.   passes : of its fit so
-    far.   change : largest change of a constant in the last pass, in sigmas; NaN before the first.
-    """
-
-    name: str = ''
-    done: float = 0.0
-    passes: int = 0
-    change: float = nan
+    name: str = ''         # the running method, or ``tracks``; empty before the first
+    done: float = 0.0      # share of the work in the stages before; a fit cannot be predicted
+    passes: int = 0        # of its fit so far
+    change: float = nan    # largest one of a constant in the last pass, sigmas; NaN: none yet
 
     def words(self) -> str:
         if not self.passes:
@@ -86,36 +76,25 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class PreparedLeg(Placed):
-    """
-    Input of all methods. They do not change it, so their order has no effect.
+    """Input of all methods. They do not change it, so their order has no effect."""
 
-    leg, inputs, config : raw and screened leg, settings.   facing : IMU orientation, None if not
-    determined.   lever_b : (3,) m, from the odometer's point to the antenna.   spans : (s, 2) s,
-    standstills.   alignment, about_alignment : alignment and its reasons.   epochs : attitude
-    after alignment, t (m,) s and q_nb (m, 4).   track : dead reckoned from these and the odometer
-    (mean of the wheels).   wheel_slips : of one wheel relative to the other.   metres_per_unit :
-    approximate scale, until a method estimates a better one.   distance : m, by it.   t_fit : s;
-    if ``holdout``, later fixes are held out.   reasons : of the leg.   of_ends : those that only
-    concern methods by its ends.
-    """
-
-    leg: Leg
-    inputs: Inputs
+    leg: Leg                             # raw
+    inputs: Inputs                       # screened
     config: Config
-    facing: Facing | None
-    lever_b: NDArray[np.float64]
-    spans: NDArray[np.float64]
+    facing: Facing | None                # IMU orientation, None if not determined
+    lever_b: NDArray[np.float64]         # (3,) m, from the odometer's point to the antenna
+    spans: NDArray[np.float64]           # (s, 2) s, standstills
     alignment: Alignment
     about_alignment: tuple[Reason, ...]
-    epochs: tuple[NDArray[np.float64], NDArray[np.float64]]
-    track: Track
-    wheel_slips: WheelSlips
-    metres_per_unit: float
-    distance: float
-    t_fit: float
+    epochs: tuple[Floats, Floats]        # attitude after alignment, t (m,) s and q_nb (m, 4)
+    track: Track                         # dead reckoned from these and the mean of the wheels
+    wheel_slips: WheelSlips              # of one wheel relative to the other
+    metres_per_unit: float               # approximate, until a method estimates a better one
+    distance: float                      # m, by it
+    t_fit: float                         # s; if ``holdout``, later fixes are held out
     holdout: bool
-    reasons: tuple[Reason, ...]
-    of_ends: tuple[Reason, ...]
+    reasons: tuple[Reason, ...]          # of the leg
+    of_ends: tuple[Reason, ...]          # those that only concern methods by its ends
 
     def path(self, f: Floats, track: Track | None = None) -> Path:
         """Return the path of the antenna, t (n,) to (n, 3) m up to a constant, for f = K d."""

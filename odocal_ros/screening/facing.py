@@ -36,20 +36,14 @@ MAX_RATE = 8.0                  # rad/s, physical: vehicles on wheels turn more 
 
 @dataclass(frozen=True, eq=False)
 class Accelerations:
-    """
-    Accelerations of the IMU in the level plane, in bins of BIN_S seconds, complex: e1 + i e2.
+    """Accelerations of the IMU in the level plane in bins of BIN_S, complex: e1 + i e2."""
 
-    e1, e2 : (3,) level axes, in the frame of the IMU's data.   t : (m,) s, middle of the bin.
-    force : (m,) m/s^2.   onward, inward : (m,) by odometer and gyro, m/s^2: forward; centripetal,
-    positive to the left.
-    """
-
-    e1: Floats
+    e1: Floats          # (3,) level axes, in the frame of the IMU's data
     e2: Floats
-    t: Floats
-    force: Complexes
-    onward: Floats
-    inward: Floats
+    t: Floats           # (m,) s, middle of the bin
+    force: Complexes    # (m,) m/s^2
+    onward: Floats      # (m,) m/s^2, by odometer: forward
+    inward: Floats      # (m,) m/s^2, by odometer and gyro: centripetal, positive to the left
 
     def __getitem__(self, rows: slice) -> 'Accelerations':
         return Accelerations(self.e1, self.e2, self.t[rows], self.force[rows], self.onward[rows],
@@ -64,16 +58,12 @@ class Accelerations:
 
 @dataclass(frozen=True)
 class Facing:
-    """
-    Yaw mounting angle by the accelerations, rad, and its sigma.
-
-    inward, inward_sigma : gain of the centripetal acceleration (force over that by gyro and
-    odometer) relative to the gain of the forward acceleration: 1; -1 if gyro or accelerometer has
-    a mirrored axis, nan if unknown.
-    """
+    """Yaw mounting angle by the accelerations, rad, and its sigma."""
 
     yaw: float
     sigma: float
+    # gain of the centripetal acceleration (force over that by gyro and odometer) relative to that
+    # of the forward one: 1; -1 if gyro or accelerometer has a mirrored axis, nan if unknown
     inward: float = np.nan
     inward_sigma: float = np.nan
 

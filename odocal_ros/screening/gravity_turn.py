@@ -35,16 +35,11 @@ WEIGHTING_PASSES = 4    # judgement: the weights of segments have converged
 
 @dataclass(frozen=True, eq=False)
 class GravityFit:
-    """
-    Coefficients of the gyro axes w1, w2, w3.
+    """Coefficients of the gyro axes w1, w2, w3: (3,) each."""
 
-    coefficient : (3,) complex, 1, i and 0 for a correct gyro.   sigma : (3,) from the scatter of
-    the segments.   segments : (3,) effective number of segments that determine it.
-    """
-
-    coefficient: Complexes
-    sigma: Floats
-    segments: Floats
+    coefficient: Complexes    # 1, i and 0 for a correct gyro
+    sigma: Floats             # from the scatter of the segments
+    segments: Floats          # effective number of segments that determine it
 
     def chance(self, k: int, correct: complex) -> float:
         """

@@ -87,19 +87,13 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """
-    Fixes in metres, and the approximate scale.
+    """Fixes in metres, and the approximate scale."""
 
-    origin : of n.   fixes_n : (k, 3) m, NaN up if a fix has no height.   fix_sigma : m, median
-    1 sigma of a horizontal axis, NaN without fixes.   nominal : K0, metres per unit of travel,
-    0 unknown.   rough : scale by the fixes, K0 if they move too little.
-    """
-
-    origin: Origin
-    fixes_n: NDArray[np.float64]
-    fix_sigma: float
-    nominal: float
-    rough: float
+    origin: Origin                     # of n
+    fixes_n: NDArray[np.float64]       # (k, 3) m, NaN up if a fix has no height
+    fix_sigma: float                   # m, median 1 sigma of a horizontal axis, NaN: no fixes
+    nominal: float                     # K0, metres per unit of travel, 0: unknown
+    rough: float                       # scale by the fixes, K0 if they move too little
 
 
 def place(inputs: Inputs, config: Config) -> Placed:

@@ -23,20 +23,14 @@ TUKEY = 4.685
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """
-    Travel of both wheels and the vehicle's turn at the edges of equal cells.
+    """Travel of both wheels and the vehicle's turn at the edges of equal cells."""
 
-    t : (n,) s.   left, right : (n,) scale units.   turn : (n,) rad about the vehicle's up axis,
-    with gyro bias.   known : (n - 1,) cells without a gap.   quantum : scale units.
-    names : of left and right.
-    """
-
-    t: NDArray[np.float64]
-    left: NDArray[np.float64]
-    right: NDArray[np.float64]
-    turn: NDArray[np.float64]
-    known: NDArray[np.bool_]
-    quantum: float
+    t: NDArray[np.float64]        # (n,) s
+    left: NDArray[np.float64]     # (n,) scale units
+    right: NDArray[np.float64]    # (n,) scale units
+    turn: NDArray[np.float64]     # (n,) rad about the vehicle's up axis, with gyro bias
+    known: NDArray[np.bool_]      # (n - 1,) cells without a gap
+    quantum: float                # scale units
     names: tuple[str, ...] = SIDES
 
     @property

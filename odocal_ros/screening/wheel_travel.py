@@ -138,14 +138,10 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats, name: str, *,
 
 @dataclass(frozen=True, eq=False)
 class Wheels:
-    """
-    Travel of the wheels, and its uncertain parts.
-
-    each : the only wheel or all.   doubts : of each, times of uncertain travel and its sigmas,
-    (k,) s and (k,) scale units.
-    """
+    """Travel of the wheels, and its uncertain parts."""
 
     each: tuple[Travel, ...]
+    # of each: times of uncertain travel, (k,) s, and its sigmas, (k,) scale units
     doubts: tuple[tuple[Floats, Floats], ...]
 
     @cached_property

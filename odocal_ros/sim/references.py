@@ -16,18 +16,13 @@ REMAINDER = 0.2     # judgement: share of the accumulated drift that a loop clos
 
 @dataclass(frozen=True)
 class Reference:
-    """
-    A kind of reference.
-
-    encoder : function of ``bagio.encode``.   planar : z is 0, as of 2D SLAM.
-    stated : with a covariance.   usual : SimOptions of this kind.
-    """
+    """A kind of reference."""
 
     topic: str
-    encoder: str
-    planar: bool = False
-    stated: bool = False
-    usual: dict[str, Any] = field(default_factory=dict)
+    encoder: str            # function of ``bagio.encode``
+    planar: bool = False    # z is 0, as of 2D SLAM
+    stated: bool = False    # with a covariance
+    usual: dict[str, Any] = field(default_factory=dict)    # SimOptions of this kind
 
 
 # Judgement, by data sheets and documentation: motion capture 0.1 to 1 mm at 50 to 200 Hz; total

@@ -28,18 +28,13 @@ AIR = 1e-5           # judgement: air drag over load, per (m/s)^2
 
 @dataclass(frozen=True, eq=False)
 class SimWheel:
-    """
-    A wheel.
+    """A wheel."""
 
-    name : joint.   draws : name of its random numbers.   arm : (3,) m, contact point in base_link.
-    scale : true scale factor.   steered : it is turned to its rolling direction (Ackermann).
-    """
-
-    name: str
-    draws: str
-    arm: Floats
-    scale: float
-    steered: bool = False
+    name: str         # joint
+    draws: str        # name of its random numbers
+    arm: Floats       # (3,) m, contact point in base_link
+    scale: float      # true scale factor
+    steered: bool = False    # it is turned to its rolling direction (Ackermann)
 
 
 def wheels_of(options: SimOptions) -> list[SimWheel]:
