@@ -191,15 +191,6 @@ def test_speeds_are_sent_in_steps_the_same_to_and_fro():
     assert_allclose(wheels.coarse(v, Real(dead_band=0.5)), [0, 0, 0, 0.99, -0.99, 1.6])
 
 
-def test_a_coarse_speed_leaves_the_truth_alone():
-    coarse, fine = (simulate(SimOptions(**RUN, odometer='speed', real=Real(**figures)))
-                    for figures in ({'speed_step': 1 / 3.6}, {}))
-    assert coarse.truth.scale == fine.truth.scale
-    off = fine.odometer.value - coarse.odometer.value
-    assert off.min() >= 0
-    assert off.max() < 1 / 3.6
-
-
 def test_a_filtered_speed_lags_a_ramp_by_its_time_constant():
     t = np.arange(0.0, 20.0, 0.05)
     sent = wheels.low_passed(1.5 * t, t, 0.4)
