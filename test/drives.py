@@ -80,12 +80,20 @@ def configured(made):
 
 
 def changed(samples, **columns):
-    """Return samples with columns changed by functions of a writable copy."""
+    """Return samples with columns changed: by (rows, value) or by functions of a copy."""
     arrays = {f.name: np.array(getattr(samples, f.name)) for f in fields(samples)}
     for name, change in columns.items():
-        result = change(arrays[name])
-        arrays[name] = arrays[name] if result is None else result
+        if isinstance(change, tuple):
+            rows, value = change
+            arrays[name][rows] = value
+        elif (result := change(arrays[name])) is not None:
+            arrays[name] = result
     return type(samples)(**arrays)
+
+
+def spoilt(leg, slot, **columns):
+    """Return a leg with columns of a topic ``changed``."""
+    return leg.with_rows(**{slot: changed(leg.rows(slot), **columns)})
 
 
 def seconds(leg, samples):
