@@ -16,17 +16,20 @@ class Refusing:
     """
     Counts the steps of ``whole.disk`` and refuses some.
 
-    at : the first that is refused, 0 for none.   for_ever : so are those after it.
+    at : the first that is refused, 0 for none.   for_ever : so are those after it.   error : what
+    it raises, else an OSError with the code.
     """
 
-    def __init__(self, at: int, code: int = errno.ENOSPC, for_ever: bool = False) -> None:
-        self.at, self.code, self.for_ever, self.steps = at, code, for_ever, []
+    def __init__(self, at: int, code: int = errno.ENOSPC, for_ever: bool = False,
+                 error: BaseException | None = None) -> None:
+        self.at, self.for_ever, self.steps = at, for_ever, []
+        self.error = error or OSError(code, os.strerror(code), 'refused')
 
     def __call__(self, step, *values):
         self.steps.append(getattr(step, '__name__', str(step)))
         count = len(self.steps)
         if self.at and (count == self.at or self.for_ever and count > self.at):
-            raise OSError(self.code, os.strerror(self.code), 'refused')
+            raise self.error
         return step(*values)
 
     def put_in(self, monkeypatch) -> 'Refusing':

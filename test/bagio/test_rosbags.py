@@ -9,13 +9,13 @@ import re
 import subprocess
 import sys
 
+from bag_content import chunks_of
 from drives import drive
 import pytest
 import ros_bags
 from rosbags import rosbag1
 from rosbags.rosbag1 import reader
 from rosbags.rosbag2 import storage_mcap
-from test_damage import chunks_of
 
 from odocal_ros.bagio import rosbag1_file, write
 from odocal_ros.bagio.encode import counter, fix, imu

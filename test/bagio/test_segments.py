@@ -3,11 +3,12 @@
 
 """A bag that grows by closed files: what readers find of it whenever its writer stops."""
 
-import errno
-import os
+from contextlib import suppress
+from itertools import count
 import struct
 import zlib
 
+from faults import Refusing
 import pytest
 import ros_bags
 import ros_messages as make
@@ -37,13 +38,13 @@ def second(k, rate=20):
     return [pack(1, times, imu), pack(2, times, counts)], messages
 
 
-def grown(folder, count):
+def grown(folder, number):
     """Return a bag of so many segments, not finished, and its messages by topic."""
-    folder.mkdir()
+    folder.mkdir(parents=True)
     (folder / JOURNAL).touch()
     bag, messages = SegmentedBag(folder), {'/imu/data': [], '/odometer': []}
     bag.channels = CHANNELS
-    for k in range(count):
+    for k in range(number):
         packed, new = second(k)
         bag.append(packed)
         for topic, some in new.items():
@@ -143,63 +144,23 @@ class Killed(BaseException):
     """The process ends here."""
 
 
-def steps(monkeypatch):
-    """Return a function that lets so many changes of the folder happen, then kills."""
-    def allow(count):
-        left = [count]
-
-        def counted(change):
-            def act(*args, **kwargs):
-                if not left[0]:
-                    raise Killed
-                left[0] -= 1
-                return change(*args, **kwargs)
-            return act
-        for name in ('rename', 'unlink'):
-            monkeypatch.setattr(os, name, counted(getattr(os, name)))
-    return allow
-
-
-@pytest.mark.parametrize('joining', ['some', 'all'])
-def test_a_kill_at_any_step_of_joining_loses_and_doubles_nothing(tmp_path, joining):
+@pytest.mark.parametrize('join', [SegmentedBag.join_some, SegmentedBag.finish])
+def test_a_kill_at_any_step_of_joining_loses_and_doubles_nothing(tmp_path, join):
     seen = set()
-    for count in range(20):
-        folder = tmp_path / f'leg{count}'
+    for step in count(1):
+        folder = tmp_path / str(step) / 'leg'
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(segments, 'TOGETHER', 99)
             bag, messages = grown(folder, 5)
             patch.setattr(segments, 'TOGETHER', 4)
-            steps(patch)(count)
-            try:
-                bag.join_some() if joining == 'some' else bag.finish()
-            except Killed:
-                done = False
-            else:
-                done = True
-        assert read(folder) == messages, count
-        seen.add(tuple(sorted(p.name.replace(f'leg{count}', 'leg') for p in folder.iterdir())))
-        if done:
+            disk = Refusing(step, for_ever=True, error=Killed()).put_in(patch)
+            with suppress(Killed):
+                join(bag)
+        assert read(folder) == messages, step
+        seen.add(tuple(sorted(path.name for path in folder.iterdir())))
+        if len(disk.steps) < step:
             break
-    assert done
     assert len(seen) > 5      # states that differ were met
-
-
-def test_a_full_disk_leaves_what_was_written(tmp_path, monkeypatch):
-    bag, messages = grown(tmp_path / 'leg', 3)
-
-    def full(_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr(os, 'fsync', full)
-    with pytest.raises(OSError, match='No space left'):
-        bag.append(second(3)[0])
-    with pytest.raises(OSError, match='No space left'):
-        bag.finish()
-    assert read(bag.folder) == messages
-    assert not list(bag.folder.glob(f'.*{PART}'))
-    monkeypatch.undo()
-    bag.append(second(3)[0])
-    bag.finish()
-    assert len(read(bag.folder)['/odometer']) == 80
 
 
 def test_without_room_for_the_copy_the_segments_are_the_bag(tmp_path):

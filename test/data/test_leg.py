@@ -50,6 +50,12 @@ def rows(leg):
             for slot in SLOTS for f in fields(leg.rows(slot))}
 
 
+def assert_same(leg, other):
+    wanted = rows(other)
+    for name, column in rows(leg).items():
+        np.testing.assert_array_equal(column, wanted[name], err_msg=name)
+
+
 TOPICS = {slot: topic(slot, np.random.default_rng(7))
           for slot in ('imu', 'odometer', 'fix', 'heading')}
 WHOLE = recorded(TOPICS, [(s, 0, 10**6) for s in TOPICS]).close(START, STOP, preroll=5.0)
@@ -71,20 +77,18 @@ def test_chopping_and_racing_leave_no_trace(data):
         recorder.forget_before(START - 5 * S)
     if data.draw(st.booleans(), label='look'):
         recorder.rows('imu')
-    leg = recorder.snapshot().close(START, STOP, preroll=5.0)
-    for name, column in rows(leg).items():
-        np.testing.assert_array_equal(column, rows(WHOLE)[name], err_msg=name)
+    assert_same(recorder.snapshot().close(START, STOP, preroll=5.0), WHOLE)
+
+
+def placed(block):
+    return np.where(block.stamp_ns > 0, block.stamp_ns, block.received_ns)
 
 
 def test_the_preroll_is_cut_and_the_first_row_after_the_stop_is_kept():
-    leg = WHOLE
-    for slot in ('imu', 'odometer', 'fix', 'heading'):
-        block = leg.rows(slot)
-        key = np.where(block.stamp_ns > 0, block.stamp_ns, block.received_ns)
+    for slot, block in TOPICS.items():
+        key, every = placed(WHOLE.rows(slot)), placed(block)
         assert key.min() >= START - 5 * S
         assert np.sum(key > STOP) == 1, slot
-        every = np.where(TOPICS[slot].stamp_ns > 0, TOPICS[slot].stamp_ns,
-                         TOPICS[slot].received_ns)
         assert key.max() == every[every > STOP].min()
         assert len(key) == np.sum((every >= START - 5 * S) & (every <= key.max()))
 
@@ -102,17 +106,9 @@ def test_a_row_without_a_stamp_is_placed_by_its_arrival():
 def test_how_late_a_leg_is_closed_leaves_no_trace():
     early, late = LegRecorder(), LegRecorder()
     for slot, block in TOPICS.items():
-        key = np.where(block.stamp_ns > 0, block.stamp_ns, block.received_ns)
-        early.feed(slot, take(block, key <= STOP + 3 * S))
+        early.feed(slot, take(block, placed(block) <= STOP + 3 * S))
         late.feed(slot, block)
-    first, second = (rows(r.close(START, STOP, 5.0)) for r in (early, late))
-    for name, column in first.items():
-        np.testing.assert_array_equal(column, second[name], err_msg=name)
-
-
-def test_an_empty_recorder_gives_an_empty_leg():
-    leg = LegRecorder().close(START, STOP)
-    assert all(len(column) == 0 for column in rows(leg).values())
+    assert_same(early.close(START, STOP, 5.0), late.close(START, STOP, 5.0))
 
 
 def test_clearing_forgets_and_the_newest_stamp_is_the_last_fed():
@@ -121,7 +117,7 @@ def test_clearing_forgets_and_the_newest_stamp_is_the_last_fed():
     assert recorder.newest_ns('fix') == 0
     recorder.clear()
     assert recorder.newest_ns('imu') == 0
-    assert len(recorder.rows('imu').stamp_ns) == 0
+    assert all(len(column) == 0 for column in rows(recorder.close(START, STOP)).values())
 
 
 def test_a_first_row_years_after_the_mark_is_no_part_of_the_leg():

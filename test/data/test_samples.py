@@ -25,11 +25,16 @@ ROW = 104      # bytes of an IMU row
 N = 20_000
 
 
-def imu_of(n, first=0):
-    row = np.arange(first, first + n)
-    return s.ImuSamples(row * 10**7, row * 10**7 + 5, np.outer(row, [1.0, 2.0, 3.0]),
-                        np.outer(row, [0.1, 0.2, 9.8]), np.tile([0.0, 0, 0, 1], (n, 1)),
-                        np.full(n, np.nan))
+@pytest.fixture(scope='module')
+def imu():
+    stamp = 10**9 + np.arange(N) * 1_000_000
+    x = np.random.default_rng(3).standard_normal((N, 11))
+    return ImuSamples(stamp, stamp + 5, x[:, :3], x[:, 3:6], x[:, 6:10], x[:, 10])
+
+
+def assert_same(rows, imu, first=0, last=N):
+    for name, column in vars(imu).items():
+        np.testing.assert_array_equal(getattr(rows, name), column[first:last], err_msg=name)
 
 
 def test_a_block_is_read_only_and_owns_its_rows():
@@ -59,13 +64,10 @@ def test_a_wrong_shape_is_refused_by_name(bad):
         bad()
 
 
-def test_what_is_cut_and_joined_is_the_whole():
-    whole = imu_of(7)
-    parts = [s.take(whole, slice(a, b)) for a, b in ((0, 1), (1, 1), (1, 5), (5, 7))]
-    again = s.join(parts)
-    for name in ('stamp_ns', 'received_ns', 'w_i', 'f_i', 'q_ni', 'yaw_variance'):
-        np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
-    assert s.join([whole]) is whole
+def test_what_is_cut_and_joined_is_the_whole(imu):
+    parts = [take(imu, slice(a, b)) for a, b in ((0, 1), (1, 1), (1, 5), (5, N))]
+    assert_same(s.join(parts), imu)
+    assert s.join([imu]) is imu
 
 
 @pytest.mark.parametrize('empty', [kind.none for kind in s.Samples.__subclasses__()])
@@ -98,19 +100,17 @@ def test_lengths_are_numpys_norms_of_rows(columns):
         np.testing.assert_array_equal(lengths(x), np.linalg.norm(x, axis=1))
 
 
-def unlike(kind, n):
-    """Return values of which those taken to tell the median say much, little, or nothing."""
-    rng = np.random.default_rng(5)
-    x = rng.normal(size=n)
-    return {'noise': x, 'steps': np.round(x), 'one': np.full(n, 2.0), 'sorted': np.sort(x),
-            'misled': np.where(np.arange(n) % 64, x, 9.0), 'infinite': np.where(x > 0, np.inf, x),
-            'nan': np.where(x > 4, np.nan, x)}[kind]
+# of which the subset that tells the median says much, little, or nothing
+UNLIKE = {'noise': lambda x: x, 'steps': np.round, 'one': np.ones_like, 'sorted': np.sort,
+          'misled': lambda x: np.where(np.arange(len(x)) % 64, x, 9.0),
+          'infinite': lambda x: np.where(x > 0, np.inf, x),
+          'nan': lambda x: np.where(x > 4, np.nan, x)}
 
 
-@pytest.mark.parametrize('kind', ['noise', 'steps', 'one', 'sorted', 'misled', 'infinite', 'nan'])
+@pytest.mark.parametrize('kind', UNLIKE)
 def test_a_median_of_many_rows_is_numpys(kind):
     for n in (PIECE_ROWS, PIECE_ROWS + 1):
-        x = unlike(kind, n)
+        x = UNLIKE[kind](np.random.default_rng(5).normal(size=n))
         np.testing.assert_array_equal(median(x), np.median(x))
         both = np.stack([x, -x], -1)
         np.testing.assert_array_equal(medians(both), np.median(both, axis=0))
@@ -139,14 +139,6 @@ def test_an_integral_over_pieces_is_that_at_once_at_each_of_several_times():
                                   np.interp(times[0], t, again))
 
 
-@pytest.fixture(scope='module')
-def imu():
-    rng = np.random.default_rng(3)
-    stamp = 10**9 + np.arange(N) * 1_000_000
-    x = rng.standard_normal((N, 11))
-    return ImuSamples(stamp, stamp + 5, x[:, :3], x[:, 3:6], x[:, 6:10], x[:, 10])
-
-
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Let rows go to the file from 200 kB on."""
@@ -160,11 +152,6 @@ def fed(recorder, imu, first, last):
     for k in range(first, last, 50):
         recorder.feed('imu', take(imu, slice(k, k + 50)))
     return recorder
-
-
-def assert_same(rows, imu, first, last):
-    for name, column in vars(imu).items():
-        np.testing.assert_array_equal(getattr(rows, name), column[first:last], err_msg=name)
 
 
 def test_rows_of_a_file_are_those_that_came(imu):
@@ -239,4 +226,4 @@ def test_a_full_disk_costs_memory_only(imu, monkeypatch):
         return write(*args)
 
     monkeypatch.setattr(os, 'pwrite', full)
-    assert_same(fed(LegRecorder(), imu, 0, N).rows('imu'), imu, 0, N)
+    assert_same(fed(LegRecorder(), imu, 0, N).rows('imu'), imu)
