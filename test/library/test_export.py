@@ -175,7 +175,7 @@ def test_the_command_puts_them_beside_the_results(town, tmp_path, capsys):
     assert main([*argv, '--export', 'residual.csv']) == 2
     assert 'available: trajectory.tum, track.kml' in capsys.readouterr().err
     assert not out.exists()
-    assert main([*argv, '--export', 'residuals.csv, trajectory.csv']) == 2
+    assert main([*argv, '--export', 'residuals.csv,track.kml', '--export', 'trajectory.csv']) == 2
     assert 'no leg has a result of the smoother' in capsys.readouterr().err
     assert (out / 'calibration.json').exists()
     assert (out / 'residuals.csv').exists()

@@ -178,16 +178,6 @@ def test_wheels_are_the_joints_that_follow_the_fixes(tmp_path, capsys):
         assert sigmas_off(content, f'scale_factor_{side}', truth / 0.05) < 4
 
 
-def test_try_takes_the_field_that_inspect_finds(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    made = town()
-    write(tmp_path / 'bag', made, encoders(made, ('motors',)))
-    assert main(['try', 'bag', '--no-browser']) in (0, 1)
-    out = ' '.join(capsys.readouterr().out.split())
-    assert 'odometer: /encoders' in out
-    assert "'odometer.field=motors[1].angle' --set odometer.quantity=cumulative" in out
-
-
 def test_the_search_is_bounded():
     kind = types().types['mycar_msgs/msg/Encoders']
     motor = types().types['mycar_msgs/msg/Motor']

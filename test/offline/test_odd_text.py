@@ -1,18 +1,16 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text of any kind in metadata.yaml, journal.yaml and options: one sentence; --export again."""
+"""Text of any kind in metadata.yaml, journal.yaml and options: one sentence."""
 
 from contextlib import suppress
 import random
 import shutil
 
-from drives import drive
 import pytest
 import ros_bags
 import yaml
 
-from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.library.asked import parse_leg
 from odocal_ros.offline.cli import main
@@ -111,13 +109,3 @@ def test_legs_of_any_text():
 def test_a_sentence_ends_somewhere(capsys):
     _, errors = said(capsys, 'inspect', 'x' * 50_000)
     assert len(errors) < 2200
-
-
-def test_an_option_given_again_adds_its_files(tmp_path):
-    made = drive(scenario='straight', duration=200.0)
-    bag = write_bag(tmp_path / 'drive', drive_topics(made))
-    main(['replay', str(bag), '--output', str(tmp_path / 'out'), '--quiet', '--set',
-          'output.formats=[params]', '--export',
-          'trajectory.tum,track.kml', '--export', 'trajectory.csv'])
-    for name in ('trajectory.tum', 'track.kml', 'trajectory.csv'):
-        assert (tmp_path / 'out' / name).is_file(), name

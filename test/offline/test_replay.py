@@ -8,7 +8,6 @@ import json
 import math
 import os
 from pathlib import Path
-import re
 import subprocess
 import sys
 
@@ -88,24 +87,6 @@ def test_a_reader_that_goes_away_takes_no_file_with_it(drive, bag, tmp_path):
     assert (tmp_path / 'out' / 'report.html').exists()
 
 
-@pytest.mark.core
-def test_result_meets_the_truth_within_its_sigma(drive, bag, tmp_path, capsys):
-    assert replay(bag, *known(drive), '--output', tmp_path / 'out', '--json') == 0
-    printed = json.loads(capsys.readouterr().out)
-    written = json.loads((tmp_path / 'out' / 'calibration.json').read_text())
-    assert printed == written
-    assert printed['schema'] == 1
-    for name, truth in (('scale_factor', drive.truth.scale),
-                        ('scale_ratio', drive.truth.scale_ratio),
-                        ('yaw_mounting_angle', drive.truth.yaw)):
-        estimate = printed['result'][name]
-        assert abs(estimate['value'] - truth) < 4 * estimate['sigma']    # one draw in 16 000
-    assert printed['result']['scale_factor']['sigma'] < 1e-3 * drive.truth.scale
-    values = yaml.safe_load((tmp_path / 'out' / 'calibration.yaml').read_text())
-    parameters = values['/**']['ros__parameters']
-    assert parameters['result']['scale_factor'] == printed['result']['scale_factor']['value']
-
-
 def test_replay_of_a_bag_is_the_pipeline_on_the_samples(drive, bag, tmp_path, capsys):
     """The bag's way through CDR and blocks changes no bit (but for the degrees of a NavSatFix)."""
     start, stop = drive.truth.start_ns, drive.truth.stop_ns
@@ -152,15 +133,6 @@ def test_several_bags_are_legs_of_one_vehicle(tmp_path, capsys):
     assert min(single) / 3 < whole['sigma'] < min(single)
 
 
-def test_no_heading_refuses_yaw_with_a_remedy_but_gives_scale(drive, bag, tmp_path, capsys):
-    assert replay(bag, '--method', 'two_point', '--output', tmp_path / 'out') == 0
-    screen = capsys.readouterr().out
-    assert re.search(r'scale factor\s+0\.0', screen)
-    assert 'YAW_NOT_SEPARABLE' in screen
-    assert 'alignment.heading' in screen
-    assert 'nan' not in screen.lower().split()
-
-
 def test_holdout_checks_on_what_was_not_fitted(drive, bag, tmp_path, capsys):
     assert replay(bag, *known(drive), '--holdout', '--json', '--output', tmp_path / 'out') == 0
     printed = json.loads(capsys.readouterr().out)
@@ -173,8 +145,9 @@ def test_holdout_checks_on_what_was_not_fitted(drive, bag, tmp_path, capsys):
     assert printed['check']['before']['end'] < off * whole / 5 + 20
 
 
-def test_an_existing_result_is_not_replaced_without_force(drive, bag, tmp_path, capsys):
+def test_an_existing_result_is_not_replaced_without_force(bag, tmp_path, capsys):
     assert replay(bag, *QUICK, '--output', tmp_path, '--quiet') == 0
+    assert capsys.readouterr() == ('', '')
     before = (tmp_path / 'calibration.json').read_text()
     assert replay(bag, *QUICK, '--output', tmp_path, '--quiet') == 2
     assert '--force' in capsys.readouterr().err
@@ -182,7 +155,7 @@ def test_an_existing_result_is_not_replaced_without_force(drive, bag, tmp_path, 
     assert replay(bag, *QUICK, '--output', tmp_path, '--quiet', '--force') == 0
 
 
-def test_config_file_then_set_then_default(drive, bag, tmp_path, capsys):
+def test_config_file_then_set_then_default(bag, tmp_path, capsys):
     config = tmp_path / 'calibrator.yaml'
     config.write_text('/**/calibrator:\n  ros__parameters:\n    leg:\n      min_distance: 9000\n'
                       '    imu: {grade: tactical}\n')
@@ -208,19 +181,11 @@ def test_wrong_requests_are_one_line_and_exit_2(argv, says, bag, tmp_path, capsy
     assert not (tmp_path / 'out').exists()
 
 
-def test_quiet_says_nothing_and_the_output_is_named_after_the_bag(
-        bag, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert replay(bag, *QUICK, '--quiet') == 0
-    assert capsys.readouterr() == ('', '')
-    assert (tmp_path / 'odocal_drive' / 'calibration.json').exists()
-
-
 # real drives ------------------------------------------------------------------------------------
 
 def accept(data_dir, name):
     truth = yaml.safe_load((data_dir / name / 'truth.yaml').read_text())
-    return truth['scale']['accept'], truth['odometer']['k0_m_per_pulse'], truth
+    return *truth['scale']['accept'], truth['odometer']['k0_m_per_pulse'], truth['scale']
 
 
 REAR = (1.0092 + 1.0096) / 2        # README of the drive: of its rear wheels, taken of the four
@@ -230,23 +195,22 @@ REAR = (1.0092 + 1.0096) / 2        # README of the drive: of its rear wheels, t
     ('/imu/data', '/odometer/pulses_derived'), ('/imu/data_flu', '/odometer/pulses_derived'),
     ('/imu/data_flu', '/vehicle/twist'), ('/imu/data_flu', '/wheel_states')])
 def test_rav4_scale_is_within_accept_and_yaw_is_refused(imu, odometer, data_dir, tmp_path, capsys):
-    (low, high), k0, truth = accept(data_dir, 'comma2k19_rav4')
+    low, high, k0, truth = accept(data_dir, 'comma2k19_rav4')
     nominal = k0 if 'pulses' in odometer else 1.0
-    code = replay(data_dir / 'comma2k19_rav4/bag', '--imu-topic', imu, '--odometer-topic',
+    assert replay(data_dir / 'comma2k19_rav4/bag', '--imu-topic', imu, '--odometer-topic',
                   odometer, '--fix-topic', '/fix', '--set', f'odometer.nominal_scale={nominal}',
-                  '--json', '--output', tmp_path / 'out')
-    assert code == 0
+                  '--json', '--output', tmp_path / 'out') == 0
     result = json.loads(capsys.readouterr().out)['result']
-    assert low <= result['scale_ratio']['value'] <= high
-    true = REAR if odometer == '/wheel_states' else truth['scale']['value']
-    assert abs(result['scale_ratio']['value'] - true) \
-        < 2 * math.hypot(result['scale_ratio']['sigma'], truth['scale']['sigma'])
+    ratio = result['scale_ratio']
+    assert low <= ratio['value'] <= high
+    true = REAR if odometer == '/wheel_states' else truth['value']
+    assert abs(ratio['value'] - true) < 2 * math.hypot(ratio['sigma'], truth['sigma'])
     assert result['yaw_mounting_angle']['value'] is None
 
 
 def test_husky_loop_is_refused_by_its_ends_and_its_straight_parts_meet_accept(
         data_dir, tmp_path, capsys):
-    (low, high), k0, _ = accept(data_dir, 'husky_parking_lot')
+    low, high, k0, _ = accept(data_dir, 'husky_parking_lot')
     common = [data_dir / 'husky_parking_lot/bag', '--imu-topic', '/imu/data_flu',
               '--odometer-topic', '/odometer/pulses_derived', '--set',
               f'odometer.nominal_scale={k0}', '--json']

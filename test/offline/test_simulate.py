@@ -60,16 +60,6 @@ def test_a_bag_its_truth_and_its_settings(tmp_path, capsys):
     assert f'odocal replay {out} --config {out.parent / "calibrator.yaml"}' in told.out
 
 
-def test_the_options_in_truth_make_the_drive_again(tmp_path):
-    assert odocal(*SHORT, '--out', tmp_path / 'drive', '--outage', '50:60', '--yaw-deg', 2,
-                  '--antenna-lever-arm', 1, 0, 1.5, '--two-wheels', '--quiet') == 0
-    truth = load(tmp_path / 'truth.yaml')
-    drive = again(truth['options'])
-    assert drive.options.outages[0] == [50.0, 60.0]
-    assert math.degrees(drive.truth.yaw) == pytest.approx(2)
-    assert drive.truth.distance == truth['distance']['value']
-
-
 def test_the_settings_are_settings_of_the_node(tmp_path):
     """Each name and value passes the very checks of the pipeline."""
     from odocal_ros.settings.config import Config, flat, SETTINGS, with_settings
@@ -178,14 +168,17 @@ def test_a_terminal_gets_a_bar_that_goes_away(tmp_path, capsys, monkeypatch):
 def test_a_vehicle_is_drawn_and_what_is_given_goes_before(tmp_path):
     out = tmp_path / 'drive'
     assert odocal(*SHORT, '--out', out, '--vehicle', 'real', '--seed', 5, '--yaw-deg', 2,
-                  '--roll-deg', 0, '--real', 'vibration=0.25', '--quiet') == 0
+                  '--roll-deg', 0, '--outage', '50:60', '--real', 'vibration=0.25', '--quiet') == 0
     truth = load(tmp_path / 'truth.yaml')
     assert truth['yaw_mounting_housing_deg']['value'] == pytest.approx(2)
     assert truth['yaw_mounting_deg']['value'] != truth['yaw_mounting_housing_deg']['value']
     real = truth['options']['real']
     assert real['vibration'] == 0.25
     assert real['squat'] > 0
-    assert math.degrees(again(truth['options']).truth.yaw) == truth['yaw_mounting_deg']['value']
+    drive = again(truth['options'])
+    assert drive.options.outages[0] == [50.0, 60.0]
+    assert math.degrees(drive.truth.yaw) == truth['yaw_mounting_deg']['value']
+    assert drive.truth.distance == truth['distance']['value']
     assert settings_of(tmp_path)['gnss']['lever_arm'] == pytest.approx([a + b for a, b in zip(
         truth['options']['antenna_lever_arm'], real['antenna_arm_error'], strict=True)])
 
