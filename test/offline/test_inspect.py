@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal inspect: it tells the truth about real drives and about made ones with known faults."""
+"""odocal inspect: it tells the truth about made drives with known faults."""
 
 import json
 import math
@@ -9,6 +9,7 @@ import re
 import shlex
 import struct
 
+from inspecting import codes, drive, G, inspect, K, planar, RATE, topic
 import numpy as np
 import pytest
 import ros_bags
@@ -22,61 +23,6 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.cli import main
 
 pytestmark = pytest.mark.slow
-K = 0.02                   # m per pulse
-RATE = 25                  # Hz, IMU
-G = 9.81
-
-
-def planar(seconds=150):
-    """Return t, speed, turn rate and acceleration of a drive: rest, go, left turn, go, rest."""
-    t = np.arange(0, seconds, 1 / RATE)
-    a = np.where((t > 12) & (t < 22), 1.0, 0) - np.where((t > 130) & (t < 140), 1.0, 0) \
-        + np.where((t > 40) & (t < 120), 0.3 * np.sin(math.pi / 4 * t), 0)
-    w = np.where((t > 70) & (t < 80), math.pi / 20, 0.0)
-    v = np.cumsum(a) / RATE
-    return t, np.where(np.abs(v) < 1e-6, 0, v), w, a
-
-
-def drive(seconds=150, C_ib=None, gyro=1.0, accel=1.0, lag=0.0, status=0, loop=False, known=2):
-    """
-    Return rows of a planar drive.
-
-    C_ib takes b to the IMU frame; gyro, accel: factors on what is sent; lag: s, added to the
-    fixes' stamps; loop: half way round a circle and back to the start.
-    """
-    t, v, w, a = planar(seconds)
-    if loop:
-        w = np.where(v > 0.1, 2 * math.pi * v / (v.sum() / RATE), 0.0)
-    C_ib = np.eye(3) if C_ib is None else C_ib
-    yaw = np.cumsum(w) / RATE
-    east, north = np.cumsum(v * np.cos(yaw)) / RATE, np.cumsum(v * np.sin(yaw)) / RATE
-    counts = np.floor(np.cumsum(v) / RATE / K).astype(int)
-    rng = np.random.default_rng(5)
-    rows = []
-    for i, s in enumerate(t):
-        ns = T0 + round(s * 1e9)
-        f = C_ib @ (a[i], v[i] * w[i], G) * accel + rng.normal(0, 0.02, 3)
-        rate = C_ib @ (0, 0, w[i]) * gyro + rng.normal(0, 0.001, 3)
-        rows.append(('/imu/data', ns, make.imu(ns, w=rate, f=f)))
-        rows.append(('/odometer', ns + 1, make.whole(int(counts[i]))))
-        if i % 5 == 0:
-            x, y = east[i] + rng.normal(0, 0.3), north[i] + rng.normal(0, 0.3)
-            rows.append(('/fix', ns + 2, make.fix(
-                ns + round(lag * 1e9), 48 + np.rad2deg(y / 6.38e6),
-                11 + np.rad2deg(x / 6.38e6 / math.cos(math.radians(48))), 500, sigma=0.3,
-                status=status, known=known)))
-    return rows
-
-
-def inspect(path, capsys, *options):
-    """Return what the command tells, as JSON and as text."""
-    assert main(['inspect', str(path), '--json', *options]) == 0
-    seen = json.loads(capsys.readouterr().out)
-    assert main(['inspect', str(path), *options]) == 0
-    out = capsys.readouterr()
-    assert out.err == ''
-    assert max(len(line) for line in out.out.splitlines() if str(path) not in line) < 100
-    return seen, out.out
 
 
 @pytest.fixture
@@ -87,90 +33,6 @@ def look(tmp_path, capsys):
         return inspect(path, capsys, *options)
     return written
 
-
-def codes(seen):
-    return {finding['code'] for finding in seen['findings']}
-
-
-def topic(seen, name):
-    return next(t for t in seen['topics'] if t['name'] == name)
-
-
-# ---- real drives ---------------------------------------------------------------------------
-
-def test_comma(data_dir, capsys):
-    path = data_dir / 'comma2k19_rav4' / 'bag'
-    seen, text = inspect(path, capsys)
-    assert seen['mapping'] == {'odometer': '/odometer/pulses_derived', 'imu': '/imu/data',
-                               'fix': '/fix'}
-    assert codes(seen) == {'COVARIANCE_UNKNOWN', 'IMU_LOOKS_Z_DOWN', 'NO_STANDSTILL',
-                           'YAW_NOT_SEPARABLE'}
-    assert seen['standstills'] == []
-    assert seen['drive']['slowest'] > 7.9          # README: 8 to 20 m/s, never at rest
-    assert seen['drive']['distance'] == pytest.approx(1004, rel=0.01)
-    assert seen['drive']['rough_scale'] == pytest.approx(0.010084, rel=0.005)
-    # README: forward-right-down, pitch 3.75 deg on top
-    assert seen['mounting']['rpy'] == pytest.approx([math.pi, 0, 0], abs=1e-9)
-    assert seen['mounting']['needed']
-    assert not seen['mounting']['assumed_forward']
-    imu = topic(seen, '/imu/data')
-    assert imu['rate_hz'] == pytest.approx(104.3, abs=0.1)
-    assert (imu['imu']['gravity_axis'], imu['imu']['orientation']) == ('-z', False)
-    assert topic(seen, '/imu/data_flu')['imu']['gravity_axis'] == '+z'
-    fix = topic(seen, '/fix')
-    assert fix['fix']['sigma'] is None
-    assert fix['timing']['header_to_bag'] == pytest.approx(0.20, abs=0.01)
-    pulses = topic(seen, '/odometer/pulses_derived')
-    assert pulses['timing']['headerless']
-    assert (pulses['odometer']['quantity'], pulses['rate_hz']) == (
-        'cumulative', pytest.approx(82.9, abs=0.1))
-    for line in ('looks z-down', 'no header: arrival time', 'arrival jitter', 'never at rest',
-                 'no covariance', '3 topics can be the odometer', '[3.141592654, 0, 0] rad'):
-        assert line in text
-
-
-def test_husky(data_dir, capsys):
-    path = data_dir / 'husky_parking_lot' / 'bag'
-    seen, text = inspect(path, capsys)
-    assert seen['mounting']['rpy'] == pytest.approx([math.pi / 2, 0, -math.pi / 2], abs=1e-9)
-    assert not seen['mounting']['assumed_forward']
-    imu = topic(seen, '/imu/data')['imu']
-    assert (imu['gravity_axis'], imu['orientation']) == ('+y', True)
-    assert topic(seen, '/fix')['rate_hz'] == pytest.approx(2.5, abs=0.01)
-    (start, stop), = seen['standstills']           # README: one stop of 11 s
-    assert stop - start == pytest.approx(11, abs=1)
-    leg, = seen['legs']
-    assert leg['chord'] < 0.1 * leg['distance']         # a closed loop
-    assert leg['distance'] == pytest.approx(0.98 * 359, rel=0.02)
-    assert {'CHORD_TOO_SHORT', 'SPEED_TOO_LOW', 'IMU_AXES', 'YAW_NOT_SEPARABLE'} <= codes(seen)
-    assert seen['drive']['gyro_over_course'] == pytest.approx(1, abs=0.2)
-    # its counts, at the 0.980 mm of its README: 0.996 m in the fastest second
-    assert seen['drive']['fastest'] == pytest.approx(0.996, rel=0.013)
-    assert len(seen['straight']) == 2              # the long sides of 145 x 70 m
-    assert all(leg['chord'] > 0.9 * leg['distance'] for leg in seen['straight'])
-    # the whole drive gives the smoother more than its straight sides: 1.7 % instead of 3.3 %
-    assert '--leg' not in seen['command']
-    alone = text[text.index('affects the two-point method only'):]
-    for code in ('NO_STANDSTILL', 'CHORD_TOO_SHORT', 'YAW_NOT_SEPARABLE'):
-        assert text.count(f'{code}:') == alone.count(f'{code}:') == 1
-    seen, text = inspect(path, capsys, '--set', 'method=two_point')
-    assert '--leg' in seen['command']
-    assert 'mounted on its side' in text
-    assert 'affects the two-point method only' not in text
-
-
-@pytest.mark.parametrize('name', ['talker_mcap', 'cdr_test_mcap', 'service_events_mcap',
-                                  'split3_sqlite3_no_metadata', 'split5_mcap'])
-def test_bags_without_any_input(data_dir, capsys, name):
-    seen, text = inspect(data_dir / 'reader_bags' / name, capsys)
-    assert codes(seen) == {'NO_IMU', 'NO_ODOMETER', 'NO_FIX'}
-    assert seen['command'] == ''
-    assert 'replay without options fails: no odometer' in text
-    unwrapped = ' '.join(text.split())       # a long path moves the line breaks
-    assert ('metadata.yaml is missing' in unwrapped) == ('no_metadata' in name)
-
-
-# ---- made drives ---------------------------------------------------------------------------
 
 @pytest.mark.core
 def test_a_good_drive_lacks_only_a_heading(look):

@@ -5,6 +5,7 @@
 
 import json
 
+from inspecting import inspect, topic
 import numpy as np
 import pytest
 import ros_bags
@@ -36,19 +37,19 @@ def drive(message, seconds=120):
     return rows
 
 
-def inspect(folder, capsys, message):
-    """Return path, JSON, the wheels' topic and the text of a drive with such an odometer."""
-    path = ros_bags.write(folder / 'bag', drive(message))
-    assert main(['inspect', str(path), '--json']) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert main(['inspect', str(path)]) == 0
-    wheels = next(t for t in printed['topics'] if t['name'] == '/wheels')
-    return path, printed, wheels, capsys.readouterr().out
+@pytest.fixture
+def look(tmp_path, capsys):
+    """Return a function: what is told of a drive with such an odometer, its wheels, the text."""
+    def inspected(message):
+        path = ros_bags.write(tmp_path / 'bag', drive(message))
+        told, text = inspect(path, capsys)
+        return told, topic(told, '/wheels'), text
+    return inspected
 
 
-def test_unnamed_joints_are_told_apart_by_how_they_move(tmp_path, capsys):
+def test_unnamed_joints_are_told_apart_by_how_they_move(look):
     names = ['j1', 'j2', 'j3']
-    _, printed, wheels, text = inspect(tmp_path, capsys, lambda ns, i, left, right: make.joints(
+    printed, wheels, text = look(lambda ns, i, left, right: make.joints(
         ns, names, [0.4 * np.sin(i / 30), right, left]))
     assert [v['side'] for v in wheels['values']] == ['', 'right', 'left']
     assert [v['rolls'] for v in wheels['values']] == [False, True, True]
@@ -57,29 +58,29 @@ def test_unnamed_joints_are_told_apart_by_how_they_move(tmp_path, capsys):
     assert 'j1 travels' in text
 
 
-def test_four_unnamed_joints_are_a_list_of_axles(tmp_path, capsys):
-    _, found, wheels, _ = inspect(tmp_path, capsys, lambda ns, i, left, right: make.joints(
+def test_four_unnamed_joints_are_a_list_of_axles(look):
+    found, wheels, _ = look(lambda ns, i, left, right: make.joints(
         ns, ['a', 'b', 'c', 'd'], [right, left, 1.01 * right, 0.99 * left]))
     assert [v['side'] for v in wheels['values']] == ['right', 'left', 'right', 'left']
     assert found['command'].endswith("--set 'odometer.wheels=[b, a, d, c]'")
 
 
-def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, capsys):
-    path, printed, wheels, _ = inspect(tmp_path, capsys, lambda ns, i, left, right: (
+def test_the_sides_of_two_counters_are_told_and_their_replay_runs(look, tmp_path, capsys):
+    printed, wheels, _ = look(lambda ns, i, left, right: (
         make.whole_array([int(right * 50), int(left * 50)])))
     assert 'the mean of 0 and 1 is used' in wheels['chosen']
     options = ['--set', 'odometer.left=1', '--set', 'odometer.right=0']
     assert printed['command'].split()[-4:] == options
-    assert main(['replay', str(path), *options, '--output', str(tmp_path / 'out'), '--json',
+    assert main(['replay', printed['path'], *options, '--output', str(tmp_path / 'out'), '--json',
                  '--set', 'output.formats=[params]']) < 2
     said = capsys.readouterr().out
     assert 'scale_factor_left' in json.loads(said)['methods']['smoother']['estimates']
     assert 'WHEELS_SWAPPED' not in said
 
 
-def test_wheels_told_by_their_names_are_shown_with_the_settings_to_write(tmp_path, capsys):
+def test_wheels_told_by_their_names_are_shown_with_the_settings_to_write(look):
     names = ['left_steer', 'left_wheel', 'right_steer', 'right_wheel']
-    _, found, wheels, _ = inspect(tmp_path, capsys, lambda ns, i, left, right: make.joints(
+    found, wheels, _ = look(lambda ns, i, left, right: make.joints(
         ns, names, velocity=[0.1, left, 0.1, right]))
     assert 'left_wheel is used as left wheel, right_wheel as right' in wheels['chosen']
     assert found['command'].endswith(
