@@ -1,30 +1,24 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is foreseen of a leg while it is recorded: cells, sigmas, metres, words, and no harm."""
+"""What is foreseen of a leg while it is recorded: sigmas, metres and words."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 import math
-import time
-from types import SimpleNamespace
 
+from conftest import foreseen, HEADING
 from drives import thinned
 import numpy as np
 import pytest
 
-from odocal_ros.data.leg import LegRecorder
-from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
+from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import OdocalError
 from odocal_ros.forecast import foresight
 from odocal_ros.forecast.forecast import as_keys, Forecast, Prospect, UNREACHABLE
 from odocal_ros.forecast.foresight import Abandoned, DriveSoFar, forecast_of
 from odocal_ros.forecast.leg_so_far import faults_in_cells, SmootherSoFar
-from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
-from odocal_ros.live import running_estimate as watch
 from odocal_ros.live.answers import hint
-from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
 from odocal_ros.live.session import Session, SessionView
-from odocal_ros.live.worker import Worker
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
@@ -32,107 +26,10 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
 SECOND = 10**9
-HEADING = 0.003         # rad
-
-
-def imu_rows(t, yaw_rate):
-    n = len(t)
-    stamps = SECOND + np.round(np.asarray(t) * 1e9).astype(np.int64)
-    w_i = np.stack([np.zeros(n), np.zeros(n), yaw_rate], -1)
-    return ImuSamples(stamps, stamps, w_i, np.tile([0.0, 0.0, 9.81], (n, 1)), np.zeros((n, 4)),
-                      np.full(n, np.nan))
-
-
-def odometer_rows(t, value):
-    stamps = SECOND + np.round(np.asarray(t) * 1e9).astype(np.int64)
-    return OdometerSamples(stamps, stamps, value)
-
-
-def fed(form, slot, rows, chop):
-    cells = ThinnedLeg(form)
-    for first in range(0, len(rows.stamp_ns), chop):
-        cells.feed(slot, take(rows, slice(first, first + chop)))
-    return cells
-
-
-def turned(leg):
-    t = (leg.imu.stamp_ns - leg.imu.stamp_ns[0]) * 1e-9
-    return float(np.trapezoid(leg.imu.w_i[:, 2], t) if hasattr(np, 'trapezoid')
-                 else np.trapz(leg.imu.w_i[:, 2], t))
-
-
-# cells
-
-def test_work_does_not_grow_with_the_leg_and_no_turn_is_lost():
-    t = np.arange(0.0, 4 * 3600.0, 0.05)          # four hours, the longest leg there may be
-    rate = np.where((t % 60) < 3, 0.5, 0.0)       # 3 s turns, one a minute
-    leg = fed(None, 'imu', imu_rows(t, rate), 12_000).leg(SECOND)
-    assert MOST_CELLS / 2 < len(leg.imu.stamp_ns) <= MOST_CELLS
-    # the cells are 1.6 s wide by then: a trapezoid misses at most a cell at either end
-    assert turned(leg) == pytest.approx(1.5 * 240, abs=2 * 0.5 * 1.6)
-    assert (np.diff(leg.imu.stamp_ns) > 0).all()
-
-
-def test_vibration_is_no_turn():
-    t = np.arange(0.0, 300.0, 0.005)
-    leg = fed(None, 'imu', imu_rows(t, np.sin(2 * np.pi * 10.03 * t)), 1000).leg(SECOND)
-    # 10.03 Hz seen every 0.1 s is a slow wave: picked rows would turn by 1 / (pi 0.03) = 10 rad;
-    # of a cell's mean sinc(1.003) = 0.3 % is left
-    assert abs(np.cumsum(leg.imu.w_i[:, 2] * 0.1)).max() < 0.1
-
-
-@pytest.mark.parametrize(('form', 'sent'), [
-    (OdometerForm('cumulative', 256, 'm/pulse'), lambda n: (15 * np.arange(n)) % 256),
-    (OdometerForm('cumulative', 2**64, 'm/pulse'), lambda n: 2**63 - 700 + 15 * np.arange(
-        n, dtype=np.uint64)),
-    (OdometerForm('increment', 2**16, 'm/pulse'), lambda n: np.full(n, 15))])
-def test_counts_never_roll_over_however_the_blocks_are_cut(form, sent):
-    t = np.arange(0.0, 10.0, 0.01)
-    value = sent(len(t)).astype(np.uint64).view(np.int64)
-    legs = [fed(form, 'odometer', odometer_rows(t, value), chop).leg(SECOND)
-            for chop in (1, 7, len(t))]
-    for leg in legs:
-        assert leg.form == OdometerForm('cumulative', 2**64, 'm/pulse')
-        rows = leg.odometer
-        assert np.diff(rows.value) == pytest.approx(150)    # 0.1 s of 1500 counts a second
-        assert np.diff(rows.stamp_ns) == pytest.approx(SECOND // 10)
-        for f in fields(rows):
-            assert (getattr(rows, f.name) == getattr(legs[0].odometer, f.name)).all()
-
-
-def test_speeds_are_averaged_and_rows_without_a_figure_left_out():
-    form = OdometerForm('rate', 0, '1')
-    t = np.arange(0.0, 10.0, 0.01)
-    value = 10.0 + np.sin(2 * np.pi * 10 * t)
-    value[500] = np.nan
-    rows = fed(form, 'odometer', odometer_rows(t, value), 33).leg(SECOND).odometer
-    # one row of ten less moves the mean of that cell by at most 1 / 9
-    assert rows.value == pytest.approx(np.full(len(rows.value), 10.0), abs=0.12)
-
-
-# the estimate
-
-@pytest.fixture(scope='module')
-def drive():
-    return simulate(SimOptions(scenario='straight', duration=300.0, imu_rate=50.0, seed=3,
-                               imu_grade='tactical', fix_noise='white', fix_sigma=0.5))
-
-
-@pytest.fixture(scope='module')
-def config(drive):
-    return with_settings(Config(), {
-        'imu.grade': 'tactical', 'gnss.correlation_time': 0.0, 'alignment.heading_source': 'fixed',
-        'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': HEADING})
-
-
-def sketched(drive, t_stop):
-    """Return the cells of a drive up to a time after the start mark, s, and the mark."""
-    return thinned(drive.leg(), t_stop), drive.leg().start_ns
-
-
-def foreseen(drive, config, t_stop, **more):
-    cells, start_ns = sketched(drive, t_stop)
-    return forecast_of(cells.leg(start_ns), cells.fix_rate(), config, **more)
+GOOD = Prospect(430e-6, 1e-3, 0.0, (('fix_end', 3e-4), ('fix_start', 2.5e-4)))
+MORE = Prospect(1820e-6, 1e-3, 231.0)
+YAW = Prospect(0.005, 0.0087, 0.0)
+NO_YAW = Prospect(None, 0.0087, None, (), 'limited by the heading uncertainty (1 deg)')
 
 
 def test_a_leg_at_its_end_is_foreseen_as_it_comes_out(drive, config):
@@ -175,10 +72,9 @@ def test_a_yaw_beyond_its_heading_is_never_there_nor_one_by_course_alone(drive, 
 
 def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
     """10 s after a mark set in motion; with another 15 s of such driving the smoother tells it."""
-    start_ns = drive.leg().start_ns + 100 * SECOND
     cells = thinned(drive.leg(), 110.0, 98.0)
     config = with_settings(Config(), {'odometer.nominal_scale': drive.truth.scale})
-    leg = cells.leg(start_ns)
+    leg = cells.leg(drive.leg().start_ns + 100 * SECOND)
     found = forecast_of(leg, cells.fix_rate(), config, smoother=SmootherSoFar())
     assert found.methods == {}
     assert 'yaw is not determined yet' in found.words()
@@ -192,8 +88,8 @@ def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
 def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
     auto = with_settings(config, {'alignment.heading_source': 'auto',
                                   'alignment.heading': math.nan})
-    cells, start_ns = sketched(drive, 150.0)
-    leg = cells.leg(start_ns)
+    cells = thinned(drive.leg(), 150.0)
+    leg = cells.leg(drive.leg().start_ns)
     n = len(leg.imu.stamp_ns)
     oriented = replace(leg, imu=replace(leg.imu, yaw_variance=np.full(n, 0.004**2),
                                         q_ni=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))))
@@ -255,116 +151,6 @@ def test_a_look_gives_up_at_its_next_step_once_the_leg_is_over(drive, config):
     assert len(asked) == 3
 
 
-# the watch
-
-class Log:
-    def __init__(self):
-        self.lines = []
-
-    def debug(self, text):
-        self.lines.append(text)
-
-
-def watched(drive, config, worker, log):
-    leg = drive.leg()
-    recorder, look = LegRecorder(), RunningEstimate(worker, log)
-    recorder.form = leg.form
-    half = leg.start_ns + 150 * SECOND
-    for slot in ('imu', 'odometer', 'fix'):
-        rows = leg.rows(slot)
-        recorder.feed(slot, take(rows, rows.stamp_ns <= leg.start_ns))
-    look.begin(recorder, leg.start_ns, config)
-    for slot in ('imu', 'odometer', 'fix'):
-        rows = leg.rows(slot)
-        for first_ns in range(leg.start_ns, half, 10 * SECOND):
-            look.feed(slot, take(rows, (rows.stamp_ns > first_ns)
-                                 & (rows.stamp_ns <= first_ns + 10 * SECOND)))
-    return look, half
-
-
-def finished(worker):
-    done = []
-    worker.submit(lambda: None, lambda *_: done.append(True))
-    deadline = time.monotonic() + 20.0
-    while not done and time.monotonic() < deadline:
-        time.sleep(0.001)       # a loop without a rest keeps the interpreter from the worker
-        worker.poll()
-    assert done
-
-
-@pytest.fixture
-def worker():
-    one = Worker()
-    yield one
-    one.close()
-
-
-def test_the_watch_foresees_what_its_thinned_does(drive, config, worker):
-    log = Log()
-    look, now_ns = watched(drive, config, worker, log)
-    look.look(drive.leg().start_ns + LOOK_PERIOD_NS - 1)
-    finished(worker)
-    assert look.forecast is None                      # too early
-    look.look(now_ns)
-    finished(worker)
-    expected = foreseen(drive, config, 150.0, smoother=SmootherSoFar())
-    assert log.lines == []
-    assert look.forecast.scale.sigma == pytest.approx(expected.scale.sigma)
-    assert look.forecast.yaw.sigma == pytest.approx(expected.yaw.sigma)
-
-
-def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypatch):
-    def fail(*_):
-        raise ValueError('a bug')
-
-    monkeypatch.setattr(watch, 'forecast_of', fail)
-    log = Log()
-    look, now_ns = watched(drive, config, worker, log)
-    look.look(now_ns)
-    finished(worker)
-    assert look.forecast is None
-    line, = log.lines
-    assert 'a bug' in line
-    monkeypatch.undo()
-    look.look(now_ns + LOOK_PERIOD_NS)
-    finished(worker)
-    assert look.forecast is not None
-
-
-def test_a_leg_that_ended_meanwhile_leaves_no_forecast(drive, config, worker):
-    log = Log()
-    look, now_ns = watched(drive, config, worker, log)
-    look.look(now_ns)
-    look.end()
-    finished(worker)
-    assert (look.forecast, log.lines) == (None, [])
-    look.look(now_ns + LOOK_PERIOD_NS)
-    finished(worker)
-    assert look.forecast is None
-
-
-def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
-    looks = []
-
-    def dear(*args):
-        looks.append(1)
-        return Forecast(GOOD, GOOD), (), 1.0, None    # a second of CPU
-
-    monkeypatch.setattr(watch, '_look', dear)
-    clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
-    monkeypatch.setattr(watch, 'time', clock)
-    look, now_ns = watched(drive, config, worker, Log())
-    for _ in range(320):
-        clock.now += 1.0
-        now_ns += LOOK_PERIOD_NS
-        look.look(now_ns)
-        finished(worker)
-    # the first comes with imports and goes free, the others 60 s apart: at 1, 2, 62, ... 302 s
-    assert len(looks) == 7
-
-
-# two wheels
-
 @pytest.fixture(scope='module')
 def two():
     return simulate(SimOptions(scenario='town', duration=240.0, two_wheels=True, imu_rate=50.0,
@@ -373,9 +159,8 @@ def two():
 
 def looked_at(made, t_stop, **settings):
     """Return what is foreseen after so many seconds of a drive."""
-    cells, start_ns = sketched(made, t_stop)
     config = with_settings(Config(), {'imu.grade': made.options.imu_grade} | settings)
-    return forecast_of(cells.leg(start_ns), cells.fix_rate(), config, smoother=SmootherSoFar())
+    return foreseen(made, config, t_stop, smoother=SmootherSoFar())
 
 
 @pytest.fixture(scope='module')
@@ -423,14 +208,6 @@ def test_swapped_wheels_are_said_while_it_is_driven(two):
         'odometer.track_width': 1.6, 'imu.grade': 'tactical'}))
     assert found[0].code is Code.WHEELS_SWAPPED
     assert 'Swap odometer.left' in found[0].remedy
-
-
-# what is said
-
-GOOD = Prospect(430e-6, 1e-3, 0.0, (('fix_end', 3e-4), ('fix_start', 2.5e-4)))
-MORE = Prospect(1820e-6, 1e-3, 231.0)
-YAW = Prospect(0.005, 0.0087, 0.0)
-NO_YAW = Prospect(None, 0.0087, None, (), 'limited by the heading uncertainty (1 deg)')
 
 
 def test_a_coarse_scale_is_said_in_per_cent():
@@ -495,6 +272,16 @@ def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():
     none = as_keys(None)
     assert set(none) == set(keys) | set(running) | {'estimate_method'}
     assert {none[key] for key in keys} == {''}
+    found = as_keys(Forecast(GOOD, YAW, estimates={
+        'scale_factor': Estimate(0.02, 1e-5, 'm/pulse', 'smoother'),
+        'yaw_mounting_angle': Estimate(0.01, 1e-3, 'rad', 'two_point'),
+        'pitch_mounting_angle': Estimate(None, None, 'rad', 'smoother')}), 7.5)
+    assert [found[f'estimate_{name}'] for name in (
+        'scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle_rad',
+        'yaw_mounting_angle_sigma_rad', 'method', 'age_s')] == [
+            0.02, 1e-5, 0.01, 1e-3, 'smoother, two_point', 7.5]
+    assert all(math.isnan(found[f'estimate_pitch_mounting_angle{end}_rad'])
+               for end in ('', '_sigma'))
 
 
 def test_an_estimate_is_never_of_a_time_to_come():

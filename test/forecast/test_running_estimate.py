@@ -1,0 +1,127 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The running estimate beside the recording: when it looks, what it costs, and no harm."""
+
+import time
+from types import SimpleNamespace
+
+from conftest import foreseen
+import pytest
+
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.samples import take
+from odocal_ros.forecast.forecast import Forecast, Prospect
+from odocal_ros.forecast.leg_so_far import SmootherSoFar
+from odocal_ros.live import running_estimate as watch
+from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
+from odocal_ros.live.worker import Worker
+
+pytestmark = pytest.mark.slow
+SECOND = 10**9
+
+
+class Log:
+    def __init__(self):
+        self.lines = []
+
+    def debug(self, text):
+        self.lines.append(text)
+
+
+def watched(drive, config, worker, log):
+    leg = drive.leg()
+    recorder, look = LegRecorder(), RunningEstimate(worker, log)
+    recorder.form = leg.form
+    half = leg.start_ns + 150 * SECOND
+    for slot in ('imu', 'odometer', 'fix'):
+        rows = leg.rows(slot)
+        recorder.feed(slot, take(rows, rows.stamp_ns <= leg.start_ns))
+    look.begin(recorder, leg.start_ns, config)
+    for slot in ('imu', 'odometer', 'fix'):
+        rows = leg.rows(slot)
+        for first_ns in range(leg.start_ns, half, 10 * SECOND):
+            look.feed(slot, take(rows, (rows.stamp_ns > first_ns)
+                                 & (rows.stamp_ns <= first_ns + 10 * SECOND)))
+    return look, half
+
+
+def finished(worker):
+    done = []
+    worker.submit(lambda: None, lambda *_: done.append(True))
+    deadline = time.monotonic() + 20.0
+    while not done and time.monotonic() < deadline:
+        time.sleep(0.001)       # a loop without a rest keeps the interpreter from the worker
+        worker.poll()
+    assert done
+
+
+@pytest.fixture
+def worker():
+    one = Worker()
+    yield one
+    one.close()
+
+
+def test_the_watch_foresees_what_its_thinned_does(drive, config, worker):
+    log = Log()
+    look, now_ns = watched(drive, config, worker, log)
+    look.look(drive.leg().start_ns + LOOK_PERIOD_NS - 1)
+    finished(worker)
+    assert look.forecast is None                      # too early
+    look.look(now_ns)
+    finished(worker)
+    expected = foreseen(drive, config, 150.0, smoother=SmootherSoFar())
+    assert log.lines == []
+    assert look.forecast.scale.sigma == pytest.approx(expected.scale.sigma)
+    assert look.forecast.yaw.sigma == pytest.approx(expected.yaw.sigma)
+
+
+def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypatch):
+    def fail(*_):
+        raise ValueError('a bug')
+
+    monkeypatch.setattr(watch, 'forecast_of', fail)
+    log = Log()
+    look, now_ns = watched(drive, config, worker, log)
+    look.look(now_ns)
+    finished(worker)
+    assert look.forecast is None
+    line, = log.lines
+    assert 'a bug' in line
+    monkeypatch.undo()
+    look.look(now_ns + LOOK_PERIOD_NS)
+    finished(worker)
+    assert look.forecast is not None
+
+
+def test_a_leg_that_ended_meanwhile_leaves_no_forecast(drive, config, worker):
+    log = Log()
+    look, now_ns = watched(drive, config, worker, log)
+    look.look(now_ns)
+    look.end()
+    finished(worker)
+    assert (look.forecast, log.lines) == (None, [])
+    look.look(now_ns + LOOK_PERIOD_NS)
+    finished(worker)
+    assert look.forecast is None
+
+
+def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
+    looks, good = [], Prospect(430e-6, 1e-3, 0.0)
+
+    def dear(*args):
+        looks.append(1)
+        return Forecast(good, good), (), 1.0, None    # a second of CPU
+
+    monkeypatch.setattr(watch, '_look', dear)
+    clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(watch, 'time', clock)
+    look, now_ns = watched(drive, config, worker, Log())
+    for _ in range(320):
+        clock.now += 1.0
+        now_ns += LOOK_PERIOD_NS
+        look.look(now_ns)
+        finished(worker)
+    # the first comes with imports and goes free, the others 60 s apart: at 1, 2, 62, ... 302 s
+    assert len(looks) == 7

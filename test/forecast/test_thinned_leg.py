@@ -1,0 +1,84 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The cells that a leg is thinned to while it is recorded: turns, counts and speeds."""
+
+from dataclasses import fields
+
+from drives import seconds
+import numpy as np
+import pytest
+
+from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
+from odocal_ros.forecast.thinned_leg import MOST_CELLS, ThinnedLeg
+from odocal_ros.nav.integral import running_integral
+
+SECOND = 10**9
+
+
+def imu_rows(t, yaw_rate):
+    n = len(t)
+    stamps = SECOND + np.round(np.asarray(t) * 1e9).astype(np.int64)
+    w_i = np.stack([np.zeros(n), np.zeros(n), yaw_rate], -1)
+    return ImuSamples(stamps, stamps, w_i, np.tile([0.0, 0.0, 9.81], (n, 1)), np.zeros((n, 4)),
+                      np.full(n, np.nan))
+
+
+def odometer_rows(t, value):
+    stamps = SECOND + np.round(np.asarray(t) * 1e9).astype(np.int64)
+    return OdometerSamples(stamps, stamps, value)
+
+
+def fed(form, slot, rows, chop):
+    cells = ThinnedLeg(form)
+    for first in range(0, len(rows.stamp_ns), chop):
+        cells.feed(slot, take(rows, slice(first, first + chop)))
+    return cells
+
+
+def test_work_does_not_grow_with_the_leg_and_no_turn_is_lost():
+    t = np.arange(0.0, 4 * 3600.0, 0.05)          # four hours, the longest leg there may be
+    rate = np.where((t % 60) < 3, 0.5, 0.0)       # 3 s turns, one a minute
+    leg = fed(None, 'imu', imu_rows(t, rate), 12_000).leg(SECOND)
+    assert MOST_CELLS / 2 < len(leg.imu.stamp_ns) <= MOST_CELLS
+    # the cells are 1.6 s wide by then: a trapezoid misses at most a cell at either end
+    turned = running_integral(seconds(leg, leg.imu), leg.imu.w_i[:, 2])[-1]
+    assert turned == pytest.approx(1.5 * 240, abs=2 * 0.5 * 1.6)
+    assert (np.diff(leg.imu.stamp_ns) > 0).all()
+
+
+def test_vibration_is_no_turn():
+    t = np.arange(0.0, 300.0, 0.005)
+    leg = fed(None, 'imu', imu_rows(t, np.sin(2 * np.pi * 10.03 * t)), 1000).leg(SECOND)
+    # 10.03 Hz seen every 0.1 s is a slow wave: picked rows would turn by 1 / (pi 0.03) = 10 rad;
+    # of a cell's mean sinc(1.003) = 0.3 % is left
+    assert abs(np.cumsum(leg.imu.w_i[:, 2] * 0.1)).max() < 0.1
+
+
+@pytest.mark.parametrize(('form', 'sent'), [
+    (OdometerForm('cumulative', 256, 'm/pulse'), lambda n: (15 * np.arange(n)) % 256),
+    (OdometerForm('cumulative', 2**64, 'm/pulse'), lambda n: 2**63 - 700 + 15 * np.arange(
+        n, dtype=np.uint64)),
+    (OdometerForm('increment', 2**16, 'm/pulse'), lambda n: np.full(n, 15))])
+def test_counts_never_roll_over_however_the_blocks_are_cut(form, sent):
+    t = np.arange(0.0, 10.0, 0.01)
+    value = sent(len(t)).astype(np.uint64).view(np.int64)
+    legs = [fed(form, 'odometer', odometer_rows(t, value), chop).leg(SECOND)
+            for chop in (1, 7, len(t))]
+    for leg in legs:
+        assert leg.form == OdometerForm('cumulative', 2**64, 'm/pulse')
+        rows = leg.odometer
+        assert np.diff(rows.value) == pytest.approx(150)    # 0.1 s of 1500 counts a second
+        assert np.diff(rows.stamp_ns) == pytest.approx(SECOND // 10)
+        for f in fields(rows):
+            assert (getattr(rows, f.name) == getattr(legs[0].odometer, f.name)).all()
+
+
+def test_speeds_are_averaged_and_rows_without_a_figure_left_out():
+    form = OdometerForm('rate', 0, '1')
+    t = np.arange(0.0, 10.0, 0.01)
+    value = 10.0 + np.sin(2 * np.pi * 10 * t)
+    value[500] = np.nan
+    rows = fed(form, 'odometer', odometer_rows(t, value), 33).leg(SECOND).odometer
+    # one row of ten less moves the mean of that cell by at most 1 / 9
+    assert rows.value == pytest.approx(np.full(len(rows.value), 10.0), abs=0.12)
