@@ -5,7 +5,6 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from importlib.resources import files
 import json
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from odocal_ros.fleet.statistics import LEAST, Population, population
 from odocal_ros.fleet.tables import LEGS
 from odocal_ros.output.drawing import BLUE, evenly, GREEN, GREY, look, PINK, RED, sheet, svg
 from odocal_ros.output.figures import with_sigma
+from odocal_ros.output.report import rendered
 from odocal_ros.output.summary import DEG
 from odocal_ros.settings.levels import TYRE_SPREAD
 
@@ -139,20 +139,14 @@ def _legs(path: Path, known: set[str], named: set[str]) -> list[tuple[str, float
 
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
     """Return the page of a fleet with its rows in ``output``, the worst vehicle first."""
-    from jinja2 import Environment, StrictUndefined
-
-    template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-                           lstrip_blocks=True).from_string(
-        (files('odocal_ros.fleet') / 'templates' / 'fleet.html').read_text(encoding='utf-8'))
-    style = (files('odocal_ros.output') / 'templates' / 'report.css').read_text(encoding='utf-8')
     counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
     most_rows = 2000    # vehicles in the table
-    return template.render(
-        style=style, title=output.resolve().name, facts=_facts(vehicles),
+    return rendered(
+        'fleet', 'fleet.html', title=output.resolve().name, facts=_facts(vehicles),
         counts=sorted(counts.items()), models=[_model(*one) for one in _models(vehicles)],
         figures=fleet_figures(vehicles, output / LEGS),
         vehicles=[_row(row) for row in vehicles[:most_rows]],
-        left=max(0, len(vehicles) - most_rows)) + '\n'
+        left=max(0, len(vehicles) - most_rows))
 
 
 def _facts(vehicles: Sequence[dict[str, Any]]) -> str:

@@ -9,30 +9,40 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import legs_from, Row
 from odocal_ros.outside.names import one_line
 from odocal_ros.outside.whole import locked, whole_file
+from odocal_ros.reasons import Reason
 
 LEGS, VEHICLES = 'legs.parquet', 'vehicles.parquet'
 VALUES = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')
 VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in VALUES)
 
 
+def all_reasons(leg: LegResult) -> list[Reason]:
+    """Return the reasons of a leg and of its methods."""
+    return [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
+
+
 def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
             leg: LegResult) -> dict[str, Any]:
-    estimates = leg_estimates(leg)
-    reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
     row = {'vehicle': vehicle, 'model': model, 'leg': number, 'bag': one_line(leg.bag),
            'odometer_km': odometer_km, 'start': utc(leg.start_ns), 'start_ns': leg.start_ns,
            'stop_ns': leg.stop_ns, 'duration_s': leg.duration, 'distance_m': leg.distance,
            'fixes': leg.fixes, 'verdict': leg.verdict.value,
-           'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
+           'reasons': ' '.join(dict.fromkeys(r.code.name for r in all_reasons(leg)))}
+    return row | value_cells(leg_estimates(leg))
+
+
+def value_cells(estimates: dict[str, Estimate]) -> dict[str, Any]:
+    """Return the cells of VALUE_COLUMNS, and the unit of the scale."""
+    cells: dict[str, Any] = {}
     for name in VALUES:
         e = estimates.get(name)
-        row |= {name: e and e.value, f'{name}_sigma': e and e.sigma}
-    return row | {'unit': estimates['scale_factor'].unit if 'scale_factor' in estimates else ''}
+        cells |= {name: e and e.value, f'{name}_sigma': e and e.sigma}
+    return cells | {'unit': estimates['scale_factor'].unit if 'scale_factor' in estimates else ''}
 
 
 def rows_of_legs(bag: FleetBag, row: Row) -> list[dict[str, Any]]:

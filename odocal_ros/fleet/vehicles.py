@@ -20,7 +20,7 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import DONE, legs_from, Row, rows_of
 from odocal_ros.fleet.statistics import covariance, History, history
-from odocal_ros.fleet.tables import leg_row, utc, VALUES
+from odocal_ros.fleet.tables import all_reasons, leg_row, utc, value_cells
 from odocal_ros.library.calibrate_bag import unique_names
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.output.figures import accept_line, iso
@@ -102,7 +102,7 @@ def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndar
 
 def rejecting(leg: LegResult) -> list[Reason]:
     """Return the reasons that reject a leg, empty if it is not rejected."""
-    return [r for r in (*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons))
+    return [r for r in all_reasons(leg)
             if r.code.gravity is Verdict.REJECTED and leg.verdict is Verdict.REJECTED]
 
 
@@ -173,15 +173,13 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
 
 
 def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
-    none = {f'{name}{part}': None for name in VALUES for part in ('', '_sigma')}
-    return row | none | {
-        'legs': 0, 'legs_good': 0, 'distance_km': 0.0, 'driven_h': 0.0, 'first': None,
-        'last': None, 'unit': '', 'since': None, 'verdict': Verdict.REJECTED.value,
-        'decision': decision, 'why': 'none of its bags could be calibrated',
-        'remedy': LOOK_AT_BAGS, 'reasons': '', 'changes': '[]', 'odd_legs': '',
-        'rejected_for': '', 'rejected_since': None,
-        'drift_per_year': None, 'drift_per_year_sigma': None, 'drift_per_1000_km': None,
-        'drift_per_1000_km_sigma': None, 'now': [], 'report': None, 'line': json.dumps(
+    return row | value_cells({}) | dict.fromkeys((
+        'first', 'last', 'since', 'rejected_since', 'drift_per_year', 'drift_per_year_sigma',
+        'drift_per_1000_km', 'drift_per_1000_km_sigma', 'report')) | {
+        'legs': 0, 'legs_good': 0, 'distance_km': 0.0, 'driven_h': 0.0, 'changes': '[]',
+        'verdict': Verdict.REJECTED.value, 'decision': decision, 'remedy': LOOK_AT_BAGS,
+        'why': 'none of its bags could be calibrated', 'reasons': '', 'odd_legs': '',
+        'rejected_for': '', 'now': [], 'line': json.dumps(
             {'vehicle': row['vehicle'], 'decision': decision,
              'why': row['failures'], 'remedy': LOOK_AT_BAGS, 'values': {},
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
@@ -190,19 +188,14 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
 def _current(calibration: Calibration, config: Config, driven: Sequence[Driven],
           starts: Sequence[int]) -> dict[str, Any]:
     """Return the calibration since the last change."""
-    estimates, legs = calibration.estimates, [one.leg for one in driven]
-    row: dict[str, Any] = {}
-    for name in VALUES:
-        e = estimates.get(name)
-        row |= {name: e and e.value, f'{name}_sigma': e and e.sigma}
+    legs = [one.leg for one in driven]
     acceptance = accept(calibration, config)
-    scale = estimates.get('scale_factor')
-    return row | {
+    return value_cells(calibration.estimates) | {
         'legs': len(legs), 'legs_good': sum(g.verdict is not Verdict.REJECTED for g in legs),
         'distance_km': sum(g.distance for g in legs) / 1000,
         'driven_h': sum(g.duration for g in legs) / 3600,
         'first': utc(legs[0].start_ns), 'last': utc(legs[-1].start_ns),
-        'unit': scale.unit if scale else '', 'since': utc(legs[starts[-1]].start_ns),
+        'since': utc(legs[starts[-1]].start_ns),
         'verdict': calibration.verdict.value,
         'decision': acceptance.decision.value if acceptance else '',
         'why': acceptance.why if acceptance else '',

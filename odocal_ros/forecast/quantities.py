@@ -57,19 +57,13 @@ def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
     Unknown before the first update; a configured track width need not be determined.
     ``lost``: the leg would be rejected: no value is within its limit.
     """
-    ok = nothing_known()
     if forecast is None:
-        return ok | dict.fromkeys(('scale', 'yaw', 'pitch'), NO) if lost else ok
-    for name, quantity in QUANTITIES.items():
-        if quantity.of_two_wheels and (not two_wheels or forecast.wheels is None):
-            continue
-        if quantity.of_imu and PLANAR in forecast.methods:
-            continue
-        good = NO if lost else _within(forecast.sigma(name), quantity.limit(config))
-        if good == NO and _given(name, config):
-            good = UNKNOWN
-        ok[name] = good
-    return ok
+        return nothing_known() | dict.fromkeys(('scale', 'yaw', 'pitch'), NO) if lost else \
+            nothing_known()
+    known = {name: forecast.sigma(name) for name, quantity in QUANTITIES.items()
+             if not (quantity.of_two_wheels and (not two_wheels or forecast.wheels is None)
+                     or quantity.of_imu and PLANAR in forecast.methods)}
+    return _judged({name: None if lost else sigma for name, sigma in known.items()}, config)
 
 
 def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str, str]:
@@ -88,8 +82,9 @@ def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: boo
     valid : False: no value is usable.   doubted : names of estimates with a reason against
     their use.
     """
-    ok = nothing_known()
     planar = any(e.method == PLANAR for e in estimates.values())
+    known: dict[str, float | None] = {}
+    bad = set()
     for name, quantity in QUANTITIES.items():
         found = [estimates.get(part) for part in quantity.estimates]
         if quantity.of_imu and planar:
@@ -97,14 +92,10 @@ def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: boo
         if quantity.of_two_wheels and not two_wheels and not any(
                 e is not None and e.value is not None for e in found):
             continue
-        sigma = max((_share(e, quantity.relative) for e in found), default=math.inf)
-        good = _within(sigma, quantity.limit(config))
+        known[name] = max(_share(e, quantity.relative) for e in found)
         if not valid or doubted & set(quantity.estimates):
-            good = NO
-        elif good == NO and _given(name, config):
-            good = UNKNOWN
-        ok[name] = good
-    return ok
+            bad.add(name)
+    return _judged(known, config) | dict.fromkeys(bad, NO)
 
 
 def as_keys(ok: dict[str, str]) -> dict[str, str]:
@@ -122,8 +113,15 @@ def words(ok: dict[str, str]) -> str:
     return '; '.join(parts)
 
 
-def _given(name: str, config: Config) -> bool:
-    return name == 'track_width' and config.odometer.track_width > 0
+def _judged(sigmas: dict[str, float | None], config: Config) -> dict[str, str]:
+    """Return yes or no for known sigmas; a configured track width may stay unknown."""
+    ok = nothing_known()
+    for name, sigma in sigmas.items():
+        if sigma is not None and sigma <= QUANTITIES[name].limit(config):
+            ok[name] = YES
+        elif name != 'track_width' or not config.odometer.track_width > 0:
+            ok[name] = NO
+    return ok
 
 
 def _share(estimate: Estimate | None, relative: bool) -> float:
@@ -134,6 +132,3 @@ def _share(estimate: Estimate | None, relative: bool) -> float:
         return estimate.sigma / abs(estimate.value) if estimate.value else math.inf
     return estimate.sigma
 
-
-def _within(sigma: float | None, limit: float) -> str:
-    return YES if sigma is not None and sigma <= limit else NO

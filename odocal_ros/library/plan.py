@@ -27,7 +27,6 @@ from odocal_ros.library import planned_drives
 from odocal_ros.library.asked import config_of, Settings
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.pipeline.combination import together
-from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import GRADES, with_settings
 
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
@@ -151,39 +150,20 @@ def ranked(found: list[Change], before: Plan, parameter: str) -> list[Change]:
 
 
 @dataclass(frozen=True, eq=False)
-class Planned:
-    """
-    The prediction of a drive.
-
-    drive : the motion.   sigmas : its errors, and the settings.   plan : of each method.
-    """
+class Planned(Plan):
+    """The prediction of a drive: its motion, its errors and settings, and each method."""
 
     drive: PlannedDrive
     sigmas: Sigmas
-    plan: Plan
-
-    @property
-    def verdict(self) -> Verdict:
-        """Return the predicted verdict of the drive."""
-        return self.plan.verdict
-
-    @property
-    def reasons(self) -> tuple[Reason, ...]:
-        """Return the reasons of the prediction."""
-        return self.plan.reasons
-
-    def sigma(self, parameter: str) -> float | None:
-        return self.plan.sigma(parameter)
 
     @cached_property
     def helps(self) -> list[Change]:
         """Return the computed improvements; this takes some seconds."""
-        return changes(self.drive, self.sigmas, self.plan)
+        return changes(self.drive, self.sigmas, self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the output of ``odocal plan --json``; sigmas of the scale are relative."""
-        plan, sigmas = self.plan, self.sigmas
-        two_point, alignment = plan.two_point, plan.two_point.alignment
+        sigmas, two_point, alignment = self.sigmas, self.two_point, self.two_point.alignment
         return {
             'drive': {'distance': two_point.distance, 'chord': two_point.chord,
                       'duration': two_point.duration, 'standing': list(two_point.standing)},
@@ -192,15 +172,15 @@ class Planned:
                        'heading_sigma': alignment.heading_sigma, 'fix_sigma': sigmas.fix,
                        'fix_rate': sigmas.fix_rate, 'correlation_time': sigmas.correlation_time,
                        'pulse': sigmas.quantum, 'sway': sigmas.sway, 'slip_walk': sigmas.slip},
-            'verdict': plan.verdict.value, 'reasons': [r.as_dict() for r in plan.reasons],
-            'estimates': {name: {'sigma': plan.sigma(name), 'method': plan.by(name) or None}
+            'verdict': self.verdict.value, 'reasons': [r.as_dict() for r in self.reasons],
+            'estimates': {name: {'sigma': self.sigma(name), 'method': self.by(name) or None}
                           for name in PARAMETERS},
             'methods': {name: {
                 'estimates': {name: {'sigma': e.sigma, 'unit': e.unit}
                               for name, e in method.estimates.items() if name != 'scale_ratio'},
-                'reasons': [r.as_dict() for r in plan.reasons_of(name)],
+                'reasons': [r.as_dict() for r in self.reasons_of(name)],
                 'budget': method.details.get('budget', {})}
-                for name, method in plan.methods.items()},
+                for name, method in self.methods.items()},
             'changes': [{'text': c.text, 'scale_factor': c.scale, 'yaw_mounting_angle': c.yaw}
                         for c in self.helps]}
 
@@ -265,4 +245,4 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     if 'fix' in figures:
         own |= {'fix_up': None}
     sigmas = Sigmas(config=settings, **(own | figures))
-    return Planned(drive, sigmas, plan_methods(drive, sigmas))
+    return Planned(**vars(plan_methods(drive, sigmas)), drive=drive, sigmas=sigmas)

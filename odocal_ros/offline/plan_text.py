@@ -8,8 +8,7 @@ import textwrap
 
 from odocal_ros.estimator.factors.slow_error import WHITE_SHARE
 from odocal_ros.forecast.planned_methods import Plan, SWAY_RATE
-from odocal_ros.forecast.predict import Sigmas
-from odocal_ros.library.plan import Change, PARAMETERS, PITCH, Planned, ranked, SCALE, YAW
+from odocal_ros.library.plan import PARAMETERS, PITCH, Planned, ranked, SCALE, YAW
 from odocal_ros.library.plan_indoor import PlannedRun, SHOWN
 from odocal_ros.output.figures import length, share, table_row, time_span, wrapped
 from odocal_ros.output.tables import budget_lines
@@ -18,9 +17,8 @@ WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 
 
 def screen(planned: Planned) -> str:
-    before, sigmas, found = planned.plan, planned.sigmas, planned.helps
-    return '\n'.join([*_head(before, sigmas), '', *_methods(before), '', *_budgets(before),
-                      *_helps(before, found), *_reasons(before)])
+    return '\n'.join([*_head(planned), '', *_methods(planned), '', *_budgets(planned),
+                      *_helps(planned), *_reasons(planned)])
 
 
 def indoor_screen(runs: list[PlannedRun]) -> str:
@@ -56,8 +54,8 @@ def _indoor_sigma(sigma: float | None, head: str) -> str:
     return f'{math.degrees(sigma):.2g} deg' if head == 'yaw' else f'{100 * sigma:.2g} %'
 
 
-def _head(before: Plan, sigmas: Sigmas) -> list[str]:
-    two_point, a = before.two_point, before.two_point.alignment
+def _head(before: Planned) -> list[str]:
+    sigmas, two_point, a = before.sigmas, before.two_point, before.two_point.alignment
     stands = [f'standing {time_span(s)}' if s else 'in motion' for s in two_point.standing]
     tau = sigmas.correlation_time
     noise = f'correlation time {tau:g} s' if tau else 'white'
@@ -115,10 +113,10 @@ def _budgets(before: Plan) -> list[str]:
     return out
 
 
-def _helps(before: Plan, found: list[Change]) -> list[str]:
+def _helps(before: Planned) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
-        best, word = ranked(found, before, parameter), WORDS[parameter]
+        best, word = ranked(before.helps, before, parameter), WORDS[parameter]
         lines.append(f'  largest improvements of the {word}' if best else
                      f'  no tested change improves the {word}')
         lines += [f'    {c.text:<58}{_shown(parameter, before.sigma(parameter)):>10} -> '

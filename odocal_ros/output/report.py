@@ -13,8 +13,8 @@ from odocal_ros.calib.choice import ABOUT, leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.drawing import Drawing, look
-from odocal_ros.output.figures import counted, known, length, shared, time_span
-from odocal_ros.output.summary import MEANING, rotation_text, sentence
+from odocal_ros.output.figures import known, length, shared, time_span
+from odocal_ros.output.summary import driven, MEANING, rotation_text, sentence
 from odocal_ros.output.tables import before_label, check_table
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
@@ -34,19 +34,24 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
 
     Raises ImportError: matplotlib or jinja2 is missing.
     """
-    from jinja2 import Environment, StrictUndefined
-    folder = files('odocal_ros.output') / 'templates'
-    page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-                       lstrip_blocks=True).from_string(
-        (folder / 'report.html').read_text(encoding='utf-8'))
-    style = (folder / 'report.css').read_text(encoding='utf-8')
     legs, compared, missing = _drawn(calibration)
     # the first track is shown next to the verdict instead
     first = legs[0]['figures'][:1] if legs else []
     if first:
         legs[0]['figures'] = legs[0]['figures'][1:]
-    return page.render(style=style, legs=legs, compared=compared, missing=missing, first=first,
-                       **_context(calibration, config, content)) + '\n'
+    return rendered('output', NAME, legs=legs, compared=compared, missing=missing, first=first,
+                    **_context(calibration, config, content))
+
+
+def rendered(room: str, name: str, **content: Any) -> str:
+    """Return the page of a template in ``templates`` of a package, with the style of reports."""
+    from jinja2 import Environment, StrictUndefined
+    home = files('odocal_ros')
+    style = (home / 'output' / 'templates' / 'report.css').read_text(encoding='utf-8')
+    template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+                           lstrip_blocks=True).from_string(
+        (home / room / 'templates' / name).read_text(encoding='utf-8'))
+    return template.render(style=style, **content) + '\n'
 
 
 def report_or_why(calibration: Calibration, config: Config,
@@ -69,7 +74,6 @@ def report_or_why(calibration: Calibration, config: Config,
 
 def _context(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, Any]:
     legs = calibration.legs
-    distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
     methods = _leading(calibration.methods, calibration.estimates)
     bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
     return {
@@ -77,7 +81,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
         'created': _readable_date(content['created']),
         'verdict': calibration.verdict.value, 'meaning': MEANING[calibration.verdict],
         'sentence': sentence(calibration).partition(': ')[2],
-        'driven': f'{counted(len(legs), "leg")}, {length(distance)} in {time_span(duration)}',
+        'driven': driven(legs),
         'headline': tables.headline(calibration),
         'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),
         'why': _why(calibration.reasons), 'rotation': rotation_text(calibration),

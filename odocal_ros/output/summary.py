@@ -94,14 +94,17 @@ def values_in_words(estimates: dict[str, result.Estimate]) -> str:
 
 
 def _head(calibration: result.Calibration, styled: bool) -> list[str]:
-    legs = calibration.legs
-    distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
     verdict = calibration.verdict.value.upper()
     if styled:
         colours = {Verdict.ACCEPTED: 32, Verdict.CAUTION: 33, Verdict.REJECTED: 31}
         verdict = f'\x1b[1;{colours[calibration.verdict]}m{verdict}\x1b[0m'
-    return [f'{verdict}: {MEANING[calibration.verdict]}',
-            f'{counted(len(legs), "leg")}, {length(distance)} in {time_span(duration)}']
+    return [f'{verdict}: {MEANING[calibration.verdict]}', driven(calibration.legs)]
+
+
+def driven(legs: tuple[result.LegResult, ...]) -> str:
+    """Return the number of legs, their length and duration, as text."""
+    distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
+    return f'{counted(len(legs), "leg")}, {length(distance)} in {time_span(duration)}'
 
 
 def _values(calibration: result.Calibration, width: int) -> list[str]:
