@@ -73,15 +73,16 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.fleet.bags import find_bags
     from odocal_ros.fleet.engine import dashboard, engine
     from odocal_ros.fleet.jobs import bag_jobs, writable
-    from odocal_ros.fleet.kpi import limits_of, write_kpi
+    from odocal_ros.fleet.kpi import write_kpi
     from odocal_ros.fleet.outcome import asked, exit_code, said, write_outcome
     from odocal_ros.output.figures import counted
+    from odocal_ros.settings.config import Config, with_settings
     if not args.task_timeout > 0:
         raise BadUsage(f'--task-timeout {args.task_timeout:g}: required: seconds above 0')
     output = Path(args.output)
     bags = find_bags(args.bags, args.vehicle_from)
     jobs = bag_jobs(bags, args, output, args.task_timeout, args.task_memory)
-    limits = limits_of(asked(jobs))
+    limits = with_settings(Config(), asked(jobs)).accept.limits
     if args.kpi and not limits:
         raise BadUsage('--kpi needs limits: give --accept NAME=LOW:HIGH')
     writable(output)

@@ -24,7 +24,6 @@ from odocal_ros.output.figures import table_row
 from odocal_ros.outside.whole import locked, write_text
 from odocal_ros.pipeline.acceptance import Decision, hold
 from odocal_ros.reasons import Verdict
-from odocal_ros.settings.config import Config, with_settings
 
 KPI = 'kpi.json'
 NORMAL = 1.4826                  # statistical: sigma over the median of absolute errors
@@ -50,10 +49,6 @@ def _rates(counted: Counter[tuple[bool, Decision]]) -> dict[str, Any]:
 
 def _ratio(part: int, whole: int) -> float | None:
     return part / whole if whole else None
-
-
-def limits_of(settings: dict[str, Any]) -> Limits:
-    return dict(with_settings(Config(), settings).accept.limits)
 
 
 def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],

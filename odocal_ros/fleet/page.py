@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from odocal_ros import __version__
-from odocal_ros.fleet.second_stage import COMPARED, file_name, flagged
+from odocal_ros.fleet.second_stage import by_model, COMPARED, file_name, flagged
 from odocal_ros.fleet.statistics import LEAST, Population, population
 from odocal_ros.fleet.tables import LEGS
 from odocal_ros.output.drawing import BLUE, evenly, GREEN, GREY, look, PINK, RED, sheet, svg
@@ -143,7 +143,8 @@ def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
     most_rows = 2000    # vehicles in the table
     return rendered(
         'fleet', 'fleet.html', title=output.resolve().name, facts=_facts(vehicles),
-        counts=sorted(counts.items()), models=[_model(*one) for one in _models(vehicles)],
+        counts=sorted(counts.items()), models=[_model(*kind, rows) for kind, rows in sorted(
+            by_model(row for row in vehicles if row['legs']).items())],
         figures=fleet_figures(vehicles, output / LEGS),
         vehicles=[_row(row) for row in vehicles[:most_rows]],
         left=max(0, len(vehicles) - most_rows))
@@ -157,15 +158,6 @@ def _facts(vehicles: Sequence[dict[str, Any]]) -> str:
     return (f'{len(vehicles)} vehicles, {bags} bags ({failed} failed), {legs} legs, '
             f'{sum(row["distance_km"] for row in vehicles):.0f} km in '
             f'{sum(row["driven_h"] for row in vehicles):.1f} h{when}; odocal_ros {__version__}')
-
-
-def _models(vehicles: Sequence[dict[str, Any]]) -> list[tuple[str, str, list[dict[str, Any]]]]:
-    """Return (model, unit of the scale, vehicles), without rejected vehicles."""
-    kinds: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in vehicles:
-        if row['legs'] and row['verdict'] != 'rejected':
-            kinds.setdefault((row['model'], row['unit']), []).append(row)
-    return [(model, unit, rows) for (model, unit), rows in sorted(kinds.items())]
 
 
 def _model(model: str, unit: str, rows: list[dict[str, Any]]) -> dict[str, Any]:

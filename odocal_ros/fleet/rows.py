@@ -107,7 +107,6 @@ class RowStore:
             return None
 
     def drop(self, key: str) -> None:
-        """Remove a row."""
         self.path(key).unlink(missing_ok=True)
 
     def remember(self, seen: str, key: str) -> None:

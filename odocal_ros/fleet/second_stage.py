@@ -3,7 +3,7 @@
 
 """Vehicles from rows on the engine: groups of vehicles, each a task that writes its part."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, UTC
 import hashlib
@@ -124,16 +124,21 @@ def file_name(vehicle: str) -> str:
     return name
 
 
+def by_model(rows: Iterable[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """Return the vehicles of each model and unit of the scale, without rejected ones."""
+    kinds: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        if row['verdict'] != 'rejected':
+            kinds.setdefault((row['model'], row['unit']), []).append(row)
+    return kinds
+
+
 def beside_their_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the rows with each vehicle's deviations from its model in sigmas, the worst first."""
     for name, short in COMPARED.items():
         for row in rows:
             row[f'{short}_deviate'] = None
-        kinds: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-        for row in rows:
-            if row[name] is not None and row['verdict'] != 'rejected':
-                kinds.setdefault((row['model'], row['unit']), []).append(row)
-        for some in kinds.values():
+        for some in by_model(row for row in rows if row[name] is not None).values():
             found = population(*(np.array([row[key] for row in some], float)
                                  for key in (name, f'{name}_sigma')))
             for row, deviate in zip(some, found.deviates.tolist(), strict=True):

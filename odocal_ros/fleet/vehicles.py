@@ -136,7 +136,6 @@ class Vehicle:
 
 
 def vehicle_of(job: VehicleJob) -> Vehicle:
-    """Return the vehicle result from the rows of its bags."""
     rows = [row for row in rows_of(job.rows) if row.vehicle == job.vehicle]
     known = {bag.bag: bag for bag in job.bags}
     done = sorted((row for row in rows if row.status == DONE), key=lambda row: row.start_ns)

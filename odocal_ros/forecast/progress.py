@@ -133,7 +133,6 @@ class Travel:
             self._since = self.total, self.newest_ns
 
     def still_s(self) -> float:
-        """Return the duration of the current standstill."""
         return (self.newest_ns - self.moved_ns) * 1e-9 if self.moved_ns else 0.0
 
     def rested_s(self, since_s: float) -> float:
@@ -184,7 +183,6 @@ class Progress:
 
     def feed(self, slot: str, block: Any, config: Config, form: OdometerForm | None,
              found_scale: float) -> None:
-        """Process a recorded block."""
         if not len(block.stamp_ns):
             return
         self.clocks.feed(slot, block)
@@ -229,5 +227,4 @@ class Progress:
         return self._path.top
 
     def still_s(self) -> float:
-        """Return the duration of the standstill by the odometer."""
         return self._travel.still_s() if self._travel else 0.0

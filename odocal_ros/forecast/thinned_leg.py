@@ -44,7 +44,6 @@ class ThinnedLeg:
         self._fix_steps: list[Ints] = []
 
     def feed(self, slot: str, samples: data.Samples) -> None:
-        """Add recorded rows."""
         samples = _usable(samples)
         if not len(samples.stamp_ns):
             return

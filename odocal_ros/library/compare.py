@@ -49,7 +49,6 @@ class Difference:
 
     @property
     def beyond(self) -> bool:
-        """Return True if the change is significant."""
         return self.sigmas is not None and abs(self.sigmas) > REMARK_SIGMAS
 
 
@@ -90,7 +89,6 @@ def changes(stored: list[Stored]) -> list[Change]:
 
 
 def notes(stored: list[Stored]) -> list[str]:
-    """Return the notes on the compared calibrations."""
     out = []
     for s in stored:
         if not s.usable:
@@ -166,7 +164,6 @@ class Comparison:
     changed: bool | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the comparison as plain dicts and lists."""
         names = [s.name for s in self.stored]
 
         def difference(d: Difference | None) -> dict[str, Any] | None:

@@ -55,7 +55,6 @@ class Change:
 
 
 def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
-    """Return the possible changes, each with the resulting sigmas."""
     # the same keyframe spacing: a wider one alone makes a sigma larger
     spacing = spacing_for(drive)
     found = []

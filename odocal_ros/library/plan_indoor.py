@@ -92,7 +92,6 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
 
 
 def robot_of(options: SimOptions) -> Robot:
-    """Return the robot and reference of options of a simulated run."""
     usual = dict(REFERENCES[options.reference].usual)
     drift, length = usual.get('reference_drift', 0.0), usual.get('drift_length', 0.0)
     model = Robot.drift_length

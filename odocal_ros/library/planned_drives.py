@@ -60,7 +60,6 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
 
 
 def from_scenario(name: str, duration: float | None) -> PlannedDrive:
-    """Return the motion of a simulated scenario."""
     from odocal_ros.sim.options import resolved, SimOptions
     from odocal_ros.sim.scenarios import motion_of
     options = resolved(SimOptions(scenario=name) if duration is None

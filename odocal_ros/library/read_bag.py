@@ -94,7 +94,6 @@ class Recording:
 
     @property
     def form(self) -> OdometerForm:
-        """Return the meaning of the odometer values."""
         return self.recorder.form
 
     def samples(self, slot: str) -> Samples:

@@ -82,7 +82,6 @@ def _row(name: str, result: dict[str, dict[str, Any]], truth: dict[str, Any],
 
 
 def table(found: list[Row]) -> str:
-    """Return the rows as text for a terminal."""
     lines = [f'{"":<28}{"found":<32}{"truth":<20}off by']
     for row in found:
         if row.value is None:
@@ -99,7 +98,6 @@ def _truth(row: Row) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Print the table; return 0 if all agree, 1 if not, 2 on wrong use."""
     argv = sys.argv[1:] if argv is None else argv
     try:
         if len(argv) != 2:

@@ -48,7 +48,6 @@ class OdocalCommand:
             f'  {name:<10}{about}' for name, (_, about) in cli.COMMANDS.items())
 
     def main(self, *, parser: argparse.ArgumentParser, args: argparse.Namespace) -> int:
-        """Run the command; return its exit code."""
         return cli.main(args.argv)
 
 
@@ -98,7 +97,6 @@ def _module_of(name: str) -> ModuleType:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command line; return its exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
     if sys.stdout is None:       # closed by the parent process
         sys.stdout = open(os.devnull, 'w', encoding='utf-8')     # noqa: SIM115 until exit

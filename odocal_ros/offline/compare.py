@@ -26,7 +26,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare calibrations; return 0 unchanged, 1 changed or nothing to compare."""
     from odocal_ros.library.compare import compare
     from odocal_ros.offline.cli import OK, REJECTED
     found = compare(*args.files)

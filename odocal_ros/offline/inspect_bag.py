@@ -17,7 +17,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Inspect a bag and print what was found."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.offline.inspection import inspect
     from odocal_ros.offline.inspection_text import text

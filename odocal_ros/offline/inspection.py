@@ -242,7 +242,6 @@ def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
 
 def _read_again(bag: Bag, taps: dict[str, _Tap], topic: str, config: Config,
                 topics: list[dict[str, Any]]) -> None:
-    """Read the odometer again, with the found settings."""
     tap = taps[topic] = _Tap(make_reader('odometer', bag.topics[topic].msgtype, config))
     bag.read({topic: tap}, print)
     facts = next(facts for facts in topics if facts['name'] == topic)

@@ -209,7 +209,6 @@ def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:
 
 
 def lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
-    """Return the reasons on data that a calibration lacks."""
     topics = {topic['name']: topic for topic in found['topics']}
     out = []
     for slot, code, word in (('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER,

@@ -16,7 +16,6 @@ STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
 
 
 def text(found: dict[str, Any]) -> str:
-    """Return the findings as text, one screen or more."""
     roles = {topic: slot for slot, topic in found['mapping'].items()}
     blocks = [_head(found), _topics(found, roles)]
     blocks += [_details(topic, roles) for topic in found['topics']

@@ -84,7 +84,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _indoor(args: argparse.Namespace) -> int:
-    """Predict and print runs of a small robot; return 0."""
     from odocal_ros.library.plan_indoor import plan_indoor
     from odocal_ros.offline.plan_text import indoor_screen
     asked = {'reference': args.reference, 'drive': args.drive, 'size': args.size,

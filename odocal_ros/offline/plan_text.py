@@ -22,7 +22,6 @@ def screen(planned: Planned) -> str:
 
 
 def indoor_screen(runs: list[PlannedRun]) -> str:
-    """Return the predictions of runs of a small robot as one screen of plain text."""
     robot, by = runs[0].robot, runs[0].method
     names = [name for name in SHOWN if name in by.estimates
              and not (name == 'yaw_mounting_angle' and by.name == 'planar')]

@@ -115,7 +115,6 @@ class _Screen(Listener):
             warn(f'odocal: {text}')
 
     def phase(self, title: str) -> Phase:
-        """Return a progress line that disappears after the phase."""
         return Phase(title, self._silent)
 
 

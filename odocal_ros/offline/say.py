@@ -21,7 +21,6 @@ def say(text: str, end: str = '\n') -> None:
 
 
 def say_json(content: Any) -> None:
-    """Print plain dicts and lists as JSON on stdout."""
     say(json.dumps(content, indent=2, allow_nan=False))
 
 

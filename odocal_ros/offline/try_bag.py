@@ -173,7 +173,6 @@ def _why_mounting(mounting: dict[str, Any] | None) -> str:
 
 
 def _open(report: Path, never: bool) -> None:
-    """Show the report in a browser if there is a display."""
     import webbrowser
     if never or not report.exists():
         return

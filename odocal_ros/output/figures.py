@@ -112,7 +112,6 @@ def known(estimates: dict[str, Estimate], name: str) -> Estimate:
 
 
 def with_unit(estimate: Estimate) -> str:
-    """Return value and sigma with their unit."""
     unit = '' if estimate.unit == '1' else f' {estimate.unit}'
     return with_sigma(estimate.value, estimate.sigma) + unit
 

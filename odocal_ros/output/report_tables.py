@@ -217,7 +217,6 @@ def full_digits(content: dict[str, Any]) -> list[tuple[str, str, str, str, str]]
 
 
 def versions(software: str) -> list[tuple[str, str]]:
-    """Return the versions of the packages that compute and draw."""
     from importlib.metadata import PackageNotFoundError, version
     import platform
     found = [('odocal_ros', software.rpartition(' ')[2]), ('Python', platform.python_version())]

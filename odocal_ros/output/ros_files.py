@@ -69,14 +69,21 @@ def _params(calibration: Calibration, content: dict[str, Any]) -> str:
 
 
 def _autoware(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
-    out = {}
-    top = device_files.head(calibration, content)
+    out: dict[str, tuple[str, str, dict[str, Any]]] = {}
     factor, bias_i = _speed_factor(calibration), _gyro_bias_i(calibration, config)
     if factor is not None:
-        out[VELOCITY] = top + _velocity_converter(factor, config.frames.base)
+        out[VELOCITY] = 'vehicle_velocity_converter', 'the two stddev', {
+            'speed_scale_factor': factor, 'velocity_stddev_xx': 0.2,
+            'angular_velocity_stddev_zz': 0.1, 'frame_id': config.frames.base}
     if bias_i is not None:
-        out[IMU] = top + _imu_corrector(bias_i)
-    return out
+        out[IMU] = 'imu_corrector', 'the stddev', {
+            f'angular_velocity_offset_{axis}': float(b)
+            for axis, b in zip(AXES, bias_i, strict=True)} | {
+            f'angular_velocity_stddev_{axis}{axis}': 0.03 for axis in AXES}
+    top = device_files.head(calibration, content)
+    return {name: f'{top}# for autoware {node}, in place of its param file of this name;\n'
+            f'# {defaults} are its defaults, not measured here\n{parameters(values)}'
+            for name, (node, defaults, values) in out.items()}
 
 
 def _speed_factor(calibration: Calibration) -> float | None:
@@ -87,13 +94,6 @@ def _speed_factor(calibration: Calibration) -> float | None:
     return None if ratio is None else ratio.value
 
 
-def _velocity_converter(factor: float, frame: str) -> str:
-    return ('# for autoware vehicle_velocity_converter, in place of its param file of this name;\n'
-            '# the two stddev are its defaults, not measured here\n' + parameters({
-                'speed_scale_factor': factor, 'velocity_stddev_xx': 0.2,
-                'angular_velocity_stddev_zz': 0.1, 'frame_id': frame}))
-
-
 def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
     """Return the gyro bias in the IMU's own axes and raw unit, (3,), None if unknown."""
     found = [calibration.estimates.get(f'gyro_bias_{axis}') for axis in AXES]
@@ -102,14 +102,6 @@ def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
     if C_bi is None or len(bias) < len(AXES):
         return None
     return np.asarray(C_bi).T @ bias / config.imu.gyro_scale
-
-
-def _imu_corrector(bias_i: Floats) -> str:
-    offsets = {f'angular_velocity_offset_{axis}': float(b)
-               for axis, b in zip(AXES, bias_i, strict=True)}
-    return ('# for autoware imu_corrector, in place of its param file of this name;\n'
-            '# the stddev are its defaults, not measured here\n' + parameters(
-                offsets | {f'angular_velocity_stddev_{axis}{axis}': 0.03 for axis in AXES}))
 
 
 def _transform(calibration: Calibration, config: Config,
