@@ -66,18 +66,6 @@ def test_correlated_fixes_leave_what_a_gauss_markov_mean_leaves():
             2.0 * math.sqrt(left) / 11_200, rel=0.01)
 
 
-def test_gyro_noise_is_the_integral_of_what_is_still_to_drive():
-    result = predict(paper_drive(), Sigmas(config=config()))
-    t = np.linspace(0.0, 600.0, 60_001)
-    v = np.interp(t, [0, 40, 560, 600], [0, 20, 20, 0])
-    way = np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) / 2 * 0.01)])
-    q = (math.radians(0.001) / 60)**2
-    integral = np.sum(((1 - way / way[-1])**2)[:-1]) * 0.01
-    # the sum on 0.1 s against that on 0.01 s: of first order, 0.1 / 200 at most
-    assert row(result, 'gyro_noise')[YAW] == pytest.approx(math.sqrt(q * integral), rel=1e-3)
-    assert row(result, 'gyro_noise')[YAW] * DEG == pytest.approx(2.4e-4, abs=0.05e-4)
-
-
 def test_a_bias_about_the_vertical_turns_by_the_mean_time_of_the_way():
     result = predict(paper_drive(), Sigmas(config=config()))
     # the trapezoid of speed is symmetric: its way lies 300 s after the start on the mean
@@ -87,13 +75,6 @@ def test_a_bias_about_the_vertical_turns_by_the_mean_time_of_the_way():
     assert math.radians(0.01) / 3600 / sigma * row(result, 'gyro_bias_z')[YAW] * DEG == \
         pytest.approx(8.33e-4, abs=0.005e-4)
     assert row(result, 'gyro_bias_x')[YAW] < 1e-9 * sigma * 300.0
-
-
-def test_the_heading_goes_into_the_yaw_as_it_is():
-    result = predict(paper_drive(), Sigmas(config=config()))
-    assert row(result, 'initial_heading')[YAW] == pytest.approx(HEADING, rel=1e-9)
-    assert row(result, 'initial_heading')['shared'] is True
-    assert row(result, 'projection') == {SCALE: 0.0, YAW: 0.0, PITCH: 0.0, 'shared': False}
 
 
 @pytest.mark.parametrize('scenario', ['paper', 'straight', 'town'])

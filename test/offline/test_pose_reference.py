@@ -146,27 +146,18 @@ def test_inspect_shows_tf_positions_and_other_frames_are_an_error(tf_bag, capsys
     assert "no transform from world to prism: 'map' has no parent" in capsys.readouterr().err
 
 
-@pytest.fixture
-def robot(tmp_path, monkeypatch):
-    """Return the name of a bag of a robot with two wheels and motion capture."""
+def test_a_robot_without_an_imu_is_inspected_and_calibrated(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     assert cli.main(['simulate', '--scenario', 'indoor', '--duration', '90', '--no-imu',
                      '--reference', 'mocap', '--fix-rate', '10', '--out', 'robot',
                      '--quiet']) == 0
-    return 'robot'
-
-
-def test_inspect_suggests_a_replay_without_an_imu(robot, capfd):
     capfd.readouterr()
-    assert cli.main(['inspect', robot, '--json']) == 0
+    assert cli.main(['inspect', 'robot', '--json']) == 0
     found = json.loads(capfd.readouterr()[0])
     assert 'NO_IMU' not in {reason['code'] for reason in found['findings']}
     assert '--set odometer.left=topic' in found['command']
     assert 'imu' not in found['command']
-
-
-def test_try_calibrates_it(robot, capfd):
-    assert cli.main(['try', robot, '--no-browser']) == 0
+    assert cli.main(['try', 'robot', '--no-browser']) == 0
     out, _ = capfd.readouterr()
     assert 'track width' in out
     assert 'yaw mounting' not in out
