@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from odocal_ros.calib.choice import deciding
-from odocal_ros.forecast.planned_alignment import plan_alignment
 from odocal_ros.forecast.planned_drive import from_rates
+from odocal_ros.forecast.predict import plan_alignment
 from odocal_ros.nav.alignment import Alignment, HEADING_LIMIT
 from odocal_ros.pipeline.methods import METHODS
 from odocal_ros.screening.glitches import Oriented, oriented
