@@ -1,14 +1,13 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulated legs as the smoother sees them, and their truth at its keyframes."""
-
+"""Simulated legs as the smoother sees them, their results, their truth at its keyframes."""
 
 from drives import cached, settings
 import numpy as np
 
 from odocal_ros.data.samples import VelocitySamples
-from odocal_ros.estimator import smoother_leg
+from odocal_ros.estimator import smooth, smoother_leg
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.state import GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
 from odocal_ros.nav.dead_reckoning import mounting_from_forward
@@ -33,6 +32,18 @@ def made(**options):
     config = settings(drive, None, verdict__max_yaw_sigma=0.0087, imu__accel_scale_sigma=0.0,
                       imu__misalignment_sigma=0.0, imu__gyro_by_force_sigma=0.0)
     return drive, config, leg_of(drive.leg(), config)
+
+
+@cached
+def smoothed(**options):
+    """Return a drive and the result of the smoother."""
+    drive, config, leg = made(**options)
+    return drive, smooth(leg, config)
+
+
+def said(result):
+    """Return the texts of the reasons of a result, by code."""
+    return {reason.code: reason.text for reason in result.reasons}
 
 
 def leg_of(leg, config):

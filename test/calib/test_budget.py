@@ -42,16 +42,15 @@ class Reckoner:
         w[:, 1] += 0.002 * np.sin(self.t / 30)
         self.w = w
 
-
     def track(self, phi_n=(0, 0, 0), w_error=0.0, late=0.0):
         """Return the track with an attitude error, gyro errors, an odometer that is late."""
         q = quat_from_matrix(exp_so3(-np.asarray(phi_n, float)) @ C0)
         t, q_nb = attitude(self.t, self.w + w_error, q, EARTH)
         return dead_reckon(t, q_nb, Travel(self.t + late, self.s, 0.0))
 
-    def solve(self, chord_n, **errors):
-        """Return (ln K, yaw, pitch) that a chord and an erring track give."""
-        return parameters(np.linalg.solve(self.track(**errors).P[-1], chord_n))
+    def solve(self, chord_n, off=0.0, **errors):
+        """Return (ln K, yaw, pitch) that a chord with an error and an erring track give."""
+        return parameters(np.linalg.solve(self.track(**errors).P[-1], chord_n + off))
 
 
 @pytest.fixture(scope='module')
@@ -95,61 +94,46 @@ def test_the_gradient_is_the_derivative():
                                    atol=1e-6 / K)
 
 
-def differ(leg, chord, plus, minus):
-    """Return half the difference of what an error and its opposite do."""
-    return (leg.solve(chord, **plus) - leg.solve(chord, **minus)) / 2
+def on_axis(leg, axis, about):
+    """Return the gyro error of an axis that measures a share of the turn about another."""
+    w = np.zeros_like(leg.w)
+    w[:, axis] = SMALL * leg.w[:, about]
+    return {'w_error': w}
 
 
-@pytest.mark.parametrize(('name', 'column', 'figures', 'error', 'tolerance'), [
-    ('initial_level', 0, {'level_sigma': SMALL}, {'phi_n': C0[:, 0] * SMALL}, 1e-3),
-    ('initial_level', 1, {'level_sigma': SMALL}, {'phi_n': C0[:, 1] * SMALL}, 1e-3),
-    ('initial_heading', 0, {'heading_sigma': SMALL}, {'phi_n': np.array([0.0, 0.0, SMALL])}, 1e-3),
-    *((f'gyro_bias_{axis}', 0, {'gyro_bias_sigma': bias}, {'w_error': bias}, 2e-3)
+CHANGE, ENDS = np.array([3.0, -5.0, 0.2]), np.diag([0.4, 0.4, 0.6])
+
+
+@pytest.mark.parametrize(('name', 'figures', 'errors', 'tolerance'), [
+    ('initial_level', {'level_sigma': SMALL},
+     lambda *_: [{'phi_n': axis * SMALL} for axis in C0.T[:2]], 1e-3),
+    ('initial_heading', {'heading_sigma': SMALL}, lambda *_: [{'phi_n': [0, 0, SMALL]}], 1e-3),
+    *((f'gyro_bias_{axis}', {'gyro_bias_sigma': bias}, lambda *_, b=bias: [{'w_error': b}], 2e-3)
       for axis, bias in zip('xyz', np.eye(3) * 1e-6, strict=True)),
-    ('odometer_delay', 0, {'more': {'odometer_time_sigma': 0.1}}, {'late': 0.1}, 0.02)])
-def test_a_column_is_what_its_error_does(leg, truth, name, column, figures, error, tolerance):
+    ('gyro_scale', {'gyro_scale_sigma': SMALL},
+     lambda leg, _: [on_axis(leg, i, i) for i in range(3)], 2e-3),
+    ('gyro_axes', {'gyro_axes_sigma': SMALL},
+     lambda leg, _: [on_axis(leg, i, k) for i in range(3) for k in range(3) if i != k], 2e-3),
+    ('odometer_delay', {'more': {'odometer_time_sigma': 0.1}}, lambda *_: [{'late': 0.1}], 0.02),
+    *((name, {'cov': 0.04, 'fix_scale': (2.0, 2.0, 3.0)},
+       lambda *_: [{'off': e} for e in ENDS], 1e-3) for name in ('fix_start', 'fix_end')),
+    ('fix_latency', {'more': {'time_sigma': 0.05, 'velocity_change': CHANGE}},
+     lambda *_: [{'off': CHANGE * 0.05}], 1e-3),
+    ('antenna_lever_arm', {'more': {'lever_arm_sigma': 0.1}},
+     lambda _, C: [{'off': e} for e in (C[-1] - C[0]).T * 0.1], 1e-3)])
+def test_a_column_is_what_its_error_does(leg, truth, name, figures, errors, tolerance):
     track, chord, _ = truth
-    column = sources(track, **figures)[name].effects[:, column]
-    real = differ(leg, chord, error, {k: -v for k, v in error.items()})
-    # the sign of a column is free: only products of columns enter; but all rows share it
-    real = real * np.sign(real @ column)
-    assert np.abs(column).max() > 1e-5      # turns at speed make a late odometer matter
-    np.testing.assert_allclose(real, column, atol=tolerance * np.abs(column).max())
-
-
-@pytest.mark.parametrize(('name', 'mark', 'sign'), [('fix_start', 0, -1), ('fix_end', 1, 1)])
-def test_fix_ends(leg, truth, name, mark, sign):
-    source = sources(truth[0], cov=0.04, fix_scale=(2.0, 2.0, 3.0))[name]
-    _, chord, _ = truth
-    real = np.stack([(leg.solve(chord + sign * e) - leg.solve(chord - sign * e)) / 2
-                     for e in np.diag([0.4, 0.4, 0.6])], -1)
-    # columns may be turned among themselves: compare covariances
-    np.testing.assert_allclose(source.effects @ source.effects.T, real @ real.T,
-                               atol=1e-3 * np.abs(real @ real.T).max())
-    assert not source.shared
-
-
-def test_fix_latency_acts_by_the_change_of_velocity(leg, truth):
-    change = np.array([3.0, -5.0, 0.2])
-    column = sources(truth[0], more={'time_sigma': 0.05, 'velocity_change': change})[
-        'fix_latency'].effects[:, 0]
-    _, chord, _ = truth
-    real = (leg.solve(chord + change * 0.05) - leg.solve(chord - change * 0.05)) / 2
-    np.testing.assert_allclose(column, real, atol=1e-6)
-
-
-def test_antenna_lever_arm(leg, truth):
-    source = sources(truth[0], more={'lever_arm_sigma': 0.1})['antenna_lever_arm']
-    track, chord, _ = truth
-    C = matrix_from_quat(track.q_nb)
-    real = []
-    for arm in np.eye(3) * 0.1:
-        e = (C[-1] - C[0]) @ arm
-        real.append((leg.solve(chord + e) - leg.solve(chord - e)) / 2)
-    real = np.array(real).T
-    np.testing.assert_allclose(source.effects @ source.effects.T, real @ real.T,
-                               atol=1e-3 * np.abs(real @ real.T).max())
-    assert source.shared
+    effects = sources(track, **figures)[name].effects
+    real = np.stack([
+        leg.solve(chord, **error) - leg.solve(chord, **{k: np.negative(v)
+                                                        for k, v in error.items()})
+        for error in errors(leg, matrix_from_quat(track.q_nb))], -1) / 2
+    # the sign of a source is free: only products of its columns enter; but all of it shares it
+    real = real * np.sign((real * effects).sum())
+    assert np.abs(effects).max() > 1e-5     # turns at speed make a late odometer matter
+    for found, column in zip(real.T, effects.T, strict=True):
+        np.testing.assert_allclose(found, column,
+                                   atol=tolerance * np.abs(column).max() + 1e-7 * SMALL)
 
 
 def test_quantisation_is_that_of_two_roundings(truth):
@@ -165,25 +149,7 @@ def test_height_makes_the_earth_larger(truth):
     track, _, _ = truth
     found = sources(track, cov=100.0)['height']
     assert found.effects[0, 0] == pytest.approx(10.0 / 6378137, rel=1e-3)
-    assert found.shared
     assert sources(track)['projection'].effects.any() == np.False_
-
-
-@pytest.mark.parametrize('about', [0, 1, 2])
-@pytest.mark.parametrize('axis', [0, 1, 2])
-def test_gyro_scale_and_axes(leg, truth, axis, about):
-    """An axis that shows a share of the turn about another."""
-    found = sources(truth[0], gyro_scale_sigma=SMALL, gyro_axes_sigma=SMALL)
-    others = [k for k in range(3) if k != axis]
-    column = (found['gyro_scale'].effects[:, axis] if axis == about else
-              found['gyro_axes'].effects[:, 2 * axis + others.index(about)])
-    w = np.zeros_like(leg.w)
-    w[:, axis] = SMALL * leg.w[:, about]
-    # the sign is that of the correction; but all columns share it
-    np.testing.assert_allclose(-differ(leg, truth[1], {'w_error': w}, {'w_error': -w}), column,
-                               atol=2e-3 * np.abs(column).max() + 1e-7 * SMALL)
-    assert found['gyro_scale'].shared
-    assert found['gyro_axes'].shared
 
 
 @pytest.mark.parametrize('name', ['gyro_noise', 'gyro_bias_walk'])

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from drives import ANGLES, cached, off, turned
 import numpy as np
 import pytest
-from smoother_legs import leg_of, made
+from smoother_legs import leg_of, made, said as texts
 
 from odocal_ros.calib.sections import counter_change, Sections
 from odocal_ros.estimator import smooth
@@ -22,7 +22,7 @@ from odocal_ros.estimator.fit import CONVERGENCE
 from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.result.remarks import _changes, LEAST_CHANGE
 from odocal_ros.estimator.smoother import best_fit
-from odocal_ros.estimator.state import LN_K, PITCH, YAW
+from odocal_ros.estimator.state import LN_K, M, PITCH, YAW
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
@@ -47,8 +47,13 @@ def changed(turn=(0.0, 0.0, 0.0), scale=0.0, **limits):
     leg = leg.with_rows(imu=turned(leg.imu, at, turn),
                         odometer=replace(leg.odometer, value=np.round(value).astype(int)))
     result = smooth(leg_of(leg, config), with_settings(config, limits))
-    said = {r.code: r.text for r in result.reasons}
-    return drive.truth, result.estimates, said
+    return drive.truth, result.estimates, texts(result)
+
+
+def equations_at(problem, fit, constants):
+    """Return the equations of a fit at other constants."""
+    return Equations(problem, replace(fit.state, constants=constants), fit.priors, fit.spread,
+                     True)
 
 
 @pytest.fixture(scope='module')
@@ -61,14 +66,9 @@ def fitted():
 def column_of(problem, fit, constant, size):
     """Return the whitened derivatives of the motion rows by a constant, by differences: (K, r)."""
     rows = fit.weighted[MotionRows]
-    ends = []
-    for by in (size, -size):
-        constants = fit.state.constants.copy()
-        constants[constant] += by
-        equations = Equations(problem, replace(fit.state, constants=constants), fit.priors,
-                              fit.spread, True)
-        ends.append(equations.parts['motion'].raw)
-    return np.einsum('kij,kj->ki', rows.whiten, (ends[0] - ends[1]) / (2 * size))
+    above, below = (equations_at(problem, fit, fit.state.constants + by * (
+        np.arange(M) == constant)).parts['motion'].raw for by in (size, -size))
+    return np.einsum('kij,kj->ki', rows.whiten, (above - below) / (2 * size))
 
 
 @pytest.mark.parametrize('constant', [YAW, PITCH])
@@ -103,8 +103,7 @@ def test_a_shortened_last_step_does_not_change_the_steps(fitted):
     problem, fit = fitted
     constants = fit.state.constants.copy()
     constants[[LN_K, YAW]] += 0.01
-    equations = Equations(problem, replace(fit.state, constants=constants), fit.priors,
-                          fit.spread, True)
+    equations = equations_at(problem, fit, constants)
     found = []
     for taken in (1.0, 0.4):
         weighted = equations.at(fit.levels)
@@ -160,7 +159,7 @@ def test_a_scale_that_changes_gradually_has_no_step():
     arch = 0.003 * np.sin(np.pi * np.linspace(0.0, 1.0, len(counts)))
     value = np.cumsum(np.append(0.0, counts * (1 + arch)))
     leg = leg.with_rows(odometer=replace(leg.odometer, value=np.round(value).astype(int)))
-    said = {r.code: r.text for r in smooth(leg_of(leg, config), config).reasons}
+    said = texts(smooth(leg_of(leg, config), config))
     assert 'from start to end' in said[Code.SCALE_VARIES]
     assert Code.CHANGE_IN_LEG not in said
 
@@ -172,29 +171,21 @@ def test_a_change_that_does_not_matter_is_not_reported(constant):
         assert len(_changes(fit)) == count
 
 
-def found(ratio, sigma=1e-3):
-    """Return what is said of ten sections of 100 m in 10 s each."""
+@pytest.mark.core
+@pytest.mark.parametrize(('ratio', 'sigma', 'text'), [
+    ([1.4] * 4 + [0.9] + [0.7] * 5, 1e-3, '2.00 times as much per metre after t = 40 to 50 s'),
+    ([0.7] * 4 + [0.9] + [1.4] * 5, 1e-3, '0.50 times'),
+    ([1.0] * 10, 1e-3, ''), ([1.01] * 5 + [0.99] * 5, 1e-4, ''),
+    ([1.05] * 5 + [0.95] * 5, 0.05, ''), ([1.0] * 4 + [0.7] + [1.0] * 5, 1e-3, ''),
+    (np.linspace(0.9, 1.1, 10), 1e-3, ''), ([1.0] * 5 + [np.nan] * 5, 1e-3, '')],
+    ids=['halved', 'doubled', 'constant', 'tyres', 'uncertain', 'slip', 'drift', 'half'])
+def test_a_counter_that_changes_is_found_with_place_and_factor(ratio, sigma, text):
+    """Ten sections of 100 m in 10 s each."""
     edges = np.linspace(0.0, 1000.0, len(ratio) + 1)
     parts = Sections(edges[:-1], edges[1:], np.array(ratio), np.full(len(ratio), sigma))
-    return counter_change(parts, np.linspace(0.0, 100.0, 101), np.linspace(0.0, 1000.0, 101))
-
-
-@pytest.mark.core
-def test_it_is_found_where_it_is_and_with_its_factor():
-    (reason,) = found([1.4] * 4 + [0.9] + [0.7] * 5)
-    assert reason.code is Code.TRACK_MISMATCH
-    assert '2.00 times as much per metre after t = 40 to 50 s' in reason.text
-    assert '0.50 times' in found([0.7] * 4 + [0.9] + [1.4] * 5)[0].text
-
-
-@pytest.mark.core
-@pytest.mark.parametrize(('ratio', 'sigma'), [
-    ([1.0] * 10, 1e-3), ([1.01] * 5 + [0.99] * 5, 1e-4), ([1.05] * 5 + [0.95] * 5, 0.05),
-    ([1.0] * 4 + [0.7] + [1.0] * 5, 1e-3), (np.linspace(0.9, 1.1, 10), 1e-3),
-    ([1.0] * 5 + [np.nan] * 5, 1e-3)],
-    ids=['constant', 'tyres', 'uncertain', 'slip', 'drift', 'half'])
-def test_what_else_changes_a_scale_is_none(ratio, sigma):
-    assert found(ratio, sigma) == ()
+    found = counter_change(parts, np.linspace(0.0, 100.0, 101), np.linspace(0.0, 1000.0, 101))
+    assert [r.code for r in found] == [Code.TRACK_MISMATCH] * bool(text)
+    assert all(text in r.text for r in found)
 
 
 @pytest.fixture(scope='module')
@@ -249,10 +240,10 @@ def test_a_step_of_a_bias_is_a_step_and_no_noise(stepping):
         assert off(method, drive, name) < 3.3
         # one interval without the continuity of the bias, of 200
         assert method.estimates[name].sigma < 1.3 * plain.estimates[name].sigma
-    said = {r.code: r.text for r in method.reasons}
+    said = texts(method)
     assert not {Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH, Code.WHEEL_SLIP,
                 Code.CHANGE_IN_LEG} & set(said)
-    assert Code.IMU_BIAS_STEP not in {r.code for r in plain.reasons}
+    assert Code.IMU_BIAS_STEP not in texts(plain)
     found = re.fullmatch(f'the {SENSORS[stepping]} bias changes by ([0-9.]+) (deg/s|m/s\\^2) near '
                          't = ([0-9]+) s; estimated before and after', said[Code.IMU_BIAS_STEP])
     unit = {'deg/s': np.deg2rad(1.0), 'm/s^2': 1.0}[found[2]]

@@ -19,6 +19,7 @@ NO_YAW = Reason(Code.YAW_NOT_DETERMINED, 'no turns')
 ALL = with_settings(Config(), {'method': 'all'})
 REFUSED = Reason(Code.CHORD_TOO_SHORT, 'a loop')
 DEG = np.pi / 180
+LIMIT = REMARK_SIGMAS * 2**0.5 * 1e-3       # between two scales of method()
 
 
 def method(name, scale=2.0, yaw=0.01, reasons=()):
@@ -35,40 +36,32 @@ def several(*methods):
     return {m.name: m for m in methods}
 
 
-def test_the_first_in_order_gives_what_it_has():
-    methods = several(method('two_point', 2.0, 0.01), method('smoother', 2.1, None, [NO_YAW]))
-    estimates, giving = choose(methods, 'all')
-    assert (estimates['scale_factor'].value, estimates['scale_factor'].method) == (2.1, 'smoother')
-    assert estimates['yaw_mounting_angle'].method == 'two_point'
-    assert giving == ('smoother', 'two_point')
+def chosen(methods, asked, name='scale_factor'):
+    """Return the value chosen, and the methods that gave one."""
+    estimates, giving = choose(methods, asked)
+    return estimates[name].value, giving
+
+
+def test_each_value_is_of_the_first_method_that_has_it_and_is_not_rejected():
+    ends, refused = method('two_point'), method('two_point', None, None, [REFUSED])
+    methods = several(ends, method('smoother', 2.1, None, [NO_YAW]))
+    assert chosen(methods, 'all') == (2.1, ('smoother', 'two_point'))
+    assert choose(methods, 'all')[0]['yaw_mounting_angle'].method == 'two_point'
+    fell = method('smoother', 2.1, reasons=[REFUSED])
+    assert chosen(several(fell, ends), 'auto')[0] == 2.0
+    # all are rejected; only one is asked for
+    assert chosen(several(fell, refused), 'auto') == (2.1, ('smoother',))
+    assert chosen(several(method('smoother', 2.1), refused), 'two_point') == (
+        None, ('two_point',))
+    assert choose(several(ends), 'wheels') == ({}, ())
 
 
 def test_a_pitch_that_the_smoother_cannot_tell_is_not_given_by_end_points():
-    known = {'pitch_mounting_angle': Estimate(0.02, 1e-3, 'rad')}
-    unknown = {'pitch_mounting_angle': Estimate(None, None, 'rad')}
-    smoother, ends = method('smoother'), method('two_point')
-    methods = several(replace(smoother, estimates=smoother.estimates | unknown),
-                      replace(ends, estimates=ends.estimates | known))
-    assert choose(methods, 'auto')[0]['pitch_mounting_angle'].value is None
-    assert choose(methods, 'two_point')[0]['pitch_mounting_angle'].value == 0.02
-
-
-def test_values_of_rejected_methods_are_given_only_where_all_are():
-    methods = several(method('smoother', 2.1, reasons=[REFUSED]), method('two_point'))
-    assert choose(methods, 'auto')[0]['scale_factor'].value == 2.0
-    methods = several(method('smoother', 2.1, reasons=[REFUSED]),
-                      method('two_point', None, None, [REFUSED]))
-    estimates, giving = choose(methods, 'auto')
-    assert estimates['scale_factor'].value == 2.1
-    assert giving == ('smoother',)
-
-
-def test_a_method_asked_for_is_the_only_one():
-    methods = several(method('smoother', 2.1), method('two_point', None, None, [REFUSED]))
-    estimates, giving = choose(methods, 'two_point')
-    assert estimates['scale_factor'].value is None
-    assert giving == ('two_point',)
-    assert choose(several(method('two_point')), 'wheels') == ({}, ())
+    methods = several(*(replace(one, estimates=one.estimates | {
+        'pitch_mounting_angle': Estimate(pitch, pitch and 1e-3, 'rad')}) for one, pitch in (
+            (method('smoother'), None), (method('two_point'), 0.02))))
+    assert chosen(methods, 'auto', 'pitch_mounting_angle')[0] is None
+    assert chosen(methods, 'two_point', 'pitch_mounting_angle')[0] == 0.02
 
 
 @pytest.mark.parametrize(('asked', 'run'), [
@@ -102,28 +95,22 @@ def test_a_rejected_method_is_named_where_one_behind_it_gives():
     assert passed_over(several(none, method('two_point')), 'all') == []
 
 
-def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause():
-    limit = REMARK_SIGMAS * 2**0.5 * 1e-3
-    near = several(method('smoother'), method('two_point', 2.0 + 0.99 * limit))
-    far = several(method('smoother'), method('two_point', 2.0 + 1.01 * limit))
-    assert disagreements(near) == []
-    (found,) = disagreements(far)
-    assert found.code is Code.METHODS_DISAGREE
-    assert 'scale: two_point and smoother differ by +2143 ppm, 3.0 sigma' in found.text
-    assert 'marks' in found.text
-    (found,) = disagreements(several(method('smoother'), method('two_point', 1.9)))
-    assert 'by -5.0 %, ' in found.text
-    (found,) = disagreements(several(method('smoother'), method('two_point', yaw=0.01 + 5e-3)))
-    assert '+0.286 deg' in found.text
-    assert 'heading' in found.text
-    rejected = method('two_point', 3.0, reasons=[REFUSED])
-    assert disagreements(several(method('smoother'), rejected)) == []
+@pytest.mark.parametrize(('other', 'text', 'cause'), [
+    ({'scale': 2.0 + 1.01 * LIMIT}, 'scale: two_point and smoother differ by +2143 ppm, 3.0 sigma',
+     'marks'),
+    ({'scale': 1.9}, 'by -5.0 %, ', 'marks'), ({'yaw': 0.01 + 5e-3}, '+0.286 deg', 'heading'),
+    ({'scale': 2.0 + 0.99 * LIMIT}, None, ''), ({'scale': 3.0, 'reasons': [REFUSED]}, None, '')])
+def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause(other, text, cause):
+    found = disagreements(several(method('smoother'), method('two_point', **other)))
+    assert [r.code for r in found] == [Code.METHODS_DISAGREE] * bool(text)
+    assert all(text in r.text and cause in r.text for r in found)
 
 
-def leg(number, *methods, reasons=(), deciding=()):
-    start = 10**18 + number * 10**12
+def leg(number, *methods, reasons=()):
+    """Return a leg of an hour of its own."""
+    start = number * 3600 * 10**9
     return LegResult(start, start + 10**11, 1000.0, 100.0, 10_000, 5000, 500, 0, tuple(reasons),
-                     several(*methods), C_bi=np.eye(3), deciding=deciding)
+                     several(*methods), C_bi=np.eye(3))
 
 
 def test_a_leg_is_good_by_one_method_unless_another_is_asked_for():
@@ -177,16 +164,13 @@ def test_a_method_left_out_of_one_leg_of_two_is_said_once():
 
 
 def driven(number, scale=0.02, sigma=2e-6, yaw=0.01, yaw_sigma=1e-4, unit='m/pulse'):
-    """Return a leg of an hour of its own, accepted."""
-    estimates = {'scale_factor': Estimate(scale, sigma, unit),
-                 'scale_ratio': Estimate(None, None, '1'),
-                 'yaw_mounting_angle': Estimate(yaw, yaw_sigma, 'rad'),
-                 'pitch_mounting_angle': Estimate(None, None, 'rad')}
-    start = number * 3600 * 10**9
-    return LegResult(start, start + 10**11, 1000.0, 100.0, 1, 1, 1, 0, (), {
-        'two_point': MethodResult(
-            'two_point', (), estimates, ('scale_factor', 'yaw_mounting_angle'),
-            (Source('fixes', np.diag([sigma, yaw_sigma])),), {})}, C_bi=np.eye(3))
+    """Return an accepted leg."""
+    one = method('two_point')
+    return leg(number, replace(one, estimates=one.estimates | {
+        'scale_factor': Estimate(scale, sigma, unit),
+        'yaw_mounting_angle': Estimate(yaw, yaw_sigma, 'rad'),
+        'pitch_mounting_angle': Estimate(None, None, 'rad')},
+        sources=(Source('fixes', np.diag([sigma, yaw_sigma])),)))
 
 
 def said(*legs):
@@ -197,23 +181,22 @@ def test_legs_of_one_vehicle_are_fine():
     # worn and new tyres, a mounting given 4 deg of play: LEGS_DISAGREE says it and widens
     assert said(driven(1), driven(2, scale=0.0206, yaw=0.01 + 4 * DEG)) == []
     assert said(driven(1)) == said() == []
-
-
-def test_legs_of_two_vehicles_are_named_by_scale_mounting_and_unit():
-    text, = said(driven(1, scale=0.0203), driven(2, scale=0.02), driven(3, scale=0.022))
-    assert text.startswith('the scale of leg 3 is 10.0 % above that of leg 2: larger than')
-    text, = said(driven(1), driven(2, yaw=0.01 - 6 * DEG))
-    assert text.startswith('the yaw mounting of leg 1 is 6.0 deg above that of leg 2')
-    text, = said(driven(1), driven(2, scale=0.03, yaw=0.5))
-    assert ' and the yaw mounting of leg 2 is ' in text
-    text, = said(driven(1), driven(2, scale=1.02, sigma=1e-4, unit='1'), driven(3))
-    assert text.endswith('so their scales cannot be combined: m/pulse in leg 1, 3; 1 in leg 2')
-
-
-def test_an_imu_that_faces_backwards_is_one_vehicle():
     assert said(driven(1, yaw=179.9 * DEG), driven(2, yaw=-179.9 * DEG)) == []
-    text, = said(driven(1, yaw=177 * DEG), driven(2, yaw=-177 * DEG))
-    assert text.startswith('the yaw mounting of leg 2 is 6.0 deg above that of leg 1')
+
+
+@pytest.mark.parametrize(('legs', 'text'), [
+    (({'scale': 0.0203}, {}, {'scale': 0.022}),
+     'the scale of leg 3 is 10.0 % above that of leg 2: larger than'),
+    (({}, {'yaw': 0.01 - 6 * DEG}), 'the yaw mounting of leg 1 is 6.0 deg above that of leg 2'),
+    (({}, {'scale': 0.03, 'yaw': 0.5}), ' and the yaw mounting of leg 2 is '),
+    (({}, {'scale': 1.02, 'sigma': 1e-4, 'unit': '1'}, {}),
+     'so their scales cannot be combined: m/pulse in leg 1, 3; 1 in leg 2'),
+    # an IMU that faces backwards
+    (({'yaw': 177 * DEG}, {'yaw': -177 * DEG}),
+     'the yaw mounting of leg 2 is 6.0 deg above that of leg 1')])
+def test_legs_of_two_vehicles_are_named_by_scale_mounting_and_unit(legs, text):
+    found, = said(*(driven(k, **leg) for k, leg in enumerate(legs, 1)))
+    assert text in found
 
 
 @pytest.mark.parametrize('more', [

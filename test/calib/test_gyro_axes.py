@@ -23,7 +23,7 @@ from odocal_ros.screening.gravity_turn import gravity_fit, GravityFit
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import with_settings
 
-SOUND = np.array([1.0, 1j, 0.0])
+SOUND, SAME = np.array([1.0, 1j, 0.0]), np.eye(3)
 AXES = {'mirrored x': np.diag([-1.0, 1.0, 1.0]), 'mirrored y': np.diag([1.0, -1.0, 1.0]),
         'x and y swapped': np.eye(3)[[1, 0, 2]], 'x and z swapped': np.eye(3)[[2, 1, 0]],
         'y and z swapped': np.eye(3)[[0, 2, 1]]}
@@ -40,22 +40,30 @@ def town():
     return drive(scenario='town', duration=400.0, imu_grade='industrial', slope=0.04, seed=5)
 
 
-def of_gyro(made, M, C=None, **options):
+def with_imu(made, M=SAME, **more):
+    """Return the leg of a drive whose gyro sends M w, or other columns."""
+    return replace(made.leg(), imu=changed(made.imu, **({'w_i': lambda w: w @ M.T} | more)))
+
+
+def of_gyro(made, M=SAME, C=SAME, **options):
     """Return what a leg says whose gyro sends M w, and whose Imu sits turned by C (b to i)."""
-    C = np.eye(3) if C is None else C
-    imu = changed(made.imu, w_i=lambda w: w @ C.T @ M.T, f_i=lambda f: f @ C.T)
     config = with_settings(settings(made), options)
-    leg = replace(made.leg(), imu=imu)
+    leg = with_imu(made, M @ C, f_i=lambda f: f @ C.T)
     return {r.code: r for r in faults(screened(leg, config), config)}
 
 
-@pytest.mark.parametrize('name', AXES)
-def test_a_wrong_axis_rejects_the_leg_and_its_correction_is_named(name):
-    made = town()
-    leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w @ AXES[name].T))
-    result = calibrate(leg, settings(made))
-    assert rejecting(result) == {Code.GYRO_AXES} == set(everything_said(result))
-    assert f': {DO[name]}' in next(r.do for r in result.reasons)
+X_MIRRORED, Y_MIRRORED = ({'f_i': lambda f, i=i: f * (1.0 - 2.0 * np.eye(3)[i])} for i in (0, 1))
+
+
+@pytest.mark.parametrize(('changes', 'code', 'do'), [
+    *(({'M': AXES[name]}, Code.GYRO_AXES, f': {DO[name]}') for name in AXES),
+    # an axis of the accelerometer is not blamed on the gyro
+    (X_MIRRORED, Code.IMU_AXES, 'negate linear_acceleration.x'),
+    (Y_MIRRORED, Code.IMU_AXES, 'negate linear_acceleration.y')], ids=[*AXES, 'f x', 'f y'])
+def test_a_wrong_axis_rejects_the_leg_and_its_correction_is_named(changes, code, do):
+    result = calibrate(with_imu(town(), **changes), settings(town()))
+    assert rejecting(result) == {code} == set(everything_said(result))
+    assert do in next(r.do for r in result.reasons)
 
 
 @pytest.mark.parametrize('seed', [5, 6])
@@ -65,7 +73,7 @@ def test_a_precise_coefficient_of_three_segments_names_the_axis(seed, name):
     made = drive(scenario='town', duration=300.0, imu_rate=50.0, imu_grade='industrial',
                  odometer_rate=20.0, fix_rate=5.0, fix_noise='rtk', slope=0.03, seed=seed)
     assert 'measures the turn of gravity' in of_gyro(made, AXES[name])[Code.GYRO_AXES].text
-    assert Code.GYRO_AXES not in of_gyro(made, np.eye(3))
+    assert Code.GYRO_AXES not in of_gyro(made)
 
 
 @pytest.mark.parametrize(('name', 'pitch'), [('mirrored x', 0.4), ('x and y swapped', 0.4),
@@ -77,8 +85,7 @@ def test_wrong_axes_that_flat_ground_does_not_show_are_a_skew_of_the_acceleromet
     config = settings(made, method='smoother')
     said = {}
     for axes in (np.eye(3), AXES[name]):
-        leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w, M=axes: w @ M.T))
-        result = calibrate(leg, config)
+        result = calibrate(with_imu(made, axes), config)
         said[axes is AXES[name]] = result.verdict, Code.IMU_AXES_SKEW in everything_said(result)
     assert said == {False: (Verdict.ACCEPTED, False), True: (Verdict.CAUTION, True)}
 
@@ -104,15 +111,6 @@ def test_two_gyro_axes_that_measure_one_axis_are_no_fault_of_the_axes(monkeypatc
     assert [sent for sent, *_ in found] == named
 
 
-@pytest.mark.parametrize('axis', ['x', 'y'])
-def test_a_mirrored_axis_of_the_accelerometer_is_not_blamed_on_the_gyro(axis):
-    made, M = town(), np.diag([-1.0 if axis == one else 1.0 for one in 'xyz'])
-    leg = replace(made.leg(), imu=changed(made.imu, f_i=lambda f: f @ M))
-    result = calibrate(leg, settings(made))
-    assert rejecting(result) == {Code.IMU_AXES} == set(everything_said(result))
-    assert f'negate linear_acceleration.{axis}' in next(r.do for r in result.reasons)
-
-
 @pytest.mark.parametrize(('topic', 'changes', 'cause'), [
     ('imu', {'w_i': np.negative}, 'angular_velocity has the wrong sign'),
     ('imu', {'f_i': lambda f: f * [-1.0, 1.0, 1.0], 'w_i': lambda w: w * [1.0, -1.0, -1.0]},
@@ -128,16 +126,11 @@ def test_the_sign_that_is_wrong_is_found_by_the_third_sensor(topic, changes, cau
 
 def test_turns_the_fixes_do_not_show_still_show_a_mirrored_gyro():
     """Where the course of few fixes says nothing, the accelerometer does."""
-    made = town()
-    few = np.linspace(0, len(made.fix.stamp_ns) - 1, 5).astype(int)
-    said = {}
-    for name, sign in (('sound', 1.0), ('mirrored', -1.0)):
-        leg = replace(made.leg(), fix=take(made.fix, few),
-                      imu=changed(made.imu, w_i=lambda w, s=sign: w * [1.0, 1.0, s]))
-        said[name] = {r.code: r.text for r in faults(
-            screened(leg, settings(made)), settings(made))}
-    assert Code.GYRO_SIGN not in said['sound']
-    assert 'accelerations in turns' in said['mirrored'][Code.GYRO_SIGN]
+    fix = town().fix
+    few = replace(town(), fix=take(fix, np.linspace(0, len(fix.stamp_ns) - 1, 5).astype(int)))
+    assert Code.GYRO_SIGN not in of_gyro(few)
+    mirrored = of_gyro(few, np.diag([1.0, 1.0, -1.0]))
+    assert 'accelerations in turns' in mirrored[Code.GYRO_SIGN].text
 
 
 @pytest.mark.parametrize(('sensor', 'wrong', 'yaw'), [
@@ -164,7 +157,7 @@ def test_axes_are_those_of_the_messages_whatever_the_mounting():
             continue
         assert DO[name] in said[Code.GYRO_AXES].do, name
     assert not {Code.GYRO_SIGN, Code.GYRO_AXES} & set(
-        of_gyro(town(), np.eye(3), C, **{'imu.mounting_rpy': rpy}))
+        of_gyro(town(), SAME, C, **{'imu.mounting_rpy': rpy}))
 
 
 @pytest.mark.parametrize('up', [(0.1, -0.05, 0.99), (0.0, 0.1, -0.99), (0.99, 0.1, 0.0),
@@ -179,13 +172,13 @@ def test_level_axes_are_right_handed_and_named_by_the_sensor_axis_next_to_them(u
         assert axis['xyz'.index(name[-1])] * (-1 if name[0] == '-' else 1) > 0.9
 
 
-@pytest.mark.parametrize('options', [
-    {'scenario': 'town', 'slope': 0.04}, {'scenario': 'straight', 'slope': 0.04},
-    {'scenario': 'town', 'slope': 0.04, 'imu_grade': 'consumer'}, {'scenario': 'town'},
-    {'scenario': 'straight', 'imu_grade': 'consumer'}])
-def test_a_sound_gyro_is_not_accused(options):
-    made = drive(duration=300.0, seed=11, **options)
-    assert Code.GYRO_AXES not in of_gyro(made, np.eye(3))
+@pytest.mark.parametrize(('scenario', 'more'), [
+    ('town', {'slope': 0.04}), ('straight', {'slope': 0.04}),
+    ('town', {'slope': 0.04, 'imu_grade': 'consumer'}), ('town', {}),
+    ('straight', {'imu_grade': 'consumer'})])
+def test_a_sound_gyro_is_not_accused(scenario, more):
+    made = drive(duration=300.0, seed=11, scenario=scenario, **more)
+    assert Code.GYRO_AXES not in of_gyro(made)
 
 
 def test_the_fit_finds_each_coefficient_within_its_sigma():
@@ -241,8 +234,7 @@ def test_pieces_are_long_enough_for_a_direction():
     assert len(pieces(p * 0, p * 0, t, 1.0).t) == 0
 
 
-@pytest.mark.parametrize(('begin', 'end'), [(500.0, 506.0), (200.0, 300.0), (0.0, 100.0),
-                                            (1150.0, 1200.0)])
+@pytest.mark.parametrize(('begin', 'end'), [(500, 506), (200, 300), (0, 100), (1150, 1200)])
 @pytest.mark.parametrize('drift', [0.0, 0.1 * DEG / 600])
 def test_a_stretch_driven_backwards_is_found(begin, end, drift):
     found = winding([(begin, end)], drift)
@@ -265,19 +257,16 @@ def test_a_false_course_of_two_pieces_does_not_turn_the_rest_around():
     assert not np.delete(backwards(Pieces(t, off, *np.ones((2, len(t))))), [60, 61]).any()
 
 
-def test_a_gyro_that_drifts_by_turns_is_no_reversing():
-    """A bias that grows by 0.3 deg/s within 20 min: 180 deg in all."""
+def test_errors_of_the_gyro_are_no_reversing_and_hide_none():
+    # a bias that grows by 0.3 deg/s within 20 min: 180 deg in all
     found = winding(drift=0.3 * DEG / 1200)
     assert np.ptp(np.unwrap(found.off)) > 3.0
-    assert not backwards(found).any()
     assert against_travel(found, signed=True) == ()
-
-
-def test_a_gyro_bias_that_nothing_has_shown_hides_no_reversing():
-    """A robot at 0.3 m/s: a bias of 1 deg/s turns the track by 30 deg from piece to piece."""
-    found = winding([(2000.0, 2400.0)], bias=DEG, speed=0.3, seconds=4000.0)
-    assert 9 <= backwards(found).sum() <= 12     # 120 m in pieces of 10 m and more
-    assert not backwards(winding(bias=DEG, speed=0.3, seconds=4000.0)).any()
+    # a robot at 0.3 m/s: a bias of 1 deg/s turns the track by 30 deg from piece to piece
+    slow = {'bias': DEG, 'speed': 0.3, 'seconds': 4000.0}
+    assert not backwards(winding(**slow)).any()
+    # 120 m in pieces of 10 m and more
+    assert 9 <= backwards(winding([(2000.0, 2400.0)], **slow)).sum() <= 12
 
 
 @pytest.mark.parametrize('drift', [0.0, 0.3 * DEG / 1200])
@@ -295,11 +284,11 @@ def test_fixes_that_run_back_and_on_again_are_no_reversing(drift):
 
 def test_fixes_that_jump_have_no_direction():
     found = winding()
-    back = found.off.copy()
-    back[[40, 41]] += np.pi
-    stretch = found.stretch.copy()
-    stretch[[40, 41]] = 0.33        # back by 60 m while the vehicle goes on by 20
-    assert against_travel(found._replace(off=back, stretch=stretch), signed=True) == ()
+    jumps = np.isin(np.arange(len(found.t)), (40, 41))
+    # back by 60 m while the vehicle goes on by 20
+    found = found._replace(off=found.off + np.pi * jumps,
+                           stretch=np.where(jumps, 0.33, found.stretch))
+    assert against_travel(found, signed=True) == ()
 
 
 def test_after_a_gap_in_which_the_heading_is_lost_forwards_is_what_most_pieces_are():
