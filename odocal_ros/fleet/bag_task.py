@@ -22,7 +22,7 @@ import numpy as np
 
 from odocal_ros.errors import OdocalError
 from odocal_ros.fleet.bags import at_hand, FleetBag, seen_as
-from odocal_ros.fleet.rows import changed_settings, DONE, FAILED, key_of, leg_text, Row, RowStore
+from odocal_ros.fleet.rows import changed_settings, FAILED, key_of, leg_text, Row, RowStore
 from odocal_ros.outside.names import said_by
 
 # error texts without memory for the stack of a thread, or for a library
@@ -53,11 +53,13 @@ class BagJob:
         """Return the key of the row of a failed bag, whose content is unknown."""
         return key_of('failed', self.bag.bag, self.settings)
 
+    def row(self, **more: Any) -> Row:
+        return Row(bag=self.bag.bag, vehicle=self.bag.vehicle, model=self.bag.model,
+                   odometer_km=self.bag.odometer_km, **more)
+
     def failed(self, reason: str, **more: Any) -> Row:
         longest = 500    # characters of a reason
-        return Row(key=self.place, bag=self.bag.bag, vehicle=self.bag.vehicle,
-                   model=self.bag.model, odometer_km=self.bag.odometer_km, status=FAILED,
-                   reason=reason[:longest], **more)
+        return self.row(key=self.place, status=FAILED, reason=reason[:longest], **more)
 
 
 @dataclass(frozen=True)
@@ -135,13 +137,11 @@ def _row(job: BagJob, store: RowStore, seen: str, began: float) -> tuple[Row, bo
             return replace(known, bag=job.bag.bag, seen=seen), False
         found = calibrated(path, job.topics, job.config, job.legs)
     legs = found.result.legs
-    return Row(key=key, bag=job.bag.bag, vehicle=job.bag.vehicle, model=job.bag.model,
-               odometer_km=job.bag.odometer_km, status=DONE, seen=seen, sha256=sha256,
-               settings=json.dumps(changed_settings(found.config), sort_keys=True),
-               topics=json.dumps(found.inputs[0]['topics']), bytes=size,
-               seconds=time.monotonic() - began, driven_s=sum(leg.duration for leg in legs),
-               start_ns=min((leg.start_ns for leg in legs), default=0),
-               legs=leg_text(list(legs))), True
+    return job.row(
+        key=key, seen=seen, sha256=sha256, topics=json.dumps(found.inputs[0]['topics']),
+        settings=json.dumps(changed_settings(found.config), sort_keys=True), bytes=size,
+        seconds=time.monotonic() - began, driven_s=sum(leg.duration for leg in legs),
+        start_ns=min((leg.start_ns for leg in legs), default=0), legs=leg_text(list(legs))), True
 
 
 def _worker() -> Any:

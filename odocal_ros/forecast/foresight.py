@@ -96,8 +96,7 @@ def _by_ends(leg: Leg, fix_rate: float, config: Config, wanted: Callable[[], boo
     inputs = leg_so_far.screened_in_cells(leg, config).inputs
     driven = leg_so_far.profile_of(inputs, config)
     sigmas = Sigmas(config=_heading_found(leg, config),
-                    quantum=leg_so_far.count_size(inputs, config),
-                    **leg_so_far.fix_figures(inputs) | {'fix_rate': fix_rate})
+                    **leg_so_far.figures(inputs, config) | {'fix_rate': fix_rate})
     drive = _at_rest(_thinned(driven), wanted)
     now = predict(drive, sigmas)
 

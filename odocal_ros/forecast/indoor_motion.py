@@ -18,6 +18,7 @@ FULL_TURN = 2 * math.pi        # definition, rad
 # judgement: of a small robot: m/s^2, rad/s, rad/s^2; s at rest after a move, and at either end
 ACCELERATION, TURN_RATE, TURN_ACCELERATION = 0.5, 0.8, 2.0
 REST, END_REST = 3.0, 5.0
+PATTERNS = 'straight', 'square', 'figure_eight', 'spot'
 Move = tuple[float, float, float]      # m forward, m to the left, rad to the left, at once
 
 
@@ -69,7 +70,7 @@ def pattern(name: str, size: float, rounds: int, drive: str, speed: float = 0.5)
             raise BadUsage(f'{flag} {value:g}: required: a number above 0')
     side = 1.0
     moves = []
-    for move in PATTERNS[name](size) * rounds:
+    for move in _moves(name, size) * rounds:
         moves.append(move)
         if drive in HOLONOMIC and not move[2]:
             moves.append((0.0, side * size / 2, 0.0))
@@ -106,22 +107,13 @@ def _trapezoid(length: float, top: float, acceleration: float) -> Floats:
     return out
 
 
-def _straight(size: float) -> list[Move]:
-    return [(size, 0, 0), (0, 0, math.pi), (size, 0, 0), (0, 0, -math.pi)]
-
-
-def _square(size: float) -> list[Move]:
-    return [move for side in (1, -1) for _ in range(4)
-            for move in ((size, 0, 0), (0, 0, side * math.pi / 2))]
-
-
-def _figure_eight(size: float) -> list[Move]:
-    radius = size / 4
-    return [(FULL_TURN * radius, 0, side * FULL_TURN) for side in (1, -1)]
-
-
-def _spot(size: float) -> list[Move]:
-    return [(size, 0, 0), (0, 0, FULL_TURN + math.pi), (size, 0, 0), (0, 0, -FULL_TURN - math.pi)]
-
-
-PATTERNS = {'straight': _straight, 'square': _square, 'figure_eight': _figure_eight, 'spot': _spot}
+def _moves(name: str, size: float) -> list[Move]:
+    """Return the moves of one round of a pattern, of straights of ``size`` m."""
+    if name == 'square':
+        return [move for side in (1, -1) for _ in range(4)
+                for move in ((size, 0, 0), (0, 0, side * math.pi / 2))]
+    if name == 'figure_eight':
+        radius = size / 4
+        return [(FULL_TURN * radius, 0, side * FULL_TURN) for side in (1, -1)]
+    turn = math.pi if name == 'straight' else FULL_TURN + math.pi
+    return [(size, 0, 0), (0, 0, turn), (size, 0, 0), (0, 0, -turn)]

@@ -126,11 +126,6 @@ def _placed(inputs: Inputs, config: Config) -> Placed:
     return placed
 
 
-def count_size(inputs: Inputs, config: Config) -> float:
-    """Return the size of one count, m, 0 for speeds; raise BadData if the scale is unknown."""
-    return inputs.travel.quantum * _placed(inputs, config).rough
-
-
 def _yaw(inputs: Inputs, spans: Floats, t: Floats) -> Floats:
     """Return the angle turned about the z axis of b, rad, without the rate at rest: (m,)."""
     t_imu, w = inputs.t_imu, inputs.w_b[:, 2]
@@ -156,15 +151,16 @@ def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n:
     return float(np.angle(np.sum((fixed - fixed.mean()) * np.conj(at - at.mean()))))
 
 
-def fix_figures(inputs: Inputs) -> dict[str, float]:
-    """Return sigma of one fix, east or north and up, m, and fix rate, Hz, as in ``Sigmas``."""
+def figures(inputs: Inputs, config: Config) -> dict[str, float]:
+    """Return accuracy and rate of the fixes, and the size of one count, as in ``Sigmas``."""
     inside = (inputs.t_fix >= 0) & (inputs.t_fix <= inputs.t_stop)
     if inside.sum() < 2:
         raise BadData('fewer than two usable fixes between the marks')
     middle = np.median(np.diagonal(inputs.covariance_n[inside], axis1=1, axis2=2), axis=0)
     return {'fix': float(np.sqrt((middle[0] + middle[1]) / 2)),
             'fix_up': float(np.sqrt(middle[2])),
-            'fix_rate': float(1 / np.median(np.diff(inputs.t_fix[inside])))}
+            'fix_rate': float(1 / np.median(np.diff(inputs.t_fix[inside]))),
+            'quantum': inputs.travel.quantum * _placed(inputs, config).rough}
 
 
 class SmootherSoFar:

@@ -37,21 +37,17 @@ PARAMETERS = (SCALE, YAW, PITCH)
 
 @dataclass(frozen=True)
 class Change:
-    """A change and the resulting sigmas, relative and rad; None: not determined."""
+    """A change and the resulting sigmas of scale and yaw, relative, rad; None: not determined."""
 
     text: str
-    scale: float | None
-    yaw: float | None
+    sigmas: dict[str, float | None]
 
     def gain(self, before: Plan, parameter: str) -> float:
         """Return the ratio of the old to the new sigma; inf if there was none before."""
-        now, then = self.sigma(parameter), before.sigma(parameter)
+        now, then = self.sigmas[parameter], before.sigma(parameter)
         if now is None:
             return 1.0 if then is None else 0.0
         return math.inf if then is None else then / now
-
-    def sigma(self, parameter: str) -> float | None:
-        return self.scale if parameter == SCALE else self.yaw
 
 
 def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
@@ -61,7 +57,7 @@ def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
     for text, other_drive, other_sigmas in (*_other_drives(drive, sigmas, before),
                                             *_better_sensors(drive, sigmas, before)):
         outcome = plan_methods(other_drive, other_sigmas, spacing)
-        found.append(Change(text, *(outcome.sigma(p) for p in (SCALE, YAW))))
+        found.append(Change(text, {name: outcome.sigma(name) for name in (SCALE, YAW)}))
     return found + _second_leg(drive, sigmas, before)
 
 
@@ -122,16 +118,16 @@ def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Chang
     other = {'two_point': predict(drive.turned_around(), sigmas).method}
     left: dict[str, float | None] = {}
     for parameter in (SCALE, YAW):
+        left[parameter] = None
         name = before.by(parameter)
         if not name:
-            left[parameter] = None
             continue
         one = before.methods[name]
         # the smoother works in body axes: the direction of the drive does not matter
         both = together(name, [_whole(one), _whole(other.get(name, one))],
                         (0, round(drive.duration * 1e9)), sigmas.config)
         left[parameter] = both.estimates[parameter].sigma
-    return [Change('a second leg in the other direction', left[SCALE], left[YAW])]
+    return [Change('a second leg in the other direction', left)]
 
 
 def _whole(method: MethodResult) -> MethodResult:
@@ -145,7 +141,7 @@ def ranked(found: list[Change], before: Plan, parameter: str) -> list[Change]:
     """Return the changes that help a parameter, best first."""
     worth = 0.98    # of a sigma: a change that leaves more is not listed
     helpful = [c for c in found if c.gain(before, parameter) > 1 / worth]
-    return sorted(helpful, key=lambda c: (-c.gain(before, parameter), c.sigma(parameter)))
+    return sorted(helpful, key=lambda c: (-c.gain(before, parameter), c.sigmas[parameter]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +176,7 @@ class Planned(Plan):
                 'reasons': [r.as_dict() for r in self.reasons_of(name)],
                 'budget': method.details.get('budget', {})}
                 for name, method in self.methods.items()},
-            'changes': [{'text': c.text, 'scale_factor': c.scale, 'yaw_mounting_angle': c.yaw}
-                        for c in self.helps]}
+            'changes': [{'text': c.text, **c.sigmas} for c in self.helps]}
 
 
 def plan(*, distance: float | None = None, speed: float | None = None,

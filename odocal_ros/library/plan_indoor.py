@@ -85,8 +85,8 @@ def plan_indoor(run: str = 'all', *, reference: str = 'slam', drive: str = 'diff
         sigma = settings.reference.points_sigma if points_sigma is None else points_sigma
         robot = replace(robot, white=sigma, drift=sigma, drift_length=MARKS_LENGTH, rate=10.0,
                         at_rests=True)
-    names = tuple(PATTERNS) if run == 'all' else (run,)
-    motions = {name: pattern(name, size, rounds, drive, speed) for name in names}
+    motions = {name: pattern(name, size, rounds, drive, speed)
+               for name in (PATTERNS if run == 'all' else (run,))}
     return [PlannedRun(name, motion, robot, predict_robot(motion, robot, settings))
             for name, motion in motions.items()]
 

@@ -188,7 +188,7 @@ def from_bag(path: Path, config: Config,
              topics: dict[str, str]) -> tuple[PlannedDrive, dict[str, float]]:
     """Return the drive of a bag's first leg, and ``Sigmas`` arguments by its fixes and counts."""
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.forecast.leg_so_far import count_size, fix_figures, profile_of
+    from odocal_ros.forecast.leg_so_far import figures, profile_of
     from odocal_ros.library.legs import find_legs, marked_legs
     from odocal_ros.library.read_bag import recorded
     from odocal_ros.library.topics import choose_topics
@@ -201,5 +201,4 @@ def from_bag(path: Path, config: Config,
         recorder = recorded(bag, chosen, readers)
         start_ns, stop_ns = find_legs(recorder, bag, [], marked_legs(bag), config)[0]
     inputs, _ = screen(recorder.close(start_ns, stop_ns, config.leg.preroll), config)
-    return profile_of(inputs, config), fix_figures(inputs) | {
-        'quantum': count_size(inputs, config)}
+    return profile_of(inputs, config), figures(inputs, config)

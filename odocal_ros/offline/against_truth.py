@@ -59,15 +59,10 @@ def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[
     simulate, with scale factor and ratio in ``scale``, or of a real drive, with the ratio to the
     nominal scale as its value.
     """
-    result, found = calibration['result'], []
-    if 'scale' in truth:
-        scale = truth['scale']
-        name = 'scale_factor' if 'ratio' in scale else 'scale_ratio'
-        found.append(_row(name, result, scale, 1.0))
-    found += [_row(name, result, truth[key], DEG) for name, key in (
-        ('yaw_mounting_angle', 'yaw_mounting_deg'),
-        ('pitch_mounting_angle', 'pitch_mounting_deg')) if key in truth]
-    return found
+    scale = 'scale_factor' if 'ratio' in truth.get('scale', ()) else 'scale_ratio'
+    return [_row(name, calibration['result'], truth[key], factor) for name, key, factor in (
+        (scale, 'scale', 1.0), ('yaw_mounting_angle', 'yaw_mounting_deg', DEG),
+        ('pitch_mounting_angle', 'pitch_mounting_deg', DEG)) if key in truth]
 
 
 def _row(name: str, result: dict[str, dict[str, Any]], truth: dict[str, Any],

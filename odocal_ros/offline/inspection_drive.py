@@ -29,7 +29,7 @@ from odocal_ros.screening.clocks import TOO_FAR
 from odocal_ros.screening.facing import facing, imu_sanity, MAX_RATE
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.imu_changes import turned_over, unit_changes
-from odocal_ros.screening.inputs import Inputs, place
+from odocal_ros.screening.inputs import Inputs, place, Placed
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import RAD_PER_DEG
@@ -66,40 +66,40 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
         return []
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
-    drive = survey.survey_drive(inputs, config)
+    placed = place(inputs, config)
     still = [reason for reason in not_moving(
-        inputs.travel, drive.t_fix, drive.fixes_n, drive.sigma, inputs.t_stop, inputs.least_motion)
-        if reason.code is Code.ODOMETER_STILL]
+        inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.t_stop,
+        inputs.least_motion) if reason.code is Code.ODOMETER_STILL]
     if still:       # scale, speeds, standstills and axes are computed from the counts
         findings += still
         return options
-    path_length, chord = path_and_chord(drive.t_fix, drive.fixes_n, inputs.least_motion)
-    driven = _driven(inputs, drive)
+    stops, speeds = survey.stops_and_speeds(inputs, placed.rough, config)
+    path_length, chord = path_and_chord(inputs.t_fix, placed.fixes_n, inputs.least_motion)
+    driven = _driven(inputs)
     long = path_length > 2.5 * inputs.least_motion      # judgement: then it is accurate to 1 %
-    scale = path_length / driven if long and driven else drive.scale
+    scale = path_length / driven if long and driven else placed.rough or None
     # speeds with the printed scale
-    truer = scale / drive.scale if scale and drive.scale else 1.0
+    truer = scale / placed.rough if scale and placed.rough else 1.0
     found['drive'] = {
-        'distance': path_length, 'chord': chord, 'fix_sigma': drive.sigma,
+        'distance': path_length, 'chord': chord, 'fix_sigma': placed.fix_sigma,
         'rough_scale': scale, 'scale_unit': inputs.scale_unit,
-        'slowest': drive.slowest * truer, 'fastest': drive.fastest * truer,
-        'usable_fixes': len(drive.t_fix), 'travel': driven}
+        'slowest': speeds[0] * truer, 'fastest': speeds[1] * truer,
+        'usable_fixes': len(inputs.t_fix), 'travel': driven}
     if scale:
         findings += far_from_nominal(float(f'{scale:.3g}'), inputs.scale_unit,
                                      nominal_scale(config, inputs.scale_unit), config)
-    found['standstills'] = [[base + a, base + b] for a, b in drive.stops.tolist()]
-    options += _axes(inputs, w_i, f_i, drive, config, found, findings) + _sigma_limit(
-        recorder, config)
-    options += _legs(bag, recorder, inputs, drive, first, config, found)
-    return options
+    found['standstills'] = [[base + a, base + b] for a, b in stops.tolist()]
+    return [*options, *_axes(inputs, placed, w_i, f_i, config, found, findings),
+            *_sigma_limit(recorder, config),
+            *_legs(bag, recorder, inputs, placed, stops, first, config, found)]
 
 
-def _driven(inputs: Inputs, drive: survey.Drive) -> float:
+def _driven(inputs: Inputs) -> float:
     """Return the travel between the first and the last fix (else all), in odometer units."""
     t, s = inputs.travel.t, inputs.travel.s
-    if len(drive.t_fix) > 1:
-        inside = (t > drive.t_fix[0]) & (t < drive.t_fix[-1])
-        ends = drive.t_fix[[0, -1]]
+    if len(inputs.t_fix) > 1:
+        ends = inputs.t_fix[[0, -1]]
+        inside = (t > ends[0]) & (t < ends[1])
         s = np.concatenate([inputs.travel.at(ends[:1]), s[inside], inputs.travel.at(ends[1:])])
     return float(np.abs(np.diff(s)).sum())
 
@@ -130,7 +130,7 @@ def _sigma_limit(recorder: LegRecorder, config: Config) -> list[str]:
     return ['gnss.max_sigma=nan'] if kept < every / 2 else []
 
 
-def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config: Config,
+def _axes(inputs: Inputs, placed: Placed, w_i: Floats, f_i: Floats, config: Config,
           found: dict[str, Any], findings: list[Reason]) -> list[str]:
     """Return settings for odometer sign and IMU orientation; check the gyro."""
     set_already = bool(np.any(config.imu.mounting_rpy))
@@ -139,7 +139,7 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config:
     if not set_already and step.sum() < -MOSTLY * np.abs(step).sum():
         travel = replace(travel, s=-travel.s)
         options.append(f'odometer.reversed={str(not config.odometer.reversed).lower()}')
-    m = mounting(inputs.t_imu, w_i, f_i, travel, drive.scale or 1.0)
+    m = mounting(inputs.t_imu, w_i, f_i, travel, placed.rough or 1.0)
     if not inputs.has_accelerometer:
         m = replace(m, C_bi=None)      # gravity is assumed
     agrees = m.C_bi is not None and np.allclose(
@@ -150,7 +150,6 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config:
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}
-    placed = place(inputs, config)
     faces = facing(inputs, placed.rough) if inputs.has_accelerometer and placed.rough else None
     ratio, wrong = turning(replace(inputs, w_b=w_i @ inputs.C_bi.T), placed, faces,
                            config.imu.gyro_scale)
@@ -162,17 +161,17 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: survey.Drive, config:
     return [*options, f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 
 
-def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, first: int,
-          config: Config, found: dict[str, Any]) -> list[str]:
+def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, placed: Placed, rests: Floats,
+          first: int, config: Config, found: dict[str, Any]) -> list[str]:
     """Return the legs that replay would use, and better ones for the two-point method."""
-    if not len(drive.t_fix):
+    if not len(inputs.t_fix):
         return []
     base = (first - bag.start_ns) * 1e-9
 
     def described(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
-        here = (drive.t_fix >= start) & (drive.t_fix <= stop)
-        path_length, chord = path_and_chord(drive.t_fix[here], drive.fixes_n[here],
+        here = (inputs.t_fix >= start) & (inputs.t_fix <= stop)
+        path_length, chord = path_and_chord(inputs.t_fix[here], placed.fixes_n[here],
                                             inputs.least_motion)
         return {'start': base + start, 'stop': base + stop, 'distance': path_length,
                 'chord': chord} | more
@@ -181,12 +180,12 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: survey.Drive, 
     stops = stops_of(inputs, first, config)
     found['legs'] = [described(a, b, marked=bool(marks))
                      for a, b in find_legs(recorder, bag, [], marks, config, stops)]
-    each = find_legs(recorder, bag, [EACH_STOP], [], config, stops) if len(drive.stops) > 2 else []
+    each = find_legs(recorder, bag, [EACH_STOP], [], config, stops) if len(rests) > 2 else []
     found['each_stop'] = [described(a, b) for a, b in each]
     found['straight'] = [
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
-            _from_rest(drive.stops, *ends)
-            for ends in survey.straight_stretches(inputs, drive, config.leg.min_distance)[:5])]
+            _from_rest(rests, *ends)
+            for ends in survey.straight_stretches(inputs, placed, config.leg.min_distance)[:5])]
     # the other methods gain more from the whole drive than from its sections
     if marks or config.method != 'two_point' or not all(closed(leg) for leg in found['legs']):
         return []

@@ -82,21 +82,16 @@ def _of_imu(topic: dict[str, Any]) -> Iterator[str]:
     unit = imu['force_unit']
     if not imu['gravity']:
         yield 'no specific force: no accelerometer, or its data is not published'
-        yield from _orientation(imu)
-        return
-    orientation = {'+z': 'z-up', '-z': 'looks z-down'}.get(
-        imu['gravity_axis'], 'mounted on its side')
-    yield (f'gravity {imu["gravity"]:.3f} {"" if unit == "unknown" else unit} on '
-           f'{imu["gravity_axis"]} ({math.degrees(imu["tilt_from_axis"]):.1f} deg off): '
-           f'{orientation}')
-    if unit != 'm/s^2':
-        yield 'warning: specific force is not in m/s^2' + (' but in g' if unit == 'g' else '')
-    if imu['not_finite']:
-        yield f'warning: {imu["not_finite"]} messages hold NaN or Inf'
-    yield from _orientation(imu)
-
-
-def _orientation(imu: dict[str, Any]) -> Iterator[str]:
+    else:
+        mounted = {'+z': 'z-up', '-z': 'looks z-down'}.get(
+            imu['gravity_axis'], 'mounted on its side')
+        yield (f'gravity {imu["gravity"]:.3f} {"" if unit == "unknown" else unit} on '
+               f'{imu["gravity_axis"]} ({math.degrees(imu["tilt_from_axis"]):.1f} deg off): '
+               f'{mounted}')
+        if unit != 'm/s^2':
+            yield 'warning: specific force is not in m/s^2' + ' but in g' * (unit == 'g')
+        if imu['not_finite']:
+            yield f'warning: {imu["not_finite"]} messages hold NaN or Inf'
     if not imu['orientation']:
         yield 'no orientation' + (
             ' (covariance -1)' if imu['orientation_refused'] > 0.5 else ' (never set)')

@@ -119,7 +119,7 @@ def _helps(before: Planned) -> list[str]:
         lines.append(f'  largest improvements of the {word}' if best else
                      f'  no tested change improves the {word}')
         lines += [f'    {c.text:<58}{_shown(parameter, before.sigma(parameter)):>10} -> '
-                  f'{_shown(parameter, c.sigma(parameter))}' for c in best[:4]]
+                  f'{_shown(parameter, c.sigmas[parameter])}' for c in best[:4]]
     return lines
 
 

@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.drive import path_and_chord, white_noise, within_reach
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.pieces import across, lengths, median, medians
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.nav.coarse_speed import LEAST_NUMBER
-from odocal_ros.screening.fix_screen import origin_amid, placed, usable_fixes
+from odocal_ros.screening.fix_screen import origin_amid, placed as has_place, usable_fixes
 from odocal_ros.screening.glitches import beyond, oriented
-from odocal_ros.screening.inputs import Inputs, place
+from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.screening.late_rows import arrival_jitter
 from odocal_ros.settings.config import Config, GnssConfig
 from odocal_ros.settings.grades import G
@@ -107,7 +106,7 @@ def fixes(samples: FixSamples) -> dict[str, Any]:
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
         & ~beyond('covariance_n', covariance)
     sigma = np.sqrt(covariance[known, :2].max(axis=1)) if known.any() else np.empty(0)
-    place = placed(samples)
+    place = has_place(samples)
     heights = samples.height[place & ~beyond('height', samples.height)]
     values, counts = np.unique(samples.status, return_counts=True)
     return {
@@ -209,60 +208,38 @@ def fix_path(rows: FixSamples, gnss: GnssConfig) -> FixPath | None:
                    float(np.sqrt(np.median(covariance_n[use][:, 0, 0]))))
 
 
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """
-    The drive of a recording.
-
-    scale : m per unit of travel, rough; None if the fixes do not determine it.
-    stops : (k, 2) s, begin and end of standstills.
-    sigma : m, of a fix, horizontal, as stated.
-    t_fix, fixes_n : (n,), (n, 3) s and m, usable fixes, east-north-up about the first.
-    slowest, fastest : m/s.
-    """
-
-    scale: float | None
-    sigma: float
-    stops: NDArray[np.float64]
-    t_fix: NDArray[np.float64]
-    fixes_n: NDArray[np.float64]
-    slowest: float
-    fastest: float
+def stops_and_speeds(inputs: Inputs, scale: float, config: Config) -> tuple[Floats, list[float]]:
+    """Return (k, 2) s of the standstills, and lowest and highest speed, m/s, 0 without a scale."""
+    if len(inputs.t_imu) <= 3:
+        return np.empty((0, 2)), [0.0, 0.0]
+    at_speed = 1.0    # s, over which a speed is computed
+    t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - at_speed, at_speed / 2)
+    speed = np.abs(inputs.travel.at(t + at_speed) - inputs.travel.at(t)) * scale / at_speed
+    return (inputs.standstills(scale or 1.0, config),
+            [float(speed.min()), float(speed.max())] if len(t) else [0.0, 0.0])
 
 
-def survey_drive(inputs: Inputs, config: Config) -> Drive:
-    placed = place(inputs, config)
-    fixes_n, sigma, scale = placed.fixes_n, placed.fix_sigma, placed.rough or None
-    stops, slowest, fastest = np.empty((0, 2)), 0.0, 0.0
-    if len(inputs.travel.t) > 1 and len(inputs.t_imu) > 3:
-        stops = inputs.standstills(scale or 1.0, config)
-        at_speed = 1.0    # s, over which a speed is computed
-        t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - at_speed, at_speed / 2)
-        if scale and len(t):
-            speed = np.abs(inputs.travel.at(t + at_speed) - inputs.travel.at(t)) * scale / at_speed
-            slowest, fastest = float(speed.min()), float(speed.max())
-    return Drive(scale, sigma, stops, inputs.t_fix, fixes_n, slowest, fastest)
-
-
-def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tuple[float, float]]:
+def straight_stretches(inputs: Inputs, placed: Placed,
+                       shortest: float) -> list[tuple[float, float]]:
     """Return (start, stop), s, of straight sections of ``shortest`` m or more, longest first."""
-    if drive.scale is None or len(drive.t_fix) < 3:
+    if not placed.rough or len(inputs.t_fix) < 3:
         return []
     points = 600    # fixes tested for straight sections, evenly selected
-    pick = np.unique(np.linspace(0, len(drive.t_fix) - 1, points).astype(int))
-    t, p = drive.t_fix[pick], drive.fixes_n[pick, :2]
+    pick = np.unique(np.linspace(0, len(inputs.t_fix) - 1, points).astype(int))
+    t, p = inputs.t_fix[pick], placed.fixes_n[pick, :2]
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
     chord = np.hypot(*(p[None] - p[:, None]).transpose(2, 0, 1))
     far = chord >= shortest
     # the rough scale cuts corners; the straightest sections determine it best
     ratio = chord[far] / np.maximum(travel[far], 1e-12)
     best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
-    path_length = travel * max(drive.scale, min(best, 1.2 * drive.scale))
+    path_length = travel * max(placed.rough, min(best, 1.2 * placed.rough))
     # chord over path length: a section at least this straight suits the two-point method
     straight = 0.97
     # both end points have errors of sigma: a section within these errors is accepted
-    fit = np.triu((chord >= straight * path_length - drive.sigma) & (path_length >= shortest)
-                  & (chord <= path_length / straight + 4 * drive.sigma))
+    fit = np.triu((chord >= straight * path_length - placed.fix_sigma)
+                  & (path_length >= shortest)
+                  & (chord <= path_length / straight + 4 * placed.fix_sigma))
     found: list[tuple[float, float]] = []
     while fit.any():
         i, j = np.unravel_index(np.argmax(np.where(fit, path_length, 0)), fit.shape)
