@@ -33,43 +33,31 @@ def without(samples, leg, begin_s, end_s):
     return take(samples, (t < begin_s) | (t >= end_s))
 
 
-def reversed_counter(leg):
-    return replace(leg, odometer=changed(leg.odometer, value=lambda v: -v))
+def reset(v):
+    """Return counts that begin again at zero after a third of the drive."""
+    return v - np.where(np.arange(len(v)) > len(v) // 3, v[len(v) // 3], 0)
 
 
-def reset_counter(leg):
-    half = len(leg.odometer.value) // 3
-    return replace(leg, odometer=changed(
-        leg.odometer, value=lambda v: v - np.where(np.arange(len(v)) > half, v[half], 0)))
+WRONG = {
+    'reversed counter': lambda leg: {'odometer': changed(leg.odometer, value=lambda v: -v)},
+    'reset counter': lambda leg: {'odometer': changed(leg.odometer, value=reset)},
+    'gap': lambda leg: {'imu': without(leg.imu, leg, 40.0, 43.0)},
+    'dead counter': lambda leg: {'odometer': changed(leg.odometer, value=lambda v: v * 0)},
+    'in g': lambda leg: {'imu': changed(leg.imu, f_i=lambda f: f / 9.80665)},
+    'sound': lambda leg: {}}
 
 
-def gap(leg):
-    return replace(leg, imu=without(leg.imu, leg, 40.0, 43.0))
-
-
-def dead_counter(leg):
-    return replace(leg, odometer=changed(leg.odometer, value=lambda v: v * 0))
-
-
-def in_g(leg):
-    return replace(leg, imu=changed(leg.imu, f_i=lambda f: f / 9.80665))
-
-
-def sound(leg):
-    return leg
-
-
-@pytest.mark.parametrize('wrong', [reversed_counter, reset_counter, gap, dead_counter, in_g,
-                                   sound])
+@pytest.mark.parametrize('wrong', WRONG)
 def test_the_faults_so_far_are_those_of_the_result(made, wrong):
-    leg, config = wrong(made.leg()), settings(made)
+    config = settings(made)
+    leg = replace(made.leg(), **WRONG[wrong](made.leg()))
     result = calibrate(leg, config)
     # a slip is what a method makes of the hole
     lowering = {r.code for r in result.reasons
                 if r.code.gravity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
     assert {r.code for r in faults(screened(leg, config), config)} == lowering
     assert {r.code for r in faults_in_cells(thinned(leg).leg(leg.start_ns), config)} == lowering
-    assert (lowering == set()) == (wrong is sound)
+    assert (lowering == set()) == (wrong == 'sound')
 
 
 def test_late_rows_are_put_back_so_far_as_in_the_result(made):

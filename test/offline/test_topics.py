@@ -18,10 +18,19 @@ ODD = {'/rosout': 'rcl_interfaces/msg/Log', '/cmd_vel': 'geometry_msgs/msg/Twist
        '/calibrator/odometer': INT, '/tf': 'tf2_msgs/msg/TFMessage'}
 
 
+POSE, POINT = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PointStamped'
+ODOM = 'nav_msgs/msg/Odometry'
+BY_TOPIC = {'alignment__heading_source': 'heading_topic'}
+TWO = {'odometer__left': 'topic', 'odometer__right': 'topic'}
+
+
 def topics(**types):
     """Return the base topics and more; a name's __ is a slash; None takes one away."""
     named = BASE | {'/' + name.replace('__', '/'): t for name, t in types.items()}
     return {n: TopicInfo(n, t, 5) for n, t in named.items() if t}
+
+
+SIDES = topics(odometer=None, ticks_left=INT, ticks_right=INT)
 
 
 def choose(found, overrides=None, **settings):
@@ -37,48 +46,67 @@ def test_one_of_each():
     assert choose(topics() | {'/imu/raw': TopicInfo('/imu/raw', IMU, 0)}) == wanted
 
 
-def test_several_are_listed_with_their_option():
-    with pytest.raises(BadUsage, match=r'3 topics can be the odometer; choose one with '
-                       r'--odometer-topic: /odometer \(std_msgs/msg/Int64\), /speed'):
-        choose(topics(speed=TWIST, wheels='sensor_msgs/msg/JointState'))
-    with pytest.raises(BadUsage, match='can be the IMU.*--imu-topic.*can be the fix.*--fix-topic'):
-        choose(topics(imu__raw=IMU, phone=FIX))       # all at once
-    assert choose(topics(speed=TWIST), {'odometer': 'speed'})['odometer'] == '/speed'
-    assert choose(topics(speed=TWIST), odometer__type=TWIST)['odometer'] == '/speed'
-    assert choose(topics(odometry__filtered='nav_msgs/msg/Odometry'))['odometer'] == '/odometer'
-
-
-def test_missing_lists_what_there_is():
-    with pytest.raises(BadUsage, match=r'no IMU \(a topic of sensor_msgs/msg/Imu\) in the bag; '
-                       r'the bag has /odometer \(std_msgs/msg/Int64\), /fix'):
-        choose(topics(imu__data=None))
-    with pytest.raises(BadUsage, match=r'no IMU \(a topic of sensor_msgs/msg/Imu besides '
-                       r'/imu/data\) in the bag'):
-        choose(topics(), {'heading': '/imu/data'})
-    with pytest.raises(BadUsage, match='--fix-topic /gps: no such topic; the bag has /imu/data'):
-        choose(topics(), {'fix': '/gps'})
+@pytest.mark.parametrize(('found', 'overrides', 'settings', 'match'), [
+    (topics(speed=TWIST, wheels='sensor_msgs/msg/JointState'), {}, {},
+     r'3 topics can be the odometer; choose one with --odometer-topic: /odometer '
+     r'\(std_msgs/msg/Int64\), /speed'),
+    (topics(imu__raw=IMU, phone=FIX), {}, {},       # all at once
+     'can be the IMU.*--imu-topic.*can be the fix.*--fix-topic'),
+    (topics(imu__data=None), {}, {}, r'no IMU \(a topic of sensor_msgs/msg/Imu\) in the bag; '
+     r'the bag has /odometer \(std_msgs/msg/Int64\), /fix'),
+    (topics(), {'heading': '/imu/data'}, {},
+     r'no IMU \(a topic of sensor_msgs/msg/Imu besides /imu/data\) in the bag'),
+    (topics(), {'fix': '/gps'}, {}, '--fix-topic /gps: no such topic; the bag has /imu/data'),
     # not as if the others were missing, which it would be taken from
-    with pytest.raises(BadUsage, match='^--imu-topic /fix: the topic is of '
-                       'sensor_msgs/msg/NavSatFix, which cannot be used as IMU; the bag has '
-                       '/imu/data'):
-        choose(topics(), {'imu': '/fix'})
-    for slot, topic in (('odometer', '/imu/data'), ('odometer_right', '/fix'),
-                        ('fix', '/odometer'), ('heading', '/fix'), ('fix_velocity', '/odometer')):
-        with pytest.raises(BadUsage, match='which cannot be used as '):
-            choose(topics(), {slot: topic})
-    foreign = topics(ticks='my_msgs/msg/Ticks')
-    assert choose(foreign, {'odometer': '/ticks'})['odometer'] == '/ticks'
-    with pytest.raises(BadUsage, match='the topic has no message'):
-        choose(topics() | {'/gps': TopicInfo('/gps', FIX, 0)}, {'fix': '/gps'})
-    with pytest.raises(BadUsage, match='no odometer'):
-        choose(topics(), odometer__type='my_msgs/msg/Ticks')
+    (topics(), {'imu': '/fix'}, {}, '^--imu-topic /fix: the topic is of sensor_msgs/msg/NavSatFix'
+     ', which cannot be used as IMU; the bag has /imu/data'),
+    *((topics(), {slot: topic}, {}, 'which cannot be used as ') for slot, topic in (
+        ('odometer', '/imu/data'), ('odometer_right', '/fix'), ('fix', '/odometer'),
+        ('heading', '/fix'), ('fix_velocity', '/odometer'))),
+    (topics() | {'/gps': TopicInfo('/gps', FIX, 0)}, {'fix': '/gps'}, {},
+     'the topic has no message'),
+    (topics(), {}, {'odometer__type': 'my_msgs/msg/Ticks'}, 'no odometer'),
+    (topics(odometer=None, cmd_vel='geometry_msgs/msg/Twist'), {}, {}, 'no odometer'),
+    (topics(imu__data=None, imu=IMU), {'imu': '/imu'}, BY_TOPIC, 'no heading'),
+    (topics(), {}, BY_TOPIC, r'^no heading \(a topic of sensor_msgs/msg/Imu besides the IMU\) in '
+     'the bag; the bag has /imu/data'),      # the IMU is there
+    (SIDES, {}, {}, 'odometer.left and odometer.right to topic'),
+    (topics(), {}, TWO, 'no right odometer'),
+    (topics(fix=None, slam__pose=POSE, prism=POINT), {}, {},
+     r'^2 topics can be the fix; choose one with --fix-topic: /slam/pose '
+     r'\(geometry_msgs/msg/PoseStamped\), /prism \(geometry_msgs'),
+    (topics(fix=None, tf='tf2_msgs/msg/TFMessage'), {}, {},
+     'name a tf2_msgs/msg/TFMessage or nav_msgs/msg/Odometry with --fix-topic'),
+    (topics(fix=None, lidar_odometry=ODOM), {'odometer': '/odometer'}, {},
+     r'^no fix \(a topic of sensor_msgs/msg/NavSatFix, geometry_msgs/msg/PoseStamped, .*\) in the '
+     'bag; name .*/Odometry with --fix-topic; the bag has'),
+    (topics(fix=None, odometer=None, odom=ODOM), {'odometer': 'odom', 'fix': '/odom'}, {},
+     '^/odom is both --odometer-topic and --fix-topic: an odometer cannot be calibrated against '
+     'itself'),
+    (topics(fix=None, odometer=None, odom=ODOM), {'fix': '/odom'}, {},
+     r'^no odometer in the bag besides /odom, which is the position reference \(--fix-topic\)')])
+def test_what_cannot_be_chosen_is_told_with_the_option(found, overrides, settings, match):
+    with pytest.raises(BadUsage, match=match):
+        choose(found, overrides, **settings)
 
 
-def test_only_a_fused_odometer_is_better_than_none_but_a_command_is_not():
-    found = topics(odometer=None, localization__fused='nav_msgs/msg/Odometry')
-    assert choose(found)['odometer'] == '/localization/fused'
-    with pytest.raises(BadUsage, match='no odometer'):
-        choose(topics(odometer=None, cmd_vel='geometry_msgs/msg/Twist'))
+@pytest.mark.parametrize(('found', 'overrides', 'settings', 'wanted'), [
+    (topics(speed=TWIST), {'odometer': 'speed'}, {}, '/speed'),
+    (topics(speed=TWIST), {}, {'odometer__type': TWIST}, '/speed'),
+    (topics(odometry__filtered=ODOM), {}, {}, '/odometer'),
+    (topics(ticks='my_msgs/msg/Ticks'), {'odometer': '/ticks'}, {}, '/ticks'),
+    # a fused odometer is better than none
+    (topics(odometer=None, localization__fused=ODOM), {}, {}, '/localization/fused'),
+    (SIDES, {}, TWO, '/ticks_left')])
+def test_the_odometer_is_chosen_by_name_type_and_setting(found, overrides, settings, wanted):
+    assert choose(found, overrides, **settings)['odometer'] == wanted
+
+
+@pytest.mark.parametrize(('found', 'overrides', 'wanted'), [
+    (SIDES, {}, '/ticks_right'), (topics(odometer_right=INT), {}, '/odometer_right'),
+    (topics(a=INT), {'odometer': '/odometer', 'odometer_right': 'a'}, '/a')])
+def test_the_right_wheel_has_its_own_topic(found, overrides, wanted):
+    assert choose(found, overrides, **TWO)['odometer_right'] == wanted
 
 
 def test_fixes_are_not_needed_when_the_ends_are_surveyed():
@@ -113,29 +141,8 @@ def test_heading():
     assert choose(found)['imu'] == '/imu/data'
     assert 'heading' not in choose(found, alignment__heading_source='course')
     found = topics(gnss__heading_imu=IMU)
-    assert choose(found, alignment__heading_source='heading_topic')['heading'] == \
-        '/gnss/heading_imu'
-    with pytest.raises(BadUsage, match='no heading'):
-        choose(topics(imu__data=None, imu=IMU), {'imu': '/imu'},
-               alignment__heading_source='heading_topic')
-    with pytest.raises(BadUsage, match=r'^no heading \(a topic of sensor_msgs/msg/Imu besides '
-                       r'the IMU\) in the bag; the bag has /imu/data'):
-        choose(topics(), alignment__heading_source='heading_topic')      # the IMU is there
+    assert choose(found, **BY_TOPIC)['heading'] == '/gnss/heading_imu'
     assert choose(topics(other=IMU), {'heading': 'other'})['imu'] == '/imu/data'
-
-
-def test_wheels_on_two_topics():
-    sides = topics(odometer=None, ticks_left=INT, ticks_right=INT)
-    two = {'odometer__left': 'topic', 'odometer__right': 'topic'}
-    assert choose(sides, **two)['odometer'] == '/ticks_left'
-    assert choose(sides, **two)['odometer_right'] == '/ticks_right'
-    assert choose(topics(odometer_right=INT), **two)['odometer_right'] == '/odometer_right'
-    assert choose(topics(a=INT), {'odometer': '/odometer', 'odometer_right': 'a'},
-                  **two)['odometer_right'] == '/a'
-    with pytest.raises(BadUsage, match='odometer.left and odometer.right to topic'):
-        choose(sides)
-    with pytest.raises(BadUsage, match='no right odometer'):
-        choose(topics(), **two)
 
 
 def test_the_journal_of_a_namespaced_node_is_found():
@@ -144,10 +151,6 @@ def test_the_journal_of_a_namespaced_node_is_found():
         '/car/calibrator/status': 'diagnostic_msgs/msg/DiagnosticArray'}.items()}
     assert choose(found) == {'odometer': '/car/odometer', 'imu': '/car/imu/data',
                              'fix': '/car/fix'}
-
-
-POSE, POINT = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PointStamped'
-ODOM = 'nav_msgs/msg/Odometry'
 
 
 @pytest.mark.parametrize('kind', [
@@ -167,38 +170,13 @@ def test_a_pose_is_the_reference_where_there_is_no_fix(kind):
     assert choose(unused)['fix'] == '/slam/pose'
 
 
-def test_of_two_poses_the_user_selects():
-    found = topics(fix=None, slam__pose=POSE, prism=POINT)
-    with pytest.raises(BadUsage, match=r'^2 topics can be the fix; choose one with --fix-topic: '
-                       r'/slam/pose \(geometry_msgs/msg/PoseStamped\), /prism \(geometry_msgs'):
-        choose(found)
-    assert choose(found, {'fix': '/prism'})['fix'] == '/prism'
+def test_a_reference_that_is_named_is_taken_and_goals_are_none():
+    poses = topics(fix=None, slam__pose=POSE, prism=POINT)
+    assert choose(poses, {'fix': '/prism'})['fix'] == '/prism'
     # goals and clicks are poses that a person sets
     more = topics(fix=None, slam__pose=POSE, goal_pose=POSE, clicked_point=POINT,
                   initialpose='geometry_msgs/msg/PoseWithCovarianceStamped')
     assert choose(more)['fix'] == '/slam/pose'
-
-
-def test_tf_and_odometry_are_references_only_by_name():
-    found = topics(fix=None, tf='tf2_msgs/msg/TFMessage')
-    with pytest.raises(BadUsage, match='name a tf2_msgs/msg/TFMessage or nav_msgs/msg/Odometry '
-                       'with --fix-topic'):
-        choose(found)
-    assert choose(found, {'fix': '/tf'})['fix'] == '/tf'
-    found = topics(fix=None, lidar_odometry=ODOM)
-    with pytest.raises(BadUsage, match=r'^no fix \(a topic of sensor_msgs/msg/NavSatFix, '
-                       r'geometry_msgs/msg/PoseStamped, .*\) in the bag; name .*/Odometry '
-                       'with --fix-topic; the bag has'):
-        choose(found, {'odometer': '/odometer'})
-    assert choose(found, {'fix': '/lidar_odometry'}) == {
+    assert choose(topics(fix=None, tf='tf2_msgs/msg/TFMessage'), {'fix': '/tf'})['fix'] == '/tf'
+    assert choose(topics(fix=None, lidar_odometry=ODOM), {'fix': '/lidar_odometry'}) == {
         'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/lidar_odometry'}
-
-
-def test_one_topic_is_not_odometer_and_reference():
-    found = topics(fix=None, odometer=None, odom=ODOM)
-    with pytest.raises(BadUsage, match='^/odom is both --odometer-topic and --fix-topic: an '
-                       'odometer cannot be calibrated against itself'):
-        choose(found, {'odometer': 'odom', 'fix': '/odom'})
-    with pytest.raises(BadUsage, match=r'^no odometer in the bag besides /odom, which is the '
-                       r'position reference \(--fix-topic\)'):
-        choose(found, {'fix': '/odom'})
