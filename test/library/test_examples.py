@@ -14,8 +14,8 @@ import threading
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import get_typestore, Stores
+import ros_bags
+import ros_messages as make
 
 from odocal_ros.bagio import encode
 from odocal_ros.bagio.write import write_bag
@@ -74,11 +74,12 @@ def test_add_message_type(town, tmp_path, monkeypatch, capsys):
     drive, _ = town
     bag = write_bag(tmp_path / 'sensors', [encode.imu('/imu/data', drive.imu),
                                            encode.fix('/fix', drive.fix)], 'sqlite3')
-    types = get_typestore(Stores.ROS2_JAZZY).types
     stamps = drive.odometer.stamp_ns
     speed = drive.motion.at((stamps - drive.options.start_ns) * 1e-9).speed / 1.05
-    ours = tmp_path / 'speed'
-    put(ours, types, stamps, speed)
+    kind = make.kind('geometry_msgs/msg/Vector3Stamped')
+    ours = ros_bags.write(tmp_path / 'speed', [
+        ('/wheel_speed', stamp, kind(header=make.header(stamp), vector=make.vector(v)))
+        for stamp, v in zip(stamps.tolist(), speed.tolist(), strict=True)], 'sqlite3')
     merged = tmp_path / 'merged'
     merged.mkdir()
     for path in (*bag.glob('*.db3'), *ours.glob('*.db3')):
@@ -87,18 +88,6 @@ def test_add_message_type(town, tmp_path, monkeypatch, capsys):
     scale, sigma = map(float, re.search(
         rf'claimed {NUMBER} \+- ([\d.e-]+)', capsys.readouterr().out).groups())
     assert abs(scale - 1.05) < 4 * sigma < 0.02
-
-
-def put(folder, types, stamps, speed):
-    store = get_typestore(Stores.ROS2_JAZZY)
-    name = 'geometry_msgs/msg/Vector3Stamped'
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        topic = writer.add_connection('/wheel_speed', name, typestore=store)
-        for stamp, v in zip(stamps.tolist(), speed.tolist(), strict=True):
-            when = types['builtin_interfaces/msg/Time'](stamp // 10**9, stamp % 10**9)
-            header = types['std_msgs/msg/Header'](when, 'base_link')
-            vector = types['geometry_msgs/msg/Vector3'](v, 0.0, 0.0)
-            writer.write(topic, stamp, store.serialize_cdr(types[name](header, vector), name))
 
 
 def test_custom_report(town, tmp_path, monkeypatch):
