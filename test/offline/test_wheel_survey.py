@@ -3,38 +3,29 @@
 
 """odocal inspect on lists of values: which of them roll, and which side each is on."""
 
+from itertools import count
 import json
 
-from inspecting import inspect, topic
+import inspecting
+from inspecting import inspect, planar, RATE, topic
 import numpy as np
 import pytest
 import ros_bags
-from ros_bags import T0
 import ros_messages as make
 
 from odocal_ros.offline.cli import main
 
 pytestmark = pytest.mark.slow
-RATE, WIDTH = 20, 1.6
+WIDTH, RADIUS = 1.6, 0.3      # m
 
 
-def drive(message, seconds=120):
-    """Return rows of a drive with turns; message(ns, i, left, right) gives an odometer."""
-    t = np.arange(0, seconds, 1 / RATE)
-    v = np.clip(t - 10, 0, 8) * (t < 100)
-    w = 0.2 * np.sin(t / 5) * (t > 20) * (t < 90)
-    left, right = (np.cumsum(v - s * w * WIDTH / 2) / RATE / 0.3 for s in (1, -1))
-    yaw = np.cumsum(w) / RATE
-    east, north = np.cumsum(v * np.cos(yaw)) / RATE, np.cumsum(v * np.sin(yaw)) / RATE
-    rows = []
-    for i, s in enumerate(t):
-        ns = T0 + round(s * 1e9)
-        rows.append(('/imu/data', ns, make.imu(ns, w=(0, 0, w[i]), f=(0, v[i] * w[i], 9.81))))
-        rows.append(('/wheels', ns + 1, message(ns, i, left[i], right[i])))
-        if i % 4 == 0:
-            rows.append(('/fix', ns + 2, make.fix(ns, 48 + np.rad2deg(north[i] / 6.38e6),
-                                                  11 + np.rad2deg(east[i] / 4.27e6), sigma=0.3)))
-    return rows
+def drive(message):
+    """Return rows of the planar drive; message(ns, i, left, right) gives an odometer, rad."""
+    _, v, w, _ = planar()
+    left, right = (np.cumsum(v - s * w * WIDTH / 2) / RATE / RADIUS for s in (1, -1))
+    number = count()
+    return [('/wheels', ns, message(ns, i := next(number), left[i], right[i]))
+            if name == '/odometer' else (name, ns, m) for name, ns, m in inspecting.drive()]
 
 
 @pytest.fixture
