@@ -43,61 +43,49 @@ def result(values=None, *codes):
     return Calibration(tuple(Reason(c, 'seen') for c in codes), values or WHOLE, {}, ())
 
 
-def ok(forecast=None, calibration=None, two_wheels=True, config=CONFIG):
-    if forecast is not None:
-        found = quantities.of_forecast(forecast, config, two_wheels)
-    else:
-        found = quantities.of_calibration(calibration, config, two_wheels)
-    return ' '.join(found.values())
+def ok(judged, two_wheels=True, config=CONFIG):
+    """Return yes, no or unknown of scale, yaw, pitch, left and right, track width."""
+    of = quantities.of_forecast if isinstance(judged, Forecast) else quantities.of_calibration
+    return ' '.join(of(judged, config, two_wheels).values())
 
 
-# order: scale, yaw, pitch, left and right, track width
-
-def test_a_result_within_its_limits_is_good_and_each_limit_counts_by_itself():
-    assert ok(calibration=result()) == 'yes yes yes yes yes'
-    for names, position in ((('scale_factor',), 0), (('yaw_mounting_angle',), 1),
-                            (('pitch_mounting_angle',), 2), (('scale_factor_left',), 3),
-                            (('scale_factor_right',), 3), (('track_width',), 4)):
+@pytest.mark.parametrize(('position', 'names'), list(enumerate((
+    ('scale_factor',), ('yaw_mounting_angle',), ('pitch_mounting_angle',),
+    ('scale_factor_left', 'scale_factor_right'), ('track_width',)))))
+def test_each_limit_counts_by_itself(position, names):
+    for name in names:
         for worse in (Estimate(1.0, 0.06, '1'), Estimate(None, None, '1')):
-            found = ok(calibration=result(WHOLE | dict.fromkeys(names, worse))).split()
+            found = ok(result(WHOLE | {name: worse})).split()
             assert found.pop(position) == 'no'
             assert found == ['yes'] * 4
 
 
-def test_limits_are_those_of_the_settings_and_reasons_count_against_a_value():
-    values = WHOLE | {'scale_factor': Estimate(0.02, 1.9e-5, 'm/pulse')}    # 950 ppm
-    assert ok(calibration=result(values)).startswith('yes')
-    tight = with_settings(CONFIG, {'verdict.max_scale_sigma': 9e-4})
-    assert ok(calibration=result(values), config=tight).startswith('no')
-    assert ok(calibration=result(None, Code.YAW_FAR_FROM_NOMINAL)) == 'yes no yes yes yes'
-    assert ok(calibration=result(None, Code.COVARIANCE_UNKNOWN)) == 'yes yes yes yes yes'
-    assert ok(calibration=result(None, Code.LEG_TOO_SHORT)) == 'no no no no no'
+TIGHT = {'config': with_settings(CONFIG, {'verdict.max_scale_sigma': 9e-4})}
+GIVEN = {'config': with_settings(CONFIG, {'odometer.track_width': 1.6})}
+PPM_950 = WHOLE | {'scale_factor': Estimate(0.02, 1.9e-5, 'm/pulse')}
+ONE = {name: WHOLE[name] for name in list(WHOLE)[:3]}
+BARE = WHOLE | {'track_width': Estimate(None, None, 'm')}
 
 
-def test_one_counter_says_nothing_of_two_wheels():
-    one = {n: e for n, e in WHOLE.items() if '_left' not in n and '_right' not in n
-           and n != 'track_width'}
-    assert ok(calibration=result(one), two_wheels=False) == 'yes yes yes unknown unknown'
-    assert ok(Forecast(GOOD, YAW, 0.001), two_wheels=False) == 'yes yes yes unknown unknown'
-
-
-def test_a_configured_track_width_is_not_asked_of_the_drive():
-    given = with_settings(CONFIG, {'odometer.track_width': 1.6})
-    bare = WHOLE | {'track_width': Estimate(None, None, 'm')}
-    assert ok(calibration=result(bare), config=given).endswith('yes unknown')
-    assert ok(Forecast(GOOD, YAW, 0.001, WheelsForecast(1e-4, None)), config=given).endswith(
-        'yes unknown')
-    assert ok(calibration=result(), config=given).endswith('yes yes')
-
-
-@pytest.mark.parametrize(('forecast', 'found'), [
-    (Forecast(GOOD, YAW, 0.001, WheelsForecast(2e-4, 0.01)), 'yes yes yes yes yes'),
-    (Forecast(BAD, NO_YAW, None, WheelsForecast(None, None)), 'no no no no no'),
-    (Forecast(GOOD, YAW, 0.01, WheelsForecast(2e-3, 0.06)), 'yes yes no no no'),
-    (Forecast(GOOD, YAW, 0.001), 'yes yes yes unknown unknown')])
-def test_a_leg_that_is_recorded_is_judged_by_its_forecast(forecast, found):
-    assert ok(forecast) == found
-    assert set(quantities.of_forecast(None, CONFIG, True).values()) == {'unknown'}
+@pytest.mark.parametrize(('judged', 'options', 'found'), [
+    (result(), {}, 'yes yes yes yes yes'),
+    (result(PPM_950), {}, 'yes yes yes yes yes'), (result(PPM_950), TIGHT, 'no yes yes yes yes'),
+    # a reason counts against its value, or against all
+    (result(None, Code.YAW_FAR_FROM_NOMINAL), {}, 'yes no yes yes yes'),
+    (result(None, Code.COVARIANCE_UNKNOWN), {}, 'yes yes yes yes yes'),
+    (result(None, Code.LEG_TOO_SHORT), {}, 'no no no no no'),
+    # one counter says nothing of two wheels
+    (result(ONE), {'two_wheels': False}, 'yes yes yes unknown unknown'),
+    (Forecast(GOOD, YAW, 0.001), {'two_wheels': False}, 'yes yes yes unknown unknown'),
+    # a configured track width is not asked of the drive
+    (result(BARE), GIVEN, 'yes yes yes yes unknown'), (result(), GIVEN, 'yes yes yes yes yes'),
+    (Forecast(GOOD, YAW, 0.001, WheelsForecast(1e-4, None)), GIVEN, 'yes yes yes yes unknown'),
+    (Forecast(GOOD, YAW, 0.001, WheelsForecast(2e-4, 0.01)), {}, 'yes yes yes yes yes'),
+    (Forecast(BAD, NO_YAW, None, WheelsForecast(None, None)), {}, 'no no no no no'),
+    (Forecast(GOOD, YAW, 0.01, WheelsForecast(2e-3, 0.06)), {}, 'yes yes no no no'),
+    (Forecast(GOOD, YAW, 0.001), {}, 'yes yes yes unknown unknown')])
+def test_results_and_forecasts_are_judged_by_the_limits(judged, options, found):
+    assert ok(judged, **options) == found
 
 
 def test_of_a_leg_that_is_cut_each_quantity_is_of_the_better_part():

@@ -193,15 +193,6 @@ def test_a_kill_leaves_one_result_or_none_and_the_next_clears_away(tmp_path, for
     assert not list(tmp_path.rglob('.*'))
 
 
-def test_what_another_is_writing_is_not_cleared_away(tmp_path):
-    one = ResultFolder(tmp_path / 'out', MAIN, OURS)
-    with one._sibling(tmp_path, texts('one')) as new:
-        put(tmp_path / 'out', 'two')
-        assert held(new) == texts('one')
-        one._exchange(new, True)
-    assert held(tmp_path / 'out') == texts('one')
-
-
 def test_without_an_exchange_in_one_step_it_is_done_in_two(tmp_path, monkeypatch):
     class Old:
         renameat2 = None

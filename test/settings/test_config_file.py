@@ -17,6 +17,7 @@ from odocal_ros.settings.config_file import parse_set, read_config_file, scalar
 
 pytestmark = pytest.mark.core
 BLOCK = '/**/calibrator:\n  ros__parameters:\n'
+DISTANCE = '  ros__parameters:\n    leg.min_distance: '
 
 
 @pytest.fixture
@@ -28,10 +29,28 @@ def write(tmp_path):
     return file
 
 
-@pytest.mark.parametrize('key', ['/**', '/**/calibrator', '/calibrator', 'calibrator', '/*'])
-def test_every_key_that_means_the_node_is_taken(write, key):
-    values = read_config_file(write(f'{key}:\n  ros__parameters:\n    leg.min_distance: 50.0\n'))
-    assert values == {'leg.min_distance': 50.0}
+@pytest.mark.parametrize(('text', 'values'), [
+    *((f'{key}:\n{DISTANCE}50.0\n', {'leg.min_distance': 50.0}) for key in (
+        '/**', '/**/calibrator', '/calibrator', 'calibrator', '/*')),
+    # later blocks win, a key that comes again keeps its place, and namespaces may be nested
+    (f'calibrator:\n{DISTANCE}1.0\n/**:\n{DISTANCE}2.0\n', {'leg.min_distance': 2.0}),
+    (f'/**:\n{DISTANCE}2.0\ncalibrator:\n{DISTANCE}1.0\n/**:\n{DISTANCE}5.0\n',
+     {'leg.min_distance': 1.0}),
+    ('/**:\n  calibrator:\n    ros__parameters:\n      leg.min_distance: 5.0\n',
+     {'leg.min_distance': 5.0}),
+    (BLOCK + '    leg: {min_distance: 50.0}\n    leg.min_speed: 1.0\n    method: all\n'
+     '    gnss:\n      lever_arm: [1, 0, 0.5]\n',
+     {'leg.min_distance': 50.0, 'leg.min_speed': 1.0, 'method': 'all',
+      'gnss.lever_arm': (1.0, 0.0, 0.5)}),
+    (BLOCK + '    leg.min_distance: 50\n', {'leg.min_distance': 50.0}),
+    # what a node dumps
+    (BLOCK + '    use_sim_time: true\n    result: {scale_factor: .nan, valid: false}\n'
+     '    qos_overrides:\n      /imu/data:\n        subscription: {depth: 10}\n'
+     '    start_type_description_service: true\n    method: all\n', {'method': 'all'})])
+def test_a_file_has_the_settings_of_the_node(write, text, values):
+    found = read_config_file(write(text))
+    assert found == values
+    assert [type(x) for x in found.values()] == [type(x) for x in values.values()]
 
 
 @pytest.mark.parametrize('key', ['/car1/calibrator', 'imu_driver', '/**/driver', '/calibrator2'])
@@ -39,31 +58,6 @@ def test_blocks_of_other_nodes_are_named_not_taken(write, key):
     path = write(f'{key}:\n  ros__parameters:\n    leg.min_distance: 50.0\n')
     with pytest.raises(BadConfig, match=r'no block for the calibrator; it has .*required: a top-'):
         read_config_file(path)
-
-
-def test_later_blocks_win_and_namespaces_may_be_nested(write):
-    part = '  ros__parameters:\n    leg.min_distance: '
-    one = write(f'calibrator:\n{part}1.0\n/**:\n{part}2.0\n')
-    assert read_config_file(one) == {'leg.min_distance': 2.0}
-    again = write(f'/**:\n{part}2.0\ncalibrator:\n{part}1.0\n/**:\n{part}5.0\n')
-    assert read_config_file(again) == {'leg.min_distance': 1.0}
-    path = write('/**:\n  calibrator:\n    ros__parameters:\n      leg.min_distance: 5.0\n')
-    assert read_config_file(path) == {'leg.min_distance': 5.0}
-
-
-def test_nested_names_whole_numbers_and_what_a_node_dumps_are_read(write):
-    values = read_config_file(write(
-        BLOCK + '    leg: {min_distance: 50.0}\n    leg.min_speed: 1.0\n    method: all\n'
-        '    gnss:\n      lever_arm: [1, 0, 0.5]\n'))
-    assert values == {'leg.min_distance': 50.0, 'leg.min_speed': 1.0, 'method': 'all',
-                      'gnss.lever_arm': (1.0, 0.0, 0.5)}
-    values = read_config_file(write(BLOCK + '    leg.min_distance: 50\n'))
-    assert type(values['leg.min_distance']) is float
-    values = read_config_file(write(
-        BLOCK + '    use_sim_time: true\n    result: {scale_factor: .nan, valid: false}\n'
-        '    qos_overrides:\n      /imu/data:\n        subscription: {depth: 10}\n'
-        '    start_type_description_service: true\n    method: all\n'))
-    assert values == {'method': 'all'}
 
 
 @pytest.mark.parametrize(('text', 'error', 'match'), [
