@@ -96,30 +96,8 @@ def write_table(path: Path, schema: Any, tables: Iterable[Any]) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
     with locked(path.parent), whole_file(path) as file, pq.ParquetWriter(
-            pa.PythonFile(_Sink(file), mode='w'), schema, compression='zstd') as writer:
+            pa.PythonFile(file, mode='w'), schema, compression='zstd') as writer:
         for table in tables:
             if table.num_rows:
                 writer.write_table(table)
 
-
-class _Sink:
-    """A file that pyarrow can write and that ignores its close."""
-
-    closed = False
-
-    def __init__(self, file: Any) -> None:
-        self._file, self._at = file, 0
-
-    def write(self, data: bytes) -> int:
-        self._at += len(data)
-        self._file.write(bytes(data))
-        return len(data)
-
-    def tell(self) -> int:
-        return self._at
-
-    def flush(self) -> None:
-        pass
-
-    def close(self) -> None:
-        pass

@@ -162,5 +162,4 @@ def _at_rest(drive: PlannedDrive, wanted: Callable[[], bool]) -> DriveSoFar:
     rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0
     if rested < REST_FORESEEN_S:
         drive = drive.until(drive.duration, REST_FORESEEN_S - rested)
-    return DriveSoFar(drive.t, drive.speed, drive.yaw, drive.slope, drive.latitude,
-                      drive.longitude, drive.height, wanted)
+    return DriveSoFar(**vars(drive), wanted=wanted)
