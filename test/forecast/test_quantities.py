@@ -142,7 +142,7 @@ def test_two_wheels_ask_for_turns_and_for_a_straight_stretch():
     assert manoeuvres(recording(**far, forecast=apart)) == [TURNS]
     neither = replace(apart, wheels=WheelsForecast(2e-3, None))
     assert hint(recording(**far, forecast=neither, still_s=10.0)) == (
-        'OK: scale 100 ppm (limit 1000); OK: yaw 0.286 deg (limit 0.498); drive straight at '
+        'OK: scale 100 ppm (limit 1000); OK: yaw 0.286 deg (limit 0.5); drive straight at '
         'normal speed until left and right scale are separable; for the track width: turn by '
         '90 deg in total or more; call ~/stop_leg')
     both = replace(apart, wheels=WheelsForecast(2e-4, 0.01))
