@@ -27,22 +27,16 @@ class Border:
 
     It is pull (x - value) - (x - value)' information (x - value) / 2, up to a constant,
     docs/method.md (S33). Constants are identified by name; ln K, rad, m, s.
-
-    names : of the constants.   value : (m,) linearisation point, defined as the settings are: a
-    lever arm is the full one.   information : (m, m), semidefinite.   pull : (m,).
-    centre, sigma : (m,) of the priors, sigma inf: no prior.   used : (m,) the sigmas as used:
-    widened if the leg contradicts them, scaled by the estimated size for imperfections.
-    evidence : of combined legs, by name: log likelihood of the scatter between them (S38), (g,).
     """
 
     names: tuple[str, ...]
-    value: Floats
-    information: Floats
-    pull: Floats
-    centre: Floats
-    sigma: Floats
-    used: Floats
-    evidence: dict[str, Floats] = field(default_factory=dict)
+    value: Floats  # (m,) linearisation point, as the settings are: lever arms are the full ones
+    information: Floats  # (m, m), semidefinite
+    pull: Floats         # (m,)
+    centre: Floats       # (m,) of the priors
+    sigma: Floats        # (m,) of the priors, inf: no prior
+    used: Floats         # (m,) the same, widened if the leg contradicts them, or by sizes
+    evidence: dict[str, Floats] = field(default_factory=dict)  # (S38)
 
     def widened(self, factor: float) -> 'Border':
         """Return the information with all sigmas multiplied by a factor."""
@@ -69,11 +63,7 @@ class Border:
                        pull=self.pull - taken @ (A.T @ self.pull))
 
     def with_errors(self, effects: Floats) -> 'Border':
-        """
-        Return the border that gives, with the priors used, the same x and a larger covariance.
-
-        effects : (m, L) E; the covariance increases by E E', docs/method.md (S33a).
-        """
+        """Return the border of the same x, a covariance larger by E E', effects (m, L), (S33a)."""
         weight = 1 / self.used**2
         G = (self.information + np.diag(weight)) @ effects
         taken = G @ np.linalg.inv(np.eye(G.shape[1]) + effects.T @ G)
@@ -120,18 +110,13 @@ NUMBERS = [f for f in fields(Border) if f.name not in ('names', 'evidence')]
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """
-    Border of all legs so far, with the scale at the last leg.
-
-    unit : of the scale.   first_ns, last_ns : start times of the first and of the last leg.
-    legs : number of legs.
-    """
+    """Border of all legs so far, with the scale at the last leg."""
 
     border: Border
-    unit: str
-    first_ns: int
-    last_ns: int
-    legs: int
+    unit: str      # of the scale
+    first_ns: int  # start of the first leg
+    last_ns: int   # start of the last leg
+    legs: int      # their number
 
     def includes(self, other: 'Carried') -> bool:
         """Return True if it contains all the information of another."""
@@ -157,15 +142,7 @@ class Carried:
 
 
 def carried_from(content: dict[str, Any]) -> Carried:
-    """
-    Return the Carried from the dict of ``as_dict``; null: a value that is not finite.
-
-    Raises
-    ------
-    ValueError
-        The content is not valid.
-
-    """
+    """Return the Carried from ``as_dict``, null: not finite; raises ValueError if not valid."""
     try:
         entry = content['border']
         names = tuple(map(str, entry['names']))

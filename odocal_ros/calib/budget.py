@@ -48,16 +48,10 @@ def parameter_gradient(f: Floats) -> Floats:
 
 def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> dict[str, Floats]:
     """
-    Return the gyro sources as chord errors, (3, k) m for one sigma: docs/method.md (T10).
+    Return the gyro sources as chord errors, by name, (3, k) m for one sigma: docs/method.md (T10).
 
     t : (m,) epochs from the start of the leg to its end, s.   D : (m, 3) dead-reckoned
     displacement from the start, n, m.   q_nb : (m, 4) attitude, x y z w.   alignment : sigmas.
-
-    Returns
-    -------
-    dict of name to (3, k) array: bias by axis of b, scale and directions of the axes, noise and
-    bias walk (columns of a root of the covariance): integrals of r x (the error) over the leg.
-
     """
     r = D[-1] - D
     dt = np.diff(t)
@@ -108,12 +102,9 @@ def root_of(covariance: Floats) -> Floats:
 
 def _late_odometer(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,
                    end: MarkFix) -> Floats:
-    """
-    Return the change of the chord by an odometer delay of 1 s, (3,) m/s.
-
-    Travel is then combined with later attitudes: the integral of dC/dt f ds. Minus
-    v(end) - v(start), because the travel between the marks is shifted by the delay.
-    """
+    """Return the change of the chord by an odometer delay of 1 s, (3,) m/s."""
+    # travel is combined with later attitudes: the integral of dC/dt f ds; minus
+    # v(end) - v(start), because the travel between the marks is shifted by the delay
     def middle_and_change(q_nb: Floats) -> Floats:
         C_nb = matrix_from_quat(q_nb)
         return np.stack([(C_nb[:-1] + C_nb[1:]) @ f / 2, np.diff(C_nb, axis=0) @ f], axis=1)
@@ -157,6 +148,7 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     forward = D[-1] / np.linalg.norm(D[-1])
     at_start = int(np.searchsorted(t, start.t - 1e-9))
     C_first, C_start, C_end = matrix_from_quat(q_nb[[0, at_start, -1]])
+    height = start.covariance_n[2, 2] + end.covariance_n[2, 2]
     chord = {
         'fix_start': fix_scale[:, None] * root_of(start.covariance_n),
         'fix_end': fix_scale[:, None] * root_of(end.covariance_n),
@@ -170,7 +162,8 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
         'antenna_lever_arm': (C_end - C_start) * lever_arm_sigma,
         'odometer_delay': (_late_odometer(f, t, D, q_nb, start, end)
                            * odometer_time_sigma)[:, None],
-        'height': (D[-1] * _height_sigma(start, end) / A)[:, None],
+        'height': (D[-1] * (np.sqrt(height / 2) if start.height_known and end.height_known
+                            else HEIGHT_UNKNOWN) / A)[:, None],
         'projection': np.zeros((3, 1)),
     }
     gradient = parameter_gradient(f) @ np.linalg.inv(M)
@@ -179,24 +172,11 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
     if alignment.heading_shared:
         shared.add('initial_heading')
     sources = [Source(name, gradient @ e, name in shared) for name, e in chord.items()]
-    height = start.covariance_n[2, 2] + end.covariance_n[2, 2]
     return (*sources, _second_order(t, D, alignment, height * fix_scale[2]**2))
 
 
-def _height_sigma(start: MarkFix, end: MarkFix) -> float:
-    """Return the sigma of the height error common to both ends, m."""
-    if not (start.height_known and end.height_known):
-        return HEIGHT_UNKNOWN
-    return float(np.sqrt((start.covariance_n[2, 2] + end.covariance_n[2, 2]) / 2))
-
-
 def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: float) -> Source:
-    """
-    Return the second-order error of the scale: docs/method.md (T12).
-
-    Half the distance-weighted variance of the attitude drift, for a gyro bias and noise of one
-    sigma, and half the square of the false tilt by height errors of the fixes.
-    """
+    """Return the second-order error of the scale by attitude drift and heights: (T12)."""
     share = np.linalg.norm(np.diff(D, axis=0), axis=1)
     share = share / max(share.sum(), 1e-12)
     tm = (t[:-1] + t[1:]) / 2 - t[0]
@@ -228,11 +208,7 @@ def total_covariance(sources: Iterable[Source]) -> Floats:
 
 def budget_table(sources: Iterable[Source], parameters: Sequence[str],
                  scale: Sequence[float] | Floats) -> dict[str, dict[str, float]]:
-    """
-    Return each source's one-sigma share of each parameter, for calibration.json.
-
-    scale : (p,) factor from the parameters of the sources to those shown (K for ln K).
-    """
+    """Return the one-sigma shares of the parameters; scale : (p,) factors on them (K of ln K)."""
     return {s.name: {p: float(np.linalg.norm(s.effects[i]) * scale[i])
                      for i, p in enumerate(parameters)} | {'shared': s.shared} for s in sources}
 

@@ -66,12 +66,8 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
 
 
 def _distance_limit(sigma: float, distance: float) -> float:
-    """
-    Return the limit of the distance between track and fixes, m.
-
-    Four sigmas (once in 16 000 by chance), and 0.2 % of the distance for slip, suspension and road
-    (judgement).
-    """
+    """Return the limit of the distance between track and fixes, m."""
+    # once in 16 000 by chance; slip, suspension and road: judgement
     return 4.0 * sigma + 0.002 * distance
 
 
@@ -115,14 +111,10 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
 
 def steady(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
     """
-    Return the fixes that are no outliers relative to their neighbours, and their noise.
+    Return a mask of fixes that are no outliers relative to their neighbours, (n,), and the noise.
 
     residual : (n, 2 or more) corrected track minus fixes, m; the track may have large errors.
-
-    Returns
-    -------
-    (n,) bool, and the sigma of a fix by differences of consecutive ones, m, at least fix_sigma.
-
+    The noise is the sigma of a fix by differences of consecutive ones, m, at least fix_sigma.
     """
     level = residual[:, :2]
     jump = np.median((np.diff(level, axis=0)**2).sum(axis=1)) / np.log(2) / 4
@@ -135,15 +127,10 @@ def steady(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
 
 def per_distance(path: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
     """
-    Return the errors of two tracks over pieces of the path, each set to the fix at its begin.
+    Return the rms errors of two tracks over pieces of the path, each set to the fix at its begin.
 
     path : (k,) path length at each fix, m.   before, after : (k, 3) track minus fixes, m, up to a
-    constant.
-
-    Returns
-    -------
-    An entry for each length in the path: rms difference at the ends, with the noise of the fixes.
-
+    constant. The noise of the fixes is included.
     """
     return tuple(PerDistance(length, float(np.sqrt(was.mean())), float(np.sqrt(now.mean())),
                              pieces)

@@ -60,17 +60,10 @@ def deciding(asked: str | tuple[str, ...], shown: bool = False) -> tuple[str, ..
 def choose(methods: Mapping[str, MethodResult],
            asked: str | tuple[str, ...]) -> tuple[dict[str, Estimate], tuple[str, ...]]:
     """
-    Take each parameter from the first method that has it and is not rejected.
+    Return each parameter from the first method that has it and is not rejected.
 
-    methods : by name.   asked : the setting ``method``, or the methods that may give values.
-
-    Returns
-    -------
-    estimates : dict of Estimate
-        Each with the method it is from; value None where no method has it.
-    giving : tuple of str
-        The methods that gave a value; if none did, the first usable one.
-
+    Also the methods that gave a value; if none did, the first usable one.   methods : by name.
+    asked : the setting ``method``, or the methods that may give values.
     """
     found = [methods[name] for name in dict.fromkeys((*deciding(asked), PLANAR))
              if name in methods]
@@ -89,11 +82,7 @@ def choose(methods: Mapping[str, MethodResult],
 
 def passed_over(methods: Mapping[str, MethodResult], asked: str | tuple[str, ...],
                 said: Iterable[Code] = ()) -> list[Reason]:
-    """
-    Return METHOD_REJECTED for each rejected method that precedes a usable one.
-
-    asked : as for ``choose``.   said : codes that the leg reports itself.
-    """
+    """Return METHOD_REJECTED of rejected methods before a usable one; said : by the leg."""
     found = [methods[name] for name in deciding(asked) if name in methods]
     sound = [i for i, m in enumerate(found) if m.verdict is not Verdict.REJECTED]
     why = [(m.name, next(r for r in m.reasons if r.code.gravity is Verdict.REJECTED))
@@ -117,15 +106,9 @@ def relevant_reasons(reasons: Iterable[Reason], method: str,
 
 def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
     """
-    Compare the estimates of the methods on one leg.
+    Return METHODS_DISAGREE, with the likely cause, where two methods that are not rejected differ.
 
-    methods : by name; rejected ones are left out.
-
-    Returns
-    -------
-    METHODS_DISAGREE for each parameter of a pair that differs by more than three times the root
-    of the sum of both variances, with the likely cause.
-
+    By more than REMARK_SIGMAS of both together, for each parameter.
     """
     sound = [methods[n] for n in ORDER if n in methods
              and methods[n].verdict is not Verdict.REJECTED]

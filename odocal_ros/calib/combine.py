@@ -24,16 +24,11 @@ DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: changes with each pow
 def combine_method(name: str, results: Sequence[MethodResult],
                    walked: Floats | None = None) -> MethodResult:
     """
-    Combine the results of one method on several legs.
+    Return means with the least variance of one method on several legs, the scale at the last one.
 
     name : the method.   results : one a leg, at least one.   walked : (J,) variance of the random
-    walk of ln K from each leg to the last; None: constant.
-
-    Returns
-    -------
-    MethodResult: means with the least variance, a scale at the time of the last leg. The sigma
-    includes shared errors once. Scatter beyond the sigmas widens them (LEGS_DISAGREE).
-
+    walk of ln K from each leg to the last; None: constant. The sigma includes shared errors once.
+    Scatter beyond the sigmas widens them (LEGS_DISAGREE).
     """
     if len(results) == 1:
         return results[0]
@@ -54,7 +49,8 @@ def combine_method(name: str, results: Sequence[MethodResult],
         relative = value if parameter.startswith('scale_factor') else 1.0
         sigma = abs(relative) * float(np.sqrt(own + sum(v @ v for v in shared.values())))
         estimates[parameter] = Estimate(value, sigma, unit)
-        for source, effect in (shared | {'legs': np.array([np.sqrt(own)])}).items():
+        of_legs = np.sqrt(own) * np.eye(len(parameters))[i]
+        for source, effect in (shared | {'legs': of_legs}).items():
             sources.setdefault(source, []).append((i, effect))
     estimates |= _ratio(results, estimates) | newest(results, estimates)
     stacked = _stacked(sources, len(parameters))
@@ -96,7 +92,12 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
     if relative:    # from the last leg back, two legs share the random walk up to the nearer one
         own += np.minimum.outer(walked, walked)
     names = {s.name for r in have for s in r.sources if s.shared}
-    by_leg = {n: np.stack([_effect(r, n, i) for r in have]) for n in sorted(names)}
+    by_leg = {}
+    for n in sorted(names):
+        effects = [next((s.effects[i] for s in r.sources if s.shared and s.name == n), None)
+                   for r in have]
+        width = max(len(e) for e in effects if e is not None)
+        by_leg[n] = np.stack([np.zeros(width) if e is None else e for e in effects])
     weight = _weights(own + sum(g @ g.T for g in by_leg.values()))
     mean = weight @ y
     shared = {n: weight @ g for n, g in by_leg.items()}
@@ -117,23 +118,13 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
 
 
 def _weights(covariance: Floats) -> Floats:
-    """
-    Return the weights, none below zero, of the mean with the least variance: (T15).
-
-    Weights by own errors alone ignore that a shared error may dominate one leg and hardly affect
-    another; the mean would be worse than the latter.
-    """
+    """Return the weights, none below zero, of the mean with the least variance: (T15)."""
     from scipy.optimize import nnls
+    # by own errors alone, a leg that a shared error dominates would make the mean worse
     root = np.linalg.cholesky(covariance / np.trace(covariance))
     weight, _ = nnls(root.T, np.linalg.solve(root, np.ones(len(root))))
     out: Floats = weight / weight.sum()
     return out
-
-
-def _effect(result: MethodResult, name: str, i: int) -> Floats:
-    source = next((s for s in result.sources if s.shared and s.name == name), None)
-    width = max((s.effects.shape[1] for s in result.sources if s.name == name), default=1)
-    return np.zeros(width) if source is None else source.effects[i]
 
 
 def _ratio(results: Sequence[MethodResult],
@@ -151,12 +142,8 @@ def _ratio(results: Sequence[MethodResult],
 def _stacked(sources: Mapping[str, list[tuple[int, Floats]]], p: int) -> tuple[Source, ...]:
     out = []
     for name, rows in sources.items():
-        width = max(len(e) for _, e in rows)
-        effects = np.zeros((p, width if name != 'legs' else len(rows)))
-        for k, (i, e) in enumerate(rows):
-            if name == 'legs':
-                effects[i, k] = e[0]
-            else:
-                effects[i, :len(e)] = e
+        effects = np.zeros((p, max(len(e) for _, e in rows)))
+        for i, e in rows:
+            effects[i, :len(e)] = e
         out.append(Source(name, effects, name != 'legs'))
     return tuple(out)

@@ -42,15 +42,9 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
 def check_path(track: Track, t_stop: float, metres_per_unit: float,
                leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """
-    Return the path length between the marks, and reasons if it or the speed is too low.
+    Return the path length between the marks, m, and reasons if it or the speed is too low.
 
-    track : dead reckoned.   t_stop : stop mark, s.   metres_per_unit : approximate scale.   leg :
-    limits.
-
-    Returns
-    -------
-    Path length, m, and reasons.
-
+    t_stop : stop mark, s.   metres_per_unit : approximate scale.   leg : limits.
     """
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
@@ -92,11 +86,7 @@ def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
 
 def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
                t_stop: float, least: float) -> tuple[Reason, ...]:
-    """
-    Return the reasons if wheels or fixes show no motion, empty if both do.
-
-    least : smallest motion of fixes that is significant, m.
-    """
+    """Return why wheels or fixes show no motion, () if both do; least : of fixes, m."""
     rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
     t_here, here = t_fix[rows], fixes_n[rows, :2]
     if len(here) < 2:
@@ -150,11 +140,7 @@ def _without_counts(travel: Travel, t: Floats, fixes: Floats,
 
 
 def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) -> Floats:
-    """
-    Return the intervals in which a vehicle was carried, for example by a ferry: (k, 2) s.
-
-    The fixes move without counts, and the odometer counts again afterwards.
-    """
+    """Return (k, 2) s in which fixes move without counts, which go on afterwards: ferries."""
     spans = []
     for far, begin, end in _without_counts(travel, t_fix, fixes_n[:, :2], fix_sigma):
         rows = np.flatnonzero((t_fix >= begin) & (t_fix <= end))
@@ -169,11 +155,7 @@ def carried(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float) ->
 
 
 def _motion_between(fixes: Floats, least: float) -> float:
-    """
-    Return the significant motion of (k, 2) fixes from begin to end, m, 0 below ``least``.
-
-    Single jumps, noise and outlier episodes are not motion.
-    """
+    """Return the motion of (k, 2) fixes without jumps and noise, m, 0 below ``least``."""
     stretches = 20      # enough that motion extends over more than two of them
     if len(fixes) < stretches:
         return 0.0

@@ -64,7 +64,7 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
              paths: tuple[Path, Path], config: Config, t_fit: float = np.inf,
              covered: tuple[float, float] = (0.0, np.inf)) -> Evidence:
     """
-    Collect the plot data of a leg.
+    Return the plot data of a leg, at most KEPT_ROWS of each series.
 
     leg : with all received fixes.   inputs : the screened leg.   track : epochs and attitude.
     fixes_n : (k, 3) usable fixes, m, at inputs.t_fix.   kept : (k,) bool, fixes without gross
@@ -72,11 +72,6 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
     paths are set to.   paths : (before, after) callables t (n,) to the antenna's path, (n, 3) m
     up to a constant, as configured and as calibrated.   config : settings in force.   t_fit : end
     of the fitted data, s.   covered : begin and end of the time with an odometer, s.
-
-    Returns
-    -------
-    Evidence, at most 5000 rows of each series.
-
     """
     inside = (track.t >= covered[0]) & (track.t <= min(inputs.t_stop, covered[1]))
     t = track.t[inside]

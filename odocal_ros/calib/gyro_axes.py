@@ -17,7 +17,7 @@ import numpy as np
 
 from odocal_ros.calib.check import ONE_MOTION_RATIO
 from odocal_ros.calib.drive import knots_of
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.integral import integral_at, twice_integral_at
 from odocal_ros.nav.local_frame import GNSS_MOVES
@@ -48,28 +48,22 @@ def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
     """
     Return the axes of a sensor, levelled, and their names.
 
-    up : (3,) Unit vector in the sensor's frame.
-
-    Returns
-    -------
-    (3, 3) rows e1, e2, up, right-handed, and the sensor axis nearest to each, as "-y".
-
+    Rows e1, e2, up, (3, 3), right-handed, and the sensor axis nearest to each, as "-y".
+    up : (3,) unit vector in the sensor's frame.
     """
     k = int(np.argmax(np.abs(up)))
     first, second = np.eye(3)[(k + 1) % 3], np.sign(up[k]) * np.eye(3)[(k + 2) % 3]
     e1 = first - (first @ up) * up
     e1 /= np.linalg.norm(e1)
     axes = np.stack([e1, np.cross(up, e1), up])
-    return axes, [_name(axis) for axis in (first, second, np.sign(up[k]) * np.eye(3)[k])]
+    nearest = (first, second, np.sign(up[k]) * np.eye(3)[k])
+    return axes, ['-' * bool(axis.sum() < 0) + 'xyz'[int(np.argmax(np.abs(axis)))]
+                  for axis in nearest]
 
 
 def turning(inputs: Inputs, placed: Placed, faces: Facing | None,
             gyro_scale: float) -> tuple[float | None, tuple[Reason, ...]]:
-    """
-    Return turns by the gyro over those by the fixes, None if unknown, and the reason for a fault.
-
-    Arguments as for ``gyro_axes``.   gyro_scale : as configured.
-    """
+    """Return turns by gyro over those by fixes, None if unknown, and the reason for a fault."""
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ inputs.up_b, inputs.w_b),
                        inputs.t_fix, placed.fixes_n, placed.fix_sigma, inputs.least_motion)
     found = gyro_reasons(ratio, gyro_scale)
@@ -88,14 +82,8 @@ def gyro_axes(inputs: Inputs, placed: Placed, faces: Facing | None) -> tuple[Rea
     """
     Return a reason if an axis of gyro or accelerometer is mirrored, or two of the gyro swapped.
 
-    inputs : a screened leg.   placed : its fixes in metres and approximate scale.   faces : fit of
-    its accelerations.
-
-    Returns
-    -------
-    The reason, or () if the drive does not show it: a flat road has no roll and pitch, a straight
-    one no yaw.
-
+    placed : the fixes in metres and approximate scale.   faces : fit of the accelerations. A flat
+    road does not show roll and pitch, a straight one no yaw.
     """
     w_i, f_i = (by_row(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
     up = inputs.usual_f_b @ inputs.C_bi
@@ -186,12 +174,6 @@ def _measured(sent: str, true: str, part: float) -> tuple[str, str]:
     return sent[-1], '-' * minus + true[-1]
 
 
-def _name(axis: Floats) -> str:
-    """Return a sensor axis by name, as "-y"."""
-    k = int(np.argmax(np.abs(axis)))
-    return '-' * bool(axis[k] < 0) + 'xyz'[k]
-
-
 def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
                sigma: float, least: float = GNSS_MOVES) -> float | None:
     """
@@ -211,8 +193,12 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     ends = t_fix[knots]
     gaps = gaps_longer(t_imu, LONGEST_GAP)
     since, until = (np.searchsorted(edge, ends) for edge in gaps.T)     # gaps before each end
-    keep = ~_pivots(ends, integral_at(ends, t_imu, w_up)) & (until[1:] == since[:-1]) & (
-        since[1:] == since[:-1])
+    # chords in which a vehicle stops and turns: the mean over time is not that over path. Ratio to
+    # the median duration, and rad: judgement
+    lasts = np.diff(ends)
+    pivots = (lasts > 3.0 * np.median(lasts)) & (
+        np.abs(np.diff(integral_at(ends, t_imu, w_up))) > 0.5)
+    keep = ~pivots & (until[1:] == since[:-1]) & (since[1:] == since[:-1])
     step = np.diff(fixes_n[knots, :2], axis=0)[keep]
     t = ((ends[:-1] + ends[1:]) / 2)[keep]
     course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
@@ -231,13 +217,6 @@ def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
     explained = slope**2 * power / (course @ course)      # share of the course's variance
     certain = explained * (len(t) - 1 - drift.shape[1]) > SLOPE_SIGMAS**2 * (1 - explained)
     return 1 / slope if explained > SAME_TURNS**2 and certain else None
-
-
-def _pivots(ends: Floats, angle: Floats) -> Bools:
-    """Return a mask of the chords in which a vehicle stops and turns: (n,), angle in rad."""
-    lasts, turns = np.diff(ends), np.abs(np.diff(angle))
-    # judgement: ratio to the median duration, and rad: the mean over time is not that over path
-    return (lasts > 3.0 * np.median(lasts)) & (turns > 0.5)
 
 
 def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:

@@ -30,32 +30,21 @@ FREE_STEP = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """
-    Joint estimate of the constants from all legs.
-
-    names, value, covariance : (m,), (m, m), of the last leg for the one that drifts.
-    sigma, used : (m,) prior sigmas, as given and as widened by legs that contradict them.
-    chi2, freedom : chi-square of the legs before any widening, and its degrees of freedom.
-    between : scatter sigma of constants between legs, by name.   disputed : constants in which
-    legs differ significantly.   deviation : (J, m) of each leg from the others, in sigmas,
-    without scatter.   factor : on all sigmas, included in ``covariance``.
-    bent : (J,) rad, linearisation error of each leg at the estimate.
-    carried : information of all legs, for later legs.
-    """
+    """Joint estimate of m constants from all J legs."""
 
     names: tuple[str, ...]
-    value: Floats
-    covariance: Floats
-    sigma: Floats
-    used: Floats
-    chi2: float
-    freedom: float
-    deviation: Floats
-    carried: Border
-    between: dict[str, float] = field(default_factory=dict)
-    disputed: tuple[str, ...] = ()
-    factor: float = 1.0
-    bent: Floats = field(default_factory=lambda: np.zeros(0))
+    value: Floats                   # (m,), of the last leg for the one that drifts
+    covariance: Floats              # (m, m)
+    sigma: Floats                   # (m,) of the priors
+    used: Floats                    # (m,) the same, widened by legs that contradict them
+    chi2: float                     # of the legs before any widening
+    freedom: float                  # its degrees of freedom
+    deviation: Floats  # (J, m) of each leg from the others, in sigmas, without scatter
+    carried: Border                 # information of all legs, for later legs
+    between: dict[str, float] = field(default_factory=dict)  # scatter between legs
+    disputed: tuple[str, ...] = ()  # constants in which legs differ
+    factor: float = 1.0             # on all sigmas, included in ``covariance``
+    bent: Floats = field(default_factory=lambda: np.zeros(0))  # rad, linearisation errors
 
 
 def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
@@ -63,7 +52,7 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
           curved: Sequence[str] = (), usual: Mapping[str, float] | None = None,
           same: Sequence[bool] = ()) -> Joint:
     """
-    Combine legs of one vehicle.
+    Combine legs of one vehicle; all sigmas are widened if legs differ beyond them and the scatter.
 
     borders : by time, at least one.   steps : (J - 1,) sigma of the change of ``drifting`` from
     leg to leg.   drifting : the constant with a random walk.   angles : constants with a period
@@ -71,12 +60,6 @@ def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
     change becomes an error of that leg alone.   usual : usual scatter sigma of constants between
     legs, by name; the scatter is estimated, (S38).   same : (J - 1,) True: the next is a section
     of the same leg, without scatter.
-
-    Returns
-    -------
-    Joint. If legs differ by more than their sigmas and their scatter allow, all sigmas are
-    widened.
-
     """
     usual = usual or {}
     legs = LinkedLegs(list(borders), drifting, np.asarray(steps, float), angles)
@@ -107,26 +90,16 @@ def deviate(chi2: float, freedom: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """
-    Scatter of constants between legs, by name.
+    """Scatter of constants between legs, by name."""
 
-    sigmas : geometric mean of its distribution.   evidence : (g,) log likelihood at the points
-    of SCATTER_GRID.
-    weights : (g,) of these points.
-    """
-
-    sigmas: dict[str, float]
-    evidence: dict[str, Floats]
-    weights: dict[str, Floats]
+    sigmas: dict[str, float]     # geometric means
+    evidence: dict[str, Floats]  # (g,) log likelihood at the points of SCATTER_GRID
+    weights: dict[str, Floats]   # (g,) of these points
 
 
 def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
-    """
-    Return the scatter between the legs of the constants in ``usual``, docs/method.md (S38).
-
-    By restricted likelihood, with a half-Cauchy prior whose scale is the usual sigma (Gelman
-    2006).
-    """
+    """Return the scatter between the legs of the constants in ``usual``, (S38)."""
+    # by restricted likelihood, with a half-Cauchy prior of the usual sigma (Gelman 2006)
     from scipy.interpolate import CubicSpline
     between, evidence, weights = dict(usual), dict[str, Floats](), dict[str, Floats]()
     fine = np.linspace(SCATTER_GRID[0], SCATTER_GRID[-1], 301)
@@ -147,11 +120,7 @@ def _scatter(legs: LinkedLegs, usual: Mapping[str, float]) -> Scatter:
 
 def _averaged(legs: LinkedLegs, scatter: Scatter,
               usual: Mapping[str, float]) -> tuple[Floats, Floats]:
-    """
-    Return the unknowns at this scatter, and their covariance averaged over all scatters.
-
-    Few legs hardly determine the scatter of a constant: docs/method.md (S39).
-    """
+    """Return the unknowns at this scatter, and their covariance averaged over all of it, (S39)."""
     x, C = legs.solve(scatter.sigmas)
     out = C.copy()
     for name, weight in scatter.weights.items():
@@ -163,12 +132,8 @@ def _averaged(legs: LinkedLegs, scatter: Scatter,
 
 def _disputed(legs: LinkedLegs, between: dict[str, float],
               usual: Mapping[str, float]) -> tuple[str, ...]:
-    """
-    Return the constants in which legs differ significantly.
-
-    By more than the usual scatter; of those without scatter, only the one that explains most of
-    the remaining chi-square.
-    """
+    """Return the constants in which legs differ by more than the usual scatter."""
+    # of those without scatter, only the one that explains most of the remaining chi-square
     def deviates(name: str) -> float:
         now, freedom = (legs.disagreement({**between, name: usual[name]}) if name in usual
                         else as_they_are)
@@ -209,15 +174,9 @@ class ScaleStep:
 def scale_steps(borders: Sequence[Border], steps: Sequence[float] | Floats, drifting: str,
                 angles: Sequence[str] = ()) -> list[ScaleStep]:
     """
-    Compare the scale of each leg with its prediction by the earlier legs.
+    Return changes of the scale from its prediction by the earlier legs, beyond REMARK_SIGMAS.
 
-    borders : by time.   steps : (J - 1,) sigma of the change of ``drifting`` from leg to leg.
-    drifting, angles : as for ``joint``.
-
-    Returns
-    -------
-    Changes beyond REMARK_SIGMAS, in order. After a change, only later legs predict the scale.
-
+    Arguments as for ``joint``. After a change, only later legs predict the scale.
     """
     steps, found = np.array(steps, float), []
     for j in range(1, len(borders)):

@@ -16,20 +16,14 @@ LEG_ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class LinkedEquations:
-    """
-    Normal equations H x = g of linked legs; see ``LinkedLegs.equations``.
-
-    cost : of the rows at x = 0.   prior : (n,) the diagonal part of H by priors, its right-hand
-    side and its part of ``cost`` at 0.   others : number of constants that do not drift.
-    rows : number of rows of legs and random walk.
-    """
+    """Normal equations H x = g of linked legs; see ``LinkedLegs.equations``."""
 
     H: Floats
     g: Floats
-    cost: float
-    prior: tuple[Floats, Floats, float]
-    others: int
-    rows: int
+    cost: float                          # of the rows at x = 0
+    prior: tuple[Floats, Floats, float]  # diagonal of H, g and cost by priors
+    others: int                          # number of constants that do not drift
+    rows: int                            # number of rows of legs and random walk
 
     @cached_property
     def _parts(self) -> tuple[Floats, Floats, Floats]:

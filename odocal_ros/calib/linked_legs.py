@@ -87,12 +87,9 @@ class LinkedLegs:
 
     def _of_legs(self, legs: 'LegInformation',
                  spread: dict[str, float] | None) -> tuple[Floats, Floats, float, int]:
-        """
-        Return the equations of the legs, their cost at zero and the number of their rows.
-
-        The drifting constant of a leg is the sum of its steps from the leg on: rows and columns
-        of the steps are sums over the legs up to each.
-        """
+        """Return the equations of the legs, their cost at zero and the number of their rows."""
+        # the drifting constant of a leg is the sum of its steps from the leg on: rows and columns
+        # of the steps are sums over the legs up to each
         J, k, rest = len(legs.D), self.drifting, np.delete(np.arange(len(self.names)),
                                                            self.drifting)
         taken, DA, pull, rank = self._scattering(legs, spread)
@@ -127,11 +124,7 @@ class LinkedLegs:
 
     def carried(self, value: Floats, spread: dict[str, float],
                 evidence: dict[str, Floats]) -> Border:
-        """
-        Return the information of all legs on the last leg's constants, at ``value``.
-
-        evidence : log likelihood of the scatter between legs, by name.
-        """
+        """Return the information of all legs at ``value``; evidence : of the scatter, by name."""
         equations = self.equations(self.information(), spread, prior=False)
         D, pull = equations.of(self.place(len(self.borders) - 1))
         D, pull = D / np.multiply.outer(self.unit, self.unit), pull / self.unit
@@ -176,12 +169,8 @@ class LinkedLegs:
 
     def _scattering(self, legs: 'LegInformation', spread: dict[str, float] | None
                     ) -> tuple[Floats, Floats, Floats, int]:
-        """
-        Return the loss of information by a scatter, the pull of the legs, and the sum of ranks.
-
-        The loss is T and DA of ``own_errors``. The information of combined legs already
-        includes their scatter.
-        """
+        """Return T and DA of ``own_errors`` by a scatter, the pull of the legs, sum of ranks."""
+        # the information of combined legs already includes their scatter
         at = [self.names.index(n) for n in spread or ()]
         sigmas = np.array(list((spread or {}).values())) / self.unit[at]
         taken, DA, A = own_errors(legs.D, at, sigmas)
@@ -193,17 +182,12 @@ class LinkedLegs:
 
 @dataclass(frozen=True, eq=False)
 class LegInformation:
-    """
-    Information of J legs, in units of their m constants, without what is rounding.
+    """Information of J legs, in units of their m constants, without what is rounding."""
 
-    D, pull : (J, m, m), (J, m), as in ``Border``.   nearest : (J, m) the leg's own estimate, less
-    its value: D nearest = pull, also for a scatter.   rank : (J,) of D.
-    """
-
-    D: Floats
-    pull: Floats
-    nearest: Floats
-    rank: Ints
+    D: Floats        # (J, m, m), as in ``Border``
+    pull: Floats     # (J, m)
+    nearest: Floats  # (J, m) own estimate, less its value: D nearest = pull, also for a scatter
+    rank: Ints       # (J,) of D
 
 
 def information(borders: Sequence[Border], unit: Floats, least: float) -> LegInformation:

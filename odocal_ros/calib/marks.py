@@ -34,44 +34,25 @@ SLOW_WINDOW = 20.0
 
 @dataclass(frozen=True, eq=False)
 class MarkFix:
-    """
-    Antenna position at a mark.
+    """Antenna position at a mark."""
 
-    t : s, time of the mark.       position_n : (3,) m.       covariance_n : (3, 3) m^2.
-    standing : averaged at rest.   used, dropped : fixes.     surveyed : from settings.
-    height_known : False if any fix has no height.
-    """
-
-    t: float
-    position_n: NDArray[np.float64]
-    covariance_n: NDArray[np.float64]
-    standing: bool
-    used: int
+    t: float                           # s, of the mark
+    position_n: NDArray[np.float64]    # (3,) m
+    covariance_n: NDArray[np.float64]  # (3, 3) m^2
+    standing: bool                     # averaged at rest
+    used: int                          # fixes
     dropped: int
-    height_known: bool = True
-    surveyed: bool = False
-
-    def at_least(self, variance: float, up_ratio: float) -> 'MarkFix':
-        """Return the mark with at least a horizontal variance, m^2; the increase up is scaled."""
-        if self.surveyed:
-            return self
-        level = (self.covariance_n[0, 0] + self.covariance_n[1, 1]) / 2
-        more = max(0.0, variance - level) * np.diag([1.0, 1.0, up_ratio])
-        return replace(self, covariance_n=self.covariance_n + more)
+    height_known: bool = True          # False if any fix has no height
+    surveyed: bool = False             # from settings
 
 
 def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
              correlation_time: float = np.nan) -> tuple[Floats, Floats, int, int]:
     """
-    Average fixes of one place: docs/method.md (T6), (T7).
+    Return mean, (3,) m, covariance, (3, 3) m^2, used and dropped fixes of one place: (T6), (T7).
 
     t : (n,) times, s.   position_n : (n, 3) fixes, m, motion removed.   covariance_n : (n, 3, 3)
     stated, m^2.   correlation_time : of the errors, s; 0: white; NaN: estimated from the data.
-
-    Returns
-    -------
-    mean : (3,) m.   covariance : (3, 3) of the mean, m^2.   used, dropped : int.
-
     """
     keep = _near_middle(position_n, covariance_n)
     t, position_n, covariance_n = t[keep], position_n[keep], covariance_n[keep]
@@ -140,12 +121,10 @@ def _correlation_time(t: Floats, z: Floats, fast: float, slow: float) -> float:
 
 
 def standing_at(t_mark: float, spans: Floats | Sequence[tuple[float, float]],
-                slack: float = 0.5) -> tuple[float, float] | None:
-    """Return the standstill (begin, end) at most ``slack`` s from a mark, or None."""
-    for begin, end in spans:
-        if begin - slack <= t_mark <= end + slack:
-            return float(begin), float(end)
-    return None
+                ) -> tuple[float, float] | None:
+    """Return the standstill (begin, end) at most half a second from a mark, or None."""
+    return next(((float(begin), float(end)) for begin, end in spans
+                 if begin - 0.5 <= t_mark <= end + 0.5), None)
 
 
 def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats, Floats, Floats],
@@ -252,9 +231,10 @@ def with_slow_errors(mark: MarkFix, slow: float, tau: float, span: tuple[float, 
     own = (mark.covariance_n[0, 0] + mark.covariance_n[1, 1]) / 2
     unclear = 2.0       # ratio of variances: below, neither of two estimates is better
     took_for_white = own * mark.used < unclear * stated
-    if took_for_white or floor > unclear * own:
-        return mark.at_least(floor, up_ratio)
-    return mark
+    if mark.surveyed or not (took_for_white or floor > unclear * own):
+        return mark
+    more = max(0.0, floor - own) * np.diag([1.0, 1.0, up_ratio])
+    return replace(mark, covariance_n=mark.covariance_n + more)
 
 
 def marks_with_slow_errors(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats, way_n: Floats,

@@ -28,22 +28,14 @@ MEANT_AXIS = np.deg2rad(30.0)
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """
-    The nominal rotation estimated from a drive.
+    """The nominal rotation estimated from a drive."""
 
-    C_bi : (3, 3) rotation of the IMU frame i to b (forward, left, up), quarter turns only; None
-        if not observable.
-    up_i, forward_i : (3,) measured axes; forward_i is None if not observable.
-    forward_sigma : rad.    assumed : forward is assumed to be x, not measured.
-    off : rad, angle between the measured axes and the quarter turns.
-    """
-
-    C_bi: NDArray[np.float64] | None
-    up_i: NDArray[np.float64]
-    forward_i: NDArray[np.float64] | None
-    forward_sigma: float
-    assumed: bool
-    off: float
+    C_bi: NDArray[np.float64] | None  # (3, 3) i to b, quarter turns only; None: not observable
+    up_i: NDArray[np.float64]         # (3,) measured axis
+    forward_i: NDArray[np.float64] | None  # (3,) the same; None: not observable
+    forward_sigma: float              # rad
+    assumed: bool                     # forward is assumed to be x, not measured
+    off: float                        # rad, angle between the measured axes and the quarter turns
 
     @property
     def rpy(self) -> list[float] | None:
@@ -125,13 +117,9 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
 
 def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
              metres_per_unit: float) -> tuple[Floats | None, float]:
-    """
-    Return the forward axis (level, unit) and its sigma, rad; None if not observable.
-
-    In the level plane, as complex numbers, f = e^(i theta) (dv/dt + i v w_up) + bias: forward and
-    centripetal acceleration. One least-squares angle fits both. If it does not, turns are
-    inverted, as by a mirrored axis of gyro or accelerometer, which is tested later.
-    """
+    """Return the forward axis (level, unit) and its sigma, rad; None if not observable."""
+    # in the level plane, complex: f = e^(i theta) (dv/dt + i v w_up) + bias, one angle for both
+    # accelerations; else turns are inverted, as by a mirrored axis, which is tested later
     found = pushes(t, w_i, f_i, up_i, travel, metres_per_unit)
     if found is None:
         return None, np.pi

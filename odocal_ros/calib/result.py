@@ -54,16 +54,11 @@ def wheel_factors(estimates: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """
-    One source of error of an estimate, as one-sigma effects.
-
-    effects : (p, k) effect of k independent unit errors on the p parameters of the method.
-    shared  : the error is the same in every leg of a vehicle (heading source, lever arm).
-    """
+    """One source of error of an estimate, as one-sigma effects."""
 
     name: str
-    effects: NDArray[np.float64]
-    shared: bool = False
+    effects: NDArray[np.float64]  # (p, k) of k independent unit errors on the p parameters
+    shared: bool = False          # the same in every leg of a vehicle (heading source, lever arm)
 
 
 @dataclass(frozen=True, eq=False)

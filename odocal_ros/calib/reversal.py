@@ -32,25 +32,16 @@ ERROR_LASTS = 60.0
 
 
 class Pieces(NamedTuple):
-    """
-    Pieces of a drive between fixes, one after the other: (k,) each.
+    """Pieces of a drive between fixes, one after the other: (k,) each."""
 
-    t : s, the middle.   off : rad, direction of the track minus course by the fixes.
-    length : m, by the fixes.   stretch : length of the track over ``length``, median 1.
-    """
-
-    t: Floats
-    off: Floats
-    length: Floats
-    stretch: Floats
+    t: Floats        # s, the middle
+    off: Floats      # rad, direction of the track minus course by the fixes
+    length: Floats   # m, by the fixes
+    stretch: Floats  # length of the track over ``length``, median 1
 
 
 def level_track(travel: Floats, turned: Floats) -> Floats:
-    """
-    Return the path of travel on level ground, up to a rotation: (n, 2) in units of travel.
-
-    turned, travel : (n,) arrays, turn about the upward axis, rad, and travel.
-    """
+    """Return the level path of travel, (n, 2) in its units; turned : (n,) rad about up."""
     middle = (turned[1:] + turned[:-1]) / 2
     step = np.diff(travel)[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1)
     return np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
@@ -88,7 +79,9 @@ def backwards(found: Pieces) -> Bools:
     jump of the fixes, has no direction.
     """
     back = np.zeros(len(found.t), bool)
-    found = _without_bias(found)
+    if len(found.t) > 1:        # without the remaining gyro bias, a constant rate of the offset
+        rate = np.median(wrap(np.diff(found.off)) / np.diff(found.t))
+        found = found._replace(off=wrap(found.off - rate * found.t))
     moves = np.flatnonzero((found.stretch > ONE_MOTION_RATIO[0])
                            & (found.stretch < ONE_MOTION_RATIO[1]))
     if len(moves) < 3:
@@ -116,24 +109,12 @@ def _opposite(off: Floats) -> Bools:
     return out
 
 
-def _without_bias(found: Pieces) -> Pieces:
-    """Return pieces without the remaining gyro bias, a constant rate of the offset."""
-    if len(found.t) < 2:
-        return found
-    rate = np.median(wrap(np.diff(found.off)) / np.diff(found.t))
-    return found._replace(off=wrap(found.off - rate * found.t))
-
-
 def _stays_back(found: Pieces, run: Ints, forward: Ints) -> bool:
-    """
-    Return True if the fixes stay behind after a run of pieces, as after a reversal.
-
-    To remove heading drift, the offset of each piece is relative to the nearest forward piece.
-    run, forward : indices of the pieces that may be driven backwards, and of the others.
-    """
+    """Return True if the fixes stay behind after a run of pieces, as after a reversal."""
     t = found.t
     about = (t >= t[run[0]] - ERROR_LASTS) & (t <= t[run[-1]] + ERROR_LASTS)
     about[run] = False
+    # without heading drift: the offset of a piece is relative to the nearest forward one
     nearest = forward[np.argmin(np.abs(t[about][:, None] - t[forward]), axis=1)]
     ahead = found.length[about] * (
         np.cos(found.off[about] - found.off[nearest]) - found.stretch[about])

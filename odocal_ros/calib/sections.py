@@ -36,16 +36,12 @@ NO_WINDOWS = np.empty((0, 4))    # definition
 
 @dataclass(frozen=True, eq=False)
 class Sections:
-    """
-    Scale by section: length by the fixes over length dead reckoned as calibrated.
+    """Scale by section, (k,): length by the fixes over length dead reckoned as calibrated."""
 
-    begin, end : (k,) path length, m.   ratio, sigma : (k,), NaN: not determined by the fixes.
-    """
-
-    begin: NDArray[np.float64]
-    end: NDArray[np.float64]
-    ratio: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    begin: NDArray[np.float64]  # m, path length
+    end: NDArray[np.float64]    # m
+    ratio: NDArray[np.float64]  # NaN: not determined by the fixes
+    sigma: NDArray[np.float64]  # of the ratio
 
 
 def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> Sections:
@@ -118,13 +114,7 @@ def _errors(fits: list[Similarity], stated: float) -> list[float]:
 
 @lru_cache(maxsize=32)
 def _process(n: int) -> Floats:
-    """
-    Return statistics of a line fitted to n rows of a first-order process, by its memory.
-
-    Mean power of the residuals, the variance of the slope over that of white noise, and the
-    correlation of the residuals at each lag, for a process of variance 1: each (len(MEMORIES),).
-    Closed form: traces with the residual projector of a line.
-    """
+    """Return power, slope variance, correlations of residuals of a line of n rows, by memory."""
     x = np.stack([np.ones(n), np.linspace(-1.0, 1.0, n)], -1)
     x /= np.linalg.norm(x, axis=0)
     off = np.eye(n) - x @ x.T

@@ -46,18 +46,12 @@ LATE = 0.05 * np.arange(-10, 21)
 
 
 class Slips(NamedTuple):
-    """
-    Slips of the wheels.
+    """Slips of the wheels."""
 
-    t : (k,) s, middle of each slip.   size : (k,) m, > 0 if the wheel spun, < 0 if it slid.
-    late : delay of the odometer relative to the IMU, s, if it would look like slip, else 0.
-    unforced : (k,) 0 for a slip, else the sign of travel that no force explains.
-    """
-
-    t: Floats
-    size: Floats
-    late: float = 0.0
-    unforced: Ints = np.empty(0, int)
+    t: Floats                          # (k,) s, middle of each slip
+    size: Floats                       # (k,) m, > 0 if the wheel spun, < 0 if it slid
+    late: float = 0.0  # s, of the odometer against the IMU, if it would look like slip, else 0
+    unforced: Ints = np.empty(0, int)  # (k,) 0 or the sign of travel no force explains
 
 
 def rounding(travel: Travel) -> float:
@@ -98,16 +92,11 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """
-    Windows of a drive, which begin at the times in grid, (n,) s.
+    """Windows of a drive, with a track and its scale K, a count in scale units."""
 
-    a : (n - 1,) forward acceleration by the IMU, m/s^2.   turns : (m,) bool, excluded windows.
-    track, K, quantum : Track, its scale, size of a count in scale units.
-    """
-
-    grid: Floats
-    a: Floats
-    turns: Bools
+    grid: Floats        # (n,) s, begins
+    a: Floats           # (n - 1,) m/s^2, forward acceleration by the IMU
+    turns: Bools        # (m,) excluded windows
     track: Track
     K: float
     quantum: float
@@ -155,12 +144,8 @@ def excess_path(span: int, a: Floats, path: Floats) -> Floats:
 
 
 def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Floats]:
-    """
-    Return time and size of each event.
-
-    Every window that contains an event exceeds the limit: these windows are one group, and those
-    in its middle contain the whole event.
-    """
+    """Return time and size of each event."""
+    # windows that contain an event are one group; those in its middle contain all of it
     far = np.flatnonzero(np.abs(excess) > limit)
     groups = np.split(far, np.flatnonzero(np.diff(middle[far]) > SPIN_WINDOW / 2) + 1)
     centres = [(g[0] + g[-1]) // 2 for g in groups if len(g)]
@@ -193,11 +178,7 @@ def unforced(t: float, duration: float, metres: float, t_speed: Floats, speed: F
 
 
 def travel_reasons(t: Floats, metres: Floats, sign: Ints) -> list[Reason]:
-    """
-    Return TRAVEL_MISSING and TRAVEL_EXCESS for travel that no force explains; empty if none.
-
-    t, metres : (k,) s, m.   sign : (k,) as by ``unforced``.
-    """
+    """Return TRAVEL_MISSING and TRAVEL_EXCESS of (k,) slips, s, m, sign as by ``unforced``."""
     found = []
     for code, of, relation, where in (
             (Code.TRAVEL_MISSING, -1, 'less', 'without braking'),
@@ -218,11 +199,7 @@ def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floa
 
 
 def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
-    """
-    Return the reasons for delay, slip and travel that no force explains; empty if there are none.
-
-    slips : Slips.   time_offset : odometer.time_offset in force, s.
-    """
+    """Return the reasons for delay, slip and unforced travel; time_offset : as configured, s."""
     found: tuple[Reason, ...] = ()
     t, size, late = slips.t[slips.unforced == 0], slips.size[slips.unforced == 0], slips.late
     if late:

@@ -23,17 +23,16 @@ NO_BINS = np.empty((0, 4))    # definition: no bins
 @dataclass(frozen=True, eq=False)
 class SpeedScale:
     """
-    Ratio of the distances of fixes and odometer by speed, with a fit.
+    Ratio of the distances of fixes and odometer by speed, with a fit (value, sigma).
 
-    bins : (b, 4) speed m/s, ratio in m per unit, its sigma, number of cells.
-    factor, offset, lag : (value, sigma) of reference = factor * odometer + offset * time, with
-    the odometer late by the lag: m per unit, m/s, s; None if the speeds do not determine them.
+    reference = factor * odometer + offset * time, with the odometer late by the lag; None if the
+    speeds do not determine them.
     """
 
-    bins: Floats
-    factor: tuple[float, float] | None = None
-    offset: tuple[float, float] | None = None
-    lag: tuple[float, float] | None = None
+    bins: Floats  # (b, 4) speed m/s, ratio in m per unit, its sigma, number of cells
+    factor: tuple[float, float] | None = None  # m per unit
+    offset: tuple[float, float] | None = None  # m/s
+    lag: tuple[float, float] | None = None  # s
 
 
 def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
@@ -57,7 +56,10 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     half = 0.5        # s before and after a knot, for the mean speed there
     speed = (travel.at(t + half) - travel.at(t - half)) / (2 * half)
     straight = dead > 0.8 * path      # judgement: in tighter turns a chord is too short
-    good = (2 * cell > T) & straight & (rolled != 0) & _moves(travel, t)
+    fine = travel.at(t[:-1, None] + T[:, None] * np.arange(0.0, 1.0, 0.1))
+    step = np.diff(fine, axis=1)
+    one_way = (step > 0).all(axis=1) | (step < 0).all(axis=1)
+    good = (2 * cell > T) & straight & (rolled != 0) & one_way
     top = float(np.percentile(path / T, 90))      # robust to outliers
     good &= path / T > SLOWEST_CELL * top
     if good.sum() < FEWEST_CELLS:
@@ -66,14 +68,6 @@ def speed_scale(t_fix: Floats, fix_n: Floats, dead_n: Floats, distance: Floats,
     rolled, change, T = np.abs(rolled[good]), np.diff(np.abs(speed))[good], T[good]
     fit, used = _fit(length, rolled, T, change)
     return SpeedScale(_bins(length[used], rolled[used], T[used]), *fit)
-
-
-def _moves(travel: Travel, t: Floats) -> Bools:
-    """Return a mask of cells in which the odometer moves in one direction all the time."""
-    fine = np.arange(0.0, 1.0, 0.1)
-    s = travel.at(t[:-1, None] + np.diff(t)[:, None] * fine)
-    step = np.diff(s, axis=1)
-    return np.asarray((step > 0).all(axis=1) | (step < 0).all(axis=1), bool)
 
 
 def _fit(length: Floats, rolled: Floats, T: Floats, change: Floats

@@ -61,16 +61,11 @@ class Chord:
 def solve(chord: Chord, up_scale: float = 1.0,
           limit: float = PITCH_LIMIT) -> tuple[Floats, bool]:
     """
-    Solve M f = c for f = K forward_b: docs/method.md (T3), (T4).
+    Return f = K forward_b of M f = c, (3,) m per unit, and if the pitch is known: (T3), (T4).
 
     up_scale : factor on the stated height sigmas; np.inf: heights are not used.   limit : rad;
-    heights that give a larger pitch are not used.
-
-    Returns
-    -------
-    f : (3,) m per unit of travel, in b.
-    vertical_known : False if heights contain no information; the pitch is then zero.
-
+    heights that give a larger pitch are not used. Without information from heights, the pitch is
+    zero.
     """
     M = chord.M
     turn = chord.track.C_nb_at(chord.end.t) - chord.track.C_nb_at(chord.start.t)
@@ -114,11 +109,14 @@ def refusal(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
     return ()
 
 
+def _unknown(scale_unit: str) -> dict[str, Estimate]:
+    return unknown_values(scale_unit) | {
+        f'gyro_bias_{axis}': Estimate(None, None, 'rad/s') for axis in 'xyz'}
+
+
 def unsolved(reasons: Iterable[Reason], scale_unit: str) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
-    biases = {f'gyro_bias_{axis}': Estimate(None, None, 'rad/s') for axis in 'xyz'}
-    return MethodResult('two_point', tuple(reasons), unknown_values(scale_unit) | biases,
-                        budget.PARAMETERS)
+    return MethodResult('two_point', tuple(reasons), _unknown(scale_unit), budget.PARAMETERS)
 
 
 def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix_scale: Floats,
@@ -139,31 +137,25 @@ def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix
     yaw, pitch = (float(a) for a in mounting_from_forward(f / K))
     reasons = _judge_angles(chord.alignment, yaw, sources, config)
     reasons += () if vertical_known else (_without_heights(chord, fix_scale[2]),)
-    separable = Code.YAW_NOT_SEPARABLE not in {r.code for r in reasons}
-    estimates = {
-        'scale_factor': Estimate(K, K * float(sigma[0]), scale_unit),
-        'scale_ratio': Estimate(K / nominal_scale, K / nominal_scale * float(sigma[0]), '1')
-        if nominal_scale else Estimate(None, None, '1'),
-        'yaw_mounting_angle': Estimate(yaw, float(sigma[1]), 'rad') if separable
-        else Estimate(None, None, 'rad'),
-        'pitch_mounting_angle': Estimate(pitch, float(sigma[2]), 'rad') if vertical_known
-        else Estimate(None, None, 'rad'),
-        **_gyro_bias(chord.alignment)}
+    estimates = _unknown(scale_unit)
+    estimates['scale_factor'] = Estimate(K, K * float(sigma[0]), scale_unit)
+    if nominal_scale:
+        ratio = K / nominal_scale
+        estimates['scale_ratio'] = Estimate(ratio, ratio * float(sigma[0]), '1')
+    if Code.YAW_NOT_SEPARABLE not in {r.code for r in reasons}:
+        estimates['yaw_mounting_angle'] = Estimate(yaw, float(sigma[1]), 'rad')
+    if vertical_known:
+        estimates['pitch_mounting_angle'] = Estimate(pitch, float(sigma[2]), 'rad')
+    if chord.alignment.standstill is not None:
+        for axis, bias, own in zip('xyz', chord.alignment.gyro_bias,
+                                   chord.alignment.gyro_bias_sigma, strict=True):
+            estimates[f'gyro_bias_{axis}'] = Estimate(float(bias), float(own), 'rad/s')
     check = _cross_check(chord, f, nominal_scale if 0.5 < nominal_scale / K < 2.0 else K, config)
     reasons += _planes_agree(check, K, sigma[0])
     return MethodResult('two_point', reasons, estimates, budget.PARAMETERS, sources, {
         'budget': budget.budget_table(sources, budget.PARAMETERS, (K, 1.0, 1.0)),
         'correlation': budget.correlations(covariance, budget.PARAMETERS), 'cross_check': check,
         'heading_source': chord.alignment.heading_source, 'f': f})
-
-
-def _gyro_bias(alignment: Alignment) -> dict[str, Estimate]:
-    """Return the gyro bias in b as estimates, not determined without a standstill."""
-    known = alignment.standstill is not None
-    return {f'gyro_bias_{axis}': Estimate(float(bias), float(sigma), 'rad/s') if known
-            else Estimate(None, None, 'rad/s')
-            for axis, bias, sigma in zip('xyz', alignment.gyro_bias, alignment.gyro_bias_sigma,
-                                         strict=True)}
 
 
 def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_scale: Floats,
@@ -255,11 +247,8 @@ def _judge_angles(alignment: Alignment, yaw: float, sources: tuple[Source, ...],
 
 def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
                  config: Config) -> dict[str, dict[str, float]]:
-    """
-    Return K and yaw by eq. (6)-(10) in the plane and by the geodesic: docs/method.md (T14).
-
-    The track has ``nominal_scale``, yaw 0 and the estimated pitch, and begins at the start mark.
-    """
+    """Return K and yaw by eq. (6)-(10) in the plane and by the geodesic: docs/method.md (T14)."""
+    # the track has nominal_scale, yaw 0 and the estimated pitch, and begins at the start mark
     from odocal_ros.nav.projection import plane_for
     K = np.linalg.norm(f)
     yaw, pitch = map(float, mounting_from_forward(f / K))

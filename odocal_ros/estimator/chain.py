@@ -105,8 +105,7 @@ class Solved:
         """
         Return g' H^-1 g of right-hand sides g, (r, r), and H^-1 g of the border, (m, r).
 
-        chain : (N, n, r), border : (m, r).   Uses the forward elimination only; call it before
-        ``marginals``.
+        chain : (N, n, r), border : (m, r).   Call it before ``marginals``.
         """
         assert self._chain is not None, 'call products() before marginals()'
         wide, own = self._chain
@@ -259,11 +258,7 @@ def _scale(normal: Normal) -> tuple[Floats, Floats]:
 
 
 def _eliminate(normal: Normal, corner: Floats) -> Floats:
-    """
-    Eliminate the blocks in place, in order; return the diagonals of their roots: (N, n).
-
-    corner : (m + 1, m + 1) border and right-hand side, reduced in place.
-    """
+    """Eliminate the blocks and reduce the corner, in place; return their roots' diagonals."""
     from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
     diagonal, wide = normal.diagonal, normal.wide
     N, n = normal.g.shape

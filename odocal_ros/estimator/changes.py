@@ -57,17 +57,17 @@ def changes(weighted: Weighted, solved: Solved) -> tuple[Step, ...]:
     # standing before or after a place, or a constant that no row depends on
     known = information > 1e-9 * of_rows.reshape(information.shape)
     sigma = 1 / np.sqrt(np.where(known, information, np.inf))
-    return tuple(_largest(constant, weighted.state.t[at], score_of, sigma_of)
-                 for constant, score_of, sigma_of in zip(
-                     STEPPING, score.reshape(sigma.shape), sigma, strict=True) if sigma_of.any())
+    score, t = score.reshape(sigma.shape), weighted.state.t[at]
+    most = np.argmax(np.abs(score) * sigma, axis=1)
+    return tuple(Step(constant, float(t[k]), float(score[i, k] * sigma[i, k]**2),
+                      float(sigma[i, k]))
+                 for i, (constant, k) in enumerate(zip(STEPPING, most, strict=True))
+                 if sigma[i].any())
 
 
 def _beside_gradual(score: Floats, information: Floats) -> tuple[Floats, Floats]:
-    """
-    Return score and information of each step of the scale, beside a gradual change of it.
-
-    The change is quadratic in the path, as a sum of steps at all places, and has a prior.
-    """
+    """Return score and information of each step of the scale, beside a gradual change of it."""
+    # quadratic in the path, as a sum of steps at all places, with a prior
     shares = GRADUAL / STEP_PLACES * np.vander(np.linspace(-1.0, 1.0, STEP_PLACES), 2)
     across = information @ shares
     by = np.linalg.solve(np.eye(2) + shares.T @ across,
@@ -75,7 +75,3 @@ def _beside_gradual(score: Floats, information: Floats) -> tuple[Floats, Floats]
     return score - across @ by[:, -1], np.diag(information) - (across * by[:, :-1].T).sum(axis=1)
 
 
-def _largest(constant: int, t: Floats, score: Floats, sigma: Floats) -> Step:
-    """Return the step of one constant with the largest size in sigmas; (STEP_PLACES,) each."""
-    k = int(np.argmax(np.abs(score) * sigma))
-    return Step(constant, float(t[k]), float(score[k] * sigma[k]**2), float(sigma[k]))

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.estimator import state as layout
 from odocal_ros.estimator.chain import JointMarginals, Solved
 from odocal_ros.estimator.changes import changes, Step
 from odocal_ros.estimator.equations import Equations, Weighted
@@ -28,18 +29,7 @@ from odocal_ros.estimator.factors.speed_steps import SpeedSteps
 from odocal_ros.estimator.level_steps import prior_information, update
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.problem import Problem
-from odocal_ros.estimator.state import (
-    BA,
-    BG,
-    FIX_TIME,
-    IMPERFECT,
-    M,
-    PITCH,
-    Priors,
-    SPEED_OFFSET,
-    State,
-    YAW,
-)
+from odocal_ros.estimator.state import Priors, State
 
 # called after each pass; the last argument is the largest step of a constant, in sigmas
 Trace = Callable[[int, State, Levels, Weighted, Solved, float], None]
@@ -148,15 +138,16 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     tails, last_tails = 1 if about else 3, 15
     # pass that estimates the effective sample size; of two starts only that of the better one
     judged = 3 if about is None else 0 if problem.per_effective else 1
-    of_all = np.where(np.arange(M) < factor.WANTED, 1.0, CONVERGENCE.others)
-    flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), CONVERGENCE.flat_angle, np.inf)
+    of_all = np.where(np.arange(layout.M) < factor.WANTED, 1.0, CONVERGENCE.others)
+    flat = np.full(layout.M, np.inf)
+    flat[[layout.YAW, layout.PITCH]] = CONVERGENCE.flat_angle
     pace: dict[str, tuple[float, float]] = {}
-    count, state, taken = 0, state.level(), np.zeros(M)
+    count, state, taken = 0, state.level(), np.zeros(layout.M)
     while True:
         count += 1
         weighted = Equations(problem, state, priors, spread, fitted).at(levels)
         if fitted and not was_fitted:      # this step may take back all of the one before
-            taken = np.zeros(M)
+            taken = np.zeros(layout.M)
         solved = damped(weighted.solved(), taken)
         taken = solved.step_border
         sigma = np.sqrt(np.diag(solved.covariance))
@@ -236,43 +227,32 @@ def slips(weighted: Weighted, marginals: JointMarginals, spread: Floats, levels:
 
 
 def per_effective(problem: Problem, weighted: Weighted) -> dict[str, float]:
-    """
-    Return rows per independent row, from the residuals.
-
-    Of other sensors, and of speed steps: at constant acceleration their errors repeat.
-    """
+    """Return rows per independent row, by residuals of other sensors and of speed steps."""
+    # at constant acceleration errors of speed steps repeat
     return {name: rows_per_effective(part) for name, part in weighted.parts.items()
             if name in (*problem.outside, SpeedSteps.name) and isinstance(part, PointRows)}
 
 
 def relaxed(first: Priors, now: Priors, state: State, solved: Solved,
             marginals: JointMarginals) -> Priors:
-    """
-    Return priors widened where the data are far from their centre, docs/method.md (S30).
-
-    Those of imperfections stay: their sizes are levels.
-    """
+    """Return priors widened where the data are far from their centre, docs/method.md (S30)."""
     n = solved.step.shape[1]
     P0 = np.diagonal(marginals[0])[:n]
     variance = np.diag(solved.covariance)
     constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
-    constants[IMPERFECT] = now.constants[IMPERFECT]       # their sizes are levels
-    # the grid holds that offset; times are of receivers as they are made
-    held = [SPEED_OFFSET, FIX_TIME]
-    constants[held] = now.constants[held]
+    # sizes of imperfections are levels; the grid holds that offset; times are of receivers as made
+    for held in (layout.IMPERFECT, layout.SPEED_OFFSET, layout.FIX_TIME):
+        constants[held] = now.constants[held]
     return replace(
         now,
-        gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[BG]),
-        accel_bias=_wider(first.accel_bias, now.accel_bias, state.accel_bias[0], P0[BA]),
+        gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[layout.BG]),
+        accel_bias=_wider(first.accel_bias, now.accel_bias, state.accel_bias[0], P0[layout.BA]),
         constants=constants)
 
 
 def _wider(first: Floats, now: Floats, off: Floats, variance: Floats) -> Floats:
-    """
-    Return sigmas for which ``off`` is at most RELAXED_BEYOND sigmas, none below the first.
-
-    At most 30 times the first: a larger difference is a wrong setting, which is reported.
-    """
+    """Return sigmas for which ``off`` is at most RELAXED_BEYOND sigmas, none below the first."""
+    # at most 30 times the first: a larger difference is a wrong setting, which is reported
     held = np.isfinite(first)
     first_, now_ = np.where(held, first, 1.0), np.where(held, now, 1.0)
     z2 = off**2 / np.maximum(now_**2 - variance, 0.2 * now_**2)

@@ -31,7 +31,9 @@ class FittedTrack:
         z = fix[:, 0] + 1j * fix[:, 1]
         at = np.interp(t_fix, t, self.X)
         self.K, self.slope = leg.rough_scale, None
-        self.chi = _rotation(np.diff(at), np.diff(z), sigma)
+        # weighted by length of the odometer: a jump of the fixes does not get a larger weight
+        moved, gone = np.diff(at), np.diff(z)
+        self.chi = float(np.angle((moved.conj() * gone / np.maximum(np.abs(gone), sigma)).sum()))
         for _ in range(2):
             laid = self.K * np.exp(1j * self.chi) * at
             apart = np.stack([(laid - z).real, (laid - z).imag], -1)
@@ -63,16 +65,6 @@ class FittedTrack:
         path = np.concatenate([[0.0], np.cumsum(steps)])
         off = z - np.interp(t_fix, t, path)
         return path + _smooth(t, t_fix, off.real) + 1j * _smooth(t, t_fix, off.imag)
-
-
-def _rotation(moved: Complexes, gone: Complexes, sigma: float) -> float:
-    """
-    Return the mean angle from steps of the track to those of the fixes, rad.
-
-    moved, gone : (n,) steps, any unit and m.   sigma : m, of a fix. The weight of a step is its
-    length by the odometer, so that a jump of the fixes does not get a larger weight.
-    """
-    return float(np.angle((moved.conj() * gone / np.maximum(np.abs(gone), sigma)).sum()))
 
 
 def _line(t: Floats, y: Floats) -> tuple[float, float]:

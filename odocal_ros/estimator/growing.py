@@ -26,7 +26,7 @@ from odocal_ros.estimator.factors.factor import SPREAD, WANTED
 from odocal_ros.estimator.factors.motion import gravity_n
 from odocal_ros.estimator.factors.odometer_filter import as_rolled
 from odocal_ros.estimator.fit import AGAIN_PASSES, Fit, fit, Trace, WarmStart
-from odocal_ros.estimator.imu_steps import ImuSteps
+from odocal_ros.estimator.imu_steps import ImuSteps, nearest, rows_of
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.preintegrate import preintegrate
 from odocal_ros.estimator.prepare import problem_of, SPACING
@@ -35,7 +35,7 @@ from odocal_ros.estimator.result.outcome import outcome
 from odocal_ros.estimator.result.remarks import MODEL_FLOOR
 from odocal_ros.estimator.several import combine_legs
 from odocal_ros.estimator.smoother import best_fit
-from odocal_ros.estimator.start import SPEED_WINDOW
+from odocal_ros.estimator.start import speed_at, SPEED_WINDOW
 from odocal_ros.estimator.state import BY_TIME, CONSTANTS, LN_K, NO_ERROR, State
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
@@ -49,19 +49,13 @@ DRIVING_SPEED = 0.5     # m/s; judgement: slower motion does not count as drivin
 
 @dataclass(frozen=True, eq=False)
 class Running:
-    """
-    The running estimate.
+    """The running estimate."""
 
-    method : result if the leg ended here.   sigmas : (3,) of ln scale, yaw, pitch, rad, also of
-    undetermined ones; inf: fixed.   distance : m.   agility : m^2/s^3, integral of
-    the squared horizontal acceleration.   speed : m/s, median while driving.
-    """
-
-    method: MethodResult
-    sigmas: Floats
-    distance: float
-    agility: float
-    speed: float
+    method: MethodResult  # result if the leg ended here
+    sigmas: Floats        # (3,) of ln scale, yaw, pitch, also of undetermined ones; inf: fixed
+    distance: float       # m
+    agility: float        # m^2/s^3, integral of the squared horizontal acceleration
+    speed: float          # m/s, median while driving
 
 
 class GrowingFit:
@@ -91,13 +85,8 @@ class GrowingFit:
         Return the running estimate.
 
         view : the leg so far: the earlier leg in the same frame, and more.   trace : called
-        between passes; its exceptions are passed on.
-
-        Raises
-        ------
-        BadData
-            There is no fit, and no finished window; the next fit is a cold start.
-
+        between passes; its exceptions are passed on.   Raises BadData without a fit and without a
+        finished window; the next fit is then a cold start.
         """
         self.once_s = 0.0
         if self._next is not None and view.t_stop - self._next[1] > NEXT_WINDOW:
@@ -129,7 +118,7 @@ class GrowingFit:
                 method = outcome(view, problem, best, config)
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
             raise BadData(f'the smoother cannot solve the data so far: {error}') from None
-        self._last = WarmStart(best.state, best.levels, best.priors, best.first, best.spread)
+        self._last = best.summary()
         self._per_effective = problem.per_effective
         return Running(method, _sigmas(method), *_driven(best.state))
 
@@ -204,12 +193,8 @@ def steps_of(view: SmootherLeg, spacing: float) -> ImuSteps:
 
     They lie at multiples of ``spacing``; first and last row are keyframes too.
     """
-    first = int(np.searchsorted(view.t_imu, view.t_begin))
-    last = int(np.searchsorted(view.t_imu, view.t_stop, side='right')) - 1
-    t = view.t_imu[first:last + 1]
-    grid = np.arange(np.ceil(t[0] / spacing), t[-1] / spacing) * spacing
-    k = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
-    k -= grid - t[k - 1] < t[k] - grid
+    first, t = rows_of(view)
+    k = nearest(t, np.arange(np.ceil(t[0] / spacing), t[-1] / spacing) * spacing)
     inside = (t[k] > t[0] + spacing / 2) & (t[k] < t[-1] - spacing / 2)
     key = np.unique(np.concatenate([[0], k[inside], [len(t) - 1]]))
     return ImuSteps.between(view, key + first)
@@ -260,8 +245,7 @@ def _reckoned(state: State, problem: Problem) -> State:
     arm_b = state.C_bv @ (leg.odometer_arm - leg.imu_arm)
     steps = np.einsum('kij,kj->ki', C[n - 1:-1], sums.S @ f) - (C[n:] - C[n - 1:-1]) @ arm_b
     on['p_n'][n:] = on['p_n'][n - 1] + np.cumsum(steps, axis=0)
-    speed = (travel(t[n:] + SPEED_WINDOW) - travel(t[n:] - SPEED_WINDOW)) / (2 * SPEED_WINDOW)
-    on['v_n'][n:] = (C[n:] @ f) * speed[:, None]
+    on['v_n'][n:] = (C[n:] @ f) * speed_at(travel, t[n:])[:, None]
     gained = np.einsum('kij,kj->ki', C[n - 1:-1], sums.dv) + sums.T[:, None] * gravity_n(
         on['p_n'][n:], leg.origin)
     for late in np.flatnonzero(t[n:] + SPEED_WINDOW > leg.travel.t[-1]):

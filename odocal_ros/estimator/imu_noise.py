@@ -55,16 +55,6 @@ def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     return found if leg.has_accelerometer else {'gyro': found['gyro']}
 
 
-def vibrating(leg: SmootherLeg) -> dict[str, float]:
-    """
-    Return white noise levels of gyro and accelerometer from adjacent samples.
-
-    They include vibration, most of which cancels within a second: initial levels that decrease.
-    """
-    rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
-    return {name: sigma**2 for name, sigma in of_samples(leg, rows).items()}
-
-
 def of_samples(leg: SmootherLeg, rows: slice | Ints) -> dict[str, float]:
     """Return the noise of differences of adjacent samples, as white noise, SI per sqrt(Hz)."""
     def jumps(x: Floats) -> Floats:

@@ -34,15 +34,24 @@ STEP = 0.1
 AT_A_TIME, KEYS_AT_A_TIME = 8192, 64
 
 
-def keyframes(t: Floats, t_begin: float, t_end: float, spacing: float) -> Ints:
+def rows_of(leg: SmootherLeg) -> tuple[int, Floats]:
+    """Return the first sample of a leg and the times from it to the last, s."""
+    first = int(np.searchsorted(leg.t_imu, leg.t_begin))
+    return first, leg.t_imu[first:int(np.searchsorted(leg.t_imu, leg.t_stop, side='right'))]
+
+
+def nearest(t: Floats, times: Floats) -> Ints:
+    """Return the indices of the samples at t that are nearest to some times."""
+    k: Ints = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
+    k -= times - t[k - 1] < t[k] - times
+    return k
+
+
+def keyframes(leg: SmootherLeg, spacing: float) -> Ints:
     """Return indices of the samples nearest to an even grid of times: (K + 1,), rising."""
-    first, last = np.searchsorted(t, t_begin), np.searchsorted(t, t_end, side='right') - 1
-    count = max(1, round((t[last] - t[first]) / spacing))
-    grid = np.linspace(t[first], t[last], count + 1)
-    k = np.clip(np.searchsorted(t, grid), first, last)
-    earlier = np.maximum(k - 1, first)
-    k = np.where(grid - t[earlier] < t[k] - grid, earlier, k)
-    return np.unique(k)
+    first, t = rows_of(leg)
+    grid = np.linspace(t[0], t[-1], max(1, round((t[-1] - t[0]) / spacing)) + 1)
+    return first + np.unique(nearest(t, grid))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +80,7 @@ class ImuSteps(Steps):
     @classmethod
     def of(cls, leg: SmootherLeg, spacing: float) -> 'ImuSteps':
         """Return the steps of a leg, from begin to stop, with keyframes ``spacing`` s apart."""
-        return cls.between(leg, keyframes(leg.t_imu, leg.t_begin, leg.t_stop, spacing))
+        return cls.between(leg, keyframes(leg, spacing))
 
     @classmethod
     def between(cls, leg: SmootherLeg, key: Ints) -> 'ImuSteps':

@@ -103,16 +103,11 @@ class LevelSides:
 
 @dataclass(frozen=True, eq=False)
 class LevelInformation:
-    """
-    Information of the data on the levels, and the effect of the levels on the constants.
-
-    names : of the L levels.   average : (L, L) information on their logarithms.   moves : (m, L)
-    derivatives of the constants by these logarithms.
-    """
+    """Information of the data on L levels, and the effect of the levels on the constants."""
 
     names: tuple[str, ...]
-    average: Floats
-    moves: Floats
+    average: Floats  # (L, L) information on the logarithms of the levels
+    moves: Floats    # (m, L) derivatives of the constants by these logarithms
 
     def effects(self, precision: Mapping[str, float]) -> Floats:
         """

@@ -47,17 +47,12 @@ def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
                  travel: Callable[[Floats], Floats], forward: Floats, t_points: Floats,
                  constants: Floats | None = None) -> tuple[Intervals, Points]:
     """
-    Sum up all intervals.
+    Return the sums over all intervals, and up to points within them.
 
     imu : steps.   gyro_bias, accel_bias : (K, 3) taken out, one for each interval.   travel : (m,)
     times, s, to travel, scale units.   forward : (3,) scale times forward axis, for S_by.
     t_points : (m,) times of fixes, rising, within the keyframes.   constants : (M,) of which GYRO
     and ACCEL are taken out.
-
-    Returns
-    -------
-    Intervals, Points.
-
     """
     out: list[Intervals] = []
     points: list[Points] = []
@@ -197,11 +192,7 @@ class _Chunk:
 
     def _effects(self, begin: Ints, end: Ints, dv: Floats, dp: Floats,
                  tau: Floats) -> tuple[Floats, ...]:
-        """
-        Return A, AA, F, FF, turned, dv_by and dp_by of errors in the steps from begin to end.
-
-        begin, end : (m,) cuts.   dv, dp, tau : (m, 3) and (m, 1, 1) s since the interval's begin.
-        """
+        """Return A, AA, F, FF, turned, dv_by, dp_by of errors in steps between (m,) cuts."""
         first, last = (np.searchsorted(self.cuts, x) for x in (begin, end))
         turns, once, twice, late = (x[last] - x[first] for x in self.sums)
         by_turn = self._gyro(turns[..., OF_GYRO])

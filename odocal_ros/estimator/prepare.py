@@ -14,13 +14,12 @@ from odocal_ros.estimator.factors.axle import rates_at, WARM_TIME
 from odocal_ros.estimator.factors.fixes import whitener
 from odocal_ros.estimator.factors.priors import SHARED
 from odocal_ros.estimator.factors.slide import turned
-from odocal_ros.estimator.imu_noise import at_rest, vibrating, without_accelerometer
+from odocal_ros.estimator.imu_noise import at_rest, of_samples, without_accelerometer
 from odocal_ros.estimator.imu_steps import ImuSteps
-from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, Outside, SmootherLeg
+from odocal_ros.estimator.leg import BEFORE_MARK, drift_time, SmootherLeg
 from odocal_ros.estimator.levels import LEAST
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.start import standing
-from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.screening.inputs import Inputs
 from odocal_ros.settings.config import Config
@@ -76,31 +75,26 @@ def problem_of(leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) ->
     config = replace(config, imu=imu_as_seen(config.imu, at_rest(imu, leg, still)))
     grade = grade_of(config.imu)
     grade = grade if leg.has_accelerometer else without_accelerometer(grade)
+    within = {name: sent.between(t[0], t[-1]) for name, sent in leg.outside.items()}
+    own = {part.source: part.constants for part in OUTSIDE
+           if part.name in leg.outside and part.name not in SHARED}
     root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
-    made = Problem(leg, imu, grade, _priors(config, grade, leg), use, root, still,
-               _within(leg, t), _own(leg), turned(leg, imu), config.gnss.correlation_time,
-               rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
-               drift_time(leg, t), LEAST.fix if not leg.origin.local
-               or config.reference.points else LEAST.pose)     # a robot stands on marks
+    made = Problem(
+        leg, imu, grade, _priors(config, grade, leg), use, root, still,
+        {name: sent for name, sent in within.items() if len(sent.t)}, own, turned(leg, imu),
+        config.gnss.correlation_time, rates_at(leg.t_imu, leg.w_b, t), imu.swings(),
+        drift_time(leg, t), LEAST.fix if not leg.origin.local
+        or config.reference.points else LEAST.pose)     # a robot stands on marks
     for part in FACTORS:
         if part.there(made):
             first, least = part.first_levels(made)
             made.first_levels = made.first_levels.but(**first)
             made.least |= least
-    made.vibrating = {k: max(v, made.first_levels[k]) for k, v in vibrating(leg).items()}
+    # with vibration, most of which cancels within a second: initial levels that decrease
+    rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
+    made.vibrating = {name: max(sigma**2, made.first_levels[name])
+                      for name, sigma in of_samples(leg, rows).items()}
     return made
-
-
-def _within(leg: SmootherLeg, t: Floats) -> dict[str, Outside]:
-    """Return the rows of the other sensors within the keyframes, where there are any."""
-    within = {name: sent.between(t[0], t[-1]) for name, sent in leg.outside.items()}
-    return {name: sent for name, sent in within.items() if len(sent.t)}
-
-
-def _own(leg: SmootherLeg) -> dict[str, slice]:
-    """Return the constants of sensors that no other leg shares, by the source of their errors."""
-    return {part.source: part.constants for part in OUTSIDE
-            if part.name in leg.outside and part.name not in SHARED}
 
 
 def imperfect_sigmas(grade: Grade) -> Floats:
@@ -135,13 +129,6 @@ def imperfect_sigmas(grade: Grade) -> Floats:
     return np.repeat([usual[kind] for kind in layout.KIND_SIZES], list(layout.KIND_SIZES.values()))
 
 
-def with_imperfect(priors: layout.Priors, sigmas: Floats) -> layout.Priors:
-    """Return priors with these sigmas of imperfections, (k,)."""
-    constants = priors.constants.copy()
-    constants[layout.IMPERFECT] = sigmas
-    return replace(priors, constants=constants)
-
-
 def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     sigma = np.full(layout.M, np.inf)
     sigma[layout.ODO_ARM] = sigma[layout.GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
@@ -158,13 +145,16 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
     accel_bias = np.maximum([accel, accel, up], 1e-6)
     centre = np.zeros(layout.M)
     sigma[layout.LIFT] = LIFT_SIGMA
-    sigma[layout.HEIGHT_DRIFT] = max(height_sigma(leg) / HEIGHT_TIME, layout.NO_ERROR)
+    height_sigma = np.sqrt(np.median(leg.covariance_n[:, 2, 2])) if len(leg.t_fix) else 0.0
+    sigma[layout.HEIGHT_DRIFT] = max(height_sigma / HEIGHT_TIME, layout.NO_ERROR)
     constant = np.isclose(leg.stated_sigma, leg.stated_sigma[:1]).all(axis=0)
     # definition: of an error in sigmas; a constant one has no effect
     sigma[layout.BY_SIGMA] = np.where(constant, layout.NO_ERROR, 1.0)
     # physical: receivers with an odometer trust it for 5 to 60 s
     centre[layout.FIX_TIME], sigma[layout.FIX_TIME] = np.log(20.0), 0.7
-    centre[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = _offset(leg.travel.coarse)
+    # of a coarse speed, 0 to half a step
+    half = leg.travel.coarse.truncation / 2 if leg.travel.coarse else 0.0
+    centre[layout.SPEED_OFFSET], sigma[layout.SPEED_OFFSET] = half, half or layout.NO_ERROR
     for part in OUTSIDE:
         sent = leg.outside.get(part.name)
         sigma[part.constants] = (
@@ -174,14 +164,3 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> layout.Priors:
         if 'heading' not in leg.outside:
             centre[layout.YAW], sigma[layout.YAW] = nominal_yaw(config), layout.NO_ERROR
     return layout.Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, centre)
-
-
-def height_sigma(leg: SmootherLeg) -> float:
-    """Return the median stated sigma of the heights, m."""
-    return float(np.sqrt(np.median(leg.covariance_n[:, 2, 2]))) if len(leg.t_fix) else 0.0
-
-
-def _offset(coarse: CoarseSpeed | None) -> tuple[float, float]:
-    """Return the offset of a coarse speed and its sigma: 0 to half a step."""
-    half = coarse.truncation / 2 if coarse else 0.0
-    return half, half or layout.NO_ERROR

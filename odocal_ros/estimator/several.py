@@ -39,19 +39,15 @@ DELAY_DIFFERS = ('A delay changed between the legs, not the vehicle. Check the c
 def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
                  numbers: Sequence[int] | None = None) -> MethodResult:
     """
-    Combine the smoother results of several legs of one vehicle.
+    Return the result of one fit of all legs of one vehicle, the scale as in the last leg.
 
     results : those with a border, at least one.   times_ns : when each leg was driven.   config :
     limits, ``verdict.scale_drift_per_day``.   numbers : of the legs in reasons, 1, 2, ... by
     default; 0: legs of an earlier result.
 
-    Returns
-    -------
-    MethodResult: the result of one fit of all legs, the scale as in the last leg. A value that no
-    leg determines alone may be determined by all. If the legs disagree, the sigma includes their
-    scatter (LEGS_DISAGREE). With ``leg.automatic`` a scale may change permanently between two
-    legs (SCALE_CHANGED).
-
+    A value that no leg determines alone may be determined by all. If the legs disagree, the sigma
+    includes their scatter (LEGS_DISAGREE). With ``leg.automatic`` a scale may change permanently
+    between two legs (SCALE_CHANGED).
     """
     order = np.argsort(times_ns, kind='stable')
     legs = [results[i] for i in order]
@@ -95,12 +91,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
 
 
 def _of_one_vehicle(borders: Sequence[Border]) -> list[Border]:
-    """
-    Return borders with the same sizes of imperfections.
-
-    The geometric mean of the legs' sizes, weighted by the information of each leg on the constant:
-    a leg without information has the usual size.
-    """
+    """Return borders with the same sizes of imperfections: geometric means by information."""
     imperfect = set(CONSTANTS[IMPERFECT])
     logs: dict[str, list[tuple[float, float]]] = {}
     for border in borders:

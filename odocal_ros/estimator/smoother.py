@@ -13,9 +13,10 @@ from odocal_ros.estimator.chain import NotPositive
 from odocal_ros.estimator.equations import Equations
 from odocal_ros.estimator.factors.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.estimator.fit import AGAIN_PASSES, Fit, fit, Trace
+from odocal_ros.estimator.imu_steps import rows_of
 from odocal_ros.estimator.leg import SmootherLeg
 from odocal_ros.estimator.levels import Levels
-from odocal_ros.estimator.prepare import problem_of, with_imperfect
+from odocal_ros.estimator.prepare import problem_of
 from odocal_ros.estimator.problem import Problem
 from odocal_ros.estimator.result.outcome import outcome
 from odocal_ros.estimator.result.refusal import no_imu, refused
@@ -38,15 +39,11 @@ LARGE_SIZE, LARGE_SIZE_FROM = 50.0, 200.0
 
 def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> MethodResult:
     """
-    Estimate scale, yaw and pitch mounting of a leg from all its samples.
+    Return scale, yaw and pitch mounting of a leg from all its samples.
 
     leg : screened samples.   config : grade, lever arms' and delays' sigmas, limits.   trace :
-    called with each pass of the iteration, for benchmarks.
-
-    Returns
-    -------
-    MethodResult named ``smoother``; an undetermined value is None with its reason.
-
+    called with each pass of the iteration, for benchmarks. An undetermined value is None with its
+    reason.
     """
     few = too_little_of(leg)
     if few:
@@ -75,12 +72,7 @@ def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fi
 
 
 def _with_known_offset(problem: Problem, now: Fit, trace: Trace | None) -> Fit:
-    """
-    Return a fit with the offset of a coarse speed fixed to that of truncation or of rounding.
-
-    Unchanged if the likelihood ratio is below 1000 to 1, or if the nearer one is 3.5 sigmas off
-    (one correct drive in 2000).
-    """
+    """Return a fit with the offset of a coarse speed fixed to that of truncation or rounding."""
     coarse = problem.leg.travel.coarse
     if coarse is None or not coarse.truncation:
         return now
@@ -88,6 +80,7 @@ def _with_known_offset(problem: Problem, now: Fit, trace: Trace | None) -> Fit:
     found = float(now.state.constants[SPEED_OFFSET])
     known = coarse.truncation if found > coarse.truncation / 2 else 0.0
     off, other = (abs(found - x) / sigma for x in (known, coarse.truncation - known))
+    # one correct drive in 2000; a likelihood ratio of 1000 to 1
     if off > 3.5 or other**2 - off**2 < 2 * np.log(1e3):
         return now
     constants = now.state.constants.copy()
@@ -110,25 +103,19 @@ def _held(priors: Priors, value: float, sigma: float) -> Priors:
 
 
 def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
-    nominal = nominal_yaw(config)
-    start = first_state(problem.leg, problem.imu, problem.priors,
-                        None if problem.leg.has_accelerometer else nominal)
-    if problem.leg.has_accelerometer and start.yaw_sigma > TWO_HEADINGS:
-        other = first_state(problem.leg, problem.imu, problem.priors, nominal)
+    nominal, data = nominal_yaw(config), (problem.leg, problem.imu, problem.priors)
+    level = problem.leg.has_accelerometer
+    start = first_state(*data, None if level else nominal)
+    starts, passes = [start], config.leg.compute_limit
+    if level and start.yaw_sigma > TWO_HEADINGS:
+        other = first_state(*data, nominal)
         turned = wrap(other.state.constants[YAW] - start.state.constants[YAW])
-        if abs(turned) > TWO_HEADINGS:
-            return _likelier(problem, config, (start, other), trace)
-    return fit(problem, start.state, _first_levels(problem, start), config.leg.compute_limit,
-               trace=trace)
-
-
-def _likelier(problem: Problem, config: Config, starts: tuple[Start, Start],
-              trace: Trace | None) -> Fit:
-    """Return the fit from the start that is likelier after START_PASSES."""
+        starts += [other] * bool(abs(turned) > TWO_HEADINGS)
+    if len(starts) == 1:
+        return fit(problem, start.state, _first_levels(problem, start), passes, trace=trace)
     about = max((fit(problem, one.state, _first_levels(problem, one), START_PASSES, trace=trace)
                  for one in starts), key=lambda f: f.likelihood).summary()
-    last = fit(problem, about.state, about.levels, config.leg.compute_limit, about=about,
-               trace=trace)
+    last = fit(problem, about.state, about.levels, passes, about=about, trace=trace)
     return replace(last, iterations=about.iterations + last.iterations)
 
 
@@ -146,8 +133,7 @@ def _first_levels(problem: Problem, start: Start) -> Levels:
 
 def too_little_of(leg: SmootherLeg) -> Reason | None:
     """Return the reason if a leg has too few fixes with IMU rows, else None."""
-    first = int(np.searchsorted(leg.t_imu, leg.t_begin))
-    t = leg.t_imu[first:int(np.searchsorted(leg.t_imu, leg.t_stop, side='right'))]
+    _, t = rows_of(leg)
     if len(t) < 2:
         return too_little(0, 0.0)
     beside = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
@@ -165,23 +151,11 @@ def too_little(fixes: int, seconds: float) -> Reason | None:
                   f'data; the smoother needs at least {fewest} fixes and {shortest:.0f} s')
 
 
-def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
-          imperfect: Floats | None = None) -> Floats:
+def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels) -> Floats:
     """
-    Return the covariance of the constants at a given state, covariance only.
+    Return the covariance of the constants at a given state: (M, M), ln K first.
 
-    leg, config : as for ``smooth``.   truth : values of all unknowns, at the keyframes of
-    ``problem_of``.   levels : noise levels.   imperfect : (k,) sigmas of the imperfections,
-    ordered as IMPERFECT; None: as usual.
-
-    Returns
-    -------
-    (M, M) covariance in the order of CONSTANTS, ln K first: the inverse of the information that
-    the rows hold there, priors in lever arms and delays included.
-
+    The inverse of the information that the rows hold there, priors of the constants included.
+    truth : values of all unknowns, at the keyframes of ``problem_of``.   levels : noise levels.
     """
-    problem = problem_of(leg, config)
-    if imperfect is not None:
-        problem.priors = with_imperfect(problem.priors, imperfect)
-    equations = Equations(problem, truth, fitted=True)
-    return equations.at(levels).solved().covariance
+    return Equations(problem_of(leg, config), truth, fitted=True).at(levels).solved().covariance

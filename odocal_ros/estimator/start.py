@@ -12,7 +12,7 @@ rotation from the specific force to the accelerations of the track. All this is 
 part of a long leg, since a gyro warms up.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,28 +84,19 @@ def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """
-    Part of a leg.
+    """Part of a leg."""
 
-    t : (n,) s, of its keyframes.   C_Lk : (n, 3, 3) attitudes in its level frame.   bias : (3,)
-    rad/s.   psi, sigma : rad, rotation from the level frame to n by accelerations.
-    """
-
-    t: Floats
-    C_Lk: Floats
-    bias: Floats
+    t: Floats           # (n,) s, of its keyframes
+    C_Lk: Floats        # (n, 3, 3) attitudes in its level frame
+    bias: Floats        # (3,) rad/s
     track: FittedTrack
-    psi: float
-    sigma: float
+    psi: float          # rad, rotation from the level frame to n by accelerations
+    sigma: float        # rad
 
 
 def _parts(leg: SmootherLeg, imu: ImuSteps, priors: Priors) -> list[_Part]:
-    """
-    Return the parts of a leg, of about START_PART each, with biases of their own.
-
-    One bias does not fit a gyro that warms up for an hour, and the level is lost. A part whose
-    heading no fixes determine is joined with the next one, at the end with the one before.
-    """
+    """Return the parts of a leg, of about START_PART each, with biases of their own."""
+    # one whose heading no fixes determine is joined with the next, at the end with the one before
     count = max(1, round(float(np.ptp(imu.t[imu.key])) / START_PART))
     ends = np.linspace(0, len(imu.key) - 1, count + 1).astype(int).tolist()
     parts, firsts = list[_Part](), [0]
@@ -193,23 +184,19 @@ def _level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
     return up, change
 
 
-def _speed(leg: SmootherLeg, t: Floats) -> Floats:
+def speed_at(travel: Callable[[Floats], Floats], t: Floats) -> Floats:
     """Return the odometer speed, a mean over 2 SPEED_WINDOW: (N,) units per s."""
-    s = leg.travel.at
-    return (s(t + SPEED_WINDOW) - s(t - SPEED_WINDOW)) / (2 * SPEED_WINDOW)
+    return (travel(t + SPEED_WINDOW) - travel(t - SPEED_WINDOW)) / (2 * SPEED_WINDOW)
 
 
 def _heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
              track: FittedTrack) -> tuple[float, float]:
-    """
-    Return the rotation from the level frame to n from accelerations, rad, and its sigma.
-
-    Change of velocity along the track = a times the integral of specific force in the level frame,
-    plus a tilt (constant in the level frame) and an accelerometer bias (constant in b).
-    """
+    """Return the rotation from the level frame to n from accelerations, rad, and its sigma."""
+    # change of velocity along the track = a times the integral of specific force in the level
+    # frame, plus a tilt (constant in that frame) and an accelerometer bias (constant in b)
     direction = C_Lk[:, 0, 0] + 1j * C_Lk[:, 1, 0]
     direction = direction / np.maximum(np.abs(direction), 1e-9)
-    v = track.K * _speed(leg, t) * direction * np.exp(1j * track.chi_at)
+    v = track.K * speed_at(leg.travel.at, t) * direction * np.exp(1j * track.chi_at)
     F = (C_Lk[:-1] @ sums.dv[:, :, None])[:, :, 0]
     F = F[:, 0] + 1j * F[:, 1]
     bend = np.exp(1j * (track.chi_at[:-1] - track.chi))
@@ -246,7 +233,7 @@ def _state(leg: SmootherLeg, part: _Part, K: float, yaw: float) -> State:
     constants = np.zeros(M)
     constants[[LN_K, YAW, PITCH]] = np.log(K), yaw, 0.0
     ahead = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
-    v_n = (C_nb @ ahead) * (K * _speed(leg, t))[:, None]
+    v_n = (C_nb @ ahead) * (K * speed_at(leg.travel.at, t))[:, None]
     v_n[:, 2] = 0.0
     p_n = np.stack([track.place.real, track.place.imag, track.height], -1)
     return State(t, p_n, v_n, C_nb, np.tile(part.bias, (N, 1)), np.zeros((N, 3)), np.zeros(N),

@@ -136,24 +136,18 @@ NO_ERROR = 1e-12    # definition: prior sigma of constants that do not apply, in
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """
-    Values of all unknowns.
+    """Values of all unknowns."""
 
-    t : (N,) s, keyframes.   p_n, v_n : (N, 3) of the IMU, m, m/s.   C_nb : (N, 3, 3).
-    gyro_bias, accel_bias : (N, 3) in b.   travel_error : (N,) scale units.
-    slow_n : (N, 3) slow part of the fix error, m.   constants : (M,) as CONSTANTS, ln K first.
-    up_b : (3,) up in b, mean of the leg: by it the IMU's roll on the vehicle is observable.
-    """
-
-    t: Floats
-    p_n: Floats
-    v_n: Floats
-    C_nb: Floats
-    gyro_bias: Floats
-    accel_bias: Floats
-    travel_error: Floats
-    slow_n: Floats
-    constants: Floats
+    t: Floats             # (N,) s, keyframes
+    p_n: Floats           # (N, 3) m, of the IMU
+    v_n: Floats           # (N, 3) m/s
+    C_nb: Floats          # (N, 3, 3)
+    gyro_bias: Floats     # (N, 3) rad/s, in b
+    accel_bias: Floats    # (N, 3) m/s^2
+    travel_error: Floats  # (N,) scale units
+    slow_n: Floats        # (N, 3) m, slow part of the fix error
+    constants: Floats     # (M,) as CONSTANTS, ln K first
+    # (3,) up in b, mean of the leg: by it the IMU's roll on the vehicle is observable
     up_b: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     @cached_property

@@ -85,7 +85,7 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
         outside=_heading(drive, config, t_begin, spacing))
-    key = keyframes(leg.t_imu, leg.t_begin, leg.t_stop, spacing)
+    key = keyframes(leg, spacing)
     return Ideal(leg, ImuSteps.between(leg, key), _state(motion, key),
                  max(1.0, (drive.duration - t_begin) * sigmas.fix_rate / len(t_fix)))
 

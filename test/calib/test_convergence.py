@@ -146,5 +146,3 @@ def test_the_sums_of_a_start_follow_a_change_of_the_gyro_bias_to_first_order():
     assert (np.divide(*apart) > 3.5).all()
     force_and_speed = np.array([1.0, 10.0, 20.0 / leg.rough_scale])
     assert (apart[0][:3] < force_and_speed * (change @ change)).all()
-
-

@@ -9,7 +9,7 @@ import re
 from drives import ANGLES, configured, off, settings
 import numpy as np
 import pytest
-from smoother_legs import leg_of, made
+from smoother_legs import leg_of, made, said as texts
 
 from odocal_ros.estimator import smooth
 from odocal_ros.estimator.prepare import problem_of
@@ -29,29 +29,29 @@ GRADE = 3e-3
 TOWN = {'scenario': 'town', 'duration': 250.0, 'imu_grade': 'industrial', 'sway': 0.05}
 
 
-def test_fixes_that_tell_it_well_are_not_taken_for_telling_that_there_is_none():
-    error = 5e-4      # as its grade allows, and ten times what such fixes tell it to
-    _, config, leg = made(scenario='town', duration=250.0, imu_grade='tactical', fix_noise='rtk',
-                          accel_scale_error=error, seed=4)
-    details = smooth(leg, with_settings(config, {'imu.accel_scale_sigma': np.nan})).details
-    for axis in 'xy':
-        found = details[f'accelerometer_scale_{axis}']
-        assert abs(found['value'] - error) < 3.0 * found['sigma']
-        # said beside the grade's, whatever size was found
-        assert details['posterior_to_prior'][f'accelerometer_scale_{axis}'] == pytest.approx(
-            found['sigma'] / error, rel=0.01)
+def of_grade(config, *names):
+    """Return settings with IMU errors as its grade has them."""
+    return with_settings(config, {f'imu.{name}_sigma': np.nan for name in names})
 
 
-def test_of_slow_fixes_an_error_too_small_to_be_told_is_held_too():
-    grade = 0.01
-    drive, config, leg = made(scenario='town', duration=200.0, imu_grade='consumer',
-                              fix_noise='correlated', accel_scale_error=grade / 4, seed=4)
-    result = smooth(leg, with_settings(config, {'imu.accel_scale_sigma': np.nan}))
+@pytest.mark.parametrize(('grade', 'noise', 'seconds', 'error', 'size'), [
+    # as the grade allows, and ten times what such fixes determine
+    ('tactical', 'rtk', 250.0, 5e-4, 5e-4),
+    # a quarter of the grade's, which slow fixes do not determine: by a size that axes share
+    ('consumer', 'correlated', 200.0, 0.01 / 4, 0.01)])
+def test_a_scale_error_of_the_accelerometer_is_within_its_sigma(grade, noise, seconds, error,
+                                                                size):
+    drive, config, leg = made(scenario='town', duration=seconds, imu_grade=grade,
+                              fix_noise=noise, accel_scale_error=error, seed=4)
+    result = smooth(leg, of_grade(config, 'accel_scale'))
     assert off(result, drive) < 3.0
-    for axis in 'xy':       # by a size that both share, and a third axis that no drive tells
-        found = result.details[f'accelerometer_scale_{axis}']
-        assert abs(found['value'] - grade / 4) < 3.0 * found['sigma']
-        assert found['sigma'] < grade / 2
+    for name in ('accelerometer_scale_x', 'accelerometer_scale_y'):
+        found = result.details[name]
+        assert abs(found['value'] - error) < 3.0 * found['sigma']
+        assert found['sigma'] < size / 2
+        # said beside the grade's, whatever size was found
+        assert result.details['posterior_to_prior'][name] == pytest.approx(
+            found['sigma'] / size, rel=0.01)
 
 
 @pytest.mark.parametrize('hertz', [0.3, 0.5, 0.7, 1.0])
@@ -77,8 +77,7 @@ def test_a_body_that_sways_on_a_flat_path_does_not_change_the_scale(hertz):
 @pytest.mark.parametrize('noise', ['white', 'correlated'])
 def test_the_sigma_of_the_scale_holds_it(noise):
     drive, config, leg = made(**TOWN, fix_noise=noise, accel_scale_error=GRADE, seed=4)
-    graded = with_settings(config, {'imu.accel_scale_sigma': np.nan})     # that of its grade
-    assert off(smooth(leg, graded), drive) < 3.0       # 1 in 370
+    assert off(smooth(leg, of_grade(config, 'accel_scale')), drive) < 3.0       # 1 in 370
     # of an IMU said to have none, the error is many sigmas: what this is for
     assert off(smooth(leg, config), drive) > 4.0
 
@@ -93,8 +92,7 @@ def test_angles_are_those_of_the_axes_that_the_imu_measures_in():
     drive, config, leg = made(scenario='town', duration=250.0, imu_grade='consumer', seed=4,
                               fix_noise='rtk', yaw=0.02, pitch=0.01,
                               real=Real(gyro_matrix=GYRO, accel_matrix=ACCEL))
-    graded = with_settings(config, {'imu.misalignment_sigma': np.nan})
-    truth, found = drive.truth, smooth(leg, graded)
+    truth, found = drive.truth, smooth(leg, of_grade(config, 'misalignment'))
     assert abs(truth.yaw - truth.yaw_housing) == pytest.approx(SKEW, rel=0.05)
     for name, true, housing in (('yaw', truth.yaw, truth.yaw_housing),
                                 ('pitch', truth.pitch, truth.pitch_housing)):
@@ -115,7 +113,7 @@ def test_nose_up_the_yaw_holds_what_y_has_of_z_where_axes_are_off(skew):
                               fix_noise='rtk', yaw=0.02, pitch=0.12,
                               real=Real(accel_matrix=(0.0, 0.0, 0.0, skew, 0.0, skew,
                                                       skew, 0.0, 0.0)))
-    found = smooth(leg, with_settings(config, {'imu.misalignment_sigma': np.nan}))
+    found = smooth(leg, of_grade(config, 'misalignment'))
     e = found.estimates['yaw_mounting_angle']
     assert abs(e.value - drive.truth.yaw) < 1.96 * e.sigma     # 61 of 52 mdeg; 6 of 31 without
     # as large as the others are found; without them two fifths of what is usual, sqrt(2) times an
@@ -134,31 +132,32 @@ def test_a_straight_drive_does_not_pull_the_yaw_to_zero():
     # with derivatives by the force as measured, its noise: 0.15 +- 0.22 deg, 1.7 is true
     drive, config, leg = made(scenario='straight', duration=400.0, imu_grade='consumer', seed=4,
                               yaw=np.deg2rad(1.7))
-    graded = with_settings(config, {'imu.accel_scale_sigma': np.nan,
-                                    'imu.misalignment_sigma': np.nan})
-    found = smooth(leg, graded)
+    found = smooth(leg, of_grade(config, 'accel_scale', 'misalignment'))
     assert off(found, drive, 'yaw_mounting_angle') < 3.0
     assert abs(found.details['accelerometer_scale_y']['value']) < 0.005     # nothing tells it
 
 
-def test_an_imu_worse_than_its_setting_has_the_turn_on_bias_of_its_own_grade():
+@pytest.mark.parametrize(('changes', 'accel'), [
+    ({'imu.grade': 'consumer'}, TURN_ON['consumer'][1]),
+    ({'imu.grade': 'industrial'}, TURN_ON['consumer'][1]), ({'imu.accel_bias': 0.04}, 0.04)])
+def test_an_imu_has_the_turn_on_bias_of_its_own_grade_as_sold(changes, accel):
+    """Else what a bias does would pass for an axis that points off: docs/decisions/0016."""
     _, config, leg = made(imu_grade='consumer', duration=135.0)
-    for grade in ('consumer', 'industrial'):
-        problem = problem_of(leg, with_settings(config, {'imu.grade': grade}))
-        assert problem.priors.accel_bias[0] == pytest.approx(TURN_ON['consumer'][1])
-        assert problem.priors.gyro_bias[0] == pytest.approx(TURN_ON['consumer'][0])
+    priors = problem_of(leg, with_settings(config, changes)).priors
+    assert priors.accel_bias[:2] == pytest.approx(accel)
+    assert priors.gyro_bias == pytest.approx(TURN_ON['consumer'][0])
 
 
 def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_one():
     imu = Config().imu
     grade = GRADES['tactical']
     tactical = {'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2}
-    for given, seen in (('navigation', 'tactical'), ('tactical', 'tactical'),
-                        ('consumer', 'consumer')):
-        assert imu_as_seen(replace(imu, grade=given), tactical).grade == seen
     vibrating = {name: 100.0 * value for name, value in tactical.items()}
-    assert imu_as_seen(replace(imu, grade='tactical'), vibrating).grade == 'consumer'
-    assert imu_as_seen(replace(imu, grade='navigation'), {}).grade == 'navigation'
+    for given, noise, seen in (
+            ('navigation', tactical, 'tactical'), ('tactical', tactical, 'tactical'),
+            ('consumer', tactical, 'consumer'), ('tactical', vibrating, 'consumer'),
+            ('navigation', {}, 'navigation')):
+        assert imu_as_seen(replace(imu, grade=given), noise).grade == seen
 
 
 @pytest.mark.parametrize(('set_to', 'found', 'ratio', 'text', 'do'), [
@@ -187,7 +186,7 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_
     config = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0),
                                     'gnss.lever_arm_sigma': 0.1})
     found = smooth(replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0])), config)
-    said = {r.code: r.text for r in found.reasons}
+    said = texts(found)
     assert 'gnss.lever_arm x: set to +0.00 m, estimated +1.' in said[Code.LEVER_ARM_OFF]
     # the sigma of this axis is no smaller than that of its setting, but far from it
     arm = found.estimates['antenna_lever_arm_x']
@@ -199,8 +198,7 @@ def test_a_lever_arm_that_is_off_is_not_called_unobservable_but_a_delay_without_
     found = smooth(leg, with_settings(config, {'odometer.time_sigma': 2e-3}))
     assert found.details['posterior_to_prior']['odometer_delay'] > 0.5
     assert found.estimates['odometer_delay'].value is None
-    said = {r.code: r.text for r in found.reasons}
-    assert 'odometer delay' in said[Code.PARAMETER_NOT_DETERMINED]
+    assert 'odometer delay' in texts(found)[Code.PARAMETER_NOT_DETERMINED]
 
 
 def test_what_a_vehicle_shows_beside_its_values_is_said():
@@ -210,7 +208,7 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     moved = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0)})
     leg = replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0]))
     found = smooth(leg, moved)
-    said = {r.code: r.text for r in found.reasons}
+    said = texts(found)
     tau = float(re.search(r'about (.*) s;', said[Code.FIXES_SMOOTHED])[1])
     assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # said to 0.01 s
     assert 'gnss.lever_arm x: set to +0.00 m, estimated +0.8' in said[Code.LEVER_ARM_OFF]
@@ -222,9 +220,9 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     assert off(found, drive) < 3.0
     assert 'warm tyres' in next(r for r in found.reasons if r.code is Code.SCALE_VARIES).remedy
     # and of a vehicle that has none of it nothing
-    clean = {r.code for r in smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config).reasons}
-    assert not clean & {Code.FIXES_SMOOTHED, Code.FIXES_NOISIER_THAN_SAID, Code.LEVER_ARM_OFF,
-                        Code.SCALE_VARIES, Code.IMU_AXES_SKEW}
+    clean = texts(smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config))
+    assert not {Code.FIXES_SMOOTHED, Code.FIXES_NOISIER_THAN_SAID, Code.LEVER_ARM_OFF,
+                Code.SCALE_VARIES, Code.IMU_AXES_SKEW} & set(clean)
 
 
 def test_a_scale_that_falls_with_speed_is_not_blamed_on_tyres():

@@ -85,24 +85,6 @@ def test_sigmas_are_those_of_white_noise_over_an_interval():
     np.testing.assert_allclose(sigma, stated * factor, rtol=1e-3)
 
 
-def test_of_a_fix_it_is_the_error_that_was_drawn():
-    """The track of 200 s of fixes at 5 Hz is known to a tenth of one."""
-    drive, _, leg, problem, fit = fitted()
-    value, sigma = in_halves(left_over(leg, problem, fit)['left_fix'])
-    true = fix_errors(drive, leg)[problem.use]
-    assert np.sqrt(((value + true)**2).mean(axis=0) / sigma.mean(axis=0)**2).max() < 0.2
-    # 1000 draws: their rms is told to 2 %, and tails and levels come to less than 5 %
-    assert np.sqrt(((value / sigma)**2).mean(axis=0)) == pytest.approx(np.ones(3), abs=0.1)
-
-
-def fix_errors(drive, leg):
-    """Return fixes less the true antenna, at the rear axle in these drives: (m, 3) in n."""
-    since = leg.t_fix + (drive.truth.start_ns - drive.options.start_ns) * 1e-9
-    state = drive.motion.at(since)
-    return leg.fixes_n - leg.origin.to_n(np.stack(
-        [state.latitude, state.longitude, state.height], -1))
-
-
 def test_a_wheel_that_slipped_is_seen_where_it_did():
     drive, config, *_ = fitted()
     begin, seconds, metres = 100.0, 1.0, 1.0

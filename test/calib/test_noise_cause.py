@@ -60,15 +60,15 @@ def noisy(moving, rest, rest_s=60.0, n=20_000):
 
 
 def test_noise_in_motion_only_is_vibration_noise_at_rest_the_sensors_else_unknown():
-    text = noise_remedy(noisy(1e-2, 1e-3), {'gyro': 5e-3, 'accel': 1.0}, ['gyro'])
-    assert 'vibration: gyro samples vary 10 times as much in motion as at rest' in text
-    assert 'imu.gyro_noise' not in text
-    text = noise_remedy(noisy(1e-2, 8e-3), {'gyro': 1e-2, 'accel': 1.0}, ['gyro'])
-    assert 'If this is its normal noise, set imu.gyro_noise to 0.01 (rad/s/sqrt(Hz)).' in text
-    assert 'cause is vibration' not in text
-    text = noise_remedy(noisy(1e-3, 1e-3), {'gyro': 1e-2, 'accel': 1.0}, ['gyro'])
-    assert 'unknown: single samples vary less' in text
-    assert 'at rest it is similar' not in text
+    for moving, rest, gyro, cause, other in (
+            (1e-2, 1e-3, 5e-3, 'vibration: gyro samples vary 10 times as much in motion as at '
+             'rest', 'imu.gyro_noise'),
+            (1e-2, 8e-3, 1e-2, 'If this is its normal noise, set imu.gyro_noise to 0.01 '
+             '(rad/s/sqrt(Hz)).', 'cause is vibration'),
+            (1e-3, 1e-3, 1e-2, 'unknown: single samples vary less', 'at rest it is similar')):
+        text = noise_remedy(noisy(moving, rest), {'gyro': gyro, 'accel': 1.0}, ['gyro'])
+        assert cause in text
+        assert other not in text
 
 
 def test_a_cause_of_one_sensor_is_not_stated_for_both():

@@ -68,12 +68,24 @@ def value(found, name):
     return found.value[i], np.sqrt(found.covariance[i, i])
 
 
-def test_umbmark_squares_give_ratio_and_width_exactly():
-    """No noise: squares in both directions, where ratio and width act differently."""
-    found = fit(run_of(body(SQUARES)), Known())
+OMNI = [(count, offset) for count in (3, 4) for offset in (0.0, 0.5, -2.0)]
+
+
+@pytest.mark.parametrize(('moves', 'options', 'expected', 'loose'), [
+    # squares in both directions, where ratio and width act differently
+    (SQUARES, {}, (LEFT, RIGHT, 1 / WIDTH), 2e-7),
+    (SIDEWAYS * 2, {'kind': 'mecanum', 'lateral': 0.9}, (*SCALES, 1 / WIDTH, 0.9), 1e-5),
+    *((SIDEWAYS * 2, {'kind': 'omni', 'offset': offset, 'count': count},
+       (*SCALES[:count], 1 / WIDTH), 1e-5) for count, offset in OMNI),
+    # turns on the spot and arcs of two radii: the width changes by a third
+    ([*SQUARES, (2, 0, 1.2), (1.5, 0, -0.8), (2, 0, -2.0), (1, 0, 2.0)],
+     {'kind': 'skid', 'arc': 1.0}, (LEFT, RIGHT, 1 / WIDTH, 1.0), 1e-5)])
+def test_without_noise_the_fit_is_exact(moves, options, expected, loose):
+    found = fit(run_of(body(moves), **options), Known())
     assert found.converged
-    assert_allclose(found.value[:3], (LEFT, RIGHT, 1 / WIDTH), rtol=2e-7)
-    assert_allclose(found.value[3:6], 0.0, atol=2e-7)
+    assert_allclose(found.value[:len(expected)], expected, rtol=loose)
+    offset = found.names.index('ahead')
+    assert_allclose(found.value[offset:offset + 2], 0.0, atol=loose)
 
 
 def test_offset_of_the_tracked_point_is_estimated_exactly():
@@ -87,11 +99,6 @@ def test_offset_of_the_tracked_point_is_estimated_exactly():
     assert_allclose(found.value[2], 1 / WIDTH, rtol=1e-5)
 
 
-def test_mecanum_straight_sideways_and_turn_are_exact():
-    found = fit(run_of(body(SIDEWAYS * 2), 'mecanum', lateral=0.9), Known())
-    assert_allclose(found.value[:6], (*SCALES, 1 / WIDTH, 0.9), rtol=1e-5)
-
-
 def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch):
     """A turn and no sideways motion: one difference of four wheels has its prior alone."""
     run = run_of(body([(2, 0, 0), (0, 0, 1.5), (2, 0, 0)]), 'mecanum')
@@ -99,12 +106,6 @@ def test_wheels_that_differ_by_a_few_per_cent_do_not_hide_the_scale(monkeypatch)
     assert (sigma < 1.2 * drive.UNEQUAL * SCALES).all()
     monkeypatch.setattr(drive, 'UNEQUAL', 0.3)
     assert (np.sqrt(np.diag(fit(run, Known()).covariance)[:4]) > 2 * sigma).all()
-
-
-@pytest.mark.parametrize(('count', 'offset'), [(3, 0.0), (4, 0.0), (3, 0.5), (4, -2.0)])
-def test_omni_wheels_are_exact(count, offset):
-    found = fit(run_of(body(SIDEWAYS * 2), 'omni', offset=offset, count=count), Known())
-    assert_allclose(found.value[:count + 1], (*SCALES[:count], 1 / WIDTH), rtol=1e-5)
 
 
 @pytest.mark.parametrize('kind', ['differential', 'mecanum', 'omni'])
@@ -121,13 +122,6 @@ def test_omni_rows_are_those_of_omni_wheel_drive_controller():
     assert_allclose(forward, (0, 10, 0, -10), atol=1e-12)
     assert_allclose(left, (-10, 0, 10, 0), atol=1e-12)
     assert_allclose(turn, -10)
-
-
-def test_width_of_skid_steering_on_the_spot_and_on_arcs_is_exact():
-    """Turns on the spot and arcs of two radii: the width changes by a third."""
-    moves = SQUARES + [(2, 0, 1.2), (1.5, 0, -0.8), (2, 0, -2.0), (1, 0, 2.0)]
-    found = fit(run_of(body(moves), 'skid', arc=1.0), Known())
-    assert_allclose(found.value[:4], (LEFT, RIGHT, 1 / WIDTH, 1.0), rtol=1e-5)
 
 
 def test_gyro_scale_and_bias_are_exact():

@@ -6,10 +6,10 @@
 from dataclasses import replace
 import json
 
+from legs_to_combine import apart, leg_result, moved, NO_SCATTER, STEPS, Toy
 import numpy as np
 import pytest
-from smoother_legs import made
-from test_legs_on_border import apart, leg_result, NO_SCATTER, Toy, TRUTH
+from smoother_legs import made, smoothed
 
 from odocal_ros.calib.border import carried_from
 from odocal_ros.calib.joint import joint, scale_steps
@@ -25,7 +25,6 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 from odocal_ros.sim.real import Real
 
 pytestmark = pytest.mark.slow
-STEPS = np.array([0.02, 0.0, 0.05, 0.01])
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
 ACCEL = (3e-3, 0.0, 0.0, 0.0, -2e-3, 0.0, 0.0, 0.0, 0.0)      # scale errors of x and y
 
@@ -41,27 +40,16 @@ def test_legs_carried_on_are_one_fit_with_those_to_come(first):
     assert np.abs((found.covariance - whole.covariance) / np.outer(sigma, sigma)).max() < 1e-6
 
 
-def drawn(rng, toy, change=0.0, since=3):
-    """Return the steps found in five legs whose scale walks, and changes once."""
-    constants = np.tile(TRUTH, (5, 1))
-    constants[:, 0] += np.concatenate([[0.0], np.cumsum(STEPS * rng.standard_normal(4))])
-    constants[since:, 0] += change
-    return scale_steps(toy.draw(rng, constants).borders(), STEPS, 'k')
-
-
-def test_a_walk_is_no_change_but_by_chance():
+def test_a_walk_is_no_change_but_by_chance_and_a_change_is_found():
     rng = np.random.default_rng(6)
     toy = Toy(rng, states=6, rows=60)
-    alarms = sum(len(drawn(rng, toy)) for _ in range(500))
+    alarms = sum(len(scale_steps(toy.walk(rng).borders(), STEPS, 'k')) for _ in range(500))
     # three legs of five can be held against others: one in 370 of 1500 is 4
     assert 0 < alarms <= 12
-
-
-def test_a_change_is_found_where_it_was_and_as_large():
     rng = np.random.default_rng(7)
     toy = Toy(rng, states=6, rows=60)
     for _ in range(20):
-        (found,) = drawn(rng, toy, change=-0.9)
+        (found,) = scale_steps(toy.walk(rng, change=-0.9).borders(), STEPS, 'k')
         assert found.leg == 3
         assert found.change == pytest.approx(-0.9, abs=4 * 0.06)     # walk and noise of the legs
         assert found.sigmas < -REMARK_SIGMAS
@@ -70,25 +58,21 @@ def test_a_change_is_found_where_it_was_and_as_large():
 @pytest.fixture(scope='module')
 def session():
     """Return settings and the legs of a short drive and of the same vehicle on other days."""
-    results = []
-    for seed in (1, 2, 3):
-        _, config, leg = made(duration=200.0, imu_grade='industrial', seed=seed)
-        results.append(smooth(leg, config))
-    return with_settings(config, {'method': 'smoother', 'leg.automatic': True}), results
+    short = {'duration': 200.0, 'imu_grade': 'industrial'}
+    results = [smoothed(**short, seed=seed)[1] for seed in (1, 2, 3)]
+    return with_settings(made(**short, seed=3)[1], {
+        'method': 'smoother', 'leg.automatic': True}), results
 
 
 def legs_of(results, change=0.0, since=2):
     """Return legs of results, the scale of the later ones changed."""
     out = []
     for i, one in enumerate(results, 1):
-        moved = one.border
         if i > since:
-            moved = replace(moved, value=moved.value + np.log1p(change) * (
-                np.arange(len(moved.names)) == 0))
             scale = one.estimates[SCALE]
-            one = replace(one, estimates=one.estimates | {SCALE: replace(
-                scale, value=scale.value * (1 + change))})
-        out.append(leg_result(replace(one, border=moved), i))
+            one = moved(replace(one, estimates=one.estimates | {SCALE: replace(
+                scale, value=scale.value * (1 + change))}), SCALE, np.log1p(change))
+        out.append(leg_result(one, i))
     return out
 
 
@@ -138,9 +122,12 @@ def test_a_result_on_the_disk_goes_on(session, monkeypatch):
     carried = carried_from(written['carried'])
     assert (carried.legs, carried.first_ns, carried.last_ns) == (
         2, legs[0].start_ns, legs[1].start_ns)
-    found = combine(legs[2:], config, carried)
-    compare(found, whole, 1e-3)
-    assert found.carried.legs == 3
+    for before in (carried, fold(legs[:2], config)):
+        found = combine(legs[2:], config, before)
+        compare(found, whole, 1e-3)
+        assert found.carried.legs == 3
+    rejected = leg_result(results[0], 0, Code.IMU_GAP)       # nothing to carry
+    assert fold([rejected], config, carried) is carried
     assert found.carried.includes(carried)
     assert not carried.includes(found.carried)
     (text,) = changed(combine(legs_of(results, 0.02)[2:], config, carried))
@@ -203,15 +190,3 @@ def test_what_combined_legs_tell_of_the_scatter_goes_on(session):
     compare(found, whole, 0.1)
     evidence = found.carried.border.evidence
     assert set(evidence) == {'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'}
-
-
-def test_legs_folded_into_what_is_carried_count_as_before(session, monkeypatch):
-    monkeypatch.setattr(several, 'SCATTER', NO_SCATTER)
-    config, results = session
-    legs = legs_of(results)
-    whole, carried = combine(legs, config), fold(legs[:2], config)
-    found = combine(legs[2:], config, carried)
-    assert found.carried.legs == 3
-    compare(found, whole, 1e-3)
-    rejected = leg_result(results[0], 0, Code.IMU_GAP)       # nothing to carry
-    assert fold([rejected], config, carried) is carried

@@ -6,11 +6,11 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-from drives import cached, off, settings
+from drives import off, settings
 import numpy as np
 import pytest
 from reversing_drives import made as by_hand
-from smoother_legs import leg_of, made
+from smoother_legs import leg_of, made, said as texts, smoothed
 
 from odocal_ros.calib.slip import unforced
 from odocal_ros.estimator import smooth
@@ -27,13 +27,6 @@ pytestmark = pytest.mark.slow
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
 
-@cached
-def fitted(**options):
-    """Return a drive and what the smoother says of it as it is."""
-    drive, config, leg = made(**SHORT, **options)
-    return drive, smooth(leg, config)
-
-
 def slipping(leg, begin, length, share):
     """Return a leg whose wheel turns more by a share for some seconds, and by how much, m."""
     t, s = leg.travel.t, leg.travel.s
@@ -42,8 +35,8 @@ def slipping(leg, begin, length, share):
     return replace(leg, travel=travel), spun[-1]
 
 
-def said(method):
-    return ' '.join(r.text for r in method.reasons if r.code is Code.WHEEL_SLIP)
+def said(method, code=Code.WHEEL_SLIP):
+    return texts(method).get(code, '')
 
 
 @pytest.mark.parametrize(('noise', 'begin', 'length', 'share'), [
@@ -65,9 +58,9 @@ def test_slip_of_seconds_is_said_with_place_and_size(noise, begin, length, share
 
 @pytest.mark.parametrize('noise', ['white', 'rtk'])
 def test_slip_at_starts_is_said(noise):
-    drive, method = fitted(fix_noise=noise, start_slip=0.005)
+    drive, method = smoothed(**SHORT, fix_noise=noise, start_slip=0.005)
     assert 'slip while accelerating or braking' in said(method)
-    assert not filtered(method)
+    assert not said(method, Code.SPEED_FILTERED)
     assert off(method, drive) < 3.3
 
 
@@ -77,8 +70,7 @@ def test_slip_at_starts_is_said(noise):
      'fix_noise': 'rtk'}, {'odometer_delay': 0.3}, {'scale': 0.3, 'nominal_scale': 0.3},
     {'odometer': 'speed', 'speed_noise': 0.05}], ids=str)
 def test_wheels_that_hold_without_a_filter_are_not_blamed_for_either(options):
-    assert not said(fitted(**options)[1])
-    assert not filtered(fitted(**options)[1])
+    assert not {Code.WHEEL_SLIP, Code.SPEED_FILTERED} & set(texts(smoothed(**SHORT, **options)[1]))
 
 
 def shaken(leg):
@@ -129,8 +121,7 @@ def test_travel_that_a_counter_loses_without_braking_is_no_slip():
     leg, _ = slipping(leg, t[at] + 3.0, 3.0, -0.1)
     method = smooth(leg, config)
     assert not said(method)
-    (lost,) = (r.text for r in method.reasons if r.code is Code.TRAVEL_MISSING)
-    assert 'without braking' in lost
+    assert 'without braking' in said(method, Code.TRAVEL_MISSING)
 
 
 @pytest.mark.parametrize('forward', [1.0, -1.0])
@@ -158,8 +149,7 @@ def test_a_speed_that_is_held_before_stops_is_no_slip():
     config = settings(drive, None)
     method = smooth(leg_of(leg, config), config)
     assert not said(method)
-    (extra,) = (r.text for r in method.reasons if r.code is Code.TRAVEL_EXCESS)
-    assert 'while it brakes to a stop' in extra
+    assert 'while it brakes to a stop' in said(method, Code.TRAVEL_EXCESS)
     assert off(method, drive) < 3.3
 
 
@@ -171,17 +161,13 @@ def low_passed(leg, seconds):
     return replace(leg, travel=Travel(t, np.floor(s), leg.travel.quantum))
 
 
-def filtered(method):
-    return [r.text for r in method.reasons if r.code is Code.SPEED_FILTERED]
-
-
 def test_what_a_filter_leaves_when_the_speed_changes_is_no_slip():
     """Three filters one after the other: of no first order, whose shape is taken out."""
     _, config, leg = made(**SHORT, fix_noise='rtk')
     for _ in range(3):
         leg = low_passed(leg, 0.2)
     method = smooth(leg, config)
-    assert filtered(method)
+    assert said(method, Code.SPEED_FILTERED)
     noise = method.details['noise']
     # m/sqrt(s), what changes of speed add
     assert np.sqrt(noise['along_hard']**2 - noise['along']**2) > 0.006
@@ -192,9 +178,9 @@ def test_what_a_filter_leaves_when_the_speed_changes_is_no_slip():
 def test_a_low_pass_filter_is_named_and_no_slip(noise):
     _, config, leg = made(**SHORT, fix_noise=noise)
     method = smooth(low_passed(leg, 0.4), config)
-    (text,) = filtered(method)
     # the fit's delay and noise take some of it
-    assert float(text.split('about ')[1].split(' s')[0]) == pytest.approx(0.4, abs=0.04)
+    seconds = said(method, Code.SPEED_FILTERED).split('about ')[1].split(' s')[0]
+    assert float(seconds) == pytest.approx(0.4, abs=0.04)
     assert not said(method)
     assert not method.details['slips']
 
@@ -203,7 +189,7 @@ def test_slip_of_a_filtered_odometer_is_said():
     drive, config, leg = made(**SHORT)
     slipped, pulses = slipping(leg, 100.0, 3.0, 0.2)
     method = smooth(low_passed(slipped, 0.4), config)
-    assert filtered(method)
+    assert said(method, Code.SPEED_FILTERED)
     first = method.details['slips'][0]
     assert first['metres'] == pytest.approx(pulses * drive.truth.scale, rel=0.3)
     assert 98.0 <= first['t'] <= 103.0

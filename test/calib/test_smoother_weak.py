@@ -6,6 +6,7 @@
 from dataclasses import replace
 import re
 
+from drives import off
 import numpy as np
 import pytest
 from smoother_legs import made, truth
@@ -33,13 +34,11 @@ START_NS = 1_700_000_000_000_000_000
 @pytest.mark.parametrize('noise', ['correlated', 'white'])
 def test_slow_errors_are_in_the_sigma_of_scale_and_pitch(noise):
     drive, config, leg = made(**TOWN, fix_noise=noise)
-    truth, found = drive.truth, [
-        smooth(replace(leg, t_begin=begin, t_stop=begin + WINDOW), config)
-        for begin in 20.0 + WINDOW * np.arange(WINDOWS)]
-    for name, true in (('scale_factor', truth.scale), ('pitch_mounting_angle', truth.pitch)):
-        out = [(e.value - true) / e.sigma for e in (r.estimates[name] for r in found)]
+    found = [smooth(replace(leg, t_begin=begin, t_stop=begin + WINDOW), config)
+             for begin in 20.0 + WINDOW * np.arange(WINDOWS)]
+    for name in ('scale_factor', 'pitch_mounting_angle'):
         # chi2 of 6, 1 in 1000; taken for white they are some 5 sigmas off each
-        assert np.square(out).sum() < 22.5
+        assert sum(off(one, drive, name)**2 for one in found) < 22.5
     for level in (r.details['noise'] for r in found if noise == 'white'):
         # of 450 values 3 sigmas of their rms; of the slow error 45 s tell little: not more of it
         # than the receiver states
@@ -69,8 +68,7 @@ def test_a_slow_error_too_small_to_be_seen_is_in_the_sigma_of_the_scale():
                                   real=Real(slow_errors=((0.21, 60.0),)))
         found = smooth(leg, config)
         assert found.details['noise']['correlation_time'] > 0
-        scale = found.estimates['scale_factor']
-        out.append((scale.value - drive.truth.scale) / scale.sigma)
+        out.append(off(found, drive))
     # chi2 of 6, 1 in 100 either way; taken for white it is 20.6
     assert 0.87 < np.square(out).sum() < 16.8
 

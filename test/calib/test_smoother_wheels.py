@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.data.samples import take
 from odocal_ros.estimator.result import wheel_result
 from odocal_ros.estimator.result.wheels import Wheel
 from odocal_ros.pipeline.calibrate import calibrate
@@ -28,8 +29,13 @@ SCALE = Estimate(0.02, 2e-6, 'm/pulse')
 def result_of(given=0.0, **options):
     """Return a drive and what the smoother says of it."""
     made = drive(**TOWN | options)
-    config = settings(made, method='smoother', odometer__track_width=given)
-    return made, calibrate(made.leg(), config).methods['smoother']
+    return made, smoothed(made, odometer__track_width=given)
+
+
+def smoothed(made, leg=None, **more):
+    """Return what the smoother says of a drive, or of its leg when changed."""
+    config = settings(made, method='smoother', **more)
+    return calibrate(leg or made.leg(), config).methods['smoother']
 
 
 def ratio_off(made, method):
@@ -75,8 +81,8 @@ def test_wheels_of_unlike_counters_have_factors_of_their_own():
     """Right counts twice as often: the counters' mean is not that of both sides, K is its own."""
     made, _ = result_of(seed=1)
     leg = made.leg()
-    leg = replace(leg, odometer_right=changed(leg.odometer_right, value=lambda n: 2 * n))
-    method = calibrate(leg, settings(made, method='smoother')).methods['smoother']
+    method = smoothed(made, replace(leg, odometer_right=changed(
+        leg.odometer_right, value=lambda n: 2 * n)))
     left, right = made.truth.wheel_scales[0], made.truth.wheel_scales[1] / 2
     for name, true in (('scale_factor_left', left), ('scale_factor_right', right),
                        ('scale_factor', 2 / (1 / left + 1 / right))):
@@ -91,12 +97,8 @@ def test_what_a_gap_of_one_wheel_hides_is_not_in_the_ratio():
     t = (leg.odometer.stamp_ns - leg.start_ns) * 1e-9
     lost = np.where(t > 120.0, 40, 0)       # counts, 0.85 m: 650 ppm of the path
     kept = (t < 118.0) | (t > 122.0)
-    odometer = changed(leg.odometer, value=lambda n: n - lost)
-    odometer = type(odometer)(*(getattr(odometer, x)[kept] for x in (
-        'stamp_ns', 'received_ns', 'value')))
-    method = calibrate(replace(leg, odometer=odometer), settings(
-        made, method='smoother')).methods['smoother']
-    error, sigma = ratio_off(made, method)
+    odometer = take(changed(leg.odometer, value=lambda n: n - lost), kept)
+    error, sigma = ratio_off(made, smoothed(made, replace(leg, odometer=odometer)))
     assert abs(error) < SIGMAS * np.hypot(sigma, 1e-6) < 5e-5
 
 
@@ -122,11 +124,9 @@ def test_a_width_that_is_given_counts_as_taped():
 
 def test_a_width_is_no_better_than_the_turns_are_known():
     """By fixes of 30 m the gyro alone tells the turns: a scale off by 1 % is in the width."""
-    options = TOWN | {'imu_grade': 'consumer', 'seed': 4, 'fix_sigma': 30.0,
-                      'gyro_scale_error': 0.01}
-    made = drive(**options)
-    config = settings(made, method='smoother', gnss__max_sigma=100.0)
-    method = calibrate(made.leg(), config).methods['smoother']
+    made = drive(**TOWN | {'imu_grade': 'consumer', 'seed': 4, 'fix_sigma': 30.0,
+                           'gyro_scale_error': 0.01})
+    method = smoothed(made, gnss__max_sigma=100.0)
     assert off(method, made, 'track_width') < SIGMAS
     width = method.estimates['track_width']
     sold = GRADES['consumer'].gyro_scale_error

@@ -6,7 +6,7 @@
 from dataclasses import replace
 from functools import reduce
 
-from drives import cached, changed, drive, seconds, settings
+from drives import cached, changed, drive, off, seconds, settings
 import numpy as np
 import pytest
 
@@ -20,6 +20,7 @@ from odocal_ros.screening.wheel_faults import broken_wheels
 
 pytestmark = pytest.mark.slow
 TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
+STRAIGHT = TOWN | {'scenario': 'straight'}
 COUNT = 0.0213      # m
 
 
@@ -53,6 +54,18 @@ def spun(options, at, length, size):
     """Return a change of a way by a spin, in whole counts, as an encoder would give it."""
     t = prepared(**options)[0].travels[0].t
     return lambda s: s + np.floor(np.clip((t - at) / length, 0, 1) * size / COUNT)
+
+
+def counts_more(since):
+    """Return a change of a way by a hundredth from a way on."""
+    return lambda s: s + np.floor(0.01 * np.maximum(s - since(s), 0.0))
+
+
+def assert_place(slips, begin, length, size, loose_s, loose_m):
+    """Assert where the first slip is, s, and its size, m."""
+    assert abs(abs(slips.size[0]) - abs(size)) < loose_m
+    assert abs(slips.begin[0] - begin) < loose_s
+    assert abs(slips.end[0] - begin - length) < loose_s
 
 
 def said(made, **wheels):
@@ -153,8 +166,7 @@ def test_swapped_wheels_are_told_by_the_gyro():
 
 @pytest.mark.parametrize('swap', [False, True])
 def test_a_drive_without_turns_does_not_tell_swapped_wheels_and_says_so(swap):
-    straight = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True}
-    (reason,), _ = faults(straight, swap=swap, sides=True)
+    (reason,), _ = faults(STRAIGHT, swap=swap, sides=True)
     assert reason.code is Code.ODOMETER_CHOSEN
     assert 'too few turns to test whether' in reason.text
     assert faults(TOWN, sides=True)[0] == ()
@@ -164,9 +176,10 @@ def test_a_drive_without_turns_does_not_tell_swapped_wheels_and_says_so(swap):
 def test_nothing_is_said_of_clean_drives(scenario, seeds):
     """No alarm in 50 drives: at a rate of 6 % one run of this test in 20 would see none."""
     for seed in range(seeds):
-        options = {'scenario': scenario, 'duration': 200.0 if scenario == 'straight' else 300.0,
-                   'two_wheels': True, 'seed': seed, 'odometer': ('counts', 'angle')[seed % 2],
-                   'imu_grade': ('consumer', 'industrial')[seed // 2 % 2]}
+        options = TOWN | {
+            'scenario': scenario, 'duration': 200.0 if scenario == 'straight' else 300.0,
+            'seed': seed, 'odometer': ('counts', 'angle')[seed % 2],
+            'imu_grade': ('consumer', 'industrial')[seed // 2 % 2]}
         for swap in (False, True)[:1 + (scenario == 'straight')]:
             reasons, slips = faults(options, swap=swap, prepare=prepared.__wrapped__)
             assert reasons == ()
@@ -176,17 +189,15 @@ def test_nothing_is_said_of_clean_drives(scenario, seeds):
 @pytest.mark.parametrize('size', [0.3, 1.0, -0.5])
 @pytest.mark.parametrize('side', ['left', 'right'])
 def test_a_slip_of_one_wheel_is_named_with_place_and_size(side, size):
-    options = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True, 'seed': 8}
-    reasons, slips = faults(options, **{side: spun(options, 120.0, 1.5, size)})
-    (reason,) = reasons
+    options = STRAIGHT | {'seed': 8}
+    (reason,), slips = faults(options, **{side: spun(options, 120.0, 1.5, size)})
     assert reason.code is Code.WHEEL_SLIP
     assert reason.text.startswith(f'the {side} wheel {"spins" if size > 0 else "slides"} by')
     assert slips.wheel.tolist() == [1 if side == 'right' else -1]
     # the mean over ten rounded rows at each end of each wheel, 5 sigma, and the count lost by
     # rounding the spin
-    assert abs(slips.size[0] - size) < 5 * COUNT * np.sqrt(4 / 12 / 10) + COUNT
-    assert abs(slips.begin[0] - 120.0) < 0.5
-    assert abs(slips.end[0] - 121.5) < 0.5
+    assert np.sign(slips.size[0]) == np.sign(size)
+    assert_place(slips, 120.0, 1.5, size, 0.5, 5 * COUNT * np.sqrt(4 / 12 / 10) + COUNT)
 
 
 @pytest.mark.parametrize(('length', 'told'), [(8.0, True), (18.0, False)])
@@ -196,20 +207,15 @@ def test_a_long_slip_is_seen_whole_and_no_wheel_is_blamed_without_evidence(lengt
     (reason,), slips = faults(options, left=spun(options, 100.0, length, 0.5 * length))
     assert reason.text.startswith('the left wheel spins' if told else 'one of the wheels deviates')
     # scrub in turns may be a hundredth of the track width times the turn of 90 deg: 3 cm
-    assert abs(abs(slips.size[0]) - 0.5 * length) < 0.1
-    assert abs(slips.begin[0] - 100.0) < 0.2 * length
-    assert abs(slips.end[0] - 100.0 - length) < 0.2 * length
+    assert_place(slips, 100.0, length, 0.5 * length, 0.2 * length, 0.1)
 
 
 @pytest.mark.parametrize('side', ['left', 'right'])
 def test_a_wheel_that_slips_on_and_on_is_said(side):
     """A hundredth from 150 s on, where about half the way is driven: no place stands out."""
     options = TOWN | {'seed': 3}
-    t = prepared(**options)[0].travels[0].t
-
-    def slips_on(s):
-        return s + np.floor(0.01 * np.maximum(s - s[np.searchsorted(t, 150.0)], 0.0))
-    (reason,), slips = faults(options, **{side: slips_on})
+    k = np.searchsorted(prepared(**options)[0].travels[0].t, 150.0)
+    (reason,), slips = faults(options, **{side: counts_more(lambda s: s[k])})
     assert reason.code is Code.WHEEL_SLIP
     assert '% (± ' in reason.text
     assert ('more' if side == 'right' else 'less') in reason.text
@@ -219,23 +225,17 @@ def test_a_wheel_that_slips_on_and_on_is_said(side):
 @pytest.mark.parametrize('begin', [18.0, 120.0])
 def test_a_slow_slip_is_no_ratio_of_the_drive(begin):
     """Half a per cent for 45 s of 250: a line through all of it takes a part of the slip."""
-    options = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True, 'seed': 15}
+    options = STRAIGHT | {'seed': 15}
     (reason,), slips = faults(options, left=spun(options, begin, 45.0, -2.9))
     assert reason.code is Code.WHEEL_SLIP
     # what rounding may do at the ends of each wheel, and the tenth at begin and end
-    assert abs(abs(slips.size[0]) - 2.9) < 0.3 + 4 * COUNT
-    assert abs(slips.begin[0] - begin) < 0.2 * 45
-    assert abs(slips.end[0] - begin - 45) < 0.2 * 45
+    assert_place(slips, begin, 45.0, 2.9, 0.2 * 45, 0.3 + 4 * COUNT)
     assert not slips.change
 
 
 @pytest.mark.parametrize('share', [0.25, 0.75])
 def test_a_ratio_that_changes_anywhere_is_said_with_where(share):
-    options = TOWN | {'seed': 3}
-
-    def slips_on(s):
-        return s + np.floor(0.01 * np.maximum(s - share * s[-1], 0.0))
-    (reason,), slips = faults(options, right=slips_on)
+    (reason,), slips = faults(TOWN | {'seed': 3}, right=counts_more(lambda s: share * s[-1]))
     assert f'after about {100 * share:.0f} % of the path' in reason.text
     percent = float(reason.text.split('the right wheel counts ')[1].split()[0])
     assert abs(percent - 1.0) < 0.1
@@ -255,7 +255,7 @@ def test_one_counter_sent_twice_is_no_second_wheel():
 
 
 def test_slips_by_the_dozen_are_counted():
-    options = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True, 'seed': 8}
+    options = STRAIGHT | {'seed': 8}
     at = np.arange(60.0, 240.0, 30.0)
     spins = [spun(options, t, 1.0, 0.4) for t in at]
     (reason,), slips = faults(options, right=lambda s: reduce(lambda s, spin: spin(s), spins, s))
@@ -291,22 +291,16 @@ def test_a_gyro_that_does_not_turn_is_no_ground_for_factors():
 
 
 def with_gyro_noise(sigma, grade):
-    """Return a drive in town, its leg with that gyro noise, rad/s, and its settings."""
+    """Return a drive in town, and its result with that gyro noise, rad/s."""
     made = drive(**TOWN | {'duration': 200.0}, seed=3, imu_grade=grade)
     noise = np.random.default_rng(0).normal(0.0, sigma, made.imu.w_i.shape)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
-    return made, leg, settings(made, method='smoother')
+    return made, calibrate(leg, settings(made, method='smoother')).methods['smoother']
 
 
-def test_a_gyro_of_noise_ends_in_reasons_too():
-    """Heights left out in the last round: what was solved with them has another length."""
-    _, leg, config = with_gyro_noise(0.3, 'industrial')
-    assert calibrate(leg, config).methods['smoother'].reasons
-
-
-def test_a_gyro_of_less_noise_widens_the_track_width():
-    made, leg, config = with_gyro_noise(0.1, 'consumer')
-    noisy, clean = (calibrate(x, config).methods['smoother'].estimates['track_width']
-                    for x in (leg, made.leg()))
-    assert abs(noisy.value - made.options.track_width) < 4 * noisy.sigma
-    assert noisy.sigma > 3 * clean.sigma
+def test_a_gyro_of_noise_ends_in_reasons_or_widens_the_track_width():
+    # heights left out in the last round: what was solved with them has another length
+    assert with_gyro_noise(0.3, 'industrial')[1].reasons
+    (made, noisy), (_, clean) = (with_gyro_noise(sigma, 'consumer') for sigma in (0.1, 0.0))
+    assert off(noisy, made, 'track_width') < 4
+    assert noisy.estimates['track_width'].sigma > 3 * clean.estimates['track_width'].sigma

@@ -18,7 +18,7 @@ from odocal_ros.estimator.result.wheel_noise import (
 
 K = 300             # increments of a drive of five minutes
 WAY = 10.0          # m in each
-NO_READING, NO_WALK = 1e-16, 1e-20      # m^2: nothing beside the other
+NO_READING = 1e-16      # m^2
 
 
 def increments(seed=0, walk=1e-3**2, reading=0.0, k=K, ratio=1e-3):
@@ -76,18 +76,6 @@ def test_of_a_walk_alone_the_ratio_is_that_of_the_ends():
     level, = line.levels
     assert abs(np.log(level / 1e-3**2)) < 4 * np.sqrt(2 / K)
     assert np.sqrt(line.covariance[0, 0]) == pytest.approx(np.sqrt(level / K) / WAY, rel=1e-4)
-
-
-def test_of_readings_alone_the_ratio_is_a_line_through_all_of_them():
-    """The sigma falls as the power 3/2 of the way: increments alone would give the power 1/2."""
-    q = 0.01**2
-    seen = increments(reading=q, walk=0.0)
-    x, covariance, *_ = _solved(np.array([np.log(NO_WALK), 0.0]), seen, np.ones(K))
-    readings = np.concatenate([[0.0], np.cumsum(seen.y)])
-    at = WAY * np.arange(K + 1)
-    # with the walk's share and 1e-16 of roundings left
-    assert x[0] == pytest.approx(np.polyfit(at, readings, 1)[0], rel=1e-6)
-    assert covariance[0, 0] == pytest.approx(q / ((at - at.mean())**2).sum(), rel=1e-6)
 
 
 @pytest.mark.parametrize(('walk', 'reading'), [

@@ -13,20 +13,14 @@ from odocal_ros.data.arrays import Floats, Ints
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """
-    Residual rows of one noise level: r = value + here dx_k + ahead dx_(k+1) + constant dc.
+    """Residual rows of one noise level: r = value + here dx_k + ahead dx_(k+1) + constant dc."""
 
-    node : (n,) node k of each group of rows.   value : (n, q).   here, ahead : (n, q, s)
-    derivatives by the states of nodes k and k + 1.   constant : (n, q, m) by the constants.
-    weight : (n, q), one over the variance at level 1.
-    """
-
-    node: Ints
-    value: Floats
-    here: Floats
-    ahead: Floats
-    constant: Floats
-    weight: Floats
+    node: Ints        # (n,) node k of each group of rows
+    value: Floats     # (n, q)
+    here: Floats      # (n, q, s) derivatives by the state of node k
+    ahead: Floats     # (n, q, s) by that of node k + 1
+    constant: Floats  # (n, q, m) by the constants
+    weight: Floats    # (n, q) one over the variance at level 1
 
     @property
     def count(self) -> int:

@@ -39,17 +39,11 @@ def rows_of(kind: str, count: int, offset: float = 0.0) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Wheels:
-    """
-    Increments of w wheels in n intervals.
+    """Increments of w wheels in n intervals."""
 
-    count : (n, w), scale units; for differential and skid drives the means of the left and of
-    the right wheels.   rows : (w, 3) of ``rows_of``, whose columns are orthogonal.   kind : as
-    odometer.drive.
-    """
-
-    count: Floats
-    rows: Floats
-    kind: str
+    count: Floats  # (n, w) scale units; of differential and skid drives the means of both sides
+    rows: Floats   # (w, 3) of ``rows_of``, whose columns are orthogonal
+    kind: str      # as odometer.drive
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from odocal_ros.calib.planar.chain import Equations, Rows, Solved
 from odocal_ros.calib.planar.problem import Fit, Known, Run
-from odocal_ros.calib.planar.start import First, first_values
+from odocal_ros.calib.planar.start import first_values
 from odocal_ros.data.arrays import Floats
 
 # first levels and medians of their hyperpriors, variances. Judgement: wheels slip by millimetres
@@ -44,7 +44,11 @@ def fit(run: Run, known: Known, passed: Callable[[int, float], None] = lambda *_
     """
     at_first = first_values(run, known.width)
     scale = (at_first.left + at_first.right) / 2
-    state, c, prior = _begin(run, known, at_first)
+    c, prior = priors(run, known, at_first.left, at_first.right, at_first.width)
+    state = np.zeros((len(run.t), 5))
+    state[:, 0], state[:, 1] = (np.interp(run.t, run.t[run.node], axis)
+                                for axis in run.position.T)
+    state[:, 2] = at_first.heading
     mean, n = c.copy(), len(state)
     theta, passes, converged = dict(LEVELS), 0, False
     student = {'white': np.ones(len(run.node)), 'drift': np.ones(n)}
@@ -106,15 +110,6 @@ def priors(run: Run, known: Known, left: float, right: float, width: float,
     return np.append(value, [v for v, _ in more]), information
 
 
-def _begin(run: Run, known: Known, at_first: First) -> tuple[Floats, Floats, Floats]:
-    """Return first states (n + 1, 5) and constants (m,), and the prior information (m, m)."""
-    state = np.zeros((len(run.t), 5))
-    state[:, 0], state[:, 1] = (np.interp(run.t, run.t[run.node], axis)
-                                for axis in run.position.T)
-    state[:, 2] = at_first.heading
-    return state, *priors(run, known, at_first.left, at_first.right, at_first.width)
-
-
 def noise_path(run: Run, scale: float) -> Floats:
     """Return the effective wheel path in each interval, by which its noise grows: (n,) m."""
     path: Floats = run.wheels.path * scale
@@ -138,12 +133,9 @@ def _after(rows: Rows, solved: Solved) -> Floats:
 
 def _level_steps(parts: dict[str, Equations], left: dict[str, Rows], theta: dict[str, float],
                  prior: Floats, solved: Solved) -> dict[str, float]:
-    """
-    Return the step of the logarithm of each estimated level towards the most likely value.
-
-    The likelihood is the restricted one. The degrees of freedom that the unknowns take from a
-    level are the derivative of the log determinant by the logarithm of its weight.
-    """
+    """Return the steps of the logarithms of the levels to the most likely values (restricted)."""
+    # the degrees of freedom that the unknowns take from a level are the derivative of the log
+    # determinant by the logarithm of its weight
     steps, h, whole = {}, 1e-3, solved.log_determinant()
     for name in ESTIMATED:
         other = _solved(parts, theta | {name: theta[name] * np.exp(-h)}, prior, 0 * prior[0])

@@ -23,17 +23,13 @@ WINDOW_STEPS = 4
 
 
 class First(NamedTuple):
-    """
-    First values: scale factors of both sides, track width m, headings of nodes (n + 1,) rad.
+    """First values."""
 
-    swapped : the mirrored positions fit better, so left and right are swapped.
-    """
-
-    left: float
-    right: float
-    width: float
-    heading: Floats
-    swapped: bool
+    left: float      # scale factor
+    right: float     # scale factor
+    width: float     # m, track width
+    heading: Floats  # (n + 1,) rad, of nodes
+    swapped: bool    # the mirrored positions fit better
 
 
 def first_values(run: Run, width: float) -> First:
@@ -112,11 +108,9 @@ class _Alignment:
 
     def __call__(self, log_width: float, ratios: Floats) -> tuple[Floats, Complexes, Floats]:
         """
-        Return costs, scales and rotations, and headings of r ratios of right over left wheel.
+        Return costs, (2, r) m^2, scales and rotations, (r, w), and headings, (r, n + 1) rad.
 
-        Costs are sums of squared residuals of windows, m^2, of the positions and of their mirror
-        image: (2, r).   Scales and rotations, of the positions, are complex: (r, w).   Headings
-        of all nodes: (r, n + 1) rad.
+        Of r ratios of right over left wheel; costs are of the positions and of their mirror image.
         """
         half = ratios[:, None] / 2
         turn = _from_zero((1 + half) * self.right - (1 - half) * self.left)

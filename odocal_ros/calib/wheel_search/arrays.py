@@ -95,11 +95,7 @@ def bose(q: int, columns: int) -> Ints:
     """
     Return Bose's orthogonal array L(q^2)(q^columns): (q^2, columns) level numbers.
 
-    Raises
-    ------
-    BadUsage
-        q is no prime power, or the number of columns is not 1 to q + 1.
-
+    Raises BadUsage if q is no prime power, or the number of columns is not 1 to q + 1.
     """
     add, multiply = field_tables(q)
     if not 1 <= columns <= q + 1:

@@ -84,8 +84,11 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
             bool(np.abs(step).max() < 1e3 * SETTLED and lower == value)
         q, r, J, value = q + step, new, J_new, lower
     covariance, condition = _spread(leg, r, J, space, robust)
+    # of right minus left: by scatter, and by the bend of any track
+    reach, parts = np.linalg.norm(J[:, 2]), float(np.linalg.norm(J[:, 1] - J[:, 0])) / 2
+    bent = BENT * reach / max(parts, 1e-12)
     return LeastSquares(space.T @ q, value, iterations, settled, covariance, condition,
-                        _sigma_difference(J, covariance))
+                        float(np.sqrt(DIFFERENCE @ covariance @ DIFFERENCE + bent**2)))
 
 
 def _linear(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
@@ -128,13 +131,6 @@ def _spread(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
     to_x = space.T @ (vt.T / s)
     rows = (root * r).reshape(2, -1)
     return to_x @ to_x.T * ((rows**2).sum() / freedom * repeats(rows)), condition
-
-
-def _sigma_difference(J: Floats, covariance: Floats) -> float:
-    """Return the sigma of right minus left: by scatter, and by the bend of any track."""
-    reach, parts = np.linalg.norm(J[:, 2]), float(np.linalg.norm(J[:, 1] - J[:, 0])) / 2
-    bent = BENT * reach / max(parts, 1e-12)
-    return float(np.sqrt(DIFFERENCE @ covariance @ DIFFERENCE + bent**2))
 
 
 def repeats(rows: Floats) -> float:

@@ -20,6 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from odocal_ros.calib.drive import knots_of
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.dead_reckoning import forward_b, Track
 from odocal_ros.nav.rotations import arctan2, wrap
@@ -35,23 +36,18 @@ class PlanarLeg:
     """
     A leg of two wheels as input of the search; n, metres, (k, 2) east and north.
 
-    t : (k,) s, times of the fixes.   fixes_n : (k, 2).   sigma : (k,) m, of each axis of a fix.
-    left_n, right_n : (k, 2) sum of direction over the wheel's travel from the start to each fix,
-        m per m/unit of scale factor, with the configured heading.
-    start_n : (2,) antenna at the start, where every track begins.
-    scale_left, scale_right : start values, m per unit.
-    lever_n : (k, 2) motion of the antenna by turns about the odometer's point.
-    pieces : (c, 2) rows of fixes that are far enough apart for a course over ground.
+    left_n, right_n : sums of direction over the wheel's travel from the start to each fix, m per
+    m/unit of scale factor, with the configured heading.
     """
 
-    t: NDArray[np.float64]
-    left_n: NDArray[np.float64]
-    right_n: NDArray[np.float64]
-    fixes_n: NDArray[np.float64]
-    start_n: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    scale_left: float
-    scale_right: float
+    t: NDArray[np.float64]        # (k,) s, times of the fixes
+    left_n: NDArray[np.float64]   # (k, 2)
+    right_n: NDArray[np.float64]  # (k, 2)
+    fixes_n: NDArray[np.float64]  # (k, 2)
+    start_n: NDArray[np.float64]  # (2,) antenna at the start, where every track begins
+    sigma: NDArray[np.float64]    # (k,) m, of each axis of a fix
+    scale_left: float             # start value, m per unit
+    scale_right: float            # start value
     lever_n: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 2)))
     pieces: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
@@ -110,13 +106,7 @@ def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
         return np.empty((0, 2), np.int64)
     course_baseline = 10.0    # m, minimum path between two fixes for a course
     course_clear = 20.0    # fix sigmas, minimum as well: the sigma of a course is then 4 deg
-    need = max(course_baseline, course_clear * float(np.median(sigma)))
-    x, y = fixes_n.T.tolist()
-    ends = [0]
-    for k in range(1, len(x)):
-        a = ends[-1]
-        if (x[k] - x[a])**2 + (y[k] - y[a])**2 >= need**2:
-            ends.append(k)
+    ends = knots_of(fixes_n, max(course_baseline, course_clear * float(np.median(sigma))))
     return np.stack([ends[:-1], ends[1:]], -1).astype(np.int64)
 
 
@@ -125,14 +115,6 @@ def coefficients(sets: Floats) -> Floats:
     left, right, heading = np.asarray(sets, dtype=float).T
     return np.stack([left / 2, right / 2, np.ones_like(left), -np.cos(heading),
                      -np.sin(heading)], -1)
-
-
-def positions(leg: PlanarLeg, sets: Floats) -> Floats:
-    """Return the antenna's track at the fixes, m, for (m, 3) parameter sets: (m, k, 2)."""
-    mix = coefficients(sets)
-    body = mix[:, :3] @ leg.basis[0][:3] + 1j * (mix[:, :3] @ leg.basis[1][:3])
-    p = body * np.exp(1j * np.asarray(sets, dtype=float)[:, 2:])
-    return np.stack([p.real, p.imag], -1) + leg.start_n
 
 
 def squared_distances(leg: PlanarLeg, sets: Floats) -> Iterator[tuple[slice, Floats]]:
@@ -151,20 +133,14 @@ def squared_distances(leg: PlanarLeg, sets: Floats) -> Iterator[tuple[slice, Flo
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """
-    Criteria of m parameter sets, (m,) each.
+    """Criteria of m parameter sets, (m,) each."""
 
-    max, mean, rms : m, distance of track and fix.   loss : objective; the mean square, m^2, or
-    without unit if fixes are weighted.   course_mean, course_rms : rad, dead-reckoned direction
-    minus course over ground, counter-clockwise; NaN if the fixes give no course.
-    """
-
-    max: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    rms: NDArray[np.float64]
-    loss: NDArray[np.float64]
-    course_mean: NDArray[np.float64]
-    course_rms: NDArray[np.float64]
+    max: NDArray[np.float64]          # m, distance of track and fix
+    mean: NDArray[np.float64]         # m
+    rms: NDArray[np.float64]          # m
+    loss: NDArray[np.float64]         # the mean square, m^2, or without unit if fixes are weighted
+    course_mean: NDArray[np.float64]  # rad, direction minus course over ground; NaN: no course
+    course_rms: NDArray[np.float64]   # rad
 
     def row(self, k: int) -> dict[str, float | None]:
         """Return the criteria of one set for text and JSON, m and deg; None: no course."""

@@ -31,33 +31,22 @@ MOST_ROWS = 100      # judgement: of an array kept in calibration.json
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """
-    Result of the search; parameter sets are left and right scale (m per unit), heading (rad).
+    """Result of the search; sets are left and right scale (m per unit), heading (rad)."""
 
-    start : scales before, m per unit.   sets, scores : of the array's rows.
-    best : the row with the least mean distance (robust: loss), of equal ones the least maximum.
-    meets : its maximum and mean meet the required accuracy, None without one.
-    refined : by response surfaces.   direct : by least squares.   free : least squares with left
-    and right free; the same unless held.   held : the fixes do not separate left and right, and
-    their ratio is that of the start values.   before, after : criteria of the start values and
-    of the refined ones, one row each.
-    """
-
-    start: tuple[float, float]
+    start: tuple[float, float]  # scales before, m per unit
     ranges: Ranges
     design: Design
-    sets: NDArray[np.float64]
-    scores: Scores
-    best: int
-    meets: bool | None
-    held: bool
-    refined: Refined
-    direct: LeastSquares
-    free: LeastSquares
+    sets: NDArray[np.float64]   # of the array's rows
+    scores: Scores              # of these sets
+    best: int  # row with the least mean distance (robust: loss), of equal ones the least maximum
+    held: bool  # the fixes do not separate left and right: their ratio is as at the start
+    refined: Refined            # by response surfaces
+    direct: LeastSquares        # by least squares
+    free: LeastSquares          # the same with left and right free
     refined_set: NDArray[np.float64]
     direct_set: NDArray[np.float64]
-    before: Scores
-    after: Scores
+    before: Scores              # of the start values, one row
+    after: Scores               # of the refined ones
     reasons: tuple[Reason, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -68,13 +57,14 @@ class SearchResult:
             shown = np.sort(np.argsort(self.scores.mean, kind='stable')[:MOST_ROWS])
         return {
             'ranges': [{'parameter': n, 'half': float(_deg(k, h)), 'at_the_end': float(
-                _deg(k, w)), 'unit': _unit(k), 'why': y} for k, (n, h, w, y) in enumerate(zip(
+                _deg(k, w)), 'unit': 'deg' if n == 'heading' else '1', 'why': y}
+                for k, (n, h, w, y) in enumerate(zip(
                     NAMES, self.ranges.half, r.half, self.ranges.why, strict=True))],
             'array': {'name': self.design.name, 'rows': len(self.sets),
                       'imbalance': 0.0,
                       'shown': [_set(self.sets[k]) | self.scores.row(k) for k in shown.tolist()]},
             'best_row': _set(self.sets[self.best]) | self.scores.row(self.best),
-            'meets_accuracy': self.meets,
+            'meets_accuracy': None,
             'left_and_right_held_together': self.held,
             'heading_means': HEADING_MEANS,
             'response_surface': _set(self.refined_set) | {
@@ -95,10 +85,6 @@ def _deg(k: int, value: float) -> float:
     return np.rad2deg(value) if NAMES[k] == 'heading' else value
 
 
-def _unit(k: int) -> str:
-    return 'deg' if NAMES[k] == 'heading' else '1'
-
-
 def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
@@ -108,19 +94,12 @@ def _set(parameters: Floats) -> dict[str, float]:
     return {'scale_left': left, 'scale_right': right, 'heading_deg': float(np.rad2deg(heading))}
 
 
-def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
-           accuracy: tuple[float, float] | None = None) -> SearchResult | None:
+def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False) -> SearchResult | None:
     """
-    Search left scale, right scale and heading.
+    Search left scale, right scale and heading; None with fewer than four fixes.
 
-    leg : tracks and fixes; its start values are the middle of the ranges.   ranges : search
-    ranges.   robust : weight fixes by their sigma and limit the influence of outliers.
-    accuracy : required (maximum, mean) distances, m.
-
-    Returns
-    -------
-    SearchResult; None with fewer than four fixes.
-
+    leg : tracks and fixes; its start values are the middle of the ranges.   robust : weight fixes
+    by their sigma and limit the influence of outliers.
     """
     if len(leg.t) < 4:
         return None
@@ -129,8 +108,6 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
     sets = sets_of(leg, x)
     scores = score(leg, sets, robust)
     best = int(np.lexsort((scores.max, scores.loss if robust else scores.mean))[0])
-    meets = None if accuracy is None else bool(
-        scores.max[best] <= accuracy[0] and scores.mean[best] <= accuracy[1])
     free = direct = least_squares(leg, x[best], Space(held=False), robust)
     held = not _separable(free, ranges)
     space = Space(held)
@@ -139,8 +116,8 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
     refined = _refined(leg, x[best], ranges, space, robust)
     refined_set, direct_set = (_wrapped(sets_of(leg, found.x)[0]) for found in (refined, direct))
     return SearchResult(
-        (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, meets, held,
-        refined, direct, free, refined_set, direct_set, score(leg, leg.start, robust),
+        (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, held, refined,
+        direct, free, refined_set, direct_set, score(leg, leg.start, robust),
         score(leg, refined_set, robust), _reasons(ranges, refined, direct, free, held))
 
 
@@ -162,11 +139,8 @@ def _wrapped(parameters: Floats) -> Floats:
 
 
 def _separable(free: LeastSquares, ranges: Ranges) -> bool:
-    """
-    Return True if the fixes constrain the wheel difference better than the range.
-
-    The range is twice the stated error of each wheel, which gives the sigma of the difference.
-    """
+    """Return True if the fixes constrain the wheel difference better than the range."""
+    # which is twice the stated error of each wheel: the sigma of the difference
     return free.sigma_difference <= float(np.hypot(*ranges.half[:2])) / 2
 
 

@@ -66,16 +66,11 @@ def sets_of(leg: PlanarLeg, x: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """
-    Search ranges about the start values.
+    """Search ranges about the start values."""
 
-    half : (3,) of left and right (relative) and heading (rad).   why : the source of each.
-    levels : number of levels of each.
-    """
-
-    half: NDArray[np.float64]
-    why: tuple[str, str, str]
-    levels: int
+    half: NDArray[np.float64]  # (3,) of left and right (relative) and heading (rad)
+    why: tuple[str, str, str]  # the source of each
+    levels: int                # number of levels of each
 
     def values(self, rows: Ints) -> Floats:
         """Return x of the rows of an array: equal steps from -half to half."""

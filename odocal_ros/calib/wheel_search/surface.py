@@ -22,37 +22,26 @@ from odocal_ros.data.arrays import Bools, Floats
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """
-    A fitted polynomial, value + gradient y + y hessian y / 2, of y in [-1, 1] in each coordinate.
-
-    r_squared, lack_of_fit : share of the variance explained; largest residual over the range of
-    the values.
-    """
+    """A fitted polynomial: value + gradient y + y hessian y / 2, of y in [-1, 1]."""
 
     value: float
     gradient: NDArray[np.float64]
     hessian: NDArray[np.float64]
-    r_squared: float
-    lack_of_fit: float
+    r_squared: float    # share of the variance explained
+    lack_of_fit: float  # largest residual over the range of the values
 
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """
-    Result of the search by surfaces.
+    """Result of the search by surfaces."""
 
-    x : (3,) left, right (relative), heading (rad).   value : of the criterion there.
-    half : (3,) last half range.   widened : it was increased.
-    on_edge : the minimum is still on its edge.   first, last : surfaces.
-    """
-
-    x: NDArray[np.float64]
-    value: float
+    x: NDArray[np.float64]     # (3,) left, right (relative), heading (rad)
+    value: float               # of the criterion there
     iterations: int
     settled: bool
-    half: NDArray[np.float64]
-    widened: bool
-    on_edge: bool
+    half: NDArray[np.float64]  # (3,) last half range
+    widened: bool              # it was increased
+    on_edge: bool              # the minimum is still on its edge
     first: Surface
     last: Surface
 

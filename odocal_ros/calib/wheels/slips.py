@@ -62,11 +62,6 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
     approximate scale of the mean.   track_width : m, 0 unknown.   doubt_t : (d,) s, times of
     travel that is uncertain for other reasons (gaps, resets).   max_deviation : limit of the ratio
     of the counts minus one.   count : number of wheels in the mean.
-
-    Returns
-    -------
-    Reasons (WHEELS_SWAPPED, WHEEL_COUNTERS_DIFFER, WHEEL_SLIP), and WheelSlips.
-
     """
     two = pair(axle, imu, between, SLIP_GRID,
                np.empty(0) if doubt_t is None else doubt_t)
@@ -101,11 +96,8 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
 
 
 def _level(two: Pair, apart: Floats, quantum_m: float) -> Floats:
-    """
-    Return the difference of the paths, m, without the slope it has on most of the drive.
-
-    Slopes by rounding at a steady speed, at most two counts over a window, are not removed.
-    """
+    """Return the difference of the paths, m, without its slope on most of the drive."""
+    # slopes by rounding at a steady speed, at most two counts over a window, are not removed
     path, n = _path(two), 200     # steps of a slope, 20 s: longer than most slips
     run, climb = path[n:] - path[:-n], apart[n:] - apart[:-n]
     if len(run) < n:
@@ -127,12 +119,7 @@ def _without(two: Pair, events: list[Event]) -> Pair:
 
 def _events(two: Pair, apart: Floats, quantum_m: float,
             width: float) -> tuple[list[Event], list[Event]]:
-    """
-    Return (begin, end, size) of the jumps of the difference: s, s, m, in order.
-
-    First those that end, then those that may be a change of the ratio.   apart : m, difference of
-    the wheels minus turn and ratio; the slope of most of the path is removed here.
-    """
+    """Return the jumps of the difference that end, and those that may change the ratio."""
     apart = _level(two, apart, quantum_m)
     total = np.append(0.0, np.cumsum(apart))
     mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
@@ -227,12 +214,9 @@ def _measured(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Floats,
 
 def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
            latitude: float, event: Event) -> int:
-    """
-    Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it.
-
-    A slip of the right wheel by x moves the mean by x / 2 relative to the IMU, one of the left by
-    -x moves it by -x / 2. The noise of their odds is the difference of mean and IMU elsewhere.
-    """
+    """Return the wheel that slipped: -1 left, +1 right, or 0 if acceleration does not show it."""
+    # a slip of the right wheel by x moves the mean by x / 2 relative to the IMU, one of the left
+    # by -x by -x / 2; the noise of their odds is the difference of mean and IMU elsewhere
     begin, end, size = event
     grid = np.arange(max(track.t[0], two.t[0]), min(track.t[-1], two.t[-1]), SPIN_GRID)
     beside = 1.0        # s each side of a slip, in which speeds are set equal

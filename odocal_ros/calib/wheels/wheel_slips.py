@@ -24,21 +24,14 @@ def _none(kind: type = float) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class WheelSlips:
-    """
-    Slips of single wheels, in order of time.
+    """Slips of single wheels, in order of time: (k,)."""
 
-    begin, end : (k,) s.   size : (k,) m, > 0 if the wheel travelled farther than the vehicle (for
-    an unknown wheel: right minus left).   wheel : (k,) -1 left, +1 right, 0 unknown.
-    change : of the ratio right over left during the drive, as the equivalent at half the path.
-    count : number of wheels in the mean.
-    """
-
-    begin: NDArray[np.float64] = _none()
-    end: NDArray[np.float64] = _none()
-    size: NDArray[np.float64] = _none()
-    wheel: NDArray[np.int64] = _none(np.int64)
-    change: float = 0.0
-    count: int = 2
+    begin: NDArray[np.float64] = _none()  # s
+    end: NDArray[np.float64] = _none()    # s
+    size: NDArray[np.float64] = _none()   # m, > 0: farther; unknown wheel: right minus left
+    wheel: NDArray[np.int64] = _none(np.int64)  # -1 left, +1 right, 0 unknown
+    change: float = 0.0  # of the ratio right over left in the drive, as if at half of it
+    count: int = 2                        # number of wheels in the mean
 
     @property
     def t(self) -> Floats:

@@ -80,14 +80,10 @@ def swapped(two: Pair, width: float, sigma: float, track_width: float) -> tuple[
 def changed(two: Pair, signals: Floats, metres_per_unit: float,
             count: int) -> tuple[tuple[Reason, ...], float]:
     """
-    Return a reason if the wheels' ratio differs before and after a place of the path.
+    Return a reason if the wheels' ratio differs before and after a place of the path, and by what.
 
-    count : number of wheels in the mean.
-
-    Returns
-    -------
-    Reasons; the change of the ratio, at half the path, that sigmas must include, 0 for none.
-
+    The change at half the path, that sigmas must include, 0 for none.   count : number of wheels
+    in the mean.
     """
     path = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
     best = (0.0, 0.0, 0.0, 0)

@@ -56,11 +56,8 @@ class Axle:
         return speed
 
     def _slope(self) -> Floats:
-        """
-        Return the slope of the road in each interval from the vertical velocity: (K,) rad.
-
-        The attitude contains the pitch mounting angle, which would then depend on itself.
-        """
+        """Return the slope of the road in each interval from the vertical velocity: (K,) rad."""
+        # not by the attitude, which contains the pitch mounting angle
         speed, rise = self._ahead(self.v_n), self.v_n[:, 2]
         ahead = speed[1:] + speed[:-1]
         return (rise[1:] + rise[:-1]) * ahead / np.maximum(ahead**2, (2 * WALK_SPEED)**2)
@@ -103,11 +100,7 @@ class Axle:
 
 
 def varies_with(speed: Floats, t: Floats, faster: Floats) -> Floats:
-    """
-    Return the signals that change the scale, as TYRES, docs/method.md (S11): (..., 4).
-
-    t : s since the begin of the leg.
-    """
+    """Return the signals that change the scale, as TYRES, (S11): (..., 4); t : s of the leg."""
     # m/s^2, 1/m: acceleration that rolling and air resistance take from a car at constant speed
     force = faster + 0.1 + 1e-4 * speed**2
     warm = WARM_TIME * (1 - np.exp(-t / WARM_TIME))

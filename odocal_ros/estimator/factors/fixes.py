@@ -65,11 +65,7 @@ class Fixes(PointRows):
         return self.raw + s[self.k] * (1 - share) + s[self.k + 1] * share
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
-        """
-        Return derivatives of the residual: (m, 3, n) by the keyframe before, (m, 3, M).
-
-        Those by the correlated errors are -(1 - share) before, -share after.
-        """
+        # those by the correlated errors are -(1 - share) before, -share after
         tau = self.points.tau[:, None, None]
         m = len(tau)
         one = np.broadcast_to(np.eye(3), (m, 3, 3))
@@ -97,20 +93,17 @@ class Fixes(PointRows):
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        """Return initial and minimum levels, factors on the stated variances."""
         least = (problem.fix_least / problem.fix_sigma)**2
         return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
 
     @classmethod
     def times(cls, problem: Problem, constants: Floats) -> Floats:
-        """Return the times of validity of the used fixes, s."""
         t = problem.leg.t_fix[problem.use]
         # the delay is that at the start mark
         out: Floats = t - constants[layout.GNSS_DELAY] - constants[layout.GNSS_CLOCK] * t
         return out
 
     def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        """Return some rows divided by the sigmas that the receiver states."""
         return self.root[some] @ rows
 
     def known(self) -> Bools:

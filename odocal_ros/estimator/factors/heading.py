@@ -53,7 +53,6 @@ class HeadingRows(OutsideRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Heading | None:
-        """Return the configured heading, else that of the heading topic."""
         asked, alignment = config.alignment.heading_source, config.alignment
         if not np.isnan(alignment.heading) and asked in ('auto', 'fixed'):
             yaw = yaw_from_heading(alignment.heading) + convergence(inputs, np.zeros(1), origin)
@@ -70,12 +69,10 @@ class HeadingRows(OutsideRows):
 
     @staticmethod
     def prior_sigmas(sent: Heading, config: Config) -> float:
-        """Return the prior sigma of its error."""
         return sent.sigma
 
     @classmethod
     def details(cls, sent: Heading, constants: Floats, sigma: Floats) -> dict[str, Any]:
-        """Return its source, the stated sigma and the estimated error."""
         return {'source': sent.said_by, 'sigma_stated': sent.sigma,
                 'error': float(constants[HEADING]), 'error_sigma': float(sigma[HEADING])}
 

@@ -86,11 +86,7 @@ class IntervalNoise:
         return out
 
     def grown(self, by: dict[str, float]) -> Floats:
-        """
-        Return the factors of the variances by new levels: (K, 7).
-
-        Of the road forward, left, up, and of IMU.
-        """
+        """Return the factors of the variances by new levels, of the road and of IMU: (K, 7)."""
         out = np.ones((len(self.road), JUMP))
         out[:, IMU_NOISE] = [by[name] for name in IMU]
         for column, (name, axis) in enumerate(ROAD.items()):
@@ -172,11 +168,8 @@ def rest_noise(speed: Floats, rest: Bools) -> float:
 
 
 def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
-    """
-    Return masks of the intervals with acceleration or braking, and with turns: (K,) bool each.
-
-    Above 0.5 m/s^2, where a wheel may slip, and TURNING_RATE, where it may slide.
-    """
+    """Return masks of the intervals with acceleration or braking, and with turns: (K,) each."""
+    # above 0.5 m/s^2 a wheel may slip, above TURNING_RATE it may slide
     T = motion.T[:, 0]
     speed = np.einsum('ki,ki->k', motion.displacement, (motion.f_n + motion.f_n_end) / 2) \
         / motion.state.scale / T
@@ -211,12 +204,9 @@ def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
 
 
 def _in_gaps(stamp: Floats, travel: Travel, scale: float) -> Floats:
-    """
-    Return variances of travel that is interpolated across gaps of the odometer: (K,) m^2.
-
-    A speed that rises and falls within a gap differs from the mean speed by up to half the gap
-    times its acceleration. An interval contains at most the travel of the whole gap.
-    """
+    """Return variances of travel that is interpolated across gaps of the odometer: (K,) m^2."""
+    # a speed that rises and falls within a gap differs from the mean by up to half the gap times
+    # its acceleration; an interval contains at most the travel of the whole gap
     variance = np.zeros(len(stamp) - 1)
     for begin, end in gaps_in_rhythm(travel.t):
         inside = (stamp[1:] > begin) & (stamp[:-1] < end)

@@ -153,11 +153,7 @@ class Motion:
         return self.pitched @ self.state.constants[PITCH_CENTRE]
 
     def _vary(self) -> Floats:
-        """
-        Return the change of the scaled forward axis in each interval, (K, 3): (S11), (S12).
-
-        Also sets the signals and the factor of the scale.
-        """
+        """Return the change of the scaled forward axis, (K, 3), (S11), (S12); set its signals."""
         state, T, c = self.state, self.T, self.state.constants
         self.pushed = self.axle.accelerations()
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
@@ -180,13 +176,9 @@ class Motion:
         return state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
     def _inclined(self, straight: Floats) -> Floats:
-        """
-        Return the ratio of the travelled path to its projection on the body axis: (K,).
-
-        The odometer counts the path along the ground, independent of the body pitch by sway or
-        bumps. Both projections are shorter by the cosine of their angle. Also sets the attributes
-        that ``_by_slope`` uses. straight : (K, 3) the path along the body in n, m.
-        """
+        """Return the path over its projection on the body axis, (K,); set those of its slope."""
+        # the odometer counts the path along the ground, independent of the body pitch by sway or
+        # bumps; both projections are shorter by the cosine of their angle
         axis = (self.C + self.C_end) / 2
         self.up_n, ahead = axis @ self.up, axis @ self.state.forward
 

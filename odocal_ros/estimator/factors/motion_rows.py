@@ -58,7 +58,6 @@ class MotionRows(Factor):
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        """Return initial and minimum levels, of the IMU by its standstills, and of the road."""
         imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
         imu |= at_rest(problem.imu, problem.leg, problem.still)
         slide, road = least_slide(problem.turned)**2, 0.01**2      # m^2/s, initial
@@ -159,15 +158,10 @@ class MotionRows(Factor):
     def step_sides(self, at: Ints, constants: Sequence[int]) -> tuple[Floats, Floats, Floats,
                                                                       Floats]:
         """
-        Return the right-hand sides of steps of constants from intervals on, docs/method.md (S27c).
+        Return the right-hand sides of steps of constants from (p,) intervals on, (S27c).
 
-        at : (p,) intervals.   constants : c indices.
-
-        Returns
-        -------
         g_i by the keyframes, (N, n, c p), and by the constants, (m, c p); C' R^-1 C, (c p, c p),
         and C' R^-1 r, (c p,), of the columns C; those of one constant are adjacent.
-
         """
         n, L = self.n, len(at) * len(constants)
         chain, border = room(len(self.r) + 1, n, L), np.zeros((self.m, L))
@@ -186,11 +180,8 @@ class MotionRows(Factor):
         return chain, border, square, score
 
     def _noises(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
-        """
-        Return the estimates of the unit noises and their expected variances.
-
-        (K, c) each; computed once for one ``marginals``, since levels and slips both use them.
-        """
+        """Return the estimates of the unit noises and their expected variances: (K, c) each."""
+        # once for one ``marginals``: levels and slips both use them
         if self._found is None or self._found[0]() is not marginals:
             estimates, variances = np.empty((2, len(self.r), len(self.noise.component)))
             for rows in blocks(len(self.r)):
@@ -202,7 +193,6 @@ class MotionRows(Factor):
         return self._found[1:]
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        """Yield the effects of the unit noises of each level."""
         units, given = [], []
         for rows, block in zip(blocks(len(self.r)), marginals.blocks(), strict=True):
             cross = self.with_wanted(block)
@@ -216,24 +206,14 @@ class MotionRows(Factor):
             yield SpeedSteps.source, np.concatenate(given)
 
     def road_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
-        """
-        Return the odometer's noise in each interval, forward, sideways, up: (K, 3) each.
-
-        First the estimate in its own sigmas, second its expected variance: the observable part
-        of 1.
-        """
+        """Return estimates, in sigmas, of noise forward, left, up, and variances: (K, 3) each."""
         estimate, seen = self._noises(marginals)
         columns = [self.of(*names) for names in ODOMETER_AXES]
         return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
                 np.stack([seen[:, c].sum(axis=1) for c in columns], -1))
 
     def imu_noise(self, marginals: JointMarginals) -> tuple[Floats, Floats]:
-        """
-        Return the noises of the IMU in each interval: (K, 4) each.
-
-        First the norm of the estimates of all unit noises, second the expected variance of the
-        one that is observed best.
-        """
+        """Return norms of the IMU's noises, and variances of the best observed: (K, 4) each."""
         estimate, seen = self._noises(marginals)
         columns = [self.of(name) for name in IMU]
         return (np.stack([np.linalg.norm(estimate[:, c], axis=1) for c in columns], -1),

@@ -65,7 +65,6 @@ class OutsideRows(PointRows):
 
     @classmethod
     def there(cls, problem: Problem) -> bool:
-        """Return True if there are any."""
         return cls.name in problem.outside
 
     @classmethod
@@ -74,7 +73,6 @@ class OutsideRows(PointRows):
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        """Return first levels, factors on stated variances, and their least."""
         return dict.fromkeys(cls.levels_of, 1.0), cls.least(problem.outside[cls.name])
 
     @staticmethod
@@ -83,11 +81,9 @@ class OutsideRows(PointRows):
         raise NotImplementedError
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
-        """Return derivatives by the keyframe before and by constants: (m, d, n), (m, d, M)."""
         J = self._rows.J
         return np.pad(J, ((0, 0), (0, 0), (0, n - BARE))), self._rows.c
 
     def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        """Return some rows, (k, d, c), in the sigmas that the sensor states."""
         out: Floats = rows * self._rows.root[some, :, None]
         return out

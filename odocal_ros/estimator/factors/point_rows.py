@@ -148,11 +148,7 @@ class PointRows(Factor):
             out.g[present + 1, SLOW] -= (np.swapaxes(B, 1, 2) @ r)[:, :, 0]
 
     def _intervals(self) -> Iterator[tuple[Ints, Gather]]:
-        """
-        Yield the intervals that have rows, some at a time, and a function that groups rows.
-
-        The function pads rows (m, d, c) to (intervals, d most, c).
-        """
+        """Yield the intervals that have rows, some at a time, and a function that groups rows."""
         present, first, count = np.unique(self.k, return_index=True, return_counts=True)
         for some in blocks(len(present)):
             counts, most = count[some], count.max()
@@ -209,7 +205,6 @@ class PointRows(Factor):
         return taken.reshape(len(present), -1, self.r.shape[1])
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        """Yield the effect of a unit error of each row."""
         own, end = self._columns()
         parts = []
         for present, gather in self._intervals():

@@ -52,7 +52,6 @@ class PressureRows(OutsideRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Pressure | None:
-        """Return heights as means over seconds."""
         sent, t = inputs.outside['pressure']
         if not (config.imu.use_pressure and len(t) and inputs.has_accelerometer):
             return None
@@ -68,7 +67,6 @@ class PressureRows(OutsideRows):
 
     @staticmethod
     def prior_sigmas(sent: Pressure, config: Config) -> Floats:
-        """Return the prior sigmas of zero, weather, dynamic pressure, temperature: (4,)."""
         return np.array(PRIOR_SIGMAS)
 
     @staticmethod

@@ -64,7 +64,6 @@ class PriorRows(Factor):
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        """Return initial and minimum sizes of imperfections, in squares of the usual one."""
         return dict.fromkeys(SIZES, SIZE), dict.fromkeys(SIZES, 1e-6)
 
     def weigh(self, levels: Levels) -> None:
@@ -100,7 +99,6 @@ class PriorRows(Factor):
         return dict(zip(SIZES, np.where(spread > 1, likely, mean).tolist(), strict=True))
 
     def add_levels(self, out: LevelSides) -> None:
-        """Add the right-hand sides of the sizes."""
         columns = out.at(SIZES)
         off = self._constants_off()[layout.IMPERFECT]
         sigma = self.priors.constants[layout.IMPERFECT]
@@ -118,7 +116,7 @@ class PriorRows(Factor):
         return self.state.constants - self.priors.centre
 
     def add(self, out: Normal) -> None:
-        """Add the rows to normal equations; the first keyframe has a wide prior at its value."""
+        # the first keyframe has a wide prior at its value
         for columns, sigma in START_SIGMAS.values():
             add_prior(out, 0, columns, sigma**2, 0.0)
         if self.no_heights:
@@ -136,7 +134,6 @@ class PriorRows(Factor):
         return out
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        """Yield the effects of the turn-on biases, and of constants of this leg alone."""
         first = self.with_wanted(marginals[0][None])[0]
         yield 'gyro_bias', first[:, layout.BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, layout.BA] / self.priors.accel_bias

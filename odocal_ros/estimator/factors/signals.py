@@ -78,12 +78,7 @@ class Signals:
 
     def _by_forces(self, part: Motion, columns: Floats, sway: Floats, residual: Floats,
                    of_gyro: Floats) -> None:
-        """
-        Correct the derivatives of velocity, or position, that are forces: columns (k, 3, a).
-
-        sway : (k, 3) road noise in b.
-        of_gyro : (k, 3, 3) effect of the gyro noise about each axis of b on the residual.
-        """
+        """Correct the derivatives of velocity, or position, that are forces: columns (k, 3, a)."""
         back = transpose(part.C)
         turned = back @ of_gyro      # towards an axis of b, about an axis of b
         own = turn(back, residual) - turned.sum(axis=2)

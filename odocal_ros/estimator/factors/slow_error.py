@@ -42,14 +42,12 @@ class SlowError(factor.Factor):
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        """Return initial levels by the stated sigmas of the fixes, and minimum levels."""
         gain = 2 * problem.fix_sigma**2 / USUAL_TIME
         return {'slow': gain, 'slow_up': 4 * gain}, {
             **dict.fromkeys(('slow', 'slow_up'), 2 * problem.fix_least**2 / USUAL_TIME),
             'correlation_time': 5.0}      # s: shorter times are not separable from white noise
 
     def in_use(self, levels: Levels) -> bool:
-        """Return True if correlated errors are estimated."""
         return levels.correlation_time > 0
 
     def weigh(self, levels: Levels) -> None:
@@ -116,13 +114,9 @@ class SlowError(factor.Factor):
                          for x in (z, seen)])
 
     def _time(self, product: Floats, excess: Floats, begin: Floats) -> tuple[float, float]:
-        """
-        Return the score of the logarithm of the correlation time and its information, as a level.
-
-        By Fisher's identity the score is the expected score of the complete data. product :
-        (K, 3) m^2, driving noise times the value before; excess : (K, 3) and begin : (3,) squares
-        of the driving noise and of the first value over their variances, less 1: expected values.
-        """
+        """Return the score of the logarithm of the correlation time and its information."""
+        # by Fisher's identity the expected score of the complete data. Expected: product, driving
+        # noise times the value before; excess, begin: squares of noise and first value, less 1
         a, tau, da, dq = self.decay, self.levels.correlation_time, self.da, self.dq
         score = float((product * da / self.drive + excess * dq / 2).sum() + begin.sum() / 2
                       - np.log(tau / USUAL_TIME) / TIME_SPREAD**2)
@@ -176,7 +170,6 @@ class SlowError(factor.Factor):
         return out
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        """Yield the effects of unit driving noise and of the first value."""
         cross, n = self.all_with_wanted(marginals), self.n
         end = slice(n + SLOW.start, n + SLOW.stop)
         push = cross[:, :, end] - self.decay[:, :, None] * cross[:, :, SLOW]

@@ -68,7 +68,6 @@ class SpeedSteps(PointRows):
 
     @classmethod
     def there(cls, problem: Problem) -> bool:
-        """Return True if the odometer publishes a coarse speed."""
         return problem.leg.by_steps and len(_within(problem).t) > 0
 
     @classmethod
@@ -82,19 +81,13 @@ class SpeedSteps(PointRows):
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        """
-        Return the first level, a factor on the variances by the grid, and the least.
-
-        The least is a quarter of the variance: real transitions are not more regular.
-        """
+        # factors on the variances by the grid: real transitions are no more regular
         return {'steps': 1.0}, {'steps': 0.25}
 
     def stated(self, rows: Floats, some: slice = slice(None)) -> Floats:
-        """Return some rows in the sigmas that the grid gives."""
         return rows / self.sigma[some, None, None]
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
-        """Return derivatives by the keyframe before and by constants: (m, 1, n), (m, 1, M)."""
         state, ahead, v = self.state, self.ahead, self.v_n
         J, c = np.zeros((len(v), n)), np.zeros((len(v), layout.M))
         J[:, layout.V], J[:, layout.PHI] = -ahead, -np.cross(ahead, v - self.dv)

@@ -27,7 +27,6 @@ class TravelError(Factor):
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        """Return the level of rounding to a count, initial and minimum."""
         leg = problem.leg
         least = LEAST.travel / leg.rough_scale
         level = {'travel': max(leg.travel.quantum**2 / 12, least**2)}
@@ -47,7 +46,6 @@ class TravelError(Factor):
         return out
 
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
-        """Return the quadratic sum and its expectation for the level, in motion."""
         e, moving = self.variance, ~self.still
         spread = marginals.variances()[:, E]
         x = self.state.travel_error[moving]
@@ -60,7 +58,6 @@ class TravelError(Factor):
         out.square[i, i] += g @ self.state.travel_error
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        """Yield the effect of a unit error of each reading."""
         cross = self.all_with_wanted(marginals)
         root = np.sqrt(self.weight / self.variance)
         travel = np.concatenate([cross[:, :, E], cross[-1:, :, self.n + E]]) * root[:, None]
@@ -68,11 +65,7 @@ class TravelError(Factor):
 
 
 def once_a_rest(still: Bools) -> Floats:
-    """
-    Return the weight of the prior of the rounding error at each keyframe, (N,).
-
-    The error is constant at a standstill: its keyframes together have the weight of one.
-    """
+    """Return the weights of rounding errors, (N,): 1 for all keyframes of a standstill."""
     starts = np.flatnonzero(np.diff(still, prepend=False) & still)
     stops = np.flatnonzero(np.diff(still, append=False) & still) + 1
     weight = np.ones(len(still))

@@ -52,7 +52,6 @@ class VelocityRows(OutsideRows):
 
     @classmethod
     def prepared(cls, inputs: Inputs, config: Config, origin: Origin) -> Velocity | None:
-        """Return the velocity of the antenna, in n."""
         sent, t = inputs.outside[cls.source]
         # without an accelerometer its change between keyframes is unknown
         if not (config.gnss.use_velocity and len(t) and inputs.has_accelerometer):
@@ -66,7 +65,6 @@ class VelocityRows(OutsideRows):
 
     @staticmethod
     def prior_sigmas(sent: Velocity, config: Config) -> Floats:
-        """Return the prior sigmas of delay, square of the lag, and scale: (3,)."""
         gnss = config.gnss
         return np.array([np.hypot(TIME_SIGMA, gnss.time_sigma), LAG2_SIGMA,
                          max(gnss.velocity_scale_sigma, 1e-6)])
@@ -121,7 +119,7 @@ class VelocityRows(OutsideRows):
 
     @classmethod
     def first_levels(cls, problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
-        """Return the first level, of residuals before the delay is known, and the least."""
+        # before the delay is known, residuals are larger
         first, least = super().first_levels(problem)
         sent = problem.outside[cls.name]
         assert isinstance(sent, Velocity)

@@ -40,8 +40,9 @@ def exported(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMarginals,
     rate = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate))[moving]
     t, coarse = leg.travel.t, leg.travel.coarse
     within = (t >= leg.t_begin) & (t <= leg.t_stop)
+    least = 0.0 if leg.travel.quantum else problem.least['travel']      # no reading error
     odometer = {
-        'reading': _reading_sigma(leg, problem, fit),
+        'reading': float(np.sqrt(max(fit.levels['travel'] - least, 0.0))),
         'period': float(np.median(np.diff(t[within]))),
         'speed_step': coarse.step if coarse else 0.0,
         'hard': float(hard_and_turning(motion)[0][moving].mean()),
@@ -53,13 +54,6 @@ def exported(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMarginals,
     return {'odometer': odometer} | ({'accelerometer_bias': {
         axis: {'value': float(value), 'sigma': float(s), 'ratio': float(ratio)}
         for axis, value, s, ratio in biases}} if leg.has_accelerometer else {})
-
-
-def _reading_sigma(leg: SmootherLeg, problem: Problem, fit: Fit) -> float:
-    """Return the sigma of a reading of the odometer, 0 if the fit has only its lower limit."""
-    level = fit.levels['travel']
-    limit = 0.0 if leg.travel.quantum else problem.least['travel']
-    return float(np.sqrt(max(level - limit, 0.0)))
 
 
 def as_sent(leg: SmootherLeg, state: State, covariance: Floats) -> dict[str, Estimate]:

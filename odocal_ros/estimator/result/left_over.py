@@ -35,37 +35,29 @@ def left_over(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, NDArray
     """
     Return the residuals of each sensor, fitted less measured, and the sigmas of its noise.
 
-    Returns
-    -------
-    dict of (n, 6) arrays, three residuals and their sigmas; NaN: no data. For each interval, at
-    its end: ``left_odometer`` along, left, up, m; ``left_gyro`` and ``left_accelerometer``, means
-    about x, y, z of b, rad/s and m/s^2. ``left_fix``, for each fix used, at ``left_fix_t``, s:
-    east, north, up, m, without the time-correlated error. Single precision, to save memory.
-
+    By name, (n, 6), three residuals and their sigmas; NaN: no data. For each interval, at its end:
+    ``left_odometer`` along, left, up, m; ``left_gyro`` and ``left_accelerometer``, means about x,
+    y, z of b, rad/s and m/s^2. ``left_fix``, for each fix used, at ``left_fix_t``, s: east, north,
+    up, m, without the time-correlated error. Single precision, to save memory.
     """
     rows = {**_of_intervals(fit), 'fix': _of_fixes(fit)}
     return {f'left_{name}': np.concatenate(pair, axis=1).astype(np.float32)
             for name, pair in rows.items()} | {'left_fix_t': leg.t_fix[problem.use]}
 
 
-def correlation(t: Floats, residual: Floats, width: float = 2.0) -> tuple[float, float]:
-    """
-    Return the correlation of adjacent bins of residuals, and its sigma for white residuals.
-
-    t : (m,) s.   residual : (m, c) in sigmas.   width : of a bin, s.
-    """
+def correlation(t: Floats, residual: Floats) -> float:
+    """Return the correlation of adjacent bins of 2 s of residuals; t : (m,) s, residual (m, c)."""
     if len(t) < 4:
-        return 0.0, 1.0
-    cell = np.floor((t - t[0]) / width).astype(int)
+        return 0.0
+    cell = np.floor((t - t[0]) / 2.0).astype(int)
     at, first = np.unique(cell, return_index=True)
     count = np.diff(np.append(first, len(t)))
     mean = np.add.reduceat(residual, first, axis=0) / np.sqrt(count)[:, None]
     beside = np.flatnonzero(np.diff(at) == 1)
     power = (mean**2).mean()
     if len(beside) < 5 or power == 0:
-        return 0.0, 1.0
-    return (float((mean[beside] * mean[beside + 1]).mean() / power),
-            float(1 / np.sqrt(residual.shape[1] * len(beside))))
+        return 0.0
+    return float((mean[beside] * mean[beside + 1]).mean() / power)
 
 
 def normalised(weighted: Weighted) -> dict[str, dict[str, float]]:

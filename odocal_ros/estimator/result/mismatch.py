@@ -214,11 +214,7 @@ def steps(leg: SmootherLeg) -> dict[str, float]:
 
 
 def quantised(leg: SmootherLeg, level: dict[str, float]) -> dict[str, float]:
-    """
-    Return the steps of those sensors whose noise their quantisation explains.
-
-    level : roots of the white noise levels of 'gyro' and 'accel', SI per sqrt(Hz).
-    """
+    """Return the steps of sensors whose noise they explain; level : white noise, as a root."""
     interval = float(np.median(np.diff(leg.t_imu[:SAMPLES])))
     return {name: step for name, step in steps(leg).items()
             if step**2 / 12 * interval > EXPLAINED * level[name]**2}

@@ -238,7 +238,6 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
     arm = state.C_bv @ motion.arm_v
     step = max(1, len(state.t) // KEPT_ROWS)
     t_fix = leg.t_fix[problem.use]
-    fix_correlation, _ = correlation(t_fix, fixes.r[:, :2])
     speed = np.linalg.norm(motion.displacement, axis=1) / motion.T[:, 0]
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)
                     * motion.T[:, 0]).sum()
@@ -253,7 +252,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         **{layout.CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
            for i in SCALES},
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
-                      'fix_correlation_2s': fix_correlation,
+                      'fix_correlation_2s': correlation(t_fix, fixes.r[:, :2]),
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
                       'fixes': len(t_fix), 'normalised': normalised(fit.weighted),
                       'intervals_slipping': int((fit.spread[:, 0] > slip.SLIP_VARIANCE).sum())},

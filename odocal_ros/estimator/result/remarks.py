@@ -59,12 +59,7 @@ SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms have the 
 
 
 def beside(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
-    """
-    Return additional figures by their names in calibration.json.
-
-    value, covariance : (M,), (M, M) of the constants.   grade : of the IMU, None
-    without an accelerometer.
-    """
+    """Return additional figures for calibration.json; grade : None without an accelerometer."""
     sigma = np.sqrt(np.diag(covariance))
     # scale_by_speed: the slope at FAST
     out: dict[str, Any] = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
@@ -84,12 +79,8 @@ def _figure(value: float, unit: str) -> dict[str, Any]:
 
 
 def _of_housing(found: float, found_sigma: float, sigma: float, misalignment: float) -> float:
-    """
-    Return the sigma of an angle relative to the housing, from that relative to the sensor axes.
-
-    The angle between them is one of two axis errors of equal size whose sum is ``found``: half of
-    ``found``, plus the remaining uncertainty of each.
-    """
+    """Return the sigma of an angle relative to the housing, from that to the sensor axes."""
+    # the angle between them is one of two axis errors of equal size whose sum is ``found``
     if not misalignment:
         return sigma
     posterior_share = min(1.0, found_sigma**2 / (2 * misalignment**2))
@@ -133,11 +124,7 @@ def beyond_fit(problem: Problem, fit: Fit, sigma: Floats) -> list[tuple[int, str
 
 def remarks(problem: Problem, fit: Fit, sigma: Floats, ratio: Floats,
             config: Config) -> list[Reason]:
-    """
-    Return reasons: filtered signals, a varying scale, deviations from configured values.
-
-    sigma : (M,) of the constants.   ratio : (M,) posterior sigma by that of the prior.
-    """
+    """Return reasons; sigma : (M,) of the constants; ratio : (M,) posterior to prior sigma."""
     c = fit.state.constants
     said = [*_noisy(problem, fit.levels), *_outlying(fit),
             *lag_reasons(c[layout.FIX_LAG2], sigma[layout.FIX_LAG2]),

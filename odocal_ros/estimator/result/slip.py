@@ -40,11 +40,7 @@ def along(fit: Fit, marginals: JointMarginals) -> Floats:
 
 
 def find_slips(fit: Fit, turned: Floats, count: float) -> tuple[Slip, ...]:
-    """
-    Return the runs with outliers along the path beyond a count, m, largest first.
-
-    turned : (K,) m, as ``along`` has it.
-    """
+    """Return the runs with outliers of ``along`` beyond a count, m, largest first."""
     t = fit.state.t
     least = max(4 * float(np.sqrt(fit.levels['along'])), LEAST_SLIP, count)    # sigmas of a second
     far = np.flatnonzero((fit.spread[:, 0] > SLIP_VARIANCE) | (np.abs(turned) > least))
@@ -78,11 +74,7 @@ def level_when_changing(fit: Fit, marginals: JointMarginals, count: float) -> st
 
 
 def slip_reasons(slips: tuple[Slip, ...], level: str) -> list[Reason]:
-    """
-    Return WHEEL_SLIP with places and sizes of slip, empty without slip.
-
-    level : of slip whenever the speed changes, in words.
-    """
+    """Return WHEEL_SLIP with places and sizes; level : of slip as the speed changes, as text."""
     said, most = [], 3      # runs listed singly
     if slips:
         one = [f'{s.metres:+z.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'

@@ -20,20 +20,14 @@ SWAY_TIME = 0.1      # s; judgement: a body does not change its sideways velocit
 
 @dataclass(frozen=True, eq=False)
 class TwistNoise:
-    """
-    Errors of the twist that calibrated wheels give over a message interval.
+    """Errors of the twist that calibrated wheels give over a message interval."""
 
-    period : s.   speed, turn_rate : rms of the drive in motion, m/s, rad/s.   fastest : highest
-    speed and turn rate.   legs : ``odometer``, levels and constants of each leg's fit.
-    estimates : of the calibration.
-    """
-
-    period: float
-    speed: float
-    turn_rate: float
-    fastest: tuple[float, float]
-    legs: tuple[dict[str, Any], ...]
-    estimates: dict[str, Estimate]
+    period: float                     # s
+    speed: float                      # m/s, rms of the drive in motion
+    turn_rate: float                  # rad/s, rms
+    fastest: tuple[float, float]      # highest speed and turn rate
+    legs: tuple[dict[str, Any], ...]  # ``odometer``, levels, constants of each leg's fit
+    estimates: dict[str, Estimate]    # of the calibration
 
     @property
     def has_turn_rate(self) -> bool:

@@ -28,37 +28,26 @@ TAIL_ROUNDS, TAIL_SETTLED = 8, 0.1
 
 @dataclass(frozen=True, eq=False)
 class Increments:
-    """
-    The observations y = X x + errors, in m.
+    """The observations y = X x + errors, in m."""
 
-    y : (k,).   X : (k, p).   prior : (p,) sigmas of x about ``centre``, (p,), inf: none.
-    reading : variance of the error at a node, m^2.   share : (k,) variance of the walk in each
-    increment at a level of 1.   kind : (k,) index of its level.   walk : first levels, m^2.
-    """
-
-    y: Floats
-    X: Floats
-    prior: Floats
-    centre: Floats
-    reading: float
-    share: Floats
-    kind: Ints
-    walk: Floats
+    y: Floats       # (k,)
+    X: Floats       # (k, p)
+    prior: Floats   # (p,) sigmas of x about ``centre``, inf: none
+    centre: Floats  # (p,)
+    reading: float  # m^2, variance of the error at a node
+    share: Floats   # (k,) variance of the walk in each increment at a level of 1
+    kind: Ints      # (k,) index of its level
+    walk: Floats    # m^2, first levels
 
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """
-    The line found.
+    """The line found."""
 
-    x : (p,).   covariance : (p, p).   levels : of the walk, m^2.   gain : (p, k) derivatives of x
-    by the increments.
-    """
-
-    x: Floats
-    covariance: Floats
-    levels: Floats
-    gain: Floats
+    x: Floats           # (p,)
+    covariance: Floats  # (p, p)
+    levels: Floats      # m^2, of the walk
+    gain: Floats        # (p, k) derivatives of x by the increments
 
 
 def fit_line(seen: Increments) -> Line:
@@ -84,11 +73,7 @@ def fit_line(seen: Increments) -> Line:
 
 def _solved(log_levels: Floats, seen: Increments,
             spread: Floats) -> tuple[Floats, Floats, float, Floats, Floats]:
-    """
-    Return x, its covariance, and twice the restricted likelihood negative.
-
-    Then the covariance of the increments and its root, upper form: (2, k) each.
-    """
+    """Return x, its covariance, -2 log likelihood, increments' covariance and root (banded)."""
     reading = seen.reading * np.exp(log_levels[-1])
     walk = (seen.walk * np.exp(log_levels[:-1]))[seen.kind] * seen.share * spread
     banded = np.empty((2, len(seen.y)))

@@ -50,20 +50,14 @@ WHEELBASE = 5.0         # m, 1 sigma of the distance of a steered wheel ahead. P
 
 @dataclass(frozen=True, eq=False)
 class Wheel:
-    """
-    A wheel relative to the mean.
+    """A wheel relative to the mean."""
 
-    ratio : K_i / K.   ratio_sigma : relative.   y : m to the left of the middle of all wheels.
-    y_sigma : m.   walk : m/sqrt(s), random walk relative to the mean: even, hard, in turns.
-    x, x_sigma : m, of a steered wheel ahead of the mean, None of one that does not steer.
-    """
-
-    ratio: float
-    ratio_sigma: float
-    y: float
-    y_sigma: float
-    walk: tuple[float, ...]
-    x: float | None = None
+    ratio: float             # K_i / K
+    ratio_sigma: float       # relative
+    y: float                 # m to the left of the middle of all wheels
+    y_sigma: float           # m
+    walk: tuple[float, ...]  # m/sqrt(s), relative to the mean: even, hard, in turns
+    x: float | None = None   # m, of a steered wheel ahead of the mean; None: it does not steer
     x_sigma: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -172,11 +166,7 @@ class _Common:
         return np.diff(np.interp(self.t, t, path))
 
     def line(self, i: int, delay: float, drift: float, width: float) -> Line:
-        """
-        Return the line of a wheel.
-
-        Unknown are a - 1, a y, own delay, common delay, drift of the turn; a x^2 if it steers.
-        """
+        """Return the line: a - 1, a y, own and common delay, drift; a x^2 if it steers."""
         y0 = self._left(i, width)
         X = np.stack([self.path, -self.turn, self.faster, y0 * self.turning, y0 * self.T], -1)
         taped = TRACK_WIDTH.taped_share * width / 2

@@ -1,0 +1,106 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Legs to combine: linear ones whose batch solution is known, and those of the smoother."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.border import Border
+from odocal_ros.calib.result import LegResult
+from odocal_ros.reasons import Reason
+
+NAMES = ('k', 'z0', 'z1', 'z2', 'z3')
+LEGS, STATES, ROWS = 5, 80, 130
+TRUTH = np.array([0.1, 0.3, -0.2, 0.05, 0.4])
+PRIOR = np.array([np.inf, 2.0, 0.5, 0.5, 1.0])
+STEPS = np.array([0.02, 0.0, 0.05, 0.01])
+
+
+class Toy:
+    """Legs of linear rows of unit variance: b = A (states) + B (constants) + noise."""
+
+    def __init__(self, rng, legs=LEGS, states=STATES, rows=ROWS):
+        self.A = rng.standard_normal((legs, rows, states))
+        self.B = rng.standard_normal((legs, rows, len(NAMES)))
+        self.B[:, :, 0] *= 100.0          # of ln K much is told
+        # one leg is blind to z0 and to z1 - z2, another to k
+        self.B[1, :, 1] = 0.0
+        self.B[1, :, 3] = -self.B[1, :, 2]
+        self.B[2, :, 0] = 0.0
+        self.draw(rng)
+
+    def draw(self, rng, constants=None):
+        """Draw the noise, and the states where it matters not."""
+        constants = np.tile(TRUTH, (len(self.A), 1)) if constants is None else constants
+        self.b = np.einsum('jrc,jc->jr', self.B, constants) + rng.standard_normal(self.B.shape[:2])
+        return self
+
+    def walk(self, rng, change=0.0, since=3):
+        """Draw with a random walk of the first constant, which also changes once."""
+        constants = np.tile(TRUTH, (len(self.A), 1))
+        constants[1:, 0] += np.cumsum(STEPS * rng.standard_normal(len(STEPS)))
+        constants[since:, 0] += change
+        return self.draw(rng, constants)
+
+    def border(self, j, about=None):
+        """Return the border of a leg, linearised somewhere."""
+        A, B, b = self.A[j], self.B[j], self.b[j]
+        about = TRUTH + 0.1 * j if about is None else about
+        free = B - A @ np.linalg.lstsq(A, B, rcond=None)[0]
+        return Border(NAMES, np.array(about, float), free.T @ free,
+                      free.T @ (b - B @ about), np.zeros(len(NAMES)), PRIOR, PRIOR)
+
+    def borders(self):
+        return [self.border(j) for j in range(len(self.A))]
+
+    def batch(self, steps=STEPS, own=()):
+        """
+        Return value and covariance of the last leg's constants by one dense fit of all rows.
+
+        own : (index, sigma) of constants that have an error of their own in each leg.
+        """
+        J, R, n = self.A.shape
+        z, k, d = J * n, J * n + len(NAMES) - 1, J * n + len(NAMES) - 1 + J
+        whole = np.zeros((J * R, d + J * len(own)))
+        for j in range(J):
+            rows = slice(j * R, (j + 1) * R)
+            whole[rows, j * n:(j + 1) * n] = self.A[j]
+            whole[rows, z:k] = self.B[j, :, 1:]
+            whole[rows, k + j] = self.B[j, :, 0]
+            for i, (which, _) in enumerate(own):
+                whole[rows, d + j * len(own) + i] = self.B[j, :, which]
+        more = np.zeros((len(PRIOR) - 1 + J - 1 + J * len(own), whole.shape[1]))
+        more[range(4), range(z, k)] = 1 / PRIOR[1:]
+        for j, step in enumerate(np.maximum(steps, 1e-7)):
+            more[4 + j, [k + j, k + j + 1]] = -1 / step, 1 / step
+        last = np.arange(J * len(own))
+        more[4 + J - 1 + last, d + last] = 1 / np.tile([s for _, s in own], J)
+        whole = np.concatenate([whole, more])
+        Q, T = np.linalg.qr(whole)
+        inverse = np.linalg.inv(T)
+        x = inverse @ (Q.T @ np.concatenate([self.b.ravel(), np.zeros(len(more))]))
+        at = [k + J - 1, *range(z, k)]
+        return x[at], (inverse @ inverse.T)[np.ix_(at, at)]
+
+
+def apart(a, b, covariance):
+    """Return the largest difference of two solutions, in sigmas."""
+    return np.abs((a - b) / np.sqrt(np.diag(covariance))).max()
+
+
+NO_SCATTER = 1e-9, 1e-9, 1e-9       # of ln K, yaw and pitch between legs
+
+
+def moved(result, name, by):
+    """Return a result whose border has another value of a constant."""
+    border = result.border
+    at = np.arange(len(border.names)) == border.names.index(name)
+    return replace(result, border=replace(border, value=border.value + by * at))
+
+
+def leg_result(method, number, *codes):
+    return LegResult(number * 10**12, number * 10**12 + 10**11, 1e3, 100.0, 1, 1, 1, 0,
+                     tuple(Reason(c, c.name) for c in codes), {'smoother': method},
+                     C_bi=np.eye(3))

@@ -1,0 +1,158 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The joint estimate of linear legs is one fit of all their rows, whatever each is blind to."""
+
+from dataclasses import replace
+
+from legs_to_combine import apart, LEGS, NAMES, PRIOR, STEPS, Toy, TRUTH
+import numpy as np
+import pytest
+
+from odocal_ros.calib.border import Border
+from odocal_ros.calib.joint import joint
+
+pytestmark = pytest.mark.slow
+USUAL = {'z3': 0.05}
+
+
+def of(borders, steps=STEPS, usual=None):
+    return joint(borders, steps, 'k', usual=usual)
+
+
+@pytest.fixture
+def toy():
+    return Toy(np.random.default_rng(1))
+
+
+def test_legs_are_one_fit_of_all_rows(toy):
+    found, (value, covariance) = of(toy.borders()), toy.batch()
+    assert not found.disputed
+    assert apart(found.value, value, covariance) < 1e-9
+    assert np.abs(found.covariance / covariance - 1).max() < 1e-6      # small ones beside large
+    sigma = np.sqrt(np.diag(covariance))
+    assert np.abs((found.covariance - covariance) / np.outer(sigma, sigma)).max() < 1e-9
+
+
+def test_errors_of_each_leg_alone_are_unknowns_of_the_fit(toy):
+    own = {'z0': 0.3, 'z3': 0.05}
+    value, covariance = toy.batch(own=[(NAMES.index(n), s) for n, s in own.items()])
+    found = of([b.loosened(own) for b in toy.borders()])
+    assert apart(found.value, value, covariance) < 1e-9
+
+
+def test_linearisation_and_order_of_legs_are_no_matter(toy):
+    moved = [toy.border(j, TRUTH - 0.2 * j) for j in range(LEGS)]
+    a, b = of(toy.borders()), of(moved)
+    assert apart(a.value, b.value, a.covariance) < 1e-9
+    assert a.chi2 == pytest.approx(b.chi2, rel=1e-6)
+    borders = toy.borders()
+    one = of(borders, np.zeros(LEGS - 1))
+    other = of([borders[j] for j in (3, 0, 4, 1, 2)], np.zeros(LEGS - 1))
+    assert apart(one.value, other.value, one.covariance) < 1e-6
+    assert one.chi2 == pytest.approx(other.chi2, rel=1e-6)
+
+
+def test_the_prior_counts_once(toy):
+    # next to no data: what is left is the prior, not a fifth of its variance
+    found = of([b.widened(1e5) for b in toy.borders()])
+    assert np.sqrt(np.diag(found.covariance))[1:] == pytest.approx(PRIOR[1:], rel=1e-3)
+
+
+def test_some_constants_of_a_leg_are_told_as_with_beliefs_about_the_rest(toy):
+    whole = toy.border(0)
+    believed = np.where(np.isin(NAMES, ('z1', 'z2')), 0.0, PRIOR**-2.0)
+    H = whole.information + np.diag(believed)
+    x = np.linalg.solve(H, whole.pull + whole.information @ whole.value)
+    some = whole.only(('z1', 'z2'))
+    C = np.linalg.inv(some.information)
+    assert some.names == ('z1', 'z2')
+    assert np.linalg.inv(H)[2:4, 2:4] == pytest.approx(C, rel=1e-9)
+    assert some.value + C @ some.pull == pytest.approx(x[2:4], abs=1e-9)
+
+
+def test_a_leg_without_information_changes_nothing(toy):
+    borders = toy.borders()
+    nothing = replace(borders[0], information=np.zeros((5, 5)), pull=np.zeros(5))
+    a, b = of(borders), of([nothing, *borders], [0.1, *STEPS])
+    assert apart(a.value, b.value, a.covariance) < 1e-9
+    # freedom is a sum of some twenty shares since priors are weighed: alike but for rounding
+    assert (a.freedom, a.chi2) == (pytest.approx(b.freedom, rel=1e-12),
+                                   pytest.approx(b.chi2, rel=1e-6))
+
+
+def test_sections_of_one_leg_are_one_leg(toy):
+    """With a scatter between legs, which they do not have: as without any."""
+    still = np.zeros(LEGS - 1)
+    whole = of(toy.borders(), still)
+    found = joint(toy.borders(), still, 'k', usual=USUAL, same=[True] * (LEGS - 1))
+    assert apart(found.value, whole.value, whole.covariance) < 1e-6
+    assert found.covariance == pytest.approx(whole.covariance, rel=1e-6)
+    assert (found.chi2, found.freedom) == (whole.chi2, whole.freedom)
+    scattered = of(toy.borders(), still, USUAL)
+    assert scattered.covariance[4, 4] > 1.001 * whole.covariance[4, 4]
+
+
+def test_chi_square_has_its_mean_and_variance():
+    rng = np.random.default_rng(2)
+    small = Toy(rng, states=6, rows=60)
+    found = [of(small.walk(rng).borders(), usual=USUAL) for _ in range(400)]
+    freedom, chi2 = found[0].freedom, np.array([f.chi2 for f in found])
+    # ranks 5, 3, 4, 5, 5 and 4 of the walk, less 9 unknowns
+    # (priors take up a little of what these are told to)
+    assert freedom == pytest.approx(22 + 4 - 9, abs=0.05)
+    assert chi2.mean() == pytest.approx(freedom, abs=4 * np.sqrt(2 * freedom / 400))
+    assert chi2.var() == pytest.approx(2 * freedom, rel=0.33)      # 4 sigmas of it
+    # each of five constants in one of 300, and all together in one of 20
+    assert np.mean([bool(f.disputed) for f in found]) < 0.035
+    assert 0.03 < np.mean([f.factor > 1 for f in found]) < 0.07
+    z = np.concatenate([f.deviation.ravel() for f in found])
+    assert z[z != 0].std() == pytest.approx(1.0, abs=0.03)
+
+
+def test_the_leg_and_the_constant_that_differ_are_named():
+    rng = np.random.default_rng(3)
+    small = Toy(rng, states=6, rows=40)
+    constants = np.tile(TRUTH, (LEGS, 1))
+    constants[3, 4] += 5.0
+    borders = small.draw(rng, constants).borders()
+    # the prior of that leg has given way, as it does where data gainsay it
+    borders[3] = replace(borders[3], used=np.where(PRIOR == 1.0, 5.0, PRIOR))
+    found = of(borders, usual=USUAL)
+    assert found.disputed == ('z3',)
+    assert np.argmax(np.abs(found.deviation[:, 4])) == 3
+    # one of five off by 5: scattering by 5 / sqrt(5), the mean off by 1
+    assert found.between['z3'] == pytest.approx(5 / np.sqrt(5), rel=0.5)
+    assert abs(found.value[4] - TRUTH[4]) < 2 * np.sqrt(found.covariance[4, 4])
+    assert np.abs((found.value - TRUTH) / np.sqrt(np.diag(found.covariance))).max() < 3.5
+
+
+def test_what_no_constant_explains_widens_all():
+    rng = np.random.default_rng(4)
+    small = Toy(rng, states=6, rows=40)
+    constants = TRUTH + 3.0 * rng.standard_normal((LEGS, 5))
+    found = of(small.draw(rng, constants).borders(), usual=USUAL)
+    assert found.disputed[0] == 'z3'
+    assert found.factor > 1.5
+
+
+def scale_and_yaw(yaw, *information):
+    unit = np.full(2, np.inf)
+    return Border(('k', 'yaw'), np.array([0.0, yaw]), np.diag(information), np.zeros(2),
+                  np.zeros(2), unit, unit)
+
+
+def test_a_leg_far_from_where_it_was_linearised_counts_less():
+    # the first knows nothing of the yaw and was linearised 0.1 rad off: its scale is 0.5 % off
+    legs = [scale_and_yaw(0.1, 1e12, 1e-2), scale_and_yaw(0.0, 1e8, 1e8)]
+    found = joint(legs, [0.0], 'k', ('yaw',), ('k', 'yaw'))
+    assert found.bent == pytest.approx([0.005, 0.0], abs=1e-9)
+    assert np.sqrt(found.covariance[0, 0]) == pytest.approx(1e-4, rel=1e-3)
+    assert np.sqrt(joint(legs, [0.0], 'k').covariance[0, 0]) < 2e-6
+
+
+def test_angles_about_half_a_turn_are_one():
+    legs = [scale_and_yaw(yaw, 1e6, 1e6) for yaw in (np.pi - 1e-3, 1e-3 - np.pi)]
+    found = joint(legs, [0.0], 'k', ('yaw',), ('yaw',))
+    assert abs(found.value[1]) == pytest.approx(np.pi, abs=1e-9)
+    assert not found.disputed
