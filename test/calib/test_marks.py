@@ -18,6 +18,7 @@ from odocal_ros.calib.marks import (
     standing_at,
     with_slow_errors,
 )
+from odocal_ros.sim.noise import gauss_markov
 
 pytestmark = pytest.mark.core
 STATED = np.diag([1.0, 1.0, 4.0])
@@ -25,20 +26,15 @@ RUNS = 200
 RATE, DRIVES = 0.5, 60        # s between fixes
 
 
-def gauss_markov(rng, t, tau, runs):
+def slow_errors(rng, t, tau, runs):
     """Return unit first-order Gauss-Markov errors: (n, runs, 3)."""
-    keep = np.exp(-np.diff(t) / tau)
-    x = np.empty((len(t), runs, 3))
-    x[0] = rng.standard_normal((runs, 3))
-    for k, a in enumerate(keep):
-        x[k + 1] = a * x[k] + np.sqrt(1 - a**2) * rng.standard_normal((runs, 3))
-    return x
+    return np.stack([gauss_markov(rng, 1.0, tau, t) for _ in range(runs)], axis=1)
 
 
 def run(n, white, tau, correlation_time=np.nan, stated=STATED):
     """Return (errors / sigma (runs, 3), median level sigma) of means of n fixes at 5 Hz."""
     rng, t = np.random.default_rng(1), np.arange(n) * 0.2
-    errors = np.sqrt(1 - white) * gauss_markov(rng, t, tau, RUNS) if white < 1 else 0.0
+    errors = np.sqrt(1 - white) * slow_errors(rng, t, tau, RUNS) if white < 1 else 0.0
     errors = (errors + np.sqrt(white) * rng.standard_normal((n, RUNS, 3))) * [1.0, 1.0, 2.0]
     z, sigma = [], []
     for k in range(RUNS):
@@ -158,7 +154,7 @@ def mark(variance, used):
 @pytest.mark.parametrize('tau', [15.0, 60.0])
 def test_size_and_time_of_slow_errors_are_found(tau):
     rng, t = np.random.default_rng(5), np.arange(0.0, 3600.0, RATE)
-    errors = math.sqrt(0.3) * gauss_markov(rng, t, tau, DRIVES)[..., 0] \
+    errors = math.sqrt(0.3) * slow_errors(rng, t, tau, DRIVES)[..., 0] \
         + math.sqrt(0.7) * rng.standard_normal((len(t), DRIVES))
     found = np.array([slow_variance(t, e, 10 * t, np.ones(len(t)), 0.0) for e in errors.T])
     x = 20.0 / tau

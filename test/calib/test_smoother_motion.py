@@ -133,14 +133,19 @@ def test_a_lean_is_level_though_the_imu_is_rolled():
     assert np.abs(by[:, 2, 1]).max() < 0.005 * sizes[1]
 
 
+def along_axis(problem, state, axis, constants):
+    """Return the odometer's residuals along an axis of the vehicle and how constants move them."""
+    part = Equations(problem, state).parts['motion']
+    C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
+    return ((C_vn @ part.raw[:, 15:18, None])[:, axis, 0],
+            (C_vn @ part.jacobians(layout.BARE)[2][:, 15:18, constants])[:, axis])
+
+
 @pytest.mark.parametrize(('real', 'axis'), [(Real(sideslip=0.005), 1), (Real(squat=0.005), 2)])
 def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
     """A third at least of what is left of a lean goes with the change of the push."""
     _, problem, state = at_truth(scale=1e-3, nominal_scale=1e-3, real=real)
-    part = Equations(problem, state).parts['motion']
-    C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
-    off = (C_vn @ part.raw[:, 15:18, None])[:, axis, 0]
-    by = (C_vn @ part.jacobians(layout.BARE)[2][:, 15:18, layout.LEAN])[:, axis]
+    off, by = along_axis(problem, state, axis, layout.LEAN)
 
     def left(columns):
         c = np.linalg.lstsq(by[:, columns], off, rcond=None)[0]
@@ -154,10 +159,8 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     """What is left is that the road bends within it: by (h / length)^2 of it, and seconds."""
     _, problem, state = at_truth(slope=0.1, scale=1e-3, nominal_scale=1e-3,
                                  real=Real(wheelbase=3.0))
-    part = Equations(problem, state).parts['motion']
-    C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
-    off = (C_vn @ part.raw[:, 15:18, None])[:, 2, 0]
-    by = (C_vn @ part.jacobians(layout.BARE)[2][:, 15:18, layout.PITCH_CENTRE])[:, 2, 0]
+    off, by = along_axis(problem, state, 2, layout.PITCH_CENTRE)
+    by = by[:, 0]
     centre = -(by @ off) / (by @ by)
     assert np.abs(off).max() > 1e-3       # m in a second
     assert centre == pytest.approx(1.5, rel=0.02)
@@ -165,10 +168,9 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     # no count lifts the odometer: what does is no part of what the scale multiplies
     c = state.constants.copy()
     c[layout.PITCH_CENTRE.start] = centre
-    lifted = replace(state, constants=c)
-    there = Equations(problem, lifted).parts['motion']
-    np.testing.assert_allclose(there.jacobians(layout.BARE)[2][:, D, layout.LN_K],
-                               part.jacobians(layout.BARE)[2][:, D, layout.LN_K], atol=1e-9)
+    there, here = (Equations(problem, one).parts['motion'].jacobians(layout.BARE)[2] for one in (
+        replace(state, constants=c), state))
+    np.testing.assert_allclose(there[:, D, layout.LN_K], here[:, D, layout.LN_K], atol=1e-9)
 
 
 @pytest.mark.parametrize('banking', [0.0, 1.0])

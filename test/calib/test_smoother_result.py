@@ -14,8 +14,8 @@ import pytest
 from smoother_legs import leg_of, made, said as texts, smoothed, truth
 
 from odocal_ros.calib.budget import total_covariance
-from odocal_ros.estimator import bound, smooth
-from odocal_ros.estimator.equations import Weighted
+from odocal_ros.estimator import smooth
+from odocal_ros.estimator.equations import Equations, Weighted
 from odocal_ros.estimator.fit import fit
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
@@ -85,8 +85,10 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
     details = method.details
     believed = np.array([details[name]['sigma'] / details['posterior_to_prior'][name]
                          for name in CONSTANTS[IMPERFECT]])
-    covariance = bound(leg, config, truth(drive, config, leg), Levels.of_roots(details['noise']),
-                       believed)
+    problem = problem_of(leg, config)
+    problem.priors.constants[IMPERFECT] = believed
+    covariance = Equations(problem, truth(drive, config, leg), fitted=True).at(
+        Levels.of_roots(details['noise'])).solved().covariance
     sigma = np.sqrt(np.diag(covariance))
     scale = method.estimates['scale_factor']
     # linearised at the estimate or at the truth: the same but for heavy tails

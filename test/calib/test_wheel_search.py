@@ -1,268 +1,27 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The wheels' search: many sets at once, criteria, response surface, least squares, embodiment."""
+"""The wheels' search: separable wheels, ranges, sigmas, details; its orthogonal arrays."""
 
 from dataclasses import replace
+from itertools import combinations
 import json
 
-from drives import cached, drive
 import numpy as np
 from numpy.testing import assert_allclose
+from planar_legs import DRIVES, on_a_plane, simulated, TRUE
 import pytest
 
-from odocal_ros.calib.wheel_search import planar
+from odocal_ros.calib.wheel_search import arrays
 from odocal_ros.calib.wheel_search.direct import least_squares, repeats
-from odocal_ros.calib.wheel_search.planar import (
-    course_pieces,
-    HUBER,
-    loss,
-    planar_leg,
-    PlanarLeg,
-    positions,
-    score,
-    weights,
-)
 from odocal_ros.calib.wheel_search.search import MOST_ROWS, search
-from odocal_ros.calib.wheel_search.space import Ranges, ranges_of, sets_of, Space
-from odocal_ros.calib.wheel_search.surface import fit_surface, minimum_in_box, refine
-from odocal_ros.nav.dead_reckoning import dead_reckon
-from odocal_ros.pipeline.prepare import prepare
+from odocal_ros.calib.wheel_search.space import Ranges, ranges_of, Space
+from odocal_ros.errors import BadUsage
 from odocal_ros.reasons import Code
-from odocal_ros.screening.screen import screen
-from odocal_ros.settings.config import Config, WheelsConfig, with_settings
+from odocal_ros.settings.config import WheelsConfig
 
 FREE, HELD = Space(held=False), Space(held=True)
-RTK = {'fix_noise': 'rtk', 'imu_grade': 'tactical', 'two_wheels': True}
-DRIVES = {
-    'town': RTK | {'scenario': 'town', 'duration': 300.0},
-    'another town': RTK | {'scenario': 'town', 'duration': 400.0, 'seed': 3},
-    'noisy town': {'scenario': 'town', 'two_wheels': True, 'duration': 300.0, 'outliers': 0.02},
-    'out and back': RTK | {'scenario': 'out_and_back', 'duration': 400.0},
-    'straight': {'scenario': 'straight', 'two_wheels': True, 'duration': 400.0},
-    'paper': {'scenario': 'paper', 'two_wheels': True, 'odometer': 'angle'}}
-# on the straight ones positions are blind to left against right: nothing to agree on
-TURNING = ['town', 'another town', 'noisy town', 'out and back']
-TRUE = np.array([0.99, 1.015, 0.03])       # of the drives on a plane
 RANGES = ranges_of(WheelsConfig())
-
-
-@cached
-def simulated(heading_error=0.0, **options):
-    """Return a simulated drive and its planar leg, heading given wrong by an angle from north."""
-    made = drive(**options)
-    scale, pitch = made.options.nominal_scale, made.options.pitch
-    grade = made.options.imu_grade
-    config = with_settings(Config(), {
-        'imu.grade': 'navigation' if grade == 'perfect' else grade,
-        'alignment.heading_source': 'fixed',
-        'alignment.heading': float(made.truth.heading + heading_error)})
-    inputs, _ = screen(made.leg(), config)
-    found, _ = prepare(made.leg(), inputs, config)
-    left, right = (dead_reckon(*found.epochs, s) for s in inputs.travels)
-    start = found.fixes_n[inputs.t_fix < 0.0].mean(axis=0)
-    lever_v = np.subtract(made.options.antenna_lever_arm, made.options.odometer_lever_arm)
-    return made, planar_leg(left, right, inputs.t_fix, found.fixes_n, inputs.covariance_n,
-                            (0.0, start), (scale, scale), pitch, lever_v)
-
-
-def on_a_plane(lanes=8, sigma=0.02, seed=0, length=15.0, k=600):
-    """
-    Return a robot's leg up and down a lawn: (K_L L + K_R R) / 2 turned by the heading, and noise.
-
-    Not in circles: on a circle left and right differ by a multiple of the position itself.
-    """
-    way = np.linspace(0.0, lanes * (length + 3.0), 20 * k + 1)
-    lane, along = np.divmod(way, length + 3.0)
-    turned = np.pi * np.clip((along - length) / 3.0, 0.0, 1.0)       # half turns, left and right
-    yaw = np.where(lane % 2 == 0, turned, np.pi - turned)
-    ds, dyaw = np.diff(way), np.diff(yaw)
-    direction = np.exp(1j * (yaw[1:] + yaw[:-1]) / 2)
-    left = np.cumsum((ds - 0.5 * dyaw) / TRUE[0] * direction)[::20]
-    right = np.cumsum((ds + 0.5 * dyaw) / TRUE[1] * direction)[::20]
-    fixes = np.exp(1j * TRUE[2]) * (TRUE[0] * left + TRUE[1] * right) / 2
-    noise = np.random.default_rng(seed).normal(0.0, sigma, (len(fixes), 2))
-    p = plane(fixes) + noise
-    sigmas = np.full(len(fixes), max(sigma, 1e-3))
-    return PlanarLeg(np.arange(len(fixes)) / 5.0, plane(left), plane(right), p, np.zeros(2),
-                     sigmas, 1.0, 1.0, pieces=course_pieces(p, sigmas))
-
-
-def plane(p):
-    return np.stack([p.real, p.imag], -1)
-
-
-def surface_of(leg, x, ranges, space, robust=False):
-    return refine(lambda x: score(leg, sets_of(leg, x), robust, course=False).loss, x,
-                  ranges.step, ranges.half, space)
-
-
-# dead reckoning and criteria
-
-
-def test_positions_are_those_of_the_source_summed_step_by_step():
-    rng = np.random.default_rng(1)
-    steps, yaw = rng.uniform(0.1, 0.3, (40, 2)), np.cumsum(rng.normal(0, 0.2, 40))
-    way = np.cumsum(steps * np.exp(1j * yaw)[:, None], axis=0)
-    leg = PlanarLeg(np.arange(40.0), plane(way[:, 0]), plane(way[:, 1]), np.zeros((40, 2)),
-                    np.array([5.0, -3.0]), np.ones(40), 1.0, 1.0)
-    sets = np.array([[1.0, 1.0, 0.0], [1.1, 0.9, 0.4]])
-    found = positions(leg, sets)
-    for k, (a, b, h) in enumerate(sets):
-        x, y = leg.start_n
-        for n in range(40):
-            ds = (a * steps[n, 0] + b * steps[n, 1]) / 2      # equation (ii)
-            x, y = x + ds * np.cos(yaw[n] + h), y + ds * np.sin(yaw[n] + h)     # (i)
-            assert_allclose(found[k, n], [x, y], atol=1e-13)
-
-
-def test_the_true_set_meets_perfect_fixes_and_only_it():
-    made, leg = simulated(scenario='town', duration=300.0, two_wheels=True, odometer='angle',
-                          imu_grade='perfect', fix_sigma=0.0, yaw=0.0, odometer_rate=50.0,
-                          antenna_lever_arm=(1.0, 0.3, 1.5), pitch=0.0)
-    true = np.array([[*made.truth.wheel_scales, 0.0]])
-    # trapezoid over 20 ms, 20 ms rows between which travel is linear: acceleration * dt^2 / 8
-    # at each of fewer than 50 places where it changes, and turns of 0.4 rad/s on 12 m/s
-    assert score(leg, true).max[0] < 0.02
-    assert score(leg, leg.start).max[0] > 1.0
-    without = replace(leg, lever_n=np.zeros((1, 2)))
-    assert score(without, true).max[0] > 0.5
-
-
-def test_distances_are_those_of_positions_however_they_are_chunked(monkeypatch):
-    _, leg = simulated(**DRIVES['town'])
-    sets = leg.start + np.random.default_rng(3).normal(0.0, [1e-3, 1e-3, 1.0], (23, 3))
-    d = np.hypot(*np.moveaxis(positions(leg, sets) - leg.fixes_n, -1, 0))
-    whole = score(leg, sets)
-    monkeypatch.setattr(planar, 'CHUNK', 3 * len(leg.t))
-    parts = score(leg, sets)
-    for found in (whole, parts):
-        # 2 km tracks: rounding of some 1e-12 m in each distance
-        assert_allclose(found.max, d.max(axis=1), rtol=1e-12)
-        assert_allclose(found.mean, d.mean(axis=1), rtol=1e-12)
-        assert_allclose(found.rms, np.sqrt((d**2).mean(axis=1)), rtol=1e-12)
-        assert_allclose(found.loss, (d**2).mean(axis=1), rtol=1e-12)
-
-
-def test_fixes_beyond_the_tracks_are_left_out():
-    made, leg = simulated(**DRIVES['straight'])
-    between = made.fix.stamp_ns >= made.truth.start_ns
-    assert leg.t[0] >= 0.0
-    assert len(leg.t) <= between.sum() < len(made.fix.stamp_ns)
-
-
-def test_course_differs_by_what_the_track_is_turned_by():
-    leg = on_a_plane(sigma=0.0)
-    off = np.deg2rad([0.0, 3.0, -20.0])
-    found = score(leg, TRUE + off[:, None] * [0.0, 0.0, 1.0])
-    assert_allclose(found.course_mean, off, atol=1e-12)
-    assert_allclose(found.course_rms, np.abs(off), atol=1e-12)
-    assert score(leg, TRUE + [0.0, 0.0, 2 * np.pi]).course_rms[0] < 1e-12
-    half_turned = score(leg, TRUE + [0.0, 0.0, np.pi - 1e-9])
-    assert abs(half_turned.course_mean[0]) == pytest.approx(np.pi)
-    assert half_turned.course_rms[0] == pytest.approx(np.pi)
-    still = replace(leg, pieces=course_pieces(np.zeros((50, 2)), np.ones(50)))
-    assert score(still, TRUE).row(0)['course_mean_deg'] is None
-
-
-def test_course_is_taken_over_a_way_that_fixes_can_tell():
-    line = np.stack([np.arange(0.0, 400.0), np.zeros(400)], -1)
-    assert np.diff(course_pieces(line, np.full(400, 0.02))).tolist() == [[10]] * 39
-    assert np.diff(course_pieces(line, np.full(400, 1.5))).tolist() == [[30]] * 13
-    assert course_pieces(line[:0], np.empty(0)).shape == (0, 2)
-
-
-def test_hubers_loss_and_its_weights_belong_together():
-    d2, sigma = np.array([0.0, 1.0, 8.9, 9.1, 400.0]), np.array([1.0, 2.0, 1.5, 1.5, 0.5])
-    step = 1e-6
-    for robust in (False, True):
-        for k in range(len(d2)):
-            more = d2 + step * (np.arange(5) == k)
-            rise = (loss(more[None], sigma, robust) - loss(d2[None], sigma, robust))[0] / step
-            assert rise * 5 == pytest.approx(weights(d2, sigma, robust)[k], rel=1e-4)
-    # beyond HUBER sigmas the pull, weight times distance, no longer grows
-    far = weights(np.array([1e2, 1e4]), np.ones(2), True) * [10.0, 100.0]
-    assert_allclose(far, HUBER)
-
-
-# the surface
-
-
-def test_a_quadratic_is_fitted_exactly_and_a_cubic_shows_as_lack_of_fit():
-    rng = np.random.default_rng(4)
-    H, g = rng.normal(size=(3, 3)), rng.normal(size=3)
-    H = H + H.T
-    y = np.stack([a.ravel() for a in np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)], -1)
-    values = 7.0 + y @ g + np.einsum('mi,ij,mj->m', y, H, y) / 2
-    fit = fit_surface(y, values)
-    assert_allclose(fit.hessian, H, atol=1e-13)
-    assert_allclose(fit.gradient, g, atol=1e-13)
-    assert fit.value == pytest.approx(7.0)
-    assert fit.r_squared == pytest.approx(1.0)
-    assert fit.lack_of_fit < 1e-14
-    bent = fit_surface(y, values + y[:, 0] * y[:, 1] * y[:, 2])
-    assert bent.lack_of_fit == pytest.approx(1.0 / np.ptp(values + y.prod(axis=1)))
-    assert bent.r_squared < 1.0
-
-
-@pytest.mark.parametrize('definite', [True, False])
-def test_the_minimum_in_a_box_is_the_least_value_there(definite):
-    rng = np.random.default_rng(5)
-    grid = np.stack([a.ravel() for a in np.meshgrid(*[np.linspace(0, 1, 21)] * 3)], -1)
-    for _ in range(50):
-        A, g = rng.normal(size=(3, 3)), 2 * rng.normal(size=3)
-        H = A @ A.T if definite else A + A.T
-        low = rng.uniform(-2.0, 0.0, 3)
-        high = low + rng.uniform(0.1, 3.0, 3)
-        found = minimum_in_box(g, H, low, high)
-        assert ((low <= found) & (found <= high)).all()
-        y = low + grid * (high - low)
-        values = y @ g + np.einsum('mi,ij,mj->m', y, H, y) / 2
-        assert g @ found + found @ H @ found / 2 <= values.min() + 1e-12
-
-
-@pytest.mark.parametrize(('name', 'space'), [(name, HELD) for name in DRIVES] + [
-    (name, FREE) for name in TURNING], ids=lambda x: x if isinstance(x, str) else (
-        'together' if x.held else 'free'))
-@pytest.mark.parametrize('robust', [False, True], ids=['plain', 'robust'])
-def test_surface_and_least_squares_agree(name, space, robust):
-    _, leg = simulated(**DRIVES[name])
-    direct = least_squares(leg, np.zeros(3), space, robust)
-    assert direct.settled
-    begin = surface_of(leg, np.zeros(3), RANGES, space)
-    found = surface_of(leg, begin.x, replace(RANGES, half=begin.half), space, robust)
-    assert found.settled
-    assert not found.on_edge
-    assert (np.abs(found.x - direct.x) <= 1e-4 * 2 * RANGES.half).all()
-    # kinks of Huber's function within a box over which it changes by 1e-6 (DROWNED)
-    assert found.value == pytest.approx(direct.value, rel=1e-5 if robust else 1e-9)
-
-
-@pytest.mark.parametrize('criterion', ['mean', 'max'])
-def test_a_surface_lowers_the_other_criteria_too(criterion):
-    leg = on_a_plane(sigma=0.05)
-    def value(x):
-        return getattr(score(leg, sets_of(leg, x), course=False), criterion)
-    found = refine(value, np.zeros(3), RANGES.step, RANGES.half, FREE)
-    direct = least_squares(leg, np.zeros(3), FREE)
-    assert found.value <= value(direct.x[None])[0]
-    # both have kinks and a long valley along left against right: 5 cm noise over some 10 m
-    assert found.x[:2].mean() == pytest.approx(TRUE[:2].mean() - 1, abs=0.005)
-    assert found.x[2] == pytest.approx(TRUE[2], abs=0.005)
-
-
-@pytest.mark.parametrize('space', [FREE, HELD], ids=['free', 'together'])
-@pytest.mark.parametrize('beyond', [0.051, 0.06, 0.3])
-def test_the_range_is_kept_where_it_may_not_be_widened(space, beyond):
-    def cone(x):       # a ridge between wheels that differ, its tip outside the range
-        return np.abs(x[:, 0] - beyond) + 3 * np.abs(x[:, 1] - beyond) + np.abs(x[:, 2])**0.5
-    found = refine(cone, np.array([0.03, 0.02, 0.01]), RANGES.step, RANGES.half, space,
-                   widen=False)
-    assert (np.abs(found.x) <= RANGES.half * (1 + 1e-12)).all()
-    assert not found.widened
-
-
-# the whole search
 
 
 @pytest.mark.parametrize('name', ['town', 'out and back', 'straight', 'paper'])
@@ -300,11 +59,6 @@ def test_a_small_lawn_tells_left_from_right():
         x = np.unique(np.round((found.sets[:, k] - (k < 2)), 12))
         assert_allclose(x, np.linspace(-half, half, 7), atol=1e-11)
     assert set(search(leg, Ranges(RANGES.half, RANGES.why, 1)).sets[:, 0]) == {1.0}
-    # the accuracy asked for is held against the best row
-    reach = found.scores.max[found.best], found.scores.mean[found.best]
-    assert found.meets is None
-    for more, meets in ((1e-9, True), (-1e-9, False)):
-        assert search(leg, RANGES, accuracy=(reach[0] + 1e-9, reach[1] + more)).meets is meets
 
 
 def test_the_range_is_widened_where_the_minimum_lies_on_its_edge():
@@ -383,9 +137,6 @@ def test_ranges_follow_the_settings():
     assert ranges_of(WheelsConfig(levels=2)).levels == 2
 
 
-# honesty
-
-
 def test_the_formal_sigma_holds_for_white_fixes():
     runs = 300
     z = []
@@ -421,3 +172,53 @@ def test_residuals_alike_in_a_row_count_as_fewer():
         slow[:, k] = 0.9 * slow[:, k - 1] + white[:, k]
     assert repeats(slow) == pytest.approx(1.9 / 0.1, rel=0.3)      # (1 + r) / (1 - r)
     assert repeats(np.zeros((2, 5))) == 1.0
+
+
+PRIME_POWERS = [2, 3, 4, 5, 7, 8, 9, 11, 13, 16]
+
+
+def balanced(array):
+    """Return True if each pair of columns of as many rows as pairs holds each pair once."""
+    return all(len({tuple(pair) for pair in array[:, [a, b]].tolist()}) == len(array)
+               for a, b in combinations(range(array.shape[1]), 2))
+
+
+def test_prime_powers_are_told_from_other_numbers():
+    assert [q for q in range(18) if arrays.prime_power(q)] == [*PRIME_POWERS, 17]
+    assert arrays.prime_power(49) == (7, 2)
+    assert arrays.prime_power(64) == (2, 6)
+    assert arrays.prime_power(6) is None
+    assert [arrays.next_prime_power(n) for n in (1, 6, 10, 14, 18)] == [2, 7, 11, 16, 19]
+    assert [arrays.next_prime_power(n, odd=True) for n in (3, 4, 8, 14, 26, 50)] == [
+        3, 5, 9, 17, 27, 53]
+
+
+# so the tables are those of a field, and the polynomial is no product
+@pytest.mark.core
+@pytest.mark.parametrize('q', [*PRIME_POWERS, 25, 27, 49])
+def test_every_array_is_balanced(q):
+    array = arrays.bose(q, q + 1)
+    assert array.shape == (q * q, q + 1)
+    assert balanced(array)
+    array[3, 1] = (array[3, 1] + 1) % q     # and one wrong cell is seen
+    assert not balanced(array)
+    # three of each level in each column: L9(3^4) of the patent's figure 2, but for the order
+    assert all((np.bincount(column) == q).all() for column in arrays.bose(q, q + 1).T)
+
+
+def test_what_cannot_be_built_is_refused():
+    with pytest.raises(BadUsage, match='6 levels'):
+        arrays.bose(6, 3)
+    with pytest.raises(BadUsage, match='5 columns'):
+        arrays.bose(3, 5)
+    with pytest.raises(BadUsage, match='0 levels'):
+        arrays.design_for(0)
+
+
+@pytest.mark.parametrize(('levels', 'rows'), [(1, 1), (2, 8), (3, 9), (4, 16), (7, 49), (9, 81)])
+def test_the_design_follows_the_levels(levels, rows):
+    design = arrays.design_for(levels)
+    assert design.rows.shape == (rows, 3)
+    assert levels != 9 or design.name == 'L81(9^10)'
+    assert levels == 2 or balanced(design.rows)
+    assert [len(set(column)) for column in design.rows.T.tolist()] == [levels] * 3
