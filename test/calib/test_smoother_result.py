@@ -53,6 +53,19 @@ def test_scale_and_yaw_are_within_their_sigmas(options):
     assert not late or delay.sigma < 0.005
 
 
+@pytest.mark.parametrize('share', [0.0, 0.1])
+def test_outliers_among_the_fixes_are_reported(share):
+    found = texts(result(outliers=share, outlier_size=30.0)[1]).get(Code.FIX_OUTLIERS, '')
+    assert bool(found) == bool(share)
+    if share:
+        count, of, per_cent, metres = map(float, re.fullmatch(
+            r'(\d+) of (\d+) fixes \((\d+) %\) are outliers, up to ([\d.]+) m from the track; '
+            'they were down-weighted', found).groups())
+        assert per_cent == round(100 * count / of)
+        assert count == pytest.approx(share * of, abs=4 * np.sqrt(share * of))      # 4 sigma
+        assert metres == pytest.approx(30.0, rel=0.4)
+
+
 @pytest.mark.parametrize('start', ['scale', 'nothing stands', 'in motion'])
 def test_where_it_starts_from_does_not_matter(start):
     _, config, leg = made(**SHORT)

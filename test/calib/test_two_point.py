@@ -140,6 +140,13 @@ def test_without_heights_the_scale_stands_and_the_pitch_is_refused():
     assert e['scale_factor'].sigma / made.truth.scale > 5e-4
 
 
+def test_heights_that_give_a_pitch_beyond_the_limit_reject_the_method():
+    made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', pitch=20 * DEG)
+    result = calibrate(made.leg(), drives.settings(made))
+    why, = (r for r in result.methods['two_point'].reasons if r.code is Code.TRACK_MISMATCH)
+    assert why.text == 'the heights of the marks give a pitch of +20 deg; the limit is 15 deg'
+
+
 def test_a_closed_loop_is_refused_with_what_would_help():
     made = drives.drive(scenario='out_and_back', duration=300.0, imu_grade='industrial')
     result = calibrate(made.leg(), drives.settings(made))

@@ -270,3 +270,12 @@ def test_a_drive_is_screened_once(look, capsys, monkeypatch):
     assert wanted[0]['legs']
     monkeypatch.setattr(legs, 'screen', None)
     assert inspect(wanted[0]['path'], capsys) == wanted
+
+
+def test_a_counter_that_stops_gives_no_scale_and_no_axes(look):
+    seen, text = look([(topic, ns, make.whole(700) if topic == '/odometer' and ns > T0 + 60e9
+                        else raw) for topic, ns, raw in drive()])
+    assert 'ODOMETER_STILL' in codes(seen)
+    assert seen['drive'] is None
+    assert 'scale factor' not in text
+    assert 'imu.mounting_rpy' not in text

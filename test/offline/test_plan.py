@@ -328,6 +328,11 @@ def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
     assert str(tmp_path / 'none') in refused(capsys, '--bag', str(tmp_path / 'none'))
 
 
+def test_a_drive_too_short_for_its_speed_brakes_from_a_lower_one(capsys):
+    assert main(['plan', '--distance', '10', '--speed', '30']) == 0
+    assert '10.00 m in 36.3 s' in capsys.readouterr().out      # 30 s at each mark, 2 sqrt(10)
+
+
 @pytest.mark.parametrize(('argv', 'words'), [
     ([], 'give one drive'),
     (['--scenario', 'paper', '--distance', '5'], 'not --scenario and --distance'),
