@@ -63,7 +63,7 @@ def test_outliers_among_the_fixes_are_reported(share):
             'they were down-weighted', found).groups())
         assert per_cent == round(100 * count / of)
         assert count == pytest.approx(share * of, abs=4 * np.sqrt(share * of))      # 4 sigma
-        assert metres == pytest.approx(30.0, rel=0.4)
+        assert metres == pytest.approx(1.5 * 30.0, rel=0.1)       # the largest of many draws
 
 
 @pytest.mark.parametrize('start', ['scale', 'nothing stands', 'in motion'])

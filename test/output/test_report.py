@@ -175,7 +175,7 @@ def test_the_method_that_gave_the_result_comes_first(good):
     assert budgets == sorted(budgets, key=['smoother', 'two'].index)
     assert 'roll, pitch, yaw 0.000, -0.000' not in page_of(replace(
         good, imu_rotation_rpy=(0.0, -1e-9, 0.0)))[1]
-    assert '(roll as configured), about fixed axes' in page_of(good)[1]
+    assert 'as configured), about fixed axes' in page_of(good)[1]
 
 
 def test_each_panel_of_the_comparison_has_the_rows_that_have_a_value(good):
