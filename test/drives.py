@@ -9,7 +9,7 @@ import inspect
 
 import numpy as np
 
-from odocal_ros.data.samples import OdometerSamples, take
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.forecast.planned_drive import from_rates
 from odocal_ros.forecast.thinned_leg import ThinnedLeg
 from odocal_ros.nav.rotations import exp_so3
@@ -94,6 +94,24 @@ def changed(samples, **columns):
 def spoilt(leg, slot, **columns):
     """Return a leg with columns of a topic ``changed``."""
     return leg.with_rows(**{slot: changed(leg.rows(slot), **columns)})
+
+
+def kept(leg, slot, rows):
+    """Return a leg with some rows of a topic."""
+    return leg.with_rows(**{slot: take(leg.rows(slot), rows)})
+
+
+def without(leg, slot, begin=-np.inf, end=np.inf):
+    """Return a leg without the rows of a topic between times after its start mark, s."""
+    t = seconds(leg, leg.rows(slot))
+    return kept(leg, slot, (t < begin) | (t > end))
+
+
+def with_increments(leg):
+    """Return a leg whose odometer sends increments of its counts."""
+    step = np.diff(leg.odometer.value, prepend=leg.odometer.value[:1])
+    return replace(leg, odometer=replace(leg.odometer, value=step),
+                   form=OdometerForm('increment', 0, 'm/pulse'))
 
 
 def seconds(leg, samples):

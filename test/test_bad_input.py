@@ -13,11 +13,11 @@ import json
 import re
 
 import drives
-from drives import rejecting, seconds, settings, spoilt
+from drives import kept, rejecting, seconds, settings, spoilt, without
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import join, OdometerForm, take
+from odocal_ros.data.samples import join, take
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
@@ -48,22 +48,6 @@ def sound(result, truth, sigmas=5.0):
     assert all(abs(x) < sigmas for x in z.values()), z
 
 
-def spoils(slot, **columns):
-    """Return a function that changes columns of a topic of a leg."""
-    return lambda leg: spoilt(leg, slot, **columns)
-
-
-def keeps(slot, rows):
-    """Return a function that leaves rows of a topic of a leg."""
-    return lambda leg: leg.with_rows(**{slot: take(leg.rows(slot), rows)})
-
-
-def without(leg, slot, begin=-np.inf, end=np.inf):
-    """Return a leg without the rows of a topic between times after its start mark, s."""
-    t = seconds(leg, leg.rows(slot))
-    return keeps(slot, (t < begin) | (t > end))(leg)
-
-
 def sideways(a):
     return a[:, [2, 1, 0]] * [1, 1, -1]
 
@@ -77,31 +61,32 @@ def first(a):
 
 
 UNUSABLE = [
-    (spoils('imu', w_i=lambda a: a * np.nan), Code.NO_IMU,
+    (partial(spoilt, slot='imu', w_i=lambda a: a * np.nan), Code.NO_IMU,
      'none of the 10001 IMU messages is usable'),
-    (spoils('odometer', value=lambda a: a * np.nan), Code.NO_ODOMETER,
+    (partial(spoilt, slot='odometer', value=lambda a: a * np.nan), Code.NO_ODOMETER,
      'none of the 4000 odometer messages is usable'),
-    (spoils('fix', latitude=lambda a: a * np.nan), Code.FIXES_UNUSABLE,
+    (partial(spoilt, slot='fix', latitude=lambda a: a * np.nan), Code.FIXES_UNUSABLE,
      'none of the 1000 fix messages is usable'),
-    (keeps('imu', slice(0)), Code.NO_IMU, 'no IMU message between the marks'),
-    (keeps('odometer', slice(0)), Code.NO_ODOMETER, 'no odometer message between the marks'),
-    (keeps('fix', slice(0)), Code.NO_FIX, 'no fix message between the marks'),
-    (keeps('fix', slice(500, 501)), Code.NO_FIX, '1 usable fix between the marks'),
-    (spoils('imu', w_i=lambda a: 0 * a), Code.NO_IMU, 'all turn rates are zero'),
-    (spoils('imu', w_i=lambda a: a * [1.0, 1.0, 0.0]), Code.NO_IMU,
+    (partial(without, slot='imu'), Code.NO_IMU, 'no IMU message between the marks'),
+    (partial(without, slot='odometer'), Code.NO_ODOMETER, 'no odometer message between the marks'),
+    (partial(without, slot='fix'), Code.NO_FIX, 'no fix message between the marks'),
+    (partial(kept, slot='fix', rows=slice(500, 501)), Code.NO_FIX,
+     '1 usable fix between the marks'),
+    (partial(spoilt, slot='imu', w_i=lambda a: 0 * a), Code.NO_IMU, 'all turn rates are zero'),
+    (partial(spoilt, slot='imu', w_i=lambda a: a * [1.0, 1.0, 0.0]), Code.NO_IMU,
      'angular_velocity.z is always zero'),
-    (spoils('imu', w_i=sideways, f_i=sideways), Code.IMU_AXES,
+    (partial(spoilt, slot='imu', w_i=sideways, f_i=sideways), Code.IMU_AXES,
      'gravity is on +x (up should be +z)'),
     (lambda leg: replace(leg, stop_ns=leg.start_ns + 14 * 10**9), Code.LEG_TOO_SHORT,
      'm between the marks; the limit is 100 m'),
     (lambda leg: replace(leg, stop_ns=leg.start_ns), Code.LEG_TOO_SHORT,
      'the stop mark is not after the start mark'),
-    (spoils('fix', latitude=first, longitude=first), Code.LEG_TOO_SHORT,
+    (partial(spoilt, slot='fix', latitude=first, longitude=first), Code.LEG_TOO_SHORT,
      'the odometer counts, but the fixes do not move')]
 AT_REST = [
-    (lambda leg: drives.shifted(leg, start=-55.0, stop=-145.0), Code.LEG_TOO_SHORT,
+    (partial(drives.shifted, start=-55.0, stop=-145.0), Code.LEG_TOO_SHORT,
      'the vehicle did not move'),
-    (spoils('odometer', value=first), Code.ODOMETER_STILL,
+    (partial(spoilt, slot='odometer', value=first), Code.ODOMETER_STILL,
      'the fixes move, but the odometer does not')]
 
 
@@ -127,7 +112,7 @@ def test_two_counters_on_one_topic_are_a_named_cause(made, leg):
 
 
 @pytest.mark.parametrize('spoil', [
-    *(keeps(slot, slice(first, first + n))
+    *(partial(kept, slot=slot, rows=slice(first, first + n))
       for slot, first in (('imu', 5000), ('odometer', 700), ('fix', 700)) for n in (1, 2, 3)),
     *(partial(drives.shifted, start=by, stop=by) for by in (-3600.0, 3600.0))])
 def test_a_handful_of_rows_or_marks_outside_the_data_are_rejected(made, leg, spoil):
@@ -166,13 +151,9 @@ def test_rows_that_the_odometer_lacks_cost_no_leg(made, leg, gone, text):
 
 @pytest.mark.parametrize('kind', ['increment', 'rate'])
 def test_a_gap_of_increments_or_speeds_widens_the_sigma(made, leg, kind):
-    if kind == 'increment':
-        step = np.diff(leg.odometer.value, prepend=leg.odometer.value[:1])
-        leg = replace(leg, odometer=replace(leg.odometer, value=step),
-                      form=OdometerForm('increment', 0, 'm/pulse'))
-    else:
+    if kind == 'rate':
         made = drives.drive(**drives.STRAIGHT, odometer='speed')
-        leg = made.leg()
+    leg = made.leg() if kind == 'rate' else drives.with_increments(leg)
     whole, _ = run(leg, made)
     result, said = run(without(leg, 'odometer', 20, 30), made)  # across the end of speeding up
     assert Code.TOPIC_GAP in said
@@ -193,8 +174,8 @@ def test_a_counter_that_counts_down(made, leg, heading_sigma):
 
 
 @pytest.mark.parametrize(('drive', 'spoil', 'setting', 'value'), [
-    ('made', spoils('imu', f_i=lambda a: a / 9.80665), 'imu.accel_scale', 9.80665),
-    ('town', spoils('imu', w_i=in_degrees), 'imu.gyro_scale', 0.017453292519943295)])
+    ('made', partial(spoilt, slot='imu', f_i=lambda a: a / 9.80665), 'imu.accel_scale', 9.80665),
+    ('town', partial(spoilt, slot='imu', w_i=in_degrees), 'imu.gyro_scale', 0.017453292519943295)])
 def test_units_that_are_not_si_are_told_with_their_setting(request, drive, spoil, setting, value):
     made = request.getfixturevalue(drive)
     leg = spoil(made.leg())

@@ -5,11 +5,11 @@
 
 from dataclasses import replace
 
-from drives import drive, everything_said, held_up, settings
+from drives import drive, everything_said, held_up, settings, with_increments
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
+from odocal_ros.data.samples import OdometerSamples, take
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening import late_rows
@@ -44,9 +44,8 @@ def true(made):
 
 
 def increments(made):
-    """Return the counts of the drive as increments, and their form."""
-    step = np.diff(made.odometer.value, prepend=made.odometer.value[:1])
-    return replace(made.odometer, value=step), OdometerForm('increment', 0, 'm/pulse')
+    leg = with_increments(made.leg())
+    return leg.odometer, leg.form
 
 
 def of_smoother(made, samples):

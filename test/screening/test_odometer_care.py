@@ -5,12 +5,12 @@
 
 from dataclasses import replace
 
-from drives import drive, spoilt, STRAIGHT
+from drives import drive, kept, spoilt, STRAIGHT, with_increments
 import numpy as np
 import pytest
 from screened import said
 
-from odocal_ros.data.samples import join, OdometerForm, take
+from odocal_ros.data.samples import join, take
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
@@ -77,12 +77,9 @@ def test_a_reset_is_bridged_and_leaves_a_doubt_that_covers_it(made, leg, true):
 
 
 def test_lost_increments_are_bridged_at_the_speed_beside(leg, true):
-    step = np.diff(leg.odometer.value, prepend=leg.odometer.value[:1])
-    whole = replace(leg, odometer=replace(leg.odometer, value=step),
-                    form=OdometerForm('increment', 0, 'm/pulse'))
-    keep = np.ones(len(step), bool)
-    keep[2000:2040] = False
-    inputs, _ = said(replace(whole, odometer=take(whole.odometer, keep)))
+    whole = with_increments(leg)
+    step = whole.odometer.value
+    inputs, _ = said(kept(whole, 'odometer', np.r_[:2000, 2040:len(step)]))
     lost, end = step[2000:2040].sum(), said(whole)[0].travel.s[-1]
     # the speed is even there: but for rounding of counts at each side, nothing is lost
     error = abs(inputs.travel.s[-1] - end)

@@ -3,13 +3,12 @@
 
 """Screening: what is dropped, what is said of it, and that the rest is used."""
 
-from drives import drive, seconds, settings, spoilt
+from drives import drive, seconds, settings, spoilt, without
 import numpy as np
 import pytest
 from screened import said
 
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.samples import take
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
@@ -136,9 +135,7 @@ def test_poor_fixes_are_left_out_by_a_setting_no_gap_and_zero_takes_it_off(leg):
 
 @pytest.mark.parametrize('slot', ['odometer', 'fix'])
 def test_a_gap_far_beyond_a_topics_own_rhythm_is_a_note(leg, slot):
-    t = seconds(leg, leg.rows(slot))
-    keep = (t < 30) | (t > 42)
-    _, codes = said(leg.with_rows(**{slot: take(leg.rows(slot), keep)}))
+    _, codes = said(without(leg, slot, 30, 42))
     assert set(codes) == {Code.TOPIC_GAP}
     assert codes[Code.TOPIC_GAP].startswith(f'{slot} gap of 12.')
     assert Code.TOPIC_GAP.gravity.value == 'accepted'
