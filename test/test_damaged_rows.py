@@ -4,9 +4,10 @@
 """Rows of a damaged recording, and methods that fail: each costs itself, never the leg."""
 
 from dataclasses import replace
+from functools import partial
 import warnings
 
-from drives import changed, drive, everything_said, settings
+from drives import drive, everything_said, seconds, settings, spoilt
 import numpy as np
 import pytest
 
@@ -26,7 +27,23 @@ def made():
     return drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
 
 
-def garbage(rng, column, first, last):
+@pytest.fixture(scope='module')
+def config(made):
+    return settings(made, method='auto')
+
+
+def sound(leg, made):
+    """Check that screening finds no bad row in a leg."""
+    found = {r.code for r in screen(leg, settings(made))[1]}
+    assert not {Code.BAD_ROWS_DROPPED, Code.ROWS_DAMAGED} & found
+
+
+def with_speeds(leg, speeds):
+    form = replace(leg.form, quantity='rate', modulus=0, scale_unit='1')
+    return replace(leg, odometer=replace(leg.odometer, value=speeds), form=form)
+
+
+def garbage(rng, first, last, column):
     """Overwrite rows with random bits, as a block that unpacks wrongly has them."""
     raw = rng.integers(0, 256, column[first:last].nbytes, np.uint8)
     column[first:last] = raw.view(np.float64).reshape(column[first:last].shape)
@@ -34,52 +51,41 @@ def garbage(rng, column, first, last):
 
 @pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('share', [0.002, 0.02, 0.1])
-def test_a_block_of_garbage_is_never_accepted(made, seed, share):
-    leg, rng = made.leg(), np.random.default_rng(seed)
-    n = len(leg.imu.stamp_ns)
+def test_a_block_of_garbage_is_never_accepted(made, config, seed, share):
+    rng, n = np.random.default_rng(seed), len(made.imu.stamp_ns)
     first = int(rng.integers(0, n * (1 - share)))
-    last = first + int(n * share)
-    bad = changed(leg.imu, w_i=lambda c: garbage(rng, c, first, last),
-                  f_i=lambda c: garbage(rng, c, first, last))
+    wrong = partial(garbage, rng, first, first + int(n * share))
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        result = calibrate(replace(leg, imu=bad), settings(made, method='auto'))
+        result = calibrate(spoilt(made.leg(), 'imu', w_i=wrong, f_i=wrong), config)
     assert result.verdict is not Verdict.ACCEPTED
     assert Code.ROWS_DAMAGED in everything_said(result)
 
 
-def test_mild_neighbours_go_with_their_clump(made):
+def test_mild_neighbours_go_with_their_clump(made, config):
     """One row of twenty shows; the others are off by what a sensor might say."""
-    leg, rng = made.leg(), np.random.default_rng(5)
+    rng = np.random.default_rng(5)
 
     def wrong(column):
         column[4000:4600] += rng.normal(0, 0.05, (600, 3))
         column[4000:4600:20] = 1e200
-    result = calibrate(replace(leg, imu=changed(leg.imu, w_i=wrong)),
-                       settings(made, method='auto'))
-    assert result.imu_samples <= len(leg.imu.stamp_ns) - 600
+    result = calibrate(spoilt(made.leg(), 'imu', w_i=wrong), config)
+    assert result.imu_samples <= len(made.imu.stamp_ns) - 600
     assert result.verdict is not Verdict.ACCEPTED
 
 
 def test_a_driver_that_sends_nan_now_and_then_is_no_damage(made):
-    leg = made.leg()
-
-    def gaps(column):
-        column[::50] = np.nan
-    said = everything_said(calibrate(replace(leg, imu=changed(leg.imu, w_i=gaps)), settings(made)))
+    leg = spoilt(made.leg(), 'imu', w_i=(slice(None, None, 50), np.nan))
+    said = everything_said(calibrate(leg, settings(made)))
     assert Code.BAD_ROWS_DROPPED in said
     assert Code.ROWS_DAMAGED not in said
 
 
 @pytest.mark.parametrize(('rows', 'accepted'), [(4, True), (8, False)])
-def test_several_wild_rows_are_a_caution_wherever_they_stand(made, rows, accepted):
+def test_several_wild_rows_are_a_caution_wherever_they_stand(made, config, rows, accepted):
     """Eight far apart stood beside wrong ones that nothing showed: a yaw 17 sigmas off."""
-    leg = made.leg()
-    at = np.linspace(500, len(leg.imu.stamp_ns) - 500, rows).astype(int)
-
-    def wild(column):
-        column[at] = 1e200
-    result = calibrate(replace(leg, imu=changed(leg.imu, w_i=wild)), settings(made, method='auto'))
+    at = np.linspace(500, len(made.imu.stamp_ns) - 500, rows).astype(int)
+    result = calibrate(spoilt(made.leg(), 'imu', w_i=(at, 1e200)), config)
     assert (Code.ROWS_DAMAGED not in everything_said(result)) == accepted
     assert (result.verdict is Verdict.ACCEPTED) == accepted
 
@@ -92,8 +98,7 @@ def test_wild_rows_and_rows_off_by_little_are_a_clump_together(made):
     def wrong(column):
         column[[at, at + 3, at + 24]] = 1e200
         column[at + 4, 2], column[at + 5, 0] = 0.78, 0.21
-    result = calibrate(replace(leg, imu=changed(leg.imu, w_i=wrong)),
-                       settings(made, method='two_point'))
+    result = calibrate(spoilt(leg, 'imu', w_i=wrong), settings(made))
     assert Code.ROWS_DAMAGED in everything_said(result)
     assert result.verdict is not Verdict.ACCEPTED
 
@@ -110,42 +115,30 @@ def test_what_a_clump_is():
 
 @pytest.mark.parametrize('yaw', [0, 2])
 def test_exact_zeros_that_were_rotated_twice_are_no_damage(made, yaw):
-    leg = made.leg()
     C, C_again = (matrix_from_rpy(np.pi / 2 * np.array(n)) for n in ((1, 1, yaw), (1, 1, 2)))
 
     def upright(column):
         column[:] = column * [0.0, 0.0, 1.0] @ C @ C_again
         assert 0 < np.abs(column[column != 0]).min() < 1e-50
-    said = screen(replace(leg, imu=changed(leg.imu, w_i=upright, f_i=upright)), settings(made))[1]
-    assert not {Code.BAD_ROWS_DROPPED, Code.ROWS_DAMAGED} & {r.code for r in said}
+    sound(spoilt(made.leg(), 'imu', w_i=upright, f_i=upright), made)
 
 
 def test_a_filtered_speed_that_fades_at_rest_is_zero(made):
     """A low pass of 0.4 s in double precision is at 1e-50 after 46 s of standing."""
     leg = made.leg()
-    form = replace(leg.form, quantity='rate', modulus=0, scale_unit='1')
-    t = (leg.odometer.stamp_ns - leg.start_ns) * 1e-9
+    t = seconds(leg, leg.odometer)
     speeds = np.where(t < 40.0, np.sin(t / 30.0)**2, np.exp((40.0 - t) / 0.4))
-    found = screen(replace(leg, odometer=replace(leg.odometer, value=speeds), form=form),
-                   settings(made))[1]
     assert np.abs(speeds).min() < 1e-60
-    assert not {Code.BAD_ROWS_DROPPED, Code.ROWS_DAMAGED} & {r.code for r in found}
+    sound(with_speeds(leg, speeds), made)
 
 
 @pytest.mark.parametrize('value', [5e-324, -1e-310, 1e-200])
 def test_subnormal_odometer(made, value):
-    leg = made.leg()
-    form = replace(leg.form, quantity='rate', modulus=0, scale_unit='1')
-    odometer = replace(leg.odometer, value=np.full(len(leg.odometer.stamp_ns), value))
+    leg = with_speeds(made.leg(), np.full(len(made.odometer.stamp_ns), value))
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        result = calibrate(replace(leg, odometer=odometer, form=form), settings(made))
+        result = calibrate(leg, settings(made))
     assert result.verdict is Verdict.REJECTED
-
-
-@pytest.fixture(scope='module')
-def config(made):
-    return settings(made, method='auto')
 
 
 @pytest.fixture(scope='module')
@@ -163,11 +156,9 @@ BAD_COVARIANCES = [
 
 
 def test_covariances_that_are_none(made, config, whole):
-    leg = made.leg()
-
     def some(covariance):
         covariance[::len(covariance) // 8][:8] = BAD_COVARIANCES
-    result = calibrate(replace(leg, fix=changed(leg.fix, covariance_n=some)), config)
+    result = calibrate(spoilt(made.leg(), 'fix', covariance_n=some), config)
     assert Code.METHOD_FAILED not in everything_said(result)
     for name in ('smoother', 'two_point'):
         mine, other = (r.methods[name].estimates['scale_factor'] for r in (result, whole))
