@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import changed, drive, seconds, settings
+from drives import changed, drive, kept, seconds, settings, spoilt, without
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -36,7 +36,7 @@ def clean(made):
 
 
 def with_right(made, change, **more):
-    return replace(made.leg(), odometer_right=changed(made.odometer_right, value=change), **more)
+    return replace(spoilt(made.leg(), 'odometer_right', value=change), **more)
 
 
 @pytest.mark.parametrize('span', [65536, 4096, 256, 10_000, 9000])
@@ -53,19 +53,17 @@ def test_a_hidden_span_is_found_and_undone_to_the_count(made, clean, span, signe
 
 
 def test_the_wheel_and_the_first_time_are_named(made):
-    left = changed(made.odometer, value=lambda a: a % 32768)
-    rolled = np.flatnonzero(np.diff(left.value) < 0)
-    leg = replace(made.leg(), odometer=left)
+    leg = spoilt(made.leg(), 'odometer', value=lambda a: a % 32768)
+    rolled = np.flatnonzero(np.diff(leg.odometer.value) < 0)
     _, said = screened(leg, made)
     text = said[Code.WHEEL_COUNTERS_DIFFER]
     assert text.startswith("the left wheel's counter")
-    assert f't = {seconds(leg, left)[rolled[0] + 1]:.2f} s' in text
+    assert f't = {seconds(leg, leg.odometer)[rolled[0] + 1]:.2f} s' in text
     assert f'{len(rolled)} jump' in text
 
 
 def test_both_wheels_of_one_hidden_span_are_both_undone(made, clean):
-    leg = replace(with_right(made, lambda a: a % 4096),
-                  odometer=changed(made.odometer, value=lambda a: a % 4096))
+    leg = spoilt(with_right(made, lambda a: a % 4096), 'odometer', value=lambda a: a % 4096)
     inputs, _ = screened(leg, made)
     assert np.array_equal(inputs.travel.s, clean.travel.s)
 
@@ -140,17 +138,14 @@ def test_a_count_and_a_speed_have_no_mean(made):
 
 
 def test_a_right_wheel_that_never_speaks_is_dead(made):
-    silent = take(made.odometer_right, slice(0, 0))
-    _, said = screened(replace(made.leg(), odometer_right=silent), made,
-                       odometer__left='topic', odometer__right='topic')
+    silent = without(made.leg(), 'odometer_right')
+    _, said = screened(silent, made, odometer__left='topic', odometer__right='topic')
     assert 'right wheel has no message' in said[Code.WHEEL_DEAD]
-    _, said = screened(replace(made.leg(), odometer_right=silent), made)     # one odometer
-    assert not said
+    assert not screened(silent, made)[1]     # one odometer
 
 
 def test_a_right_wheel_that_sends_no_number_is_dead(made):
-    right = replace(made.odometer_right, value=np.full(len(made.odometer_right.value), np.nan))
-    inputs, said = screened(replace(made.leg(), odometer_right=right), made)
+    inputs, said = screened(with_right(made, lambda a: a * np.nan), made)
     assert 'right wheel has no usable value' in said[Code.WHEEL_DEAD]
     assert inputs.travels == ()
     assert len(inputs.travel.t)
@@ -158,14 +153,13 @@ def test_a_right_wheel_that_sends_no_number_is_dead(made):
 
 def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made, clean):
     """Linear between rows: the mean errs by at most a(dt/2)^2/2 + a count, here 3 m/s^2, 0.1 s."""
-    right = take(made.odometer_right, slice(101, 5001, 2))
-    right = changed(right, stamp_ns=lambda a: a - 7_000_000, value=lambda a: a)
     # a row stamped early by 7 ms: as a wheel read 7 ms late
-    leg = replace(made.leg(), odometer_right=right)
-    inputs, said = screened(leg, made)
-    t = inputs.travel.t
-    assert t[0] >= seconds(leg, right)[0]
-    assert t[-1] <= seconds(leg, right)[-1]
+    leg = spoilt(kept(made.leg(), 'odometer_right', slice(101, 5001, 2)), 'odometer_right',
+                 stamp_ns=lambda a: a - 7_000_000)
+    inputs, _ = screened(leg, made)
+    t, sent = inputs.travel.t, seconds(leg, leg.odometer_right)
+    assert sent[0] <= t[0]
+    assert t[-1] <= sent[-1]
     late = clean.travels[1].at(t + 0.007)
     want = (clean.travels[0].at(t) + late - clean.travels[0].at(t[0]) - late[0]) / 2
     bound = 3.0 / 8 * 0.1**2 / 0.02 / 2 + 1.5
@@ -173,7 +167,7 @@ def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made, clean)
 
 
 def test_a_gap_of_the_right_wheel_is_said_though_the_mean_has_none(made, clean):
-    right = take(made.odometer_right, np.r_[0:2000, 2060:len(made.odometer_right.value)])
-    inputs, said = screened(replace(made.leg(), odometer_right=right), made)
+    some = np.r_[0:2000, 2060:len(made.odometer_right.value)]
+    inputs, said = screened(kept(made.leg(), 'odometer_right', some), made)
     assert said[Code.TOPIC_GAP].startswith('right odometer gap of 3.05 s')
     assert_allclose(inputs.travel.s[-1], clean.travel.s[-1])      # counts are not lost in a gap
