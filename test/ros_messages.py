@@ -32,6 +32,10 @@ def header(stamp_ns=0, frame='imu_link'):
     return kind('std_msgs/msg/Header')(stamp=time, frame_id=frame)
 
 
+def stamped(msgtype, stamp_ns, frame, **content):
+    return kind(msgtype)(header=header(stamp_ns, frame), **content)
+
+
 def vector(x=0.0, y=0.0, z=0.0):
     return kind('geometry_msgs/msg/Vector3')(x=float(x), y=float(y), z=float(z))
 
@@ -44,15 +48,16 @@ def imu(stamp_ns, w=(0, 0, 0), f=(0, 0, 9.81), q=(0, 0, 0, 1), covariance=None, 
     """Return a sensor_msgs/Imu; covariance None: no orientation, as REP-145 has it."""
     none = np.zeros(9)
     first = np.array([-1.0] + [0.0] * 8) if covariance is None else np.array(covariance, float)
-    return kind('sensor_msgs/msg/Imu')(
-        header=header(stamp_ns, frame), orientation=quaternion(*q), orientation_covariance=first,
+    return stamped(
+        'sensor_msgs/msg/Imu', stamp_ns, frame,
+        orientation=quaternion(*q), orientation_covariance=first,
         angular_velocity=vector(*w), angular_velocity_covariance=none,
         linear_acceleration=vector(*f), linear_acceleration_covariance=none)
 
 
 def fix(stamp_ns, latitude, longitude, altitude=0.0, sigma=1.0, status=0, known=2):
-    return kind('sensor_msgs/msg/NavSatFix')(
-        header=header(stamp_ns, 'gps'),
+    return stamped(
+        'sensor_msgs/msg/NavSatFix', stamp_ns, 'gps',
         status=kind('sensor_msgs/msg/NavSatStatus')(status=status, service=1),
         latitude=float(latitude), longitude=float(longitude), altitude=float(altitude),
         position_covariance=np.diag([sigma**2, sigma**2, 4 * sigma**2]).reshape(9),
@@ -76,9 +81,10 @@ def whole_array(values, name='Int32', labels=()):
 
 
 def joints(stamp_ns, names, position=(), velocity=(), effort=(), frame=''):
-    return kind('sensor_msgs/msg/JointState')(
-        header=header(stamp_ns, frame), name=list(names), position=np.array(position, float),
-        velocity=np.array(velocity, float), effort=np.array(effort, float))
+    return stamped(
+        'sensor_msgs/msg/JointState', stamp_ns, frame, name=list(names),
+        position=np.array(position, float), velocity=np.array(velocity, float),
+        effort=np.array(effort, float))
 
 
 def twist(x, y=0.0, z=0.0):
@@ -86,8 +92,7 @@ def twist(x, y=0.0, z=0.0):
 
 
 def twist_stamped(stamp_ns, x, y=0.0, z=0.0, frame='base_link'):
-    return kind('geometry_msgs/msg/TwistStamped')(header=header(stamp_ns, frame),
-                                                  twist=twist(x, y, z))
+    return stamped('geometry_msgs/msg/TwistStamped', stamp_ns, frame, twist=twist(x, y, z))
 
 
 def twist_covariance(stamp_ns, x, y=0.0, z=0.0, variances=(0.0, 0.0, 0.0), frame='base_link'):
@@ -95,8 +100,7 @@ def twist_covariance(stamp_ns, x, y=0.0, z=0.0, variances=(0.0, 0.0, 0.0), frame
     covariance[[0, 1, 2], [0, 1, 2]] = variances
     inner = kind('geometry_msgs/msg/TwistWithCovariance')(twist=twist(x, y, z),
                                                           covariance=covariance.reshape(36))
-    return kind('geometry_msgs/msg/TwistWithCovarianceStamped')(header=header(stamp_ns, frame),
-                                                                twist=inner)
+    return stamped('geometry_msgs/msg/TwistWithCovarianceStamped', stamp_ns, frame, twist=inner)
 
 
 def pose_at(position):
@@ -105,35 +109,32 @@ def pose_at(position):
 
 
 def pose(stamp_ns, position, frame='map'):
-    return kind('geometry_msgs/msg/PoseStamped')(header=header(stamp_ns, frame),
-                                                 pose=pose_at(position))
+    return stamped('geometry_msgs/msg/PoseStamped', stamp_ns, frame, pose=pose_at(position))
 
 
 def pose_covariance(stamp_ns, position, covariance, frame='map'):
     """Return a geometry_msgs/PoseWithCovarianceStamped; covariance: (6, 6)."""
     inner = kind('geometry_msgs/msg/PoseWithCovariance')(
         pose=pose_at(position), covariance=np.array(covariance, float).reshape(36))
-    return kind('geometry_msgs/msg/PoseWithCovarianceStamped')(header=header(stamp_ns, frame),
-                                                               pose=inner)
+    return stamped('geometry_msgs/msg/PoseWithCovarianceStamped', stamp_ns, frame, pose=inner)
 
 
 def point(stamp_ns, position, frame='map'):
-    return kind('geometry_msgs/msg/PointStamped')(header=header(stamp_ns, frame),
-                                                  point=pose_at(position).position)
+    return stamped('geometry_msgs/msg/PointStamped', stamp_ns, frame,
+                   point=pose_at(position).position)
 
 
 def transform(stamp_ns, position, child='robot', frame='world'):
     inner = kind('geometry_msgs/msg/Transform')(translation=vector(*position),
                                                 rotation=quaternion())
-    return kind('geometry_msgs/msg/TransformStamped')(header=header(stamp_ns, frame),
-                                                      child_frame_id=child, transform=inner)
+    return stamped('geometry_msgs/msg/TransformStamped', stamp_ns, frame, child_frame_id=child,
+                   transform=inner)
 
 
 def odometry(stamp_ns, x, child='base_link', frame='odom'):
     """Return a nav_msgs/Odometry with a forward speed."""
     inner = kind('geometry_msgs/msg/PoseWithCovariance')(pose=pose_at((1.0, 2.0, 3.0)),
                                                          covariance=np.arange(36.0))
-    return kind('nav_msgs/msg/Odometry')(
-        header=header(stamp_ns, frame), child_frame_id=child, pose=inner,
-        twist=kind('geometry_msgs/msg/TwistWithCovariance')(twist=twist(x),
-                                                            covariance=np.zeros(36)))
+    moves = kind('geometry_msgs/msg/TwistWithCovariance')(twist=twist(x), covariance=np.zeros(36))
+    return stamped('nav_msgs/msg/Odometry', stamp_ns, frame, child_frame_id=child, pose=inner,
+                   twist=moves)

@@ -57,13 +57,18 @@ def test_each_block_is_of_commands_that_somebody_runs():
     assert seen == KNOWN, 'no longer on any page: take it out of the table'
 
 
-def put_bag(folder, words, named):
-    """Write the bag that a command reads, its topics named as the command names them."""
-    made = drive(**STRAIGHT)
-    names = DEFAULTS | named | {slot: words[words.index(option) + 1]
-                                for slot, option in OPTIONS.items() if option in words}
-    write_bag(folder / words[1], [imu(names['imu'], made.imu), fix(names['fix'], made.fix),
-                                  counter(names['odometer'], made.odometer)])
+def put_bag(path, made, names=DEFAULTS):
+    write_bag(path, [imu(names['imu'], made.imu), fix(names['fix'], made.fix),
+                     counter(names['odometer'], made.odometer)])
+
+
+def printed(words, capfd, code=0):
+    """Return what a command prints that ends with a code."""
+    capfd.readouterr()
+    ended = cli.main(words)
+    out, err = capfd.readouterr()
+    assert ended == code, err
+    return out
 
 
 @pytest.fixture(autouse=True)
@@ -77,9 +82,8 @@ def undrawn(request, monkeypatch):
 def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp('results')
     for seed in (1, 2):
-        made, bag = drive(**STRAIGHT, seed=seed), folder / f'bag_{seed}'
-        write_bag(bag, [imu('/imu/data', made.imu), fix('/fix', made.fix),
-                        counter('/odometer', made.odometer)])
+        bag = folder / f'bag_{seed}'
+        put_bag(bag, drive(**STRAIGHT, seed=seed))
         code = cli.main(['replay', str(bag), '--output', str(folder / f'{seed}'), '--quiet',
                          '--method', 'two_point', '--set', 'output.formats=[params]'])
         assert code in (0, 1)
@@ -102,14 +106,14 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
     for text in yaml_blocks(page_of(page)):
         (tmp_path / 'my_vehicle.yaml').write_text(text)
     if words[0] in ('replay', 'inspect', 'try'):
-        put_bag(tmp_path, words, {'odometer': '/ticks'} if page == 'README.md' else {})
+        names = DEFAULTS | ({'odometer': '/ticks'} if page == 'README.md' else {})
+        named = {slot: words[words.index(option) + 1]
+                 for slot, option in OPTIONS.items() if option in words}
+        put_bag(tmp_path / words[1], drive(**STRAIGHT), names | named)
     if words[0] == 'compare':
         for made, name in zip(results, words[1:3], strict=True):
             shutil.copytree(made, tmp_path / name)
-    capfd.readouterr()
-    code = cli.main(words)
-    out, err = capfd.readouterr()
-    assert code == 0, err
+    out = printed(words, capfd)
     if words[0] == 'replay':
         content = json.loads((tmp_path / 'odocal_drive' / 'calibration.json').read_text())
         scale = content['result']['scale_factor']
@@ -139,8 +143,7 @@ def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch
     assert cli.main(made) == 0
     assert '\n'.join((tmp_path / 'fleet' / 'manifest.csv').read_text().splitlines()[:2]) in page
     # test/fleet looks at the reports: drawing them is most of the time
-    assert cli.main([*calibrated, '--reports', 'none']) == 1
-    out, _ = capfd.readouterr()
+    out = printed([*calibrated, '--reports', 'none'], capfd, code=1)
     worth = r'^  (\w+): (accepted|rejected); (.*) ([-\d]+)$'
     told = re.findall(worth, page, re.MULTILINE)
     assert re.findall(worth, out, re.MULTILINE) == told
@@ -153,8 +156,7 @@ def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch
     assert re.findall(r'^(\w+_\d{3}) ', out, re.MULTILINE) == [
         name for name, verdict, *_ in told if verdict == 'accepted']
     assert cli.main(replayed) == 0
-    assert cli.main([*accepted, '--reports', 'none']) == 1
-    out, _ = capfd.readouterr()
+    out = printed([*accepted, '--reports', 'none'], capfd, code=1)
     rows = {row['vehicle']: row for row in map(
         json.loads, re.findall(r'^\{.*$', out, re.MULTILINE)) if row['decision'] != 'PASS'}
     assert {name: row['decision'] for name, row in rows.items()} == {
@@ -173,9 +175,7 @@ def test_the_walk_through_a_room_prints_what_the_page_says(tmp_path, monkeypatch
     count = {'robot': 2, 'square': 1, 'wheels': 1, 'skid': 1, 'mecanum': 2, 'omni': 1}
     assert len(shown) == sum(count.values())
     for words in lines:
-        capfd.readouterr()
-        assert cli.main(words) == 0
-        out, _ = capfd.readouterr()
+        out = printed(words, capfd)
         if words[0] == 'replay':
             of_run = [shown.pop(0) for _ in range(count[words[1]])]
             assert all('\n'.join(text) in out for text in of_run), out
@@ -236,12 +236,9 @@ def test_files_for_common_vehicles_are_taken():
             found), path.name
 
 
-def test_a_plan_says_what_the_page_quotes(capsys):
+def test_a_plan_says_what_the_page_quotes(capfd):
     words = [shlex.split(line)[1:] for page, line in all_commands('odocal')
              if page == 'docs/first_calibration.md' and ' plan ' in line]
-    sigmas = []
-    for command in words:
-        assert cli.main([*command, '--json']) == 0
-        sigmas.append(json.loads(capsys.readouterr().out))
-    found = [plan['methods']['two_point']['estimates']['scale_factor']['sigma'] for plan in sigmas]
+    plans = [json.loads(printed([*command, '--json'], capfd)) for command in words]
+    found = [plan['methods']['two_point']['estimates']['scale_factor']['sigma'] for plan in plans]
     assert found == pytest.approx([2000e-6, 30e-6], rel=0.2)
