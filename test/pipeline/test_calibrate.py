@@ -161,12 +161,11 @@ def corrupted(rng, slot, samples):
     if kind in ORDERS:
         return take(samples, ORDERS[kind](rng, np.arange(n), rows)), what
     if kind == 'no stamp':
-        return drives.changed(samples, stamp_ns=lambda a: a.__setitem__(rows, 0)), what
+        return drives.changed(samples, stamp_ns=(rows, 0)), what
     jump = int(rng.choice([10**6, 10**8, 10**10, -10**8, -10**10]))
     if kind in ('set clock', 'false stamp'):
         moved = slice(first, None) if kind == 'set clock' else rows
-        return drives.changed(samples, stamp_ns=lambda a: a.__setitem__(
-            moved, a[moved] + jump)), what
+        return drives.changed(samples, stamp_ns=(moved, samples.stamp_ns[moved] + jump)), what
 
     def values(a):
         if kind == 'hang':

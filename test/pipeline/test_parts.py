@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from drives import drive, off, seconds, settings
+from drives import drive, off, seconds, settings, without
 import numpy as np
 import pytest
 
@@ -26,10 +26,9 @@ def made():
 
 def silent(leg, *gaps):
     """Return the leg with no IMU rows within some spans, s since the start mark."""
-    t, keep = seconds(leg, leg.imu), np.ones(len(leg.imu.stamp_ns), bool)
     for begin, end in gaps:
-        keep &= (t < begin) | (t >= end)
-    return replace(leg, imu=take(leg.imu, keep))
+        leg = without(leg, 'imu', begin, end)
+    return leg
 
 
 def of(leg, *gaps):

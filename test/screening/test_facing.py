@@ -7,7 +7,7 @@ from dataclasses import replace
 import re
 
 import drives
-from drives import changed, drive, everything_said, off, rejecting, settings, shifted
+from drives import drive, everything_said, off, rejecting, settings, shifted, spoilt
 import numpy as np
 import pytest
 from reversing_drives import made, there_and_back, three_point_turn, without_direction
@@ -62,11 +62,8 @@ def test_nothing_is_seen_where_nothing_pushes():
     made = town(1.0)
     rng = np.random.default_rng(1)
     for noise in (0.0, 3.0):        # m/s^2: none at all, and far above what driving does
-        leg = made.leg()
-        still = np.tile([0.0, 0.0, 9.81], (len(leg.imu.stamp_ns), 1))
-        still += noise * rng.standard_normal(still.shape)
-        flat = replace(leg, imu=changed(leg.imu, f_i=lambda f, x=still: x))
-        assert seen(made, flat) is None
+        still = [0.0, 0.0, 9.81] + noise * rng.standard_normal(made.imu.f_i.shape)
+        assert seen(made, spoilt(made.leg(), 'imu', f_i=(slice(None), still))) is None
 
 
 def test_what_is_far_off_is_said_by_its_side_and_size():
@@ -128,8 +125,7 @@ def test_an_imu_turned_on_purpose_is_calibrated_and_no_wheel_slips():
 
 def test_driven_backwards_all_along_by_a_counter_that_counts_down():
     made = town(180.0)
-    leg = made.leg()
-    backwards = replace(leg, odometer=changed(leg.odometer, value=lambda n: 20_000 - n))
+    backwards = spoilt(made.leg(), 'odometer', value=lambda n: 20_000 - n)
     result = calibrate(backwards, settings(made, heading_sigma=None, method='auto'))
     assert Code.ODOMETER_REVERSED not in everything_said(result)
 
@@ -141,7 +137,7 @@ def moved(made, rpy_deg, share=0.5):
 
     def turn(x):
         return np.concatenate([x[:begin], x[begin:] @ C.T])
-    return replace(made.leg(), imu=changed(made.imu, w_i=turn, f_i=turn))
+    return spoilt(made.leg(), 'imu', w_i=turn, f_i=turn)
 
 
 @pytest.mark.parametrize('share', [0.3, 0.45, 0.7])

@@ -3,14 +3,12 @@
 
 """Fixes that a receiver dead-reckons are found, and velocities that contradict the fixes."""
 
-from dataclasses import replace
 import re
 
-from drives import changed, configured, settings
+from drives import configured, kept, seconds, settings, spoilt
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import take
 from odocal_ros.reasons import Code
 from odocal_ros.screening.fix_screen import reckoned
 from odocal_ros.screening.screen import screen
@@ -138,8 +136,7 @@ def drive(request):
 
 
 def screened(drive, change, **options):
-    leg = drive.leg()
-    leg = leg.with_rows(fix_velocity=changed(leg.rows('fix_velocity'), velocity_n=change))
+    leg = spoilt(drive.leg(), 'fix_velocity', velocity_n=change)
     inputs, found = screen(leg, settings(drive, None, **options))
     said = [r.text for r in found if r.code is Code.VELOCITY_UNUSABLE]
     assert len(said) == (not len(inputs.outside['fix_velocity'].t))
@@ -154,10 +151,10 @@ def test_that_of_the_fixes_is_used(drive, factor):
 def test_gaps_of_the_velocity_are_not_compared(drive):
     leg = drive.leg()
     v = leg.rows('fix_velocity')
-    t = (v.stamp_ns - leg.start_ns) * 1e-9
+    t = seconds(leg, v)
     fast = np.linalg.norm(v.velocity_n, axis=1) > 8.0      # a line between them is no stop
-    kept = np.flatnonzero((t < 30.0) | (t > 170.0) | fast & (t % 60.0 < 15.0))
-    inputs, found = screen(leg.with_rows(fix_velocity=take(v, kept)), settings(drive, None))
+    some = (t < 30.0) | (t > 170.0) | fast & (t % 60.0 < 15.0)
+    inputs, found = screen(kept(leg, 'fix_velocity', some), settings(drive, None))
     assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
     assert len(inputs.outside['fix_velocity'].t)
 
@@ -176,15 +173,12 @@ def test_wheel_speeds_units_and_axes_are_found(drive):
 
 
 def test_nothing_is_said_of_a_velocity_that_is_not_wanted(drive):
-    leg = drive.leg()
-    leg = leg.with_rows(fix_velocity=changed(leg.rows('fix_velocity'),
-                                             velocity_n=lambda v: v.fill(9.0)))
+    leg = spoilt(drive.leg(), 'fix_velocity', velocity_n=lambda v: v.fill(9.0))
     _, found = screen(leg, settings(drive, None, gnss__use_velocity=False))
     assert Code.VELOCITY_UNUSABLE not in {r.code for r in found}
 
 
 def test_a_vehicle_that_stands_says_nothing(drive):
-    leg = drive.leg()
-    keep = leg.fix.stamp_ns < drive.options.start_ns + 5 * 10**9
-    inputs, _ = screen(replace(leg, fix=take(leg.fix, keep)), settings(drive, None))
+    keep = drive.fix.stamp_ns < drive.options.start_ns + 5 * 10**9
+    inputs, _ = screen(kept(drive.leg(), 'fix', keep), settings(drive, None))
     assert len(inputs.outside['fix_velocity'].t)

@@ -3,7 +3,7 @@
 
 """IMU rows: their rhythm, an axis at the limit of its range, two IMUs that alternate."""
 
-from drives import changed, drive, seconds
+from drives import drive, seconds, spoilt
 import numpy as np
 import pytest
 
@@ -152,8 +152,7 @@ def second(x, by):
     ('w_i', lambda w: w + BIAS), ('f_i', lambda f: f + 100 * BIAS),
     ('w_i', lambda w: w @ matrix_from_rpy([0.1, 0.0, 0.0]).T)], ids=['gyro', 'force', 'axes'])
 def test_rows_that_alternate_between_two_imus_reject_the_leg(leg, column, by):
-    mixed = changed(leg.imu, **{column: lambda x: second(x, by)})
-    _, reasons = screen(leg.__class__(**{**vars(leg), 'imu': mixed}), Config())
+    _, reasons = screen(spoilt(leg, 'imu', **{column: lambda x: second(x, by)}), Config())
     assert 'every second message' in {r.code: r for r in reasons}[Code.SEVERAL_IMUS].text
 
 
