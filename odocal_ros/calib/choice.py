@@ -8,7 +8,6 @@ The methods on one leg are compared: differences beyond the sigmas, with their l
 """
 
 from collections.abc import Iterable, Mapping
-from itertools import combinations
 import math
 
 from odocal_ros.calib.judge import share
@@ -112,20 +111,20 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
     """
     sound = [methods[n] for n in ORDER if n in methods
              and methods[n].verdict is not Verdict.REJECTED]
-    found = []
+    if len(sound) < len(ORDER):
+        return []
+    (better, other), found = sound, []
     for name, (word, cause) in COMPARED.items():
-        for better, other in combinations(sound, 2):
-            a, b = (m.estimates.get(name) for m in (better, other))
-            if a is None or b is None or a.value is None or b.value is None \
-                    or a.sigma is None or b.sigma is None:
-                continue
-            sigma = math.hypot(a.sigma, b.sigma)
-            apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))
-            if abs(apart) > REMARK_SIGMAS * sigma:
-                off = (share(apart / a.value, '+') if name == 'scale_factor' else
-                       f'{math.degrees(apart):+z.3f} deg')
-                found.append(Reason(
-                    Code.METHODS_DISAGREE, f'{word}: {other.name} and {better.name} differ by '
-                    f'{off}, {abs(apart) / sigma:.1f} sigma; likely cause: '
-                    f'{cause}'))
+        a, b = (m.estimates.get(name) for m in sound)
+        if a is None or b is None or a.value is None or b.value is None \
+                or a.sigma is None or b.sigma is None:
+            continue
+        sigma = math.hypot(a.sigma, b.sigma)
+        apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))
+        if abs(apart) > REMARK_SIGMAS * sigma:
+            off = (share(apart / a.value, '+') if name == 'scale_factor' else
+                   f'{math.degrees(apart):+z.3f} deg')
+            found.append(Reason(
+                Code.METHODS_DISAGREE, f'{word}: {other.name} and {better.name} differ by {off}, '
+                f'{abs(apart) / sigma:.1f} sigma; likely cause: {cause}'))
     return found

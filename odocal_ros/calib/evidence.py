@@ -35,27 +35,27 @@ class Evidence:
     Residuals are dead-reckoned minus fixed positions, along the vehicle's forward axis and left.
     """
 
-    t: NDArray[np.float64]               # (m,)
-    distance: NDArray[np.float64]        # (m,) m driven since the start mark
-    speed: NDArray[np.float64]           # (m,) m/s, below zero when reversing
-    yaw_rate: NDArray[np.float64]        # (m,) rad/s, counter-clockwise
-    track_n: NDArray[np.float64]         # (m, 3) of the antenna, as calibrated
-    track_before_n: NDArray[np.float64]  # (m, 3) as configured
-    t_fix: NDArray[np.float64]           # (k,)
-    fix_distance: NDArray[np.float64]    # (k,) m driven
-    fix_n: NDArray[np.float64]           # (k, 3) NaN up: none
-    fix_sigma: NDArray[np.float64]       # (k,) m, horizontal per axis
-    fix_status: NDArray[np.int64]        # (k,) NavSatStatus
-    residual: NDArray[np.float64]        # (k, 2) m along, across, as calibrated
-    residual_before: NDArray[np.float64]  # (k, 2) as configured
+    t: Floats                          # (m,)
+    distance: Floats                   # (m,) m driven since the start mark
+    speed: Floats                      # (m,) m/s, below zero when reversing
+    yaw_rate: Floats                   # (m,) rad/s, counter-clockwise
+    track_n: Floats                    # (m, 3) of the antenna, as calibrated
+    track_before_n: Floats             # (m, 3) as configured
+    t_fix: Floats                      # (k,)
+    fix_distance: Floats               # (k,) m driven
+    fix_n: Floats                      # (k, 3) NaN up: none
+    fix_sigma: Floats                  # (k,) m, horizontal per axis
+    fix_status: Ints                   # (k,) NavSatStatus
+    residual: Floats                   # (k, 2) m along, across, as calibrated
+    residual_before: Floats            # (k, 2) as configured
     sections: Sections
-    t_excluded: NDArray[np.float64]      # (x,) fixes not used
-    excluded_because: tuple[str, ...]    # (x,)
-    fixes: int                           # before decimation
+    t_excluded: Floats                 # (x,) fixes not used
+    excluded_because: tuple[str, ...]  # (x,)
+    fixes: int                         # before decimation
     excluded: int
-    gaps: tuple[tuple[str, float, float], ...] = ()   # of IMU and odometer: which, begin, end
-    t_fit: float = np.inf                # s: later data are held out of the fit
-    by_speed: SpeedScale = SpeedScale(NO_BINS)     # of the uncorrected odometer
+    gaps: tuple[tuple[str, float, float], ...] = ()  # of IMU and odometer: which, begin, end
+    t_fit: float = np.inf              # s: later data are held out of the fit
+    by_speed: SpeedScale = SpeedScale(NO_BINS)  # of the uncorrected odometer
     # (w, 4) as window_scale
     by_window: Floats = field(default_factory=lambda: NO_WINDOWS)
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.nav.statistics import NORMAL_MEDIAN, RAYLEIGH_MEDIAN
@@ -36,14 +35,14 @@ SLOW_WINDOW = 20.0
 class MarkFix:
     """Antenna position at a mark."""
 
-    t: float                           # s, of the mark
-    position_n: NDArray[np.float64]    # (3,) m
-    covariance_n: NDArray[np.float64]  # (3, 3) m^2
-    standing: bool                     # averaged at rest
-    used: int                          # fixes
+    t: float                   # s, of the mark
+    position_n: Floats         # (3,) m
+    covariance_n: Floats       # (3, 3) m^2
+    standing: bool             # averaged at rest
+    used: int                  # fixes
     dropped: int
-    height_known: bool = True          # False if any fix has no height
-    surveyed: bool = False             # from settings
+    height_known: bool = True  # False if any fix has no height
+    surveyed: bool = False     # from settings
 
 
 def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,

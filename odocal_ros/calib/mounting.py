@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.data.pieces import medians
@@ -30,12 +29,12 @@ MEANT_AXIS = np.deg2rad(30.0)
 class Mounting:
     """The nominal rotation estimated from a drive."""
 
-    C_bi: NDArray[np.float64] | None  # (3, 3) i to b, quarter turns only; None: not observable
-    up_i: NDArray[np.float64]         # (3,) measured axis
-    forward_i: NDArray[np.float64] | None  # (3,) the same; None: not observable
-    forward_sigma: float              # rad
-    assumed: bool                     # forward is assumed to be x, not measured
-    off: float                        # rad, angle between the measured axes and the quarter turns
+    C_bi: Floats | None       # (3, 3) i to b, quarter turns only; None: not observable
+    up_i: Floats              # (3,) measured axis
+    forward_i: Floats | None  # (3,) the same; None: not observable
+    forward_sigma: float      # rad
+    assumed: bool             # forward is assumed to be x, not measured
+    off: float                # rad, angle between the measured axes and the quarter turns
 
     @property
     def rpy(self) -> list[float] | None:

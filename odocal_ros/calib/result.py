@@ -10,10 +10,10 @@ import traceback
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.border import Border, Carried
 from odocal_ros.calib.evidence import Evidence
+from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, GRAVITY, Reason, Verdict, verdict_of
 
 # keys of a result in calibration.json that are not estimates
@@ -57,8 +57,8 @@ class Source:
     """One source of error of an estimate, as one-sigma effects."""
 
     name: str
-    effects: NDArray[np.float64]  # (p, k) of k independent unit errors on the p parameters
-    shared: bool = False          # the same in every leg of a vehicle (heading source, lever arm)
+    effects: Floats       # (p, k) of k independent unit errors on the p parameters
+    shared: bool = False  # the same in every leg of a vehicle (heading source, lever arm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +68,10 @@ class MethodResult:
     name: str
     reasons: tuple[Reason, ...]
     estimates: dict[str, Estimate] = field(default_factory=dict)
-    parameters: tuple[str, ...] = ()    # names, in the order of the rows of the sources
+    parameters: tuple[str, ...] = ()  # names, in the order of the rows of the sources
     sources: tuple[Source, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
-    border: Border | None = None        # of the leg, or of all; None: the method has none
+    border: Border | None = None      # of the leg, or of all; None: the method has none
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -94,10 +94,10 @@ class TrackCheck:
 class PerDistance:
     """Error of dead reckoning a path length after a fix, before and after calibration: rms, m."""
 
-    length: float       # m driven
+    length: float  # m driven
     before: float
     after: float
-    pieces: float       # path length over ``length``
+    pieces: float  # path length over ``length``
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,16 +117,16 @@ class LegResult:
     before: TrackCheck | None = None
     after: TrackCheck | None = None
     per_distance: tuple[PerDistance, ...] = ()
-    track_n: NDArray[np.float64] | None = None          # (m, 3) corrected dead reckoning, n, m
-    track_before_n: NDArray[np.float64] | None = None   # (m, 3) as configured
-    reference_n: NDArray[np.float64] | None = None      # (k, 3) fixes used
+    track_n: Floats | None = None         # (m, 3) corrected dead reckoning, n, m
+    track_before_n: Floats | None = None  # (m, 3) as configured
+    reference_n: Floats | None = None     # (k, 3) fixes used
     origin: tuple[float, float, float] | None = None  # latitude, longitude rad, height m of n
-    bag: str = ''                             # recording of the leg, empty when live
-    C_bi: NDArray[np.float64] | None = None   # (3, 3) nominal rotation used, imu frame to b
-    deciding: tuple[str, ...] = ()            # methods whose verdict counts, all if empty
-    evidence: Evidence | None = None          # plot data, None if no track was usable
-    path_ratio: float | None = None     # median ratio of distance between fixes to travel
-    cut_from_ns: int | None = None            # start mark of the leg of which this is a section
+    bag: str = ''                         # recording of the leg, empty when live
+    C_bi: Floats | None = None            # (3, 3) nominal rotation used, imu frame to b
+    deciding: tuple[str, ...] = ()        # methods whose verdict counts, all if empty
+    evidence: Evidence | None = None      # plot data, None if no track was usable
+    path_ratio: float | None = None       # median ratio of distance between fixes to travel
+    cut_from_ns: int | None = None        # start mark of the leg of which this is a section
 
     @property
     def driven_ns(self) -> int:
@@ -160,7 +160,7 @@ class Calibration:
     legs: tuple[LegResult, ...]
     imu_rotation_xyzw: tuple[float, ...] | None = None  # base_link <- imu frame
     imu_rotation_rpy: tuple[float, ...] | None = None
-    carried: Carried | None = None      # information for later legs
+    carried: Carried | None = None  # information for later legs
 
     @property
     def verdict(self) -> Verdict:

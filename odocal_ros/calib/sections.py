@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.nav.statistics import robust_sigma
@@ -38,10 +37,10 @@ NO_WINDOWS = np.empty((0, 4))    # definition
 class Sections:
     """Scale by section, (k,): length by the fixes over length dead reckoned as calibrated."""
 
-    begin: NDArray[np.float64]  # m, path length
-    end: NDArray[np.float64]    # m
-    ratio: NDArray[np.float64]  # NaN: not determined by the fixes
-    sigma: NDArray[np.float64]  # of the ratio
+    begin: Floats  # m, path length
+    end: Floats    # m
+    ratio: Floats  # NaN: not determined by the fixes
+    sigma: Floats  # of the ratio
 
 
 def sections(path: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> Sections:

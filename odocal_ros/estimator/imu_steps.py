@@ -13,7 +13,6 @@ step.
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.mapped import let_go
@@ -75,7 +74,7 @@ class ImuSteps(Steps):
     """The steps of a leg, with keyframes at some of their ends."""
 
     t: Floats           # (m + 1,)
-    key: NDArray[np.int64]   # (K + 1,) step that begins at each keyframe
+    key: Ints   # (K + 1,) step that begins at each keyframe
 
     @classmethod
     def of(cls, leg: SmootherLeg, spacing: float) -> 'ImuSteps':

@@ -5,9 +5,6 @@
 
 from dataclasses import dataclass, fields
 
-import numpy as np
-from numpy.typing import NDArray
-
 from odocal_ros.data.arrays import Floats, Ints
 
 
@@ -44,7 +41,7 @@ class Intervals:
 class Points:
     """Sums from the begin of an interval to m times within it."""
 
-    interval: NDArray[np.int64]   # (m,)
+    interval: Ints   # (m,)
     tau: Floats      # (m,) s since the begin
     dv: Floats       # (m, 3)
     dp: Floats       # (m, 3)

@@ -15,7 +15,6 @@ from itertools import product
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.errors import BadUsage
@@ -26,7 +25,7 @@ class Design:
     """An orthogonal array of level numbers from 0, a row for each set to try."""
 
     name: str
-    rows: NDArray[np.int64]      # (n, columns)
+    rows: Ints  # (n, columns)
 
 
 def prime_power(q: int) -> tuple[int, int] | None:
@@ -105,7 +104,7 @@ def bose(q: int, columns: int) -> Ints:
     return np.stack([slopes[0], j, *slopes[1:]][:columns], -1)
 
 
-def full_factorial(levels: tuple[int, ...]) -> NDArray[np.int64]:
+def full_factorial(levels: tuple[int, ...]) -> Ints:
     """Return all combinations: (product of levels, columns)."""
     return np.stack([g.ravel() for g in np.indices(tuple(levels))], -1).astype(np.int64)
 

@@ -11,7 +11,6 @@ whether positions separate left and right.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.wheel_search.planar import coefficients, loss, PlanarLeg, weights
 from odocal_ros.calib.wheel_search.space import sets_of, Space
@@ -25,32 +24,23 @@ BENT = 1e-4          # judgement: share of path length: bend of any track by gyr
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """
-    Result of least squares; x as in ``space``.
+    """Result of least squares; x as in ``space``."""
 
-    covariance : (3, 3) of x by the scatter of the residuals, with the effective number of
-        correlated ones; if the difference is held, left and right have the same error. Errors of
-        start, gyro and lever arm are not included.
-    condition : of the Jacobian by relative left, right scale (or both) and heading in rad.
-    sigma_difference : of right minus left, relative; includes the scatter, and a bend of the track
-        by BENT of path length, which has the same effect as a difference of the wheels.
-    """
-
-    x: NDArray[np.float64]
+    x: Floats
     value: float
     iterations: int
     settled: bool
-    covariance: NDArray[np.float64]
-    condition: float
-    sigma_difference: float
+    covariance: Floats  # (3, 3) of x by the scatter, without errors of start, gyro and lever arm
+    condition: float         # of the Jacobian by relative scales (or both) and heading in rad
+    sigma_difference: float  # of right minus left, relative; with a bend of the track by BENT
 
     @property
-    def sigma(self) -> NDArray[np.float64]:
+    def sigma(self) -> Floats:
         """Return the formal sigmas of x: (3,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def correlation(self) -> NDArray[np.float64]:
+    def correlation(self) -> Floats:
         """Return the correlations of x: (3, 3)."""
         return self.covariance / np.outer(self.sigma, self.sigma)
 

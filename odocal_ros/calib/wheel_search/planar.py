@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from odocal_ros.calib.drive import knots_of
 from odocal_ros.data.arrays import Floats, Ints
@@ -40,19 +40,19 @@ class PlanarLeg:
     m/unit of scale factor, with the configured heading.
     """
 
-    t: NDArray[np.float64]        # (k,) s, times of the fixes
-    left_n: NDArray[np.float64]   # (k, 2)
-    right_n: NDArray[np.float64]  # (k, 2)
-    fixes_n: NDArray[np.float64]  # (k, 2)
-    start_n: NDArray[np.float64]  # (2,) antenna at the start, where every track begins
-    sigma: NDArray[np.float64]    # (k,) m, of each axis of a fix
-    scale_left: float             # start value, m per unit
-    scale_right: float            # start value
-    lever_n: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 2)))
-    pieces: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    t: Floats           # (k,) s, times of the fixes
+    left_n: Floats      # (k, 2)
+    right_n: Floats     # (k, 2)
+    fixes_n: Floats     # (k, 2)
+    start_n: Floats     # (2,) antenna at the start, where every track begins
+    sigma: Floats       # (k,) m, of each axis of a fix
+    scale_left: float   # start value, m per unit
+    scale_right: float  # start value
+    lever_n: Floats = field(default_factory=lambda: np.zeros((1, 2)))
+    pieces: Ints = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
     @property
-    def start(self) -> NDArray[np.float64]:
+    def start(self) -> Floats:
         """Return the start values as a parameter set: (3,)."""
         return np.array([self.scale_left, self.scale_right, 0.0])
 
@@ -135,12 +135,12 @@ def squared_distances(leg: PlanarLeg, sets: Floats) -> Iterator[tuple[slice, Flo
 class Scores:
     """Criteria of m parameter sets, (m,) each."""
 
-    max: NDArray[np.float64]          # m, distance of track and fix
-    mean: NDArray[np.float64]         # m
-    rms: NDArray[np.float64]          # m
-    loss: NDArray[np.float64]         # the mean square, m^2, or without unit if fixes are weighted
-    course_mean: NDArray[np.float64]  # rad, direction minus course over ground; NaN: no course
-    course_rms: NDArray[np.float64]   # rad
+    max: Floats          # m, distance of track and fix
+    mean: Floats         # m
+    rms: Floats          # m
+    loss: Floats         # the mean square, m^2, or without unit if fixes are weighted
+    course_mean: Floats  # rad, direction minus course over ground; NaN: no course
+    course_rms: Floats   # rad
 
     def row(self, k: int) -> dict[str, float | None]:
         """Return the criteria of one set for text and JSON, m and deg; None: no course."""

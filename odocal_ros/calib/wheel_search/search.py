@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.wheel_search.arrays import Design, design_for
 from odocal_ros.calib.wheel_search.direct import least_squares, LeastSquares
@@ -36,15 +35,15 @@ class SearchResult:
     start: tuple[float, float]  # scales before, m per unit
     ranges: Ranges
     design: Design
-    sets: NDArray[np.float64]   # of the array's rows
+    sets: Floats                # of the array's rows
     scores: Scores              # of these sets
     best: int  # row with the least mean distance (robust: loss), of equal ones the least maximum
     held: bool  # the fixes do not separate left and right: their ratio is as at the start
     refined: Refined            # by response surfaces
     direct: LeastSquares        # by least squares
     free: LeastSquares          # the same with left and right free
-    refined_set: NDArray[np.float64]
-    direct_set: NDArray[np.float64]
+    refined_set: Floats
+    direct_set: Floats
     before: Scores              # of the start values, one row
     after: Scores               # of the refined ones
     reasons: tuple[Reason, ...]

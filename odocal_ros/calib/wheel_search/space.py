@@ -13,7 +13,6 @@ If the fixes cannot separate left and right, the difference is fixed and two coo
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.wheel_search.arrays import next_prime_power
 from odocal_ros.calib.wheel_search.planar import PlanarLeg
@@ -32,12 +31,12 @@ class Space:
     held: bool
 
     @property
-    def T(self) -> NDArray[np.float64]:     # noqa: N802
+    def T(self) -> Floats:     # noqa: N802
         """Return the matrix of x = T q."""
         return FREE[:, [0, 2]] if self.held else FREE
 
     @property
-    def S(self) -> NDArray[np.float64]:     # noqa: N802
+    def S(self) -> Floats:     # noqa: N802
         """Return the matrix of v = S q, bounded by the range: x; held: mean and heading."""
         return np.eye(2) if self.held else FREE
 
@@ -68,7 +67,7 @@ def sets_of(leg: PlanarLeg, x: Floats) -> Floats:
 class Ranges:
     """Search ranges about the start values."""
 
-    half: NDArray[np.float64]  # (3,) of left and right (relative) and heading (rad)
+    half: Floats               # (3,) of left and right (relative) and heading (rad)
     why: tuple[str, str, str]  # the source of each
     levels: int                # number of levels of each
 
@@ -79,7 +78,7 @@ class Ranges:
         return (2 * rows / (self.levels - 1) - 1) * self.half
 
     @property
-    def step(self) -> NDArray[np.float64]:
+    def step(self) -> Floats:
         """Return the step between levels; for one or two levels the half range."""
         return 2 * self.half / max(self.levels - 1, 2)
 

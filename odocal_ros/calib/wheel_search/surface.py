@@ -14,7 +14,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.wheel_search.space import Space
 from odocal_ros.data.arrays import Bools, Floats
@@ -25,8 +24,8 @@ class Surface:
     """A fitted polynomial: value + gradient y + y hessian y / 2, of y in [-1, 1]."""
 
     value: float
-    gradient: NDArray[np.float64]
-    hessian: NDArray[np.float64]
+    gradient: Floats
+    hessian: Floats
     r_squared: float    # share of the variance explained
     lack_of_fit: float  # largest residual over the range of the values
 
@@ -35,13 +34,13 @@ class Surface:
 class Refined:
     """Result of the search by surfaces."""
 
-    x: NDArray[np.float64]     # (3,) left, right (relative), heading (rad)
-    value: float               # of the criterion there
+    x: Floats      # (3,) left, right (relative), heading (rad)
+    value: float   # of the criterion there
     iterations: int
     settled: bool
-    half: NDArray[np.float64]  # (3,) last half range
-    widened: bool              # it was increased
-    on_edge: bool              # the minimum is still on its edge
+    half: Floats   # (3,) last half range
+    widened: bool  # it was increased
+    on_edge: bool  # the minimum is still on its edge
     first: Surface
     last: Surface
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.reasons import Code, Reason
 
 # s, judgement: between rows in the search for slips, which last a second or more
@@ -26,12 +26,12 @@ def _none(kind: type = float) -> NDArray[Any]:
 class WheelSlips:
     """Slips of single wheels, in order of time: (k,)."""
 
-    begin: NDArray[np.float64] = _none()  # s
-    end: NDArray[np.float64] = _none()    # s
-    size: NDArray[np.float64] = _none()   # m, > 0: farther; unknown wheel: right minus left
-    wheel: NDArray[np.int64] = _none(np.int64)  # -1 left, +1 right, 0 unknown
-    change: float = 0.0  # of the ratio right over left in the drive, as if at half of it
-    count: int = 2                        # number of wheels in the mean
+    begin: Floats = _none()        # s
+    end: Floats = _none()          # s
+    size: Floats = _none()         # m, > 0: farther; unknown wheel: right minus left
+    wheel: Ints = _none(np.int64)  # -1 left, +1 right, 0 unknown
+    change: float = 0.0            # of the ratio right over left in the drive, as if at half of it
+    count: int = 2                 # number of wheels in the mean
 
     @property
     def t(self) -> Floats:

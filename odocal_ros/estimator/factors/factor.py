@@ -41,20 +41,14 @@ WANTED = len(PARAMETERS)    # constants in the error budget: ln K, yaw, pitch
 
 @dataclass(frozen=True, eq=False)
 class LinearisationPoint:
-    """
-    The linearisation point of the equations: a state, and the preintegrated samples at it.
-
-    points : sums up to the times of the rows, by the name of their factor.
-    spread : (K, SPREAD) factors on the variances of outlier intervals.
-    fitted : as for ``Motion``.
-    """
+    """The linearisation point of the equations: a state, and the preintegrated samples at it."""
 
     state: State
     intervals: Intervals
-    points: dict[str, Points]
+    points: dict[str, Points]  # up to the times of the rows, by the name of their factor
     priors: Priors
-    spread: np.ndarray | None
-    fitted: bool = False
+    spread: np.ndarray | None  # (K, SPREAD) factors on the variances of outlier intervals
+    fitted: bool = False       # as for ``Motion``
 
 
 class Factor:

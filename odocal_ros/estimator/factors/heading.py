@@ -32,15 +32,11 @@ GIVEN_NOISE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Heading(Outside):
-    """
-    Yaw of the IMU's x axis in n: (m,) rad.
+    """Yaw of the IMU's x axis in n."""
 
-    noise : (m,) rad.   sigma : rad, of the error that is constant over the leg.
-    """
-
-    yaw: Floats
-    noise: Floats
-    sigma: float
+    yaw: Floats         # (m,) rad
+    noise: Floats       # (m,) rad
+    sigma: float        # rad, of the error that is constant over the leg
     said_by: str        # the heading source, as in the settings
 
 

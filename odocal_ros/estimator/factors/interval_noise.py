@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.estimator.factors.factor import IMU, IMU_NOISE, JUMP, SPREAD
 from odocal_ros.estimator.factors.motion import D, Motion, ROWS
 from odocal_ros.estimator.factors.odometer_filter import stamp_of
@@ -55,7 +54,7 @@ class IntervalNoise:
     road: Floats                       # (K, 5) effects of the wheels' unit noises along their axes
     extra: Floats                      # (K, 18) variances that are given, not estimated
     given: Floats                      # (K, 18, g) columns of unit noises, the same
-    component: ClassVar[NDArray[np.int64]] = np.array(
+    component: ClassVar[Ints] = np.array(
         len(GAUSS_X) * [INTERVAL.index(name) for name in IMU for _ in range(3)]
         + [INTERVAL.index(name) for name in ROAD])
 

@@ -43,7 +43,6 @@ from odocal_ros.estimator.state import (
     YAW,
 )
 from odocal_ros.estimator.sums import Intervals
-from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en, gravity
 from odocal_ros.nav.rotations import exp_so3, level_left, rotvec, skew, transpose, turn
@@ -105,8 +104,10 @@ class Motion:
         self.rolled = straight * self.varied * self._inclined(straight)[:, None]
         self.faster = self._by_odometer_filter()
         self.displacement = self.rolled + self.vertical_shift
-        self.unsaid = self._by_speed_offset(leg.travel.coarse)
-        if self.unsaid is not None:
+        self.unsaid: Floats | None = None       # derivative by the offset of a coarse speed
+        if leg.travel.coarse is not None:
+            moved_s = leg.travel.coarse.time_in_motion(state.t)
+            self.unsaid = (self.f_n + self.f_n_end) / 2 * moved_s[:, None]
             self.displacement = self.displacement + self.unsaid * state.constants[SPEED_OFFSET]
         self.dv, self.dp = dv, dp
         g = gravity_n((p[:-1] + p[1:]) / 2, leg.origin)
@@ -200,13 +201,6 @@ class Motion:
         out: Floats = self.rolled[:, :, None] * by[:, None]
         return out
 
-    def _by_speed_offset(self, coarse: CoarseSpeed | None) -> Floats | None:
-        """Return the derivative of the path by the offset of a coarse speed: (K, 3), or None."""
-        if coarse is None:
-            return None
-        moved_s = coarse.time_in_motion(self.state.t)
-        return (self.f_n + self.f_n_end) / 2 * moved_s[:, None]
-
     def _by_odometer_filter(self) -> Floats:
         """Return the derivatives of the travel by delay and filter of the odometer: (K, 2)."""
         wheel = self.axle.wheel / self.state.scale
@@ -222,7 +216,9 @@ class Motion:
         a, b = np.zeros((K, ROWS, n)), np.zeros((K, ROWS, n))
         arm_b = state.C_bv @ self.arm_v
         a[:, P, P], a[:, P, V], a[:, P, PHI] = -one, -one * T, skew(self.dp)
-        gyro = self._by_gyro()
+        gyro = np.zeros((K, ROWS, s.turned.shape[2]))       # by the gyro's bias and constants
+        gyro[:, PHI], gyro[:, V], gyro[:, P] = C @ s.turned, -C @ s.dv_by, -C @ s.dp_by
+        gyro[:, D] = -C @ s.S_by
         a[:, :, BG] = gyro[:, :, :3]
         # biases change little over HILL_INTERVALS: they do not affect the faster part
         lift = T * (C @ self.up)[:, :, None]
@@ -246,14 +242,6 @@ class Motion:
         b[:, D, P] += by_end[:, :, :3]
         b[:, D, PHI] += by_end[:, :, 3:]
         return a, b, self._by_constants(gyro)
-
-    def _by_gyro(self) -> Floats:
-        """Return derivatives by the gyro's bias and constants: (K, 18, 3 + g)."""
-        s, C = self.sums, self.C
-        out = np.zeros((len(C), ROWS, s.turned.shape[2]))
-        out[:, PHI], out[:, V], out[:, P] = C @ s.turned, -C @ s.dv_by, -C @ s.dp_by
-        out[:, D] = -C @ s.S_by
-        return out
 
     def _by_constants(self, gyro: Floats) -> Floats:
         s, C, state = self.sums, self.C, self.state

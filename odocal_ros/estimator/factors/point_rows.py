@@ -164,11 +164,6 @@ class PointRows(Factor):
 
             yield present[some], gather
 
-    def _columns(self) -> tuple[Ints, Ints]:
-        """Return the columns of J and of J_end in the joint marginals."""
-        n = self.n
-        return np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
-
     def components(self, marginals: JointMarginals) -> dict[str, tuple[float, float]]:
         if len(self.k) < FEWEST_JUDGED:
             return {}
@@ -205,8 +200,8 @@ class PointRows(Factor):
         return taken.reshape(len(present), -1, self.r.shape[1])
 
     def effects(self, marginals: JointMarginals) -> Iterator[tuple[str, Floats]]:
-        own, end = self._columns()
-        parts = []
+        n, parts = self.n, []       # columns of J and of J_end in the joint marginals
+        own, end = np.r_[0:n, 2 * n:2 * n + self.m], np.arange(n + SLOW.start, n + SLOW.stop)
         for present, gather in self._intervals():
             cross = np.ascontiguousarray(self.with_wanted(marginals.of(present)))
             X = cross[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
