@@ -68,8 +68,6 @@ def test_a_velocity_helps_and_its_size_is_found():
     silent = fitted(with_velocity(drive, lambda e: SIGMA * e, 0.0), pure)
     assert off(said, drive, *BOTH) < 3.3
     assert sigma_of(said) < 0.9 * sigma_of(without)
-    unasked = with_settings(config, {'gnss.use_velocity': False})
-    assert not leg_of(with_velocity(drive, lambda e: SIGMA * e), unasked).outside
     # 1.5 thousand draws of each: 2 % of a sigma
     assert said.details['noise']['velocity'] == pytest.approx(1.0, abs=0.08)
     assert silent.details['noise']['velocity'] == pytest.approx(0.5, abs=0.04)
@@ -133,14 +131,14 @@ def test_a_delay_is_not_lost_in_vibration():
     assert found['sigma'] < 0.08        # a third of the prior's
 
 
-def test_no_velocity_is_used_without_an_accelerometer():
-    drive, config, _ = made(**SHORT, velocity_sigma=SIGMA)
-    leg = drive.leg()
-    silent = replace(leg, imu=changed(leg.imu, f_i=lambda f: f.fill(0.0)))
-    assert 'velocity' in leg_of(leg, config).outside
-    assert 'velocity' not in leg_of(silent, config).outside
-    # nor the orientation of an IMU unless it is asked for
-    assert 'heading' not in made(**STRAIGHT, orientation_sigma=1e-3)[2].outside
+def test_what_cannot_be_used_or_is_not_asked_for_is_left_out():
+    drive, config, leg = made(**SHORT, **HILLS, velocity_sigma=SIGMA, orientation_sigma=1e-3)
+    assert set(leg.outside) == {'velocity', 'pressure'}     # no orientation unless asked for
+    without = with_settings(config, {'gnss.use_velocity': False, 'imu.use_pressure': False})
+    assert not leg_of(drive.leg(), without).outside
+    assert 'pressure' not in without.inputs
+    silent = replace(drive.leg(), imu=changed(drive.imu, f_i=lambda f: f.fill(0.0)))
+    assert not leg_of(silent, config).outside
 
 
 def test_white_errors_are_not_alike():
@@ -246,10 +244,3 @@ def test_doors_and_tunnels_are_outliers():
     value = sent.value + np.where(np.arange(len(sent.value)) % 800 < 40, 300.0, 0.0)
     leg = leg_of(drive.leg().with_rows(pressure=replace(sent, value=value)), config)
     assert off(smooth(leg, config), drive, 'pitch_mounting_angle') < 3.3
-
-
-def test_it_can_be_left_out():
-    drive, config, leg = made(**HILLY)
-    assert 'pressure' in leg.outside
-    assert not leg_of(drive.leg(), with_settings(config, {'imu.use_pressure': False})).outside
-    assert 'pressure' not in with_settings(config, {'imu.use_pressure': False}).inputs

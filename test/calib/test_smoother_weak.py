@@ -6,29 +6,27 @@
 from dataclasses import replace
 import re
 
-from drives import off
+from drives import off, settings
 import numpy as np
 import pytest
-from smoother_legs import made, truth
+from reversing_drives import made as by_hand
+from smoother_legs import made, said as texts, truth
 
-from odocal_ros.data.leg import Leg
-from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.estimator import bound, smooth
 from odocal_ros.estimator.factors import slide
 from odocal_ros.estimator.levels import Levels
 from odocal_ros.estimator.prepare import problem_of
-from odocal_ros.nav.earth import gravity
+from odocal_ros.nav.rotations import wrap
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.config import with_settings
+from odocal_ros.sim import routes
+from odocal_ros.sim.profile import hold, ramp, turn
 from odocal_ros.sim.real import Real
 
 pytestmark = pytest.mark.slow
 WINDOW, WINDOWS = 45.0, 6      # s, of one drive
 TOWN = {'scenario': 'town', 'duration': 420.0, 'imu_grade': 'consumer', 'seed': 3}
-LATITUDE, EARTH = 0.8, 6.378137e6      # rad; m, semi-major axis of WGS 84
-SPEED, RADIUS, STRAIGHT = 9.0, 30.0, 60.0     # m/s, m, m
-START_NS = 1_700_000_000_000_000_000
 
 
 @pytest.mark.parametrize('noise', ['correlated', 'white'])
@@ -146,45 +144,20 @@ def test_the_least_falls_from_a_road_to_what_turns_can_test_without_a_step():
     assert np.abs(np.diff(np.log(least))).max() < by_90 / 90 * 1.001
 
 
-def circles(heading, seed, duration=300.0, rate=100.0):
-    """Return a leg of left circles on level ground from a standstill, and the final yaw, rad."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(0.0, duration, 1 / rate)
-    speed = np.clip(1.5 * np.minimum(t - 20.0, duration - 10.0 - t), 0.0, SPEED)
-    path = np.cumsum(speed) / rate
-    turn_rate = np.where(path > STRAIGHT, speed / RADIUS, 0.0)
-    yaw = heading + np.cumsum(turn_rate) / rate
-    east, north = (np.cumsum(speed * x) / rate for x in (np.cos(yaw), np.sin(yaw)))
-    zero = np.zeros_like(t)
-    white = rng.standard_normal((6, len(t)))
-    w = np.stack([zero, zero, turn_rate], -1) + 8e-4 * white[:3].T
-    f = np.stack([np.gradient(speed, t), speed * turn_rate, zero + gravity(LATITUDE, 0.0)], -1)
-    stamps = START_NS + np.round(t * 1e9).astype(np.int64)
-    at = np.arange(0, len(t), int(rate))      # of the fixes: 1 Hz
-    sine2 = np.sin(LATITUDE)**2
-    n = EARTH / np.sqrt(1 - 0.00669438 * sine2)
-    m = n * (1 - 0.00669438) / (1 - 0.00669438 * sine2)
-    off = 0.3 * rng.standard_normal((2, len(at)))
-    fix = FixSamples(
-        stamps[at], stamps[at], LATITUDE + (north[at] + off[0]) / m,
-        (east[at] + off[1]) / n / np.cos(LATITUDE), 0.5 * rng.standard_normal(len(at)),
-        np.tile(np.diag([0.3, 0.3, 0.5])**2, (len(at), 1, 1)), np.full(len(at), 3),
-        np.zeros(len(at)))
-    return Leg(
-        START_NS + 15 * 10**9, int(stamps[-1]) - 4 * 10**9,
-        imu=ImuSamples(stamps, stamps, w, f + 0.01 * white[3:].T,
-                       np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1)), zero + np.nan),
-        odometer=OdometerSamples(stamps[::2], stamps[::2],
-                                 np.floor(path[::2] / 0.02).astype(np.int64)),
-        fix=fix, form=OdometerForm('cumulative', 2**32, 'm/pulse')), yaw[-1]
+def circles(duration, rng):
+    """Return left circles on level ground: 9 m/s, a radius of 30 m after 60 m straight on."""
+    speed = hold(20) + ramp(6, 9, 1.0) + hold(248) + ramp(6, -9, 1.0) + hold(10)
+    return routes._route([(speed, hold(30) + turn(244, 0.3 * 244, 1.0) + hold(16))])
 
 
-@pytest.mark.parametrize('heading', [-1.6, 3.1])
-def test_heading_of_circles_is_found_whatever_it_is(heading):
-    leg, yaw = circles(heading, 1)
-    method = calibrate(leg, with_settings(Config(), {
-        'odometer.nominal_scale': 0.02, 'method': 'smoother'})).methods['smoother']
+@pytest.mark.parametrize('yaw', [-1.6, 3.1])
+def test_heading_of_circles_is_found_whatever_it_is(yaw):
+    drive = by_hand(circles, heading=np.pi / 2 - yaw, yaw=0.0, pitch=0.0, imu_grade='consumer',
+                    imu_rate=100.0, fix_rate=1.0, fix_sigma=0.3, seed=1)
+    method = calibrate(drive.leg(), with_settings(settings(drive, None), {
+        'method': 'smoother'})).methods['smoother']
     forward = method.details['key_C_nb'][-1][:, 0]
-    off = np.angle(np.exp(1j * (np.arctan2(forward[1], forward[0]) - yaw)))
-    assert abs(off) < 0.05      # rad, 0.3 m of a fix at 30 m are 0.01
-    assert Code.FIXES_NOISIER_THAN_SAID not in {reason.code for reason in method.reasons}
+    last = (drive.truth.start_ns - drive.options.start_ns) * 1e-9 + method.details['key_t'][-1]
+    off = np.arctan2(forward[1], forward[0]) - drive.motion.at(np.array([last])).yaw[0]
+    assert abs(wrap(off)) < 0.05      # rad, 0.3 m of a fix at 30 m are 0.01
+    assert Code.FIXES_NOISIER_THAN_SAID not in texts(method)
