@@ -66,6 +66,10 @@ class Convergence:
 
 
 CONVERGENCE = Convergence()
+# weights of steps of the constants, and sigmas from which they do not count
+OF_ALL = np.where(np.arange(layout.M) < factor.WANTED, 1.0, CONVERGENCE.others)
+FLAT = np.full(layout.M, np.inf)
+FLAT[[layout.YAW, layout.PITCH]] = CONVERGENCE.flat_angle
 # share of the last step from which on a step that turns back is shortened. Judgement: smaller
 # reversals converge without it
 TURNS_BACK = -0.5
@@ -119,6 +123,37 @@ class Fit(FitSummary):
                        self.settled, self.creeping, self.iterations, self.likelihood)
 
 
+class _Progress:
+    """Convergence of a fit from pass to pass."""
+
+    def __init__(self, fitted: bool, frozen: bool, fewest: int) -> None:
+        """Begin; fitted : derivatives by the fitted signal; fewest : passes with free levels."""
+        self.fitted = self.was_fitted = fitted      # in the next pass, in the last
+        self.frozen, self.fewest, self.settled = frozen, fewest, False
+        # of scale and mounting: sigmas, their relative change, the larger of it and the last step
+        self.sigma, self.change, self.last = np.ones(factor.WANTED), np.inf, np.inf
+        self.move, self.taken = np.inf, np.zeros(layout.M)     # largest step in sigmas, all steps
+
+    def take(self, count: int, solved: Solved) -> None:
+        """Take the steps and sigmas of a pass."""
+        sigma = np.sqrt(np.diag(solved.covariance))
+        step = np.abs(solved.step_border / sigma)
+        self.move = float((step * np.where(sigma < FLAT, OF_ALL, 0.0)).max())
+        before, self.sigma, last_change = self.sigma, sigma[:factor.WANTED], self.change
+        self.change = np.abs(np.log(self.sigma / before)).max()
+        self.last = max(step[:factor.WANTED].max(), self.change)
+        steady = count > self.fewest and last_change < CONVERGENCE.last_sigmas \
+            and self.change < min(CONVERGENCE.sigmas, last_change)
+        self.settled = bool(self.fitted and self.move < CONVERGENCE.moves
+                            and (self.frozen or steady))
+        first_fitted, self.was_fitted = self.fitted and not self.was_fitted, self.fitted
+        self.fitted = first_fitted or self.move < (
+            CONVERGENCE.measured_above if self.fitted else CONVERGENCE.fitted_below)
+        # the first step by the fitted signal may take back all of the one before
+        fits_next = self.fitted and not self.was_fitted
+        self.taken = np.zeros(layout.M) if fits_next else solved.step_border
+
+
 def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, frozen: bool = False,
         about: WarmStart | None = None, trace: Trace | None = None) -> Fit:
     """
@@ -128,9 +163,6 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     the noise levels constant.   about : from an earlier fit, whose slips and priors are used.
     trace : called after each pass, for progress and benchmarks.
     """
-    before, still, settled, fitted = np.ones(3), 0.0, False, about is not None
-    change = np.inf
-    was_fitted = fitted
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
     spread = about.spread if about else np.ones((len(state.t) - 1, factor.SPREAD))
     # passes in which heavy tails are updated: earlier, the residuals contain the start; later,
@@ -138,50 +170,34 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     tails, last_tails = 1 if about else 3, 15
     # pass that estimates the effective sample size; of two starts only that of the better one
     judged = 3 if about is None else 0 if problem.per_effective else 1
-    of_all = np.where(np.arange(layout.M) < factor.WANTED, 1.0, CONVERGENCE.others)
-    flat = np.full(layout.M, np.inf)
-    flat[[layout.YAW, layout.PITCH]] = CONVERGENCE.flat_angle
     pace: dict[str, tuple[float, float]] = {}
-    count, state, taken = 0, state.level(), np.zeros(layout.M)
+    progress = _Progress(about is not None, frozen, tails + 2)
+    count, state = 0, state.level()
     while True:
         count += 1
-        weighted = Equations(problem, state, priors, spread, fitted).at(levels)
-        if fitted and not was_fitted:      # this step may take back all of the one before
-            taken = np.zeros(layout.M)
-        solved = damped(weighted.solved(), taken)
-        taken = solved.step_border
-        sigma = np.sqrt(np.diag(solved.covariance))
-        weight = np.where(sigma < flat, of_all, 0.0)
-        move = np.abs(solved.step_border / sigma * weight).max()
-        last_change, change = change, np.abs(np.log(sigma[:3] / before)).max()
-        before = sigma[:3]
-        settled = bool(fitted and move < CONVERGENCE.moves
-                       and (frozen or change < min(CONVERGENCE.sigmas, last_change)
-                            and count > tails + 2 and last_change < CONVERGENCE.last_sigmas))
-        first_fitted, was_fitted = fitted and not was_fitted, fitted
-        fitted = bool(first_fitted or move < (
-            CONVERGENCE.measured_above if fitted else CONVERGENCE.fitted_below))
+        weighted = Equations(problem, state, priors, spread, progress.fitted).at(levels)
+        solved = damped(weighted.solved(), progress.taken)
+        progress.take(count, solved)
         state = state.moved(solved.step, solved.step_border)
         weighted.after(solved)
         if trace is not None:
-            trace(count, state, levels, weighted, solved, float(move))
-        if settled or count >= most:
-            still = np.abs(solved.step_border / sigma)[:3].max()
-            settled = settled or bool(max(still, change) < CONVERGENCE.nearly)
+            trace(count, state, levels, weighted, solved, progress.move)
+        if progress.settled or count >= most:
             break
         if count == judged:
             problem.per_effective = per_effective(problem, weighted)
         if not frozen:
             marginals = solved.marginals()
             tail, before_levels = tails <= count <= last_tails, levels
-            levels = update(weighted, marginals, levels, problem, pace, was_fitted)
+            levels = update(weighted, marginals, levels, problem, pace, progress.was_fitted)
             # slips and levels are factors on the same rows: slips are evaluated at the new levels
             if tail:
                 spread = slips(weighted, marginals, spread, before_levels, levels)
                 priors = relaxed(first, priors, state, solved, marginals)
             del marginals
         del weighted, solved      # the largest memory of a long leg
-    creeping = not settled and bool(max(still, change) < CONVERGENCE.creeping)
+    settled = progress.settled or bool(progress.last < CONVERGENCE.nearly)
+    creeping = not settled and bool(progress.last < CONVERGENCE.creeping)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     by_levels = weighted.information(solved).effects(prior_information(levels))
     return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
