@@ -16,24 +16,14 @@ def calibrate_bags(bags: Any, config: Any = None, client: Any = None,
     """
     Calibrate bags separately, and return a pandas DataFrame with one row per leg.
 
-    Parameters
-    ----------
-    bags : str, sequence of str, or DataFrame
-        Bags, folders, globs or URLs, or a manifest; a DataFrame has the manifest's columns.
-    config : Config, dict or str, optional
-        Settings: a Config, by dotted name, or a parameter file.
-    client : distributed.Client, optional
-        Client of the workers; None: temporary local processes.
-    output : path, optional
-        Folder for the rows, which later calls reuse; None: a temporary folder.
-    **options
-        Options of ``replay`` by name: imu_topic, leg, method and the like; vehicle_from.
+    bags : bags, folders, globs or URLs, or a manifest; a DataFrame has the manifest's columns.
+    config : Config, settings by dotted name, or a parameter file.   client : distributed.Client
+    of the workers; None: temporary local processes.   output : folder for the rows, which later
+    calls reuse; None: a temporary folder.   options : of ``replay`` by name: imu_topic, leg,
+    method and the like; vehicle_from.
 
-    Returns
-    -------
-    DataFrame with the columns of legs.parquet, and ``status`` and ``reason`` of the bag; a
-    failed bag is a row without values.
-
+    Returns the columns of legs.parquet, and ``status`` and ``reason`` of the bag; a failed bag is
+    a row without values.
     """
     from odocal_ros.fleet.engine import check_installed, engine, MEMORY
     check_installed()

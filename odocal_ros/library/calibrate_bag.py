@@ -43,32 +43,17 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     """
     Calibrate from a recorded bag, or from several of one vehicle.
 
-    Parameters
-    ----------
-    path : path, or several
-        Bags as ``read_bag`` takes them.
-    topics : mapping, optional
-        Slot (imu, odometer, odometer_right, fix, fix_velocity, heading) -> topic; the others are
-        found by their type.
-    config : Config, mapping of dotted names, or a parameter file, optional
-        Settings; they take precedence over those of a journal.
-    legs : optional
-        'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates, 'each-stop', or
-        (A, B); one or several. None: as the node marked them, else found by the standstills.
-    holdout : bool
-        Keep the last fifth of each leg back from the fit and check the correction on it.
-    listener : Listener, optional
-        Receives notes and progress.
+    path : bags as ``read_bag`` takes them.   topics : slot (imu, odometer, odometer_right, fix,
+    fix_velocity, heading) -> topic; the others are found by their type.   config : Config,
+    settings by dotted name, or a parameter file; they take precedence over those of a journal.
+    legs : 'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates, 'each-stop',
+    or (A, B); one or several. None: as the node marked them, else found by the standstills.
+    holdout : keep the last fifth of each leg back from the fit and check the correction on it.
+    listener : receives notes and progress.
 
-    Returns
-    -------
-    Calibration; its reasons name the cause if the drive cannot be calibrated.
-
-    Raises
-    ------
-    BadUsage, BadBag, BadData, BadConfig
-        A bag cannot be read or used, or an argument is invalid.
-
+    Returns a Calibration; its reasons name the cause if the drive cannot be calibrated.
+    Raises BadUsage, BadBag, BadData, BadConfig: a bag cannot be read or used, or an argument is
+    invalid.
     """
     from odocal_ros.output.ros_files import framed
     from odocal_ros.output.stored import known_imu

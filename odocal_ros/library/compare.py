@@ -187,11 +187,8 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
 
     Each is a Calibration, a calibration.json or its folder.
 
-    Raises
-    ------
-    BadUsage
-        There are fewer than two, a file cannot be read, or they are of different odometers.
-
+    Raises BadUsage: there are fewer than two, a file cannot be read, or they are of different
+    odometers.
     """
     if len(calibrations) < 2:
         raise BadUsage('compare: only one calibration; give two or more, the oldest first')

@@ -14,13 +14,8 @@ import numpy as np
 
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.errors import BadUsage
-from odocal_ros.forecast.planned_drive import (
-    left_and_right_turns,
-    PlannedDrive,
-    REST_SPEED,
-    stop_and_start,
-    town_driving,
-)
+from odocal_ros.forecast import planned_drive
+from odocal_ros.forecast.planned_drive import PlannedDrive, REST_SPEED
 from odocal_ros.forecast.planned_methods import Plan, plan_methods, spacing_for
 from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
@@ -69,11 +64,11 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
     least_rest = 60.0    # s
     rest = max(least_rest, *before.two_point.standing)
     yield (f'standing {time_span(rest)} longer at both marks', drive.standing_longer(rest), sigmas)
-    yield 'one more stop and start', stop_and_start(drive), sigmas
-    yield 'one more left turn and right turn', left_and_right_turns(drive), sigmas
+    yield 'one more stop and start', planned_drive.stop_and_start(drive), sigmas
+    yield 'one more left turn and right turn', planned_drive.left_and_right_turns(drive), sigmas
     town_minutes = 5
-    yield (f'{town_minutes} min more, stop and go with turns', town_driving(drive, town_minutes),
-           sigmas)
+    yield (f'{town_minutes} min more, stop and go with turns',
+           planned_drive.town_driving(drive, town_minutes), sigmas)
     farthest = _until_farthest(drive, sigmas)
     if farthest is not None:
         yield (f'end mark at the farthest point ({length(farthest.distance)})', farthest, sigmas)
@@ -188,27 +183,14 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     """
     Predict the sigmas of one drive.
 
-    Parameters
-    ----------
-    distance, speed, turns, standstill, acceleration
-        m, m/s, turns of 90 deg, s at rest at either end, m/s^2: a drive by its figures.
-    scenario, duration
-        Name of a simulated drive, and its duration, s.
-    gpx
-        A GPX track; one without times is driven at ``speed``.
-    bag, topics
-        A recorded bag, with the accuracy and rate of its own fixes.
-    config : Config, mapping of dotted names, or a parameter file, optional
-        Settings: IMU grade, heading source and the like.
-    figures
-        Fields of ``forecast.predict.Sigmas``: fix, fix_up m, fix_rate Hz, quantum m per count,
-        sway m/s, slip m/sqrt(s).
+    distance, speed, turns, standstill, acceleration : m, m/s, turns of 90 deg, s at rest at either
+    end, m/s^2: a drive by its figures.   scenario, duration : name of a simulated drive, and its
+    duration, s.   gpx : a GPX track; one without times is driven at ``speed``.   bag, topics : a
+    recorded bag, with the accuracy and rate of its own fixes.   config : as ``calibrate_bag``:
+    IMU grade, heading source and the like.   figures : fields of ``forecast.predict.Sigmas``:
+    fix, fix_up m, fix_rate Hz, quantum m per count, sway m/s, slip m/sqrt(s).
 
-    Raises
-    ------
-    BadUsage, BadConfig
-        Not exactly one drive is given, or its values are invalid.
-
+    Raises BadUsage, BadConfig: not exactly one drive is given, or its values are invalid.
     """
     kinds = {'scenario': scenario, 'gpx': gpx, 'bag': bag, 'distance': distance}
     given = [kind for kind, value in kinds.items() if value is not None]

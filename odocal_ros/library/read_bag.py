@@ -131,23 +131,13 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None,
     """
     Read a bag: a rosbag2 folder (sqlite3, mcap), a rosbag1 file, or a file of either.
 
-    Parameters
-    ----------
-    path : path
-        Of the bag, or of a journal of the node, which has settings and topics of its own.
-    topics : mapping, optional
-        Slot (imu, odometer, odometer_right, fix, fix_velocity, heading) -> topic; the others are
-        found by their type.
-    config : Config, mapping of dotted names, or a parameter file, optional
-        Settings.
-    listener : Listener, optional
-        Receives notes and progress.
+    path : of the bag, or of a journal of the node, which has settings and topics of its own.
+    topics : slot (imu, odometer, odometer_right, fix, fix_velocity, heading) -> topic; the others
+    are found by their type.   config : Config, settings by dotted name, or a parameter file.
+    listener : receives notes and progress.
 
-    Raises
-    ------
-    BadBag, BadData, BadUsage, BadConfig
-        The bag cannot be read, or an input is missing or ambiguous.
-
+    Raises BadBag, BadData, BadUsage, BadConfig: the bag cannot be read, or an input is missing or
+    ambiguous.
     """
     listener = listener or asked.Listener()
     path = Path(path)

@@ -26,25 +26,13 @@ def simulate(scenario: str | SimOptions = 'town', out: Path | str | None = None,
     """
     Simulate a drive; equal options give equal drives, to the last bit.
 
-    Parameters
-    ----------
-    scenario : str or SimOptions
-        paper, straight, out_and_back, town, motorway, oval, yard, indoor or square; or all
-        options.
-    out : path, optional
-        Bag to write; truth.yaml and calibrator.yaml (the operator's settings) are next to it.
-    storage, compression, force, progress
-        Arguments of ``bagio.write.write_bag``.
-    heading_sigma : float, optional
-        rad: calibrator.yaml gets a heading of this accuracy.
-    options
-        Fields of SimOptions: duration, seed, imu_grade, fix_noise, two_wheels and so on.
+    scenario : paper, straight, out_and_back, town, motorway, oval, yard, indoor or square; or all
+    options.   out : bag to write; truth.yaml and calibrator.yaml (the operator's settings) are
+    next to it.   storage, compression, force, progress : of ``bagio.write.write_bag``.
+    heading_sigma : rad: calibrator.yaml gets a heading of this accuracy.   options : fields of
+    SimOptions: duration, seed, imu_grade, fix_noise, two_wheels and so on.
 
-    Raises
-    ------
-    BadUsage
-        An option is unknown or out of range; a file exists and ``force`` is not set.
-
+    Raises BadUsage: an option is unknown or out of range; a file exists and ``force`` is not set.
     """
     if out is not None:
         out = Path(out)

@@ -114,10 +114,8 @@ def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
     """
     Return the verdict of a method's values, followed by '(leg)' if it is that of the leg.
 
-    Reasons on the data of a leg are not reasons of a method, but apply to each of them: a method
-    without reasons does not make the data of a dead wheel usable.
-
-    legs : those of the values; rejected ones count only if all are rejected.
+    legs : those of the values, whose reasons apply to each method; rejected ones count only if all
+    are rejected.
     """
     twice = driven_twice([leg for leg in legs if verdict_of(leg.reasons) is not Verdict.REJECTED])
     of_data = [verdict_of(leg.reasons) for leg in legs if leg not in twice]
