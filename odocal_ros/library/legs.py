@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 Recorded: TypeAlias = 'Bag | Recording'     # open, or read
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
-Stops = tuple[Ints, tuple[Floats, float] | None]     # result of ``stops_of``
+Stops = tuple[Ints, Floats, float]     # result of ``stops_of``
 OPENING = 0.2                 # judgement: of the distance; a later first stop does not start a leg
 CUT_SHORT_NS = 10 * 10**9     # judgement: drivers and recorders start and stop within it
 OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: it ends at the '
@@ -192,15 +192,15 @@ def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
 
     inputs : screened, over the common time of the topics.   first : their start, ns.
 
-    Returns (k, 2) ns, and the path length at these, (k, 2) m, with the total; None if unknown.
+    Returns (k, 2) ns, the path length at these, (k, 2) m, and the total; none if a topic lacks.
     """
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
-        return np.empty((0, 2), np.int64), None
+        return np.empty((0, 2), np.int64), np.empty((0, 2)), 0.0
     scale = place(inputs, config).rough or 1.0
     spans = inputs.standstills(scale, config)
     path_length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
     metres = np.interp(spans, inputs.travel.t, path_length) if len(spans) else np.empty((0, 2))
-    return first + np.round(spans * 1e9).astype(np.int64), (metres, float(path_length[-1]))
+    return first + np.round(spans * 1e9).astype(np.int64), metres, float(path_length[-1])
 
 
 def automatic_legs(recorder: LegRecorder, last: int, config: Config) -> Spans:
@@ -214,10 +214,9 @@ def automatic_legs(recorder: LegRecorder, last: int, config: Config) -> Spans:
 
 def _by_standstill(first: int, last: int, known: Stops) -> tuple[int, int]:
     """Return one leg, from the first standstill to the last; intermediate stops never split."""
-    stops, driven = known
-    if driven is None or not len(stops):
+    stops, metres, whole = known
+    if not len(stops):
         return first, last
-    metres, whole = driven
     start, stop, opening = first, last, 0
     if metres[0, 0] < OPENING * whole:       # else it is an intermediate stop, or the last one
         start, opening = int(stops[0, 1]), 1
@@ -228,10 +227,7 @@ def _by_standstill(first: int, last: int, known: Stops) -> tuple[int, int]:
 
 def _each_stop(known: Stops, config: Config) -> Spans:
     """Return a leg from each standstill to the next, without short ones if others are left."""
-    stops, driven = known
-    if driven is None:
-        return []
-    metres, _ = driven
+    stops, metres, _ = known
     legs = list(zip(stops[:-1, 1].tolist(), stops[1:, 1].tolist(), strict=True))
     lengths = metres[1:, 0] - metres[:-1, 1]
     return [leg for leg, m in zip(legs, lengths, strict=True)
