@@ -54,7 +54,7 @@ def codes(reasons):
 
 def with_dead(one, dead):
     """Return the leg of a drive on which some wheels do not count."""
-    return replace(one.leg(), **{WHEELS[k]: changed(one.wheels[k], value=lambda a: 0 * a)
+    return one.leg().with_rows(**{WHEELS[k]: changed(one.wheels[k], value=lambda a: 0 * a)
                                  for k in dead})
 
 

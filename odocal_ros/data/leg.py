@@ -36,6 +36,7 @@ EMPTY: dict[str, Callable[[], Samples]] = {
     'imu_other': OtherImuSamples.none,
     **{slot: getattr(kinds, one.kind).none for slot, one in INPUTS.items()}}
 SLOTS = tuple(EMPTY)
+OTHERS = (*WHEELS[2:], *OUTSIDE)      # definition: slots without a field of a leg
 COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
 
 
@@ -56,14 +57,8 @@ class Leg:
     imu_other: OtherImuSamples = field(default_factory=OtherImuSamples.none)
     odometer: OdometerSamples = field(default_factory=OdometerSamples.none)
     odometer_right: OdometerSamples = field(default_factory=OdometerSamples.none)
-    odometer_3: OdometerSamples = field(default_factory=OdometerSamples.none)
-    odometer_4: OdometerSamples = field(default_factory=OdometerSamples.none)
-    odometer_5: OdometerSamples = field(default_factory=OdometerSamples.none)
-    odometer_6: OdometerSamples = field(default_factory=OdometerSamples.none)
-    odometer_7: OdometerSamples = field(default_factory=OdometerSamples.none)
-    odometer_8: OdometerSamples = field(default_factory=OdometerSamples.none)
     fix: FixSamples = field(default_factory=FixSamples.none)
-    outside: Mapping[str, Samples] = field(default_factory=dict)     # of OUTSIDE, by slot
+    others: Mapping[str, Samples] = field(default_factory=dict)      # of OTHERS, by slot
     form: OdometerForm = COUNTER
     form_right: OdometerForm | None = None
 
@@ -73,18 +68,15 @@ class Leg:
         return (WHEELS[0], *(slot for slot in WHEELS[1:] if len(self.rows(slot).stamp_ns)))
 
     def rows(self, slot: str) -> Any:
-        """Return the unchanged rows of a slot."""
-        rows = self.outside.get(slot) if slot in OUTSIDE else getattr(self, slot)
+        rows = self.others.get(slot) if slot in OTHERS else getattr(self, slot)
         return EMPTY[slot]() if rows is None else rows
 
     def with_rows(self, **rows: Samples) -> 'Leg':
-        """Return the leg with other rows of some slots."""
-        outside = {slot: rows.pop(slot) for slot in OUTSIDE if slot in rows}
-        changed: dict[str, Any] = {'outside': {**self.outside, **outside}, **rows}
+        others = {slot: rows.pop(slot) for slot in OTHERS if slot in rows}
+        changed: dict[str, Any] = {'others': {**self.others, **others}, **rows}
         return replace(self, **changed)
 
     def form_of(self, slot: str) -> OdometerForm:
-        """Return the meaning of a wheel's values."""
         return self.form_right or self.form if slot == WHEELS[1] else self.form
 
 
@@ -94,7 +86,6 @@ class LegRecorder:
 
     def __init__(self) -> None:
         self._rows = {slot: Rows(nothing) for slot, nothing in EMPTY.items()}
-        self._newest = dict.fromkeys(SLOTS, 0)
         self.form = COUNTER
         self.form_right: OdometerForm | None = None
 
@@ -102,17 +93,15 @@ class LegRecorder:
         """Append a block (one row or many) to a slot of SLOTS."""
         if len(block.stamp_ns):
             self._rows[slot].feed(block)
-            self._newest[slot] = int(block.stamp_ns[-1])
 
     def adopt(self, slot: str, other: 'LegRecorder', own: str) -> None:
         """Use the rows of a slot of another recorder, if it has any."""
         if len(other.rows(own).stamp_ns):
             self._rows[slot] = other._rows[own].snapshot()
-            self._newest[slot] = other._newest[own]
 
     def newest_ns(self, slot: str) -> int:
         """Return the stamp of the last row fed, 0 before the first."""
-        return self._newest[slot]
+        return self._rows[slot].newest_ns
 
     def rows(self, slot: str) -> Any:
         """Return all rows of a slot as one block, in order of arrival."""
@@ -127,7 +116,6 @@ class LegRecorder:
         """
         copy = LegRecorder()
         copy.form, copy.form_right = self.form, self.form_right
-        copy._newest = dict(self._newest)
         copy._rows = {slot: rows.snapshot() for slot, rows in self._rows.items()}
         return copy
 
@@ -171,7 +159,6 @@ def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
 
 
 def _placed(stamp_ns: Ints, received_ns: Ints) -> Ints:
-    """Return the time of each row: its stamp, or its arrival if it has none."""
     return np.where(stamp_ns > 0, stamp_ns, received_ns)
 
 

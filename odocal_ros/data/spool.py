@@ -31,7 +31,7 @@ class Rows:
     """The rows of one topic, in order of arrival."""
 
     def __init__(self, nothing: Callable[[], Samples]) -> None:
-        self._nothing = nothing
+        self._nothing, self.newest_ns = nothing, 0     # stamp of the last row fed
         self._blocks: list[Samples] = []           # after those of the file
         self._fresh: list[Samples] = []            # small ones, after the blocks
         self._size = self._fresh_size = 0     # bytes of both, of the small ones
@@ -40,7 +40,7 @@ class Rows:
         self._writes = True
 
     def feed(self, block: Samples) -> None:
-        size = _size(block)
+        size, self.newest_ns = _size(block), int(block.stamp_ns[-1])
         self._fresh.append(block)
         self._fresh_size += size
         self._size += size
@@ -70,7 +70,7 @@ class Rows:
         copy = Rows(self._nothing)
         copy._writes = False              # only this object writes to the file
         copy._hold([*self._blocks, *self._fresh])
-        copy._file, copy._stop = self._file, self._stop
+        copy._file, copy._stop, copy.newest_ns = self._file, self._stop, self.newest_ns
         return copy
 
     def forget(self, before: Callable[[Samples], Bools]) -> None:
@@ -92,7 +92,6 @@ class Rows:
             self._fresh = blocks[keep + large:]
 
     def _hold(self, blocks: list[Samples]) -> None:
-        """Store these blocks in memory, without a file."""
         self._blocks, self._fresh, self._file, self._stop = blocks, [], None, 0
         self._size, self._fresh_size = sum(map(_size, blocks)), 0
 
@@ -123,7 +122,6 @@ class _Columns:
             (nameless(), column.dtype, column.shape[1:]) for column in columns_of(like)]
 
     def write(self, block: Samples, at: int) -> int:
-        """Write a block's rows from row ``at`` on; return the row after the last."""
         for (file, dtype, shape), column in zip(self._files, columns_of(block), strict=True):
             data = np.ascontiguousarray(column, dtype).reshape(-1).view(np.uint8).data
             offset, done = at * dtype.itemsize * math.prod(shape), 0
@@ -139,7 +137,6 @@ class _Columns:
             for file, dtype, shape in self._files))
 
     def row(self, at: int) -> Samples:
-        """Return one row, in memory."""
         return of_columns(self._kind, *(
             np.frombuffer(os.pread(file.fileno(), size, at * size), dtype).reshape(1, *shape)
             for file, dtype, shape in self._files

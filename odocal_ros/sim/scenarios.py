@@ -101,11 +101,9 @@ class Drive:
             stated = [fix.covariance_n] if self.reference.stated else []
             fix = local_fixes(np.nan)(fix.stamp_ns, fix.received_ns, self.positions(), *stated)
         wheels: dict[str, Any] = dict(zip(WHEELS, self.wheels, strict=False))
-        return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
-                   fix=fix,
-                   outside={'heading': self.heading, 'fix_velocity': self.velocity,
-                            'pressure': self.pressure},
-                   form=self.form, **wheels)
+        return Leg(self.truth.start_ns, self.truth.stop_ns, form=self.form).with_rows(
+            imu=self.imu, fix=fix, heading=self.heading, fix_velocity=self.velocity,
+            pressure=self.pressure, **wheels)
 
     def positions(self) -> Floats:
         """Return the fixes in a local frame at the start, x forward there: (n, 3) m."""

@@ -93,16 +93,6 @@ def test_the_preroll_is_cut_and_the_first_row_after_the_stop_is_kept():
         assert len(key) == np.sum((every >= START - 5 * S) & (every <= key.max()))
 
 
-def test_a_row_without_a_stamp_is_placed_by_its_arrival():
-    stamp = np.array([10, 0, 12, 0, 30]) * S
-    received = np.array([10, 11, 12, 29, 30]) * S + 1
-    recorder = LegRecorder()
-    recorder.feed('odometer', OdometerSamples(stamp, received, np.arange(5)))
-    leg = recorder.close(11 * S, 20 * S, preroll=0.0)
-    # the row that arrived at 29 s is the first after the stop
-    assert leg.odometer.value.tolist() == [1, 2, 3]
-
-
 def test_how_late_a_leg_is_closed_leaves_no_trace():
     early, late = LegRecorder(), LegRecorder()
     for slot, block in TOPICS.items():
