@@ -89,11 +89,9 @@ class Recording:
         raise NotImplementedError
 
     def _scan(self) -> Iterator[tuple[int, int]]:
-        """Yield the channel and the time of every message."""
         raise NotImplementedError
 
     def _count(self) -> None:
-        """Count the messages that are in the file, one by one."""
         counts: Counter[int] = Counter()
         start_ns, end_ns = 2**63 - 1, 0
         for key, time_ns in self._scan():
@@ -109,7 +107,6 @@ class Recording:
 
     @property
     def channels(self) -> list[Channel]:
-        """Return the topics, each with the number of messages found."""
         return list(self._channels.values())
 
     def _wanted(self, topics: Mapping[str, str]) -> dict[int, Channel]:

@@ -45,7 +45,6 @@ class Chunk:
 
     @property
     def size(self) -> int:
-        """Return its number of bytes in the file."""
         return len(self.record) + len(self.index)
 
 
@@ -79,7 +78,6 @@ def _zstd() -> Any:
 
 
 def _packed(records: bytes) -> tuple[str, bytes]:
-    """Return the compression's name and the compressed bytes."""
     zstd = _zstd()
     level = 1    # a third of the size for 1 % of a core
     return ('zstd', zstd.compress(records, level)) if zstd else ('', records)

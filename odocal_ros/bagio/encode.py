@@ -45,11 +45,7 @@ class Topic:
 
 
 def _empty(msgtype: str, parts: Mapping[str, Any]) -> tuple[bytes, dict[str, tuple[Any, ...]]]:
-    """
-    Return a message whose numbers are zero, and by path (type, shape) and offset of each.
-
-    parts : by path, texts, lists of texts, and lengths of lists of numbers; others are empty.
-    """
+    """Return a message of zeros with these texts and lengths, and type, shape, offset by path."""
     raw, places = bytearray((0, 1, 0, 0)), {}      # little-endian
 
     def add(align: int, content: bytes) -> int:
@@ -98,7 +94,6 @@ def _topic(name: str, msgtype: str, time_ns: NDArray[np.int64], values: Values,
 
 def _stamped(name: str, msgtype: str, samples: data.Samples, frame: str, values: Values,
              parts: Mapping[str, Any] | None = None) -> Topic:
-    """Return the topic of samples with a header."""
     stamps = {'header.stamp.sec': lambda rows: samples.stamp_ns[rows] // 10**9,
               'header.stamp.nanosec': lambda rows: samples.stamp_ns[rows] % 10**9}
     return _topic(name, msgtype, samples.received_ns, {**stamps, **values},
@@ -183,9 +178,9 @@ def fix(name: str, samples: data.FixSamples, frame: str = 'gnss') -> Topic:
         'position_covariance_type': samples.covariance_type})
 
 
-def point(name: str, samples: data.FixSamples, position: Floats, frame: str = 'map') -> Topic:
+def point(name: str, samples: data.FixSamples, position: Floats) -> Topic:
     """Return geometry_msgs/PointStamped of positions, (n, 3) m, at the times of FixSamples."""
-    return _stamped(name, 'geometry_msgs/msg/PointStamped', samples, frame, {'point': position})
+    return _stamped(name, 'geometry_msgs/msg/PointStamped', samples, 'map', {'point': position})
 
 
 def pose(name: str, samples: data.FixSamples, position: Floats, frame: str = 'map') -> Topic:
@@ -194,24 +189,23 @@ def pose(name: str, samples: data.FixSamples, position: Floats, frame: str = 'ma
         'pose.position': position, 'pose.orientation.w': lambda rows: 1.0})
 
 
-def pose_with_covariance(name: str, samples: data.FixSamples, position: Floats,
-                         frame: str = 'map') -> Topic:
+def pose_with_covariance(name: str, samples: data.FixSamples, position: Floats) -> Topic:
     def covariance(rows: slice) -> Floats:
         return np.pad(samples.covariance_n[rows], ((0, 0), (0, 3), (0, 3))).reshape(-1, 36)
-    return _stamped(name, 'geometry_msgs/msg/PoseWithCovarianceStamped', samples, frame, {
+    return _stamped(name, 'geometry_msgs/msg/PoseWithCovarianceStamped', samples, 'map', {
         'pose.pose.position': position, 'pose.pose.orientation.w': lambda rows: 1.0,
         'pose.covariance': covariance})
 
 
-def velocity(name: str, samples: data.VelocitySamples, frame: str = 'gnss') -> Topic:
+def velocity(name: str, samples: data.VelocitySamples) -> Topic:
     """Return geometry_msgs/TwistWithCovarianceStamped of VelocitySamples; no angular rates."""
-    return _stamped(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples, frame, {
+    return _stamped(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples, 'gnss', {
         'twist.twist.linear': samples.velocity_n,
         'twist.covariance': _diagonal(samples.variance_n, 6)})
 
 
-def pressure(name: str, samples: data.ScalarSamples, frame: str = 'imu') -> Topic:
-    return _stamped(name, 'sensor_msgs/msg/FluidPressure', samples, frame, {
+def pressure(name: str, samples: data.ScalarSamples) -> Topic:
+    return _stamped(name, 'sensor_msgs/msg/FluidPressure', samples, 'imu', {
         'fluid_pressure': samples.value, 'variance': samples.variance})
 
 

@@ -41,7 +41,6 @@ class McapFile(Recording):
             raise
 
     def _open(self) -> None:
-        """Read the content of the file, by its index if that is valid."""
         try:
             if self._index():
                 return
@@ -54,7 +53,6 @@ class McapFile(Recording):
     # ---- the index -------------------------------------------------------------------------
 
     def _index(self) -> bool:
-        """Read the index; False: the file has none."""
         data = self._file
         if data[-len(mcap.MAGIC):] != mcap.MAGIC or (
                 data[-mcap.END:-mcap.END + 9] != mcap.RECORD.pack(mcap.FOOTER, 20)):
@@ -138,7 +136,6 @@ class McapFile(Recording):
             self._counted = self.damage
 
     def _by_time(self, wanted: Mapping[int, Channel]) -> Iterator[Entry]:
-        """Yield the messages of the chunks in the index; overlapping chunks are merged."""
         for together in overlapping(place for place in self._places
                                     if not place.channels or place.channels & wanted.keys()):
             yield from self._merged(together, wanted)
@@ -176,7 +173,10 @@ class McapFile(Recording):
                     chunk = mcap.unpacked(body, 0, len(body), self._allowance, cut=not whole)
                     yield from self._walked(chunk, cut=not whole)
                 elif op == mcap.MESSAGE:
-                    yield self._message(body)
+                    key, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
+                    if key not in self._channels or time_ns >= LATEST_NS:
+                        raise Damaged('a damaged record')
+                    yield time_ns, key, body[mcap.MESSAGE_HEAD.size:]
                 elif op in (mcap.SCHEMA, mcap.CHANNEL):
                     self._learn(op, body)
             except (Damaged, struct.error, UnicodeDecodeError) as error:
@@ -184,12 +184,6 @@ class McapFile(Recording):
                     str(error) if isinstance(error, Damaged) else 'a damaged record')
 
     # ---- records one by one ----------------------------------------------------------------
-
-    def _message(self, body: bytes) -> Entry:
-        key, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
-        if key not in self._channels or time_ns >= LATEST_NS:
-            raise Damaged('a damaged record')
-        return time_ns, key, body[mcap.MESSAGE_HEAD.size:]
 
     def _walked(self, chunk: mcap.Chunk, cut: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time, from a sequential scan."""

@@ -139,7 +139,6 @@ def _gathered(chunks: Sequence[Chunk], known: Bools) -> Columns | None:
 
 
 def _in_one(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
-    """Return chunks whose records are in one buffer."""
     if len({id(chunk.data) for chunk in chunks}) <= 1:
         return chunks
     data, at, found = b''.join([chunk.records for chunk in chunks]), 0, []
@@ -165,7 +164,6 @@ def _starts(chunk: Chunk) -> Ints:
 
 
 def _walked(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
-    """Return messages of a sequential scan as columns."""
     return Columns(np.array([entry[0] for entry in entries], np.int64),
                    np.array([entry[1] for entry in entries], np.uint16),
                    Raws.of([entry[2] for entry in entries]))
@@ -185,7 +183,6 @@ def _joined(*parts: Columns) -> Columns:
 
 
 def _by_time(found: Columns) -> Columns:
-    """Return messages in order of time, equal times in the order of the file."""
     if (found.time_ns[1:] >= found.time_ns[:-1]).all():
         return found
     return found.take(np.argsort(found.time_ns, kind='stable'))

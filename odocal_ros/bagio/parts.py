@@ -33,14 +33,12 @@ class Part:
         self.path = path
         self._allowance = Allowance(path, total)
         try:
-            self._file = self._opened(file, kind, convert)
+            self._file: Recording = (
+                McapFile(file, self._allowance) if kind == '.mcap' else
+                SqliteFile(file) if kind == '.db3' else
+                Rosbag1File(file, self._allowance, convert))
         except (Damaged, ValueError) as error:
             raise BadBag(f'{path}: cannot be read ({error})') from None
-
-    def _opened(self, file: Path, kind: str, convert: Callable[..., Any]) -> Recording:
-        if kind == '.mcap':
-            return McapFile(file, self._allowance)
-        return SqliteFile(file) if kind == '.db3' else Rosbag1File(file, self._allowance, convert)
 
     def __getattr__(self, name: str) -> Any:
         """Return the metadata of the file: channels, damage, count, start_ns, end_ns."""

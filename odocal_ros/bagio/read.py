@@ -77,7 +77,7 @@ class Bag:
         for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
             if not part.damage:
                 continue
-            span = dict(known.of_file).get(part.path.name) or (
+            span = known.of_file.get(part.path.name) or (
                 known.whole if len(self._parts) == 1 else None)
             note = f'{part.path.name} is damaged ({part.damage})'
             if span and part.count >= span.count:
@@ -204,7 +204,6 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
 
 
 def _opened(path: Path, stack: ExitStack) -> Bag:
-    """Return an open bag whose files are closed with the stack."""
     source, types = find(path), Types()
     if source.known.foreign:
         raise BadBag(f'{path}: its serialization format is {source.known.foreign!r}, only '
@@ -233,7 +232,6 @@ def _opened(path: Path, stack: ExitStack) -> Bag:
 
 
 def _check_content(path: Path | str, source: Source, parts: list[Part]) -> None:
-    """Raise BadBag if no message can be read."""
     if any(part.count for part in parts):
         return
     damage = ' or '.join({part.damage for part in parts if part.damage})

@@ -45,11 +45,11 @@ class Rosbag1File(Recording):
     def _opened(self, path: Path) -> Any:
         reader = _reader(path)
         reader.open()
+        from rosbags.rosbag1.reader import decompressors
+        names = {known: name for name, known in decompressors.items()}
         for at, chunk in reader.chunks.items():
-            packing = PACKINGS[next(name for name, known in _decompressors().items()
-                                    if known is chunk.decompressor)]
             reader.chunks[at] = chunk._replace(decompressor=partial(
-                self._allowance.unpack, packing))
+                self._allowance.unpack, PACKINGS[names[chunk.decompressor]]))
         return reader
 
     def _unreadable(self, error: Exception) -> BadBag:
@@ -86,12 +86,6 @@ class Rosbag1File(Recording):
         self._reader.close()
 
 
-def _decompressors() -> dict[str, Callable[..., Any]]:
-    with rosbags_for('a rosbag1 file'):
-        from rosbags.rosbag1 import reader
-    return reader.decompressors
-
-
 def _reader(path: Path) -> Any:
     """Return a reader of rosbags whose index is limited to the size of the file."""
     with rosbags_for('a rosbag1 file'):
@@ -102,7 +96,6 @@ def _reader(path: Path) -> Any:
         """File whose reads are limited to the size of the file."""
 
         def read(self, size: int | None = -1) -> bytes:
-            """Return ``size`` bytes, at most those of the file."""
             return super().read(min(size, most) if size and size > 0 else size)
 
     class File(type(Path())):     # type: ignore[misc]
@@ -117,7 +110,6 @@ def _reader(path: Path) -> Any:
         left = most
 
         def read_index_data(self, pos: int, indexes: Any) -> None:
-            """Read the entries of a connection in a chunk."""
             assert self.bio
             begin = self.bio.tell()
             super().read_index_data(pos, indexes)

@@ -75,7 +75,6 @@ class SegmentedBag:
 
     @property
     def size(self) -> int:
-        """Return the size of its files, bytes."""
         return _size((*self.segments, *self.extra))
 
     @property
@@ -124,7 +123,6 @@ class SegmentedBag:
         self._write_metadata()
 
     def _join(self, segments: list[Segment]) -> None:
-        """Replace several files by one."""
         first, last = segments[0].first, segments[-1].last
         joined = self._write(part_name(first, last), first, last, _chunks_of(segments))
         at = self.segments.index(segments[0])
@@ -151,7 +149,6 @@ def _chunks_of(segments: Iterable[Segment]) -> Iterator[Chunk]:
 
 
 def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
-    """Return the text of metadata.yaml, version 9, as written by rosbag2 of Jazzy."""
     import yaml
     every = [f.written for f in files]
     counts: Counter[int] = sum((one.counts for one in every), Counter())

@@ -3,8 +3,8 @@
 
 """The files of a bag from a path of the user, decompressed if necessary."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 import re
 import shutil
@@ -43,7 +43,7 @@ class Known:
 
     names: tuple[str, ...] = ()
     whole: Span | None = None
-    of_file: tuple[tuple[str, Span], ...] = ()
+    of_file: Mapping[str, Span] = field(default_factory=dict)      # by name
     foreign: str = ''
     trouble: str = ''
 
@@ -75,9 +75,9 @@ def find(path: Path) -> Source:
     known = _read_metadata(beside) if beside.exists() else Known()
     if path.name not in known.names:
         return Source(_stem(path), (path,))
-    whole = dict(known.of_file).get(path.name) or (
+    whole = known.of_file.get(path.name) or (
         known.whole if known.names == (path.name,) else None)
-    return Source(_stem(path), (path,), known=replace(known, whole=whole, of_file=()))
+    return Source(_stem(path), (path,), known=replace(known, whole=whole, of_file={}))
 
 
 def _folder(path: Path) -> Source:
@@ -162,12 +162,11 @@ def _known(content: dict[str, dict[str, Any]]) -> Known:
         raise ValueError('a serialization format that is not text')
     return Known(      # a file named twice is read once
         tuple(dict.fromkeys(Path(name).name for name in known.get('relative_file_paths') or ())),
-        _span(known), tuple((name, span) for name, span in spans if span),
+        _span(known), {name: span for name, span in spans if span},
         '' if 'cdr' in formats else ', '.join(sorted(formats)))
 
 
 def _span(known: dict[str, Any]) -> Span | None:
-    """Return the end and the count in the metadata of a bag or one file."""
     if not known.get('message_count') or 'starting_time' not in known:
         return None
     end_ns = (int(known['starting_time']['nanoseconds_since_epoch'])

@@ -47,11 +47,8 @@ class Leaves:
     def _first_row(self, page: int) -> int | None:
         """Return the number of the first row of a page of messages, None for other pages."""
         at = page * self._size
-        if self._map[at:at + 1] != bytes([LEAF]):
-            return None
-        for row, _, _, _ in self._rows_of(page):
-            return row
-        return None
+        is_leaf = self._map[at:at + 1] == bytes([LEAF])
+        return next((row for row, *_ in self._rows_of(page)), None) if is_leaf else None
 
     def rows(self, keys: Container[int] | None, last: int = -1
              ) -> Iterator[tuple[int, int, bytes]]:
@@ -93,7 +90,6 @@ class Leaves:
             yield row, key, time_ns, partial(self._payload, data, at, size, skip)
 
     def _payload(self, data: bytes, at: int, size: int, skip: int) -> bytes:
-        """Return the bytes of a row after ``skip``, including its overflow pages."""
         if size > min(len(self._map), MESSAGE * factor()):
             raise ValueError('larger than the file')
         largest = self._usable - 35
@@ -206,7 +202,6 @@ class SqliteFile(Recording):
             raise Damaged('damaged pages') from error
 
     def _open(self) -> None:
-        """Read the topics and count the messages."""
         kinds = dict(self._query('SELECT name, type FROM sqlite_master'))
         views = [name for name in TABLES & kinds.keys() if kinds[name] != 'table']
         if views:

@@ -93,7 +93,6 @@ class Types:
         self._definitions: dict[str, tuple[str, str]] = {}
 
     def define(self, msgtype: str, definition: tuple[str, str]) -> None:
-        """Store a definition ('msg' or 'idl', text) of a bag."""
         if definition[0]:
             self._definitions.setdefault(msgtype, definition)
 
@@ -116,7 +115,6 @@ class Types:
         return cdr
 
     def _with(self, msgtype: str) -> Any:
-        """Return the type store with a type registered, or raise BadData."""
         if self._store is None:
             with rosbags_for(msgtype):
                 from rosbags.typesys import get_typestore, Stores

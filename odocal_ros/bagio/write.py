@@ -39,13 +39,10 @@ def drive_topics(drive: Any) -> list[Topic]:
                    encode.counter('/odometer/right', right)]
     else:
         topics.append(encode.counter('/odometer', left))
-    if len(drive.heading.stamp_ns):
-        topics.append(encode.heading('/heading', drive.heading))
-    if len(drive.velocity.stamp_ns):
-        topics.append(encode.velocity('/fix_velocity', drive.velocity))
-    if len(drive.pressure.stamp_ns):
-        topics.append(encode.pressure('/pressure', drive.pressure))
-    return topics
+    others = (encode.heading('/heading', drive.heading),
+              encode.velocity('/fix_velocity', drive.velocity),
+              encode.pressure('/pressure', drive.pressure))
+    return topics + [topic for topic in others if len(topic.time_ns)]
 
 
 def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
@@ -72,9 +69,9 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
     try:
         part = work / path.name      # rosbag2 names its files after the folder
         _write(part, topics, storage, compression, progress)
-        if force:
-            _remove(path)
-        part.rename(path)
+        if force and path.is_dir():
+            shutil.rmtree(path)
+        part.replace(path)
     except OSError as error:
         raise BadUsage(f'{path}: writing failed ({error.strerror}); nothing was kept') from None
     finally:
@@ -98,19 +95,11 @@ def check_target(path: Path, storage: str, compression: str, force: bool) -> Non
 
 
 def _is_bag(path: Path) -> bool:
-    """Return True if a path can be replaced: a bag file, or a folder with nothing but a bag."""
     suffixes = {'.db3', '.mcap', '.bag', '.zstd', '.db3-wal', '.db3-shm'}
     if path.is_file():
         return path.suffix in suffixes
     return path.is_dir() and all(
         p.name == 'metadata.yaml' or p.suffix in suffixes for p in path.iterdir())
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def _write(path: Path, topics: Sequence[Topic], storage: str, compression: str,
@@ -172,7 +161,6 @@ def _merged(topics: Sequence[Topic],
 
 
 def _messages(topic: Topic, rows: slice) -> Iterator[tuple[int, bytes]]:
-    """Yield (bag time, message) of a slice of rows of one topic."""
     packed = topic.pack(rows)
     raw, size = packed.tobytes(), packed.itemsize
     for k, time_ns in enumerate(topic.time_ns[rows].tolist()):

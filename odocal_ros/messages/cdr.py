@@ -104,7 +104,6 @@ class Layout:
 
     @property
     def names(self) -> list[str]:
-        """Return the list ``name`` (of joints), empty if there is none."""
         return self.texts.get('name', [])
 
     def count(self, path: str) -> int:
@@ -122,7 +121,6 @@ class Layout:
         return None
 
     def _places(self, paths: tuple[str, ...]) -> list[Run] | None:
-        """Return the places of values, adjacent ones merged; None if one is missing."""
         if paths not in self._runs:
             self._runs[paths] = _side_by_side([self.find(path) for path in paths])
         return self._runs[paths]

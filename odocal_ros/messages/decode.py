@@ -117,7 +117,6 @@ class Reader:
 
     def _rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
               deserialize: Deserialize) -> Pairs:
-        """Decode messages of one sender."""
         plan = self._plan
         first = 0 if plan.columns else self._settled(raws, deserialize)
         if first:
@@ -169,7 +168,8 @@ class Reader:
         """Return the columns of messages of one layout; None if one is missing."""
         values: list[NDArray[Any]] = []
         for column in self._plan.columns:
-            value = column.of_table(layout, table)
+            paths = column.pick(layout)
+            value = layout.columns(table, paths) if paths else None
             if value is None:
                 self._lost(len(table), self._plan.missing(layout))
                 return None
@@ -191,7 +191,6 @@ class Reader:
         return len(raws)
 
     def _view(self, raw: bytes, deserialize: Deserialize) -> MessageView | None:
-        """Return one message deserialised, None if that fails."""
         try:
             return MessageView(deserialize(raw))
         except OdocalError:

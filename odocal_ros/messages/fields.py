@@ -10,11 +10,8 @@ import re
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.messages import cdr
-from odocal_ros.messages.raws import Table
 
 PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
 
@@ -100,13 +97,7 @@ class Column:
     width: int
     pick: Callable[[View], Sequence[str] | None]
 
-    def of_table(self, layout: cdr.Layout, table: Table) -> NDArray[Any] | None:
-        """Return (n, width) values of messages of one layout, None if they are missing."""
-        paths = self.pick(layout)
-        return layout.columns(table, paths) if paths else None
-
     def of_message(self, view: MessageView) -> list[Any] | None:
-        """Return the same values of one message."""
         values = [view.value(path) for path in self.pick(view) or ()]
         if self.dtype is np.int64:
             values = [(int(v) + 2**63) % 2**64 - 2**63 for v in values]   # uint64 as int64 bits

@@ -95,7 +95,6 @@ class OdometerPlan:
                             f'{base}[0], or set odometer.wheels')
 
     def _listed(self) -> bool:
-        """Return True if the field is a list from which one or two values must be selected."""
         base, _ = _base(self.field)
         return self.known and (not base or '[' in _kinds(self.msgtype)[base])
 
@@ -117,7 +116,6 @@ class OdometerPlan:
         return False
 
     def _choose(self, field: str, view: View) -> None:
-        """Select the wheels of a message; if they are unclear, store the reason."""
         found = choose(view.names, view.count(field))
         if isinstance(found, str):
             self.unclear = found
@@ -178,7 +176,6 @@ class OdometerPlan:
         return OdometerForm(quantity, modulus, unit)
 
     def _path(self, field: str, key: str) -> str:
-        """Return the path of a wheel's value: the list's element, or the key as a path."""
         if not key:
             return field
         return f'{_base(field)[0]}[{key}]' if field else key
@@ -199,29 +196,30 @@ class OdometerPlan:
         return pick
 
     def missing(self, view: View) -> str:
-        """Return the reason why a message has no value, as text."""
         if self.unclear and not self.columns:
             return self.unclear
         wanted = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
         names = f'; names: {", ".join(view.names)}' if view.names else ''
         return f'no {wanted} in a {self.msgtype}{names}'
 
+    @property
+    def _slots(self) -> tuple[str, ...]:
+        return WHEELS[:len(self.keys)] if len(self.keys) > 1 else (self.slot,)
+
     def readings(self, received_ns: Sequence[int], values: list[Any]
                  ) -> list[tuple[str, list[Reading]]]:
         """Return (slot, rows in plain numbers) from the values of each message."""
         first = 2 * self.stamped
-        slots = WHEELS[:len(self.keys)] if len(self.keys) > 1 else (self.slot,)
         return [(slot, [
             (row[0][0] * 10**9 + row[1][0] if first else received, received, row[wheel][0])
             for received, row in zip(received_ns, values, strict=True)])
-            for wheel, slot in enumerate(slots, first)]
+            for wheel, slot in enumerate(self._slots, first)]
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:
         stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
         values = columns[2:] if self.stamped else columns
-        slots = WHEELS[:len(values)] if len(values) > 1 else (self.slot,)
         return [(slot, of_columns(OdometerSamples, stamps, received_ns, value[:, 0]))
-                for slot, value in zip(slots, values, strict=True)]
+                for slot, value in zip(self._slots, values, strict=True)]
 
 
 def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
@@ -243,7 +241,6 @@ def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
 
 
 def _kinds(msgtype: str) -> dict[str, str]:
-    """Return path -> kind for the numbers in a message type."""
     lines = (line.split() for line in cdr.SCHEMAS[msgtype])
     return {path: kind for kind, path in lines if not kind.startswith(('string', 'dim'))}
 

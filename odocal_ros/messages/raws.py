@@ -48,7 +48,6 @@ class Raws(Sequence[bytes]):
     def __getitem__(self, which: slice) -> 'Raws': ...
 
     def __getitem__(self, which: int | slice) -> 'bytes | Raws':
-        """Return one message, or some."""
         if isinstance(which, slice):
             return self.take(which)
         start = int(self.start[which])
@@ -69,7 +68,6 @@ class Raws(Sequence[bytes]):
         return there[start].view(np.uint8).reshape(-1, size)
 
     def packed(self) -> 'Raws':
-        """Return the same messages in a buffer of their own."""
         data, start, at = [], np.empty(len(self), np.int64), 0
         for rows in self.by_size():
             data.append(self.table(rows).tobytes())
@@ -178,7 +176,6 @@ class FrameFilter:
         return raw[:2] + raw[TEXT_AT:TEXT_AT + len(self._begin) - 2] == self._begin
 
     def _count(self, frame: str | None) -> None:
-        """Count the frame of one of the first messages."""
         if frame is None:
             return
         self._seen[frame] = self._seen.get(frame, 0) + 1
@@ -204,7 +201,6 @@ class FrameFilter:
         return alike
 
     def _frame(self, raw: bytes, deserialize: Callable[[bytes], Any]) -> str | None:
-        """Return the frame_id of one message, None if it cannot be read."""
         try:
             frame = cdr.frame_of(self._msgtype, raw)
             return str(deserialize(raw).header.frame_id) if frame is None else frame

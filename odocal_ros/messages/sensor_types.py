@@ -54,7 +54,6 @@ class SensorPlan:
         return True
 
     def missing(self, view: View) -> str:
-        """Return the reason why a message has no value, as text."""
         return 'a message is incomplete'
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> Pairs:

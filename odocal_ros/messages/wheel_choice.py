@@ -147,12 +147,9 @@ def _letters(word: str) -> tuple[str, str]:
     side = {'l': 'left', 'r': 'right'}
     if word in side or word in ('lh', 'rh'):
         return '', side[word[0]]
-    if len(word) != 2:
-        return '', ''
-    if word[1] in side and word[0] in LETTERS:
-        return LETTERS[word[0]], side[word[1]]
-    if word[0] in side and word[1] in LETTERS:
-        return LETTERS[word[1]], side[word[0]]
+    for axle, letter in zip(word, word[::-1], strict=True) if len(word) == 2 else ():
+        if axle in LETTERS and letter in side:
+            return LETTERS[axle], side[letter]
     return '', ''
 
 

@@ -54,43 +54,40 @@ def test_a_drive_comes_back_value_for_value(tmp_path, drive, storage, compressio
     back = messages(path)
     assert sorted(back) == ['/fix', '/fix_velocity', '/heading', '/imu/data', '/odometer']
     assert sorted(p.name for p in tmp_path.iterdir()) == [path.name]   # no left-overs
-    imu = back['/imu/data']
-    assert header_ns(imu) == drive.imu.stamp_ns.tolist()
+    imu, odometer = back['/imu/data'], back['/odometer']
+    same(imu, drive.imu, w_i=lambda m: xyz(m.angular_velocity),
+         f_i=lambda m: xyz(m.linear_acceleration), q_ni=attitude,
+         yaw_variance=lambda m: m.orientation_covariance[8])
     assert [t for t, _ in imu] == drive.imu.received_ns.tolist()
     assert {m.header.frame_id for _, m in imu} == {'imu_link'}
-    assert np.array_equal([xyz(m.angular_velocity) for _, m in imu], drive.imu.w_i)
-    assert np.array_equal([xyz(m.linear_acceleration) for _, m in imu], drive.imu.f_i)
-    assert np.array_equal([[*xyz(m.orientation), m.orientation.w] for _, m in imu], drive.imu.q_ni)
-    assert np.array_equal([m.orientation_covariance[8] for _, m in imu], drive.imu.yaw_variance)
-    odometer = back['/odometer']
     assert [t for t, _ in odometer] == drive.odometer.stamp_ns.tolist()
     assert [m.data for _, m in odometer] == drive.odometer.value.tolist()
-    _same_fixes(back['/fix'], drive.fix)
-    velocity = back['/fix_velocity']
-    assert header_ns(velocity) == drive.velocity.stamp_ns.tolist()
-    assert np.array_equal([xyz(m.twist.twist.linear) for _, m in velocity],
-                          drive.velocity.velocity_n)
-    assert np.array_equal([m.twist.covariance[:15:7] for _, m in velocity],
-                          drive.velocity.variance_n)
-    heading = back['/heading']
-    assert header_ns(heading) == drive.heading.stamp_ns.tolist()
-    assert np.array_equal([[*xyz(m.orientation), m.orientation.w] for _, m in heading],
-                          drive.heading.q_ni)
-    assert all(m.angular_velocity_covariance[0] == -1 for _, m in heading)
+    same_fixes(back['/fix'], drive.fix)
+    same(back['/fix_velocity'], drive.velocity, velocity_n=lambda m: xyz(m.twist.twist.linear),
+         variance_n=lambda m: m.twist.covariance[:15:7])
+    same(back['/heading'], drive.heading, q_ni=attitude)
+    assert all(m.angular_velocity_covariance[0] == -1 for _, m in back['/heading'])
 
 
-def _same_fixes(rows, fixes):
-    assert header_ns(rows) == fixes.stamp_ns.tolist()
-    # one rounding to degrees and one back: two units in the last place of 1 rad
-    np.testing.assert_allclose(np.radians([m.latitude for _, m in rows]), fixes.latitude,
-                               rtol=4.5e-16)
-    np.testing.assert_allclose(np.radians([m.longitude for _, m in rows]), fixes.longitude,
-                               rtol=4.5e-16)
-    assert [m.altitude for _, m in rows] == fixes.height.tolist()
-    assert np.array_equal([m.position_covariance.reshape(3, 3) for _, m in rows],
-                          fixes.covariance_n)
-    assert [m.position_covariance_type for _, m in rows] == fixes.covariance_type.tolist()
-    assert [m.status.status for _, m in rows] == fixes.status.tolist()
+def attitude(message):
+    return [*xyz(message.orientation), message.orientation.w]
+
+
+def same(rows, samples, **columns):
+    """Check messages against samples: stamps, and each column by a function of a message."""
+    assert header_ns(rows) == samples.stamp_ns.tolist()
+    for name, value in columns.items():
+        assert np.array_equal([value(m) for _, m in rows], getattr(samples, name)), name
+
+
+def same_fixes(rows, fixes):
+    same(rows, fixes, height=lambda m: m.altitude, status=lambda m: m.status.status,
+         covariance_n=lambda m: m.position_covariance.reshape(3, 3),
+         covariance_type=lambda m: m.position_covariance_type)
+    for name in ('latitude', 'longitude'):
+        # one rounding to degrees and one back: two units in the last place of 1 rad
+        np.testing.assert_allclose(np.radians([getattr(m, name) for _, m in rows]),
+                                   getattr(fixes, name), rtol=4.5e-16)
 
 
 def test_no_orientation_is_said_as_rep_145_wants(tmp_path):
@@ -109,7 +106,7 @@ def test_every_length_of_frame_is_padded_right(tmp_path, drive, frame):
     assert {m.header.frame_id for t in ('/imu', '/fix', '/speed', '/joints')
             for _, m in back[t]} == {frame}
     assert xyz(back['/imu'][5][1].linear_acceleration) == drive.imu.f_i[5].tolist()
-    _same_fixes(back['/fix'], drive.fix)
+    same_fixes(back['/fix'], drive.fix)
     value = drive.odometer.value
     assert [m.twist.linear.x for _, m in back['/speed']] == value.tolist()
     joints = [m for _, m in back['/joints']]

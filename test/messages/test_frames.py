@@ -76,9 +76,9 @@ def mixed(made, every):
     """Return the topics of a drive whose IMU topic has a second IMU, yawed by 20 deg."""
     C = matrix_from_rpy((0.0, 0.0, np.deg2rad(20.0)))
     rear = np.arange(len(made.imu.stamp_ns)) % every == 0
-    turned = replace(made.imu, w_i=np.where(rear[:, None], made.imu.w_i @ C, made.imu.w_i),
-                     f_i=np.where(rear[:, None], made.imu.f_i @ C, made.imu.f_i))
-    topic = imu('/imu/data', turned, frame='imu_a')
+    turned = {name: np.where(rear[:, None], getattr(made.imu, name) @ C, getattr(made.imu, name))
+              for name in ('w_i', 'f_i')}
+    topic = imu('/imu/data', replace(made.imu, **turned), frame='imu_a')
 
     def pack(rows):
         out = topic.pack(rows)
@@ -132,6 +132,12 @@ def fixes_of(messages, **settings):
     return block
 
 
+def local(block):
+    """Return the positions of fixes in the frame that they were sent in."""
+    geodetic = np.stack([block.latitude, block.longitude, block.height], -1)
+    return Origin(math.radians(45.0), FRAME_LONGITUDE, 0.0).to_n(geodetic)
+
+
 def places(reach, n=200):
     """Return positions up to a distance, at all heights of a building or a hill: (n, 3) m."""
     rng = np.random.default_rng(3)
@@ -172,9 +178,7 @@ def test_a_frame_at_the_equator_has_an_origin_too():
     ids=lambda m: m.__msgtype__.rpartition('/')[2])
 def test_each_type_gives_its_position_and_no_covariance(message):
     block = fixes_of([message])
-    origin = Origin(math.radians(45.0), FRAME_LONGITUDE, 0.0)
-    geodetic = np.stack([block.latitude, block.longitude, block.height], -1)
-    np.testing.assert_allclose(origin.to_n(geodetic), [[3.0, -4.0, 1.5]], atol=TENTH_MM)
+    np.testing.assert_allclose(local(block), [[3.0, -4.0, 1.5]], atol=TENTH_MM)
     assert block.stamp_ns.tolist() == [5 * 10**9]
     assert block.status.tolist() == [LOCAL]
     covariance, unknown = covariances(block, 2.5)
@@ -194,9 +198,7 @@ def test_a_stated_covariance_is_the_block_of_the_position():
 def test_an_odometry_as_reference_is_its_pose():
     block = fixes_of([make.odometry(1, 9.0)])                   # its covariance is 0, 1, 2 .. 35
     assert block.covariance_n[0].tolist() == [[0, 1, 2], [6, 7, 8], [12, 13, 14]]
-    geodetic = np.stack([block.latitude, block.longitude, block.height], -1)
-    place = Origin(math.radians(45.0), FRAME_LONGITUDE, 0.0).to_n(geodetic)
-    np.testing.assert_allclose(place, [[1.0, 2.0, 3.0]], atol=TENTH_MM)
+    np.testing.assert_allclose(local(block), [[1.0, 2.0, 3.0]], atol=TENTH_MM)
 
 
 def test_map_coordinates_and_nan_are_no_positions():

@@ -59,10 +59,11 @@ def raws(*series):
     return sorted(found, key=lambda pair: pair[0])
 
 
-MOVING = raws((T_MAP, corrections, 'odom', 'map'), (T_ODOM, driven, 'base_link', 'odom'))
-SLOW = raws((T_ODOM, corrections, 'odom', 'map'), (T_MAP, driven, 'base_link', 'odom'))
-THREE = raws((T_ODOM, corrections, 'odom', 'map'), (T_MAP, driven, 'base_link', 'odom'),
-              (T_MAP + 0.07, driven, 'prism', 'base_link'))
+BY_SLAM, BY_WHEELS = (corrections, 'odom', 'map'), (driven, 'base_link', 'odom')
+MOVING = raws((T_MAP, *BY_SLAM), (T_ODOM, *BY_WHEELS))
+SLOW = raws((T_ODOM, *BY_SLAM), (T_MAP, *BY_WHEELS))
+THREE = raws((T_ODOM, *BY_SLAM), (T_MAP, *BY_WHEELS),
+             (T_MAP + 0.07, driven, 'prism', 'base_link'))
 STATIC = message(one(0.0, ARM, Rotation.from_euler('Z', 1.0), 'prism', 'base_link'))
 
 
@@ -103,8 +104,9 @@ def test_a_chain_is_that_of_another_program():
     inside = T_MAP[1:]      # the first may be old
     assert t == pytest.approx(inside, abs=1e-9)
     # the positions of an arm of 0.37 m; the rotation between two transforms is 0.016 rad
-    assert np.abs(places - np.stack(geodetic_of(expected(inside), np.nan)))[2].max() < 1e-7
-    assert np.abs(places - np.stack(geodetic_of(expected(inside), np.nan)))[:2].max() < 1e-14
+    off = np.abs(places - np.stack(geodetic_of(expected(inside), np.nan)))
+    assert off[2].max() < 1e-7
+    assert off[:2].max() < 1e-14
     assert (stamps[1] - stamps[0] == 10**6).all()       # the arrival of the correction
 
 
@@ -153,13 +155,11 @@ def test_no_position_in_a_gap_and_none_twice():
 
 def test_a_correction_that_is_sent_again_gives_no_position():
     """SLAM repeats its last correction; in between the robot moves by its wheels."""
-    held = raws((T_MAP, corrections, 'odom', 'map'), (T_ODOM, driven, 'base_link', 'odom'),
-                (T_MAP + 0.05, lambda t: corrections(T_MAP), 'odom', 'map'),
-                (T_MAP + 0.15, lambda t: corrections(T_MAP), 'odom', 'map'))
+    held = raws((T_MAP, *BY_SLAM), (T_ODOM, *BY_WHEELS), *(
+        (T_MAP + later, lambda t: corrections(T_MAP), 'odom', 'map') for later in (0.05, 0.15)))
     t = read(reader(), held)[0][0] / NS
     assert t == pytest.approx(read(reader())[0][0] / NS)
-    still = raws((T_MAP, lambda t: corrections(0 * t), 'odom', 'map'),
-                 (T_ODOM, driven, 'base_link', 'odom'))
+    still = raws((T_MAP, lambda t: corrections(0 * t), 'odom', 'map'), (T_ODOM, *BY_WHEELS))
     source = reader()
     assert not len(read(source, still)[0][0])
     assert 'without corrections the positions are odometry alone' in source.trouble
