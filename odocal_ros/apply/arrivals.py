@@ -141,7 +141,6 @@ class Rhythm:
         self._restart()
 
     def _restart(self) -> None:
-        """Remove the line; the next rows determine another."""
         self._count = self._row = self._assumed = 0
         self._line = self._interval = self._late = self._step = 0.0
         self._hull: list[tuple[int, float]] = []      # rows and arrivals below all others
@@ -204,11 +203,7 @@ class Rhythm:
             self._late += (t - self._line - self._late) / min(self._count - 2, LATE_ROWS)
 
     def _lost_at_rest(self, t: float, off: float, moves: bool) -> int:
-        """
-        Return lost rows that the travel does not show, less those that were only late.
-
-        t : s, arrival.   off : s, behind the line.   moves : the travel shows lost rows.
-        """
+        """Return lost rows that the travel does not show, less those that were only late."""
         if self._assumed:
             row, at, interval = self._before
             least = round((t - at) / interval) - (self._row + 1 - self._assumed - row)
@@ -231,7 +226,6 @@ class Rhythm:
         return lost
 
     def _fit(self, t: float) -> None:
-        """Fit the line: the edge below the middle row of the lower convex hull."""
         hull, row = self._hull, self._row
         while len(hull) > 1 and (t - hull[-2][1]) * (hull[-1][0] - hull[-2][0]) <= (
                 hull[-1][1] - hull[-2][1]) * (row - hull[-2][0]):

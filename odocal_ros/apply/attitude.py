@@ -58,7 +58,6 @@ def rotated(C: Sequence[Sequence[float]], v: Sequence[float]) -> Vector:
 
 
 def cross(a: Sequence[float], b: Sequence[float]) -> Vector:
-    """Return the cross product of two vectors."""
     (x, y, z), (u, v, w) = a, b
     return y * w - z * v, z * u - x * w, x * v - y * u
 

@@ -114,7 +114,6 @@ class Errors:
         self.changed = True
 
     def add_turn(self, variance: Floats) -> None:
-        """Add the variance of an unknown turn, (3, 3) rad^2 in n."""
         self.cov[PHI, PHI] += variance / max(1.0, float(np.trace(variance)) / np.pi**2)
         self.changed = True
 

@@ -71,7 +71,6 @@ class Odometry:
                     if one.lag_ns is not None), key=abs) * 1e-9
 
     def restart(self, why: str) -> None:
-        """Restart at the origin, with a note of the cause."""
         self.restarts += 1
         self._notes.append(f'{RESTARTS} from the origin: {why}')
         self._reset()
@@ -113,7 +112,6 @@ class Odometry:
         return self.lacking_s() + self.imu.usual
 
     def poses(self) -> list[Pose]:
-        """Return the poses whose samples have arrived since the last call."""
         apart = self.apart()
         if apart and self._path is not None:
             self.restart(f'odometer stamps differ from IMU stamps by {apart:+.3g} s')
@@ -130,7 +128,6 @@ class Odometry:
         return out
 
     def _begin(self) -> Reckoning | None:
-        """Return a path from the first samples, None while there are too few."""
         start = begin(self.imu, self.wheels, self.vehicle, self.config, self.grade)
         if start is None:
             return None

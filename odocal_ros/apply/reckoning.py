@@ -165,7 +165,6 @@ class Reckoning:
         self._t, imu.at = t[-2], last
 
     def _turn(self, phi: Vector, T: float) -> Matrix:
-        """Rotate the attitude by a rotation vector in b, rad, over T s; return its matrix."""
         self.q = product(self.q, rotation(phi))
         if any(self._earth_n):
             self.q = product(rotation(plus(ZERO, self._earth_n, -T)), self.q)
@@ -200,7 +199,6 @@ class Reckoning:
             self.failed = f'the sigma of the tilt exceeds {TILT_LOST:g} rad'
 
     def _velocity_n(self, t: float) -> Floats:
-        """Return the velocity of the IMU in n, (3,) m/s, by odometer and turn rate."""
         v, C_nb = self.vehicle, np.array(self._C_nb)
         moved = self.wheels.at(t) - self.wheels.at(t - SPEED_SPAN)
         arm_b = v.C_vb.T @ self.config.imu.lever_arm + v.arm_b
@@ -208,7 +206,6 @@ class Reckoning:
         return C_nb @ (v.forward_b * moved / SPEED_SPAN + cross(rate, arm_b.tolist()))
 
     def _correct_periodically(self) -> None:
-        """Correct tilt and gyro bias once per CORRECTION_PERIOD."""
         T = self._t - self._t_corrected
         if T < CORRECTION_PERIOD - 1e-6:
             return
@@ -263,7 +260,6 @@ class Reckoning:
         self.accel_bias = plus(self.accel_bias, by[BA].tolist())
 
     def _pose(self) -> Pose:
-        """Return the pose at the current row."""
         T, C_bn = self._t - self._t_pose, tuple(zip(*self._C_nb, strict=True))
         arm_n = rotated(self._C_nb, self._arm_b)
         rate_b = plus(plus(ZERO, self._turn_b, 1 / T), rotated(C_bn, self._earth_n), -1.0)
@@ -281,14 +277,10 @@ class Reckoning:
 
     def _uncertainty(self, T: float, speed: float, arm_n: Vector, rate_b: Vector,
                      swing: Sequence[float]) -> list[bytes]:
-        """
-        Return the covariances of pose and twist after T s, as in a message.
-
-        speed : m/s.   arm_n : m.   rate_b : rad/s.   swing : (6,) m/s and rad/s, twist by the turn
-        rate.   A delay of the odometer changes the position by delay times the change of velocity
-        by accelerations along the path; a clock step also changes the time of the pose.
-        """
+        """Return the covariances of pose and twist after T s, as in a message."""
         forward_n = rotated(self._C_nb, self._forward_b)
+        # a delay changes the position by delay times the change of velocity by accelerations along
+        # the path; a clock step also changes the time of the pose
         delay = math.hypot(self._delay.sigma_s, self._moved, self.wheels.delay_s)
         late = (*plus(ZERO, plus(self._swung, forward_n, -speed), delay),
                 *plus(ZERO, rotated(self._C_nb, rate_b), self._moved))

@@ -74,7 +74,6 @@ def _tilting(w: Floats, f: Floats) -> Floats:
 
 
 def _given(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Start:
-    """Return the start given by the settings."""
     start = config.start
     q = np.asarray(start.attitude)
     earth = np.zeros(3) if np.isnan(start.latitude) else earth_rate_n(np.deg2rad(start.latitude))

@@ -1,20 +1,213 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The IMU rows of a stream that dead reckoning still needs."""
+"""
+The IMU rows of a stream that dead reckoning still needs, without implausible ones.
 
-from bisect import bisect_left
+A leg is screened as a whole (``screening/glitches.py``). A stream has the rows before, and those
+after within the longest duration of a spike. The limits are those of a leg. A block has two or
+three rows, so numbers are faster than numpy arrays.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
+from operator import itemgetter
+from typing import NamedTuple
 
-from odocal_ros.apply import spikes
-from odocal_ros.apply.attitude import rotated
+from odocal_ros.apply.attitude import rotated, Vector, ZERO
 from odocal_ros.data.samples import NO_FORCE, Reading
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.screening.glitches import (
+    BACK_SHARE,
+    EQUAL_NEIGHBOURS,
+    FORCE_STEP,
+    GLITCH_TIME,
+    ROWS_BESIDE,
+    SINGLE_FORCE,
+    SINGLE_TIMES,
+    SINGLE_TURN,
+    TURN_STEP,
+    USUAL_STEPS,
+)
 from odocal_ros.settings.node_configs import ApplyConfig
 
 INTERVAL_ROWS = 64      # judgement: rows of the median interval
 HOLE_INTERVALS = 2.5      # judgement: median intervals; in a longer gap a turn is not measured
+# physical: twice the range of common gyros, 2000 deg/s; range of accelerometers for crashes, 200 g
+MOST_TURN, MOST_FORCE = 70.0, 2000.0      # rad/s, m/s^2
+USUAL_ROWS = 50           # judgement: rows of the mean step
+STUCK_TIME = 0.1          # s; judgement: rows that are equal for longer are frozen
+TURN_CHANGE = 10.0        # rad/s^2; physical: of a vehicle, except over a stone
+STRANGE_TURN_TIME = 1.0        # s; judgement: a longer turn after a step is real
+ALONE_CHANGE = 2.5        # rad/s^2; judgement: least isolated step; turns start more slowly
+SINGLES = (SINGLE_TURN,) * 3 + (SINGLE_FORCE,) * 3
+SINGLE_ROWS = ROWS_BESIDE + 4      # definition: rows that ``is_single`` uses
+
+
+class Row(NamedTuple):
+    """
+    A row of the IMU.
+
+    t : s since the first.   w_b, f_b : rad/s, m/s^2; NO_FORCE: no force published.
+    strange : rad/s, implausible part of the turn rate.
+    """
+
+    t: float
+    stamp_ns: int
+    w_b: Vector
+    f_b: Vector
+    strange: Vector = ZERO
+
+
+time_of = itemgetter(0)      # definition: sort key of a row
+Pair = tuple[float, float]
+
+
+def is_possible(w_b: Vector, f_b: Vector) -> bool:
+    """Return True if turn rate, rad/s, and force, m/s^2 or NO_FORCE, are in a sensor's range."""
+    return _within(w_b, MOST_TURN) and (f_b is NO_FORCE or _within(f_b, MOST_FORCE))
+
+
+def _within(a: Vector, most: float) -> bool:
+    """Return True if all elements of a vector are within ``most``; False for NaN."""
+    x, y, z = a
+    return abs(x) <= most and abs(y) <= most and abs(z) <= most
+
+
+class SpikeScreen:
+    """
+    Selection of plausible rows.
+
+    A row after a large step is held until later rows decide: if the values return, it is a spike
+    and is dropped; otherwise it is motion or a permanent fault, and is kept.
+    """
+
+    def __init__(self) -> None:
+        self._usual = 0.0, 0.0              # mean steps from row to row, in units of ``_step``
+        self._since = 0.0                   # s, begin of equal rows
+        self._kept: deque[Row] = deque(maxlen=ROWS_BESIDE + 1)
+        self._dropped = False               # a row was dropped since the last kept one
+        self._strange = ZERO                # rad/s, implausible step of the gyro
+        self._before = ZERO                 # rad/s, rate before the step
+        self._until = 0.0                   # s, end of the implausible part
+
+    def sift(self, rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+        """Return the rows to keep, with their implausible rates, and the rows to hold."""
+        kept, k = [], 0
+        while k < len(rows):
+            row, last = rows[k], self._kept[-1] if self._kept else rows[k]
+            step, alone, back = _step(last, row), self._alone(rows[k:k + 2]), None
+            if any(self._leaves(step)) and not self._is_over(row):
+                within = bisect_right(rows, last.t + GLITCH_TIME, key=time_of)
+                back = self._back(last, rows[k + 1:within], step)
+                if back is None and within == len(rows):
+                    break
+            if any(alone) and k + 1 == len(rows) and back is None:
+                break                  # wait for the next row
+            self._learn(step)
+            if any(step) or not any(row.w_b) or not self._kept:      # a gyro may have a dead band
+                self._since = row.t
+            self._dropped = back is not None or row.t - self._since > STUCK_TIME
+            if not self._dropped:
+                strange = self._implausible_part(last, row, alone)
+                kept.append(row if strange is ZERO else row._replace(strange=strange))
+                self._kept.append(row)
+            k += 1 + (back or 0)
+        return kept, list(rows[k:])
+
+    def _alone(self, rows: Sequence[Row]) -> tuple[bool, ...]:
+        """Return a mask of the gyro axes with an isolated step: a turn starts over several."""
+        kept = self._kept
+        if self._dropped or len(kept) <= ROWS_BESIDE or (
+                _largest(kept[-1].w_b, rows[0].w_b) <= SINGLE_TURN):
+            return ()
+        steps = [[abs(b - a) for a, b in zip(one.w_b, other.w_b, strict=True)]
+                 for one, other in pairwise((*kept, *rows))]
+        own = steps.pop(ROWS_BESIDE)
+        least = max(SINGLE_TURN, ALONE_CHANGE * (rows[0].t - kept[-1].t))
+        return tuple(size > max(least, SINGLE_TIMES * max(beside))
+                     for size, *beside in zip(own, *steps, strict=True))
+
+    def _is_over(self, row: Row) -> bool:
+        """Return True if the gyro is back at its value before an implausible step."""
+        return self._strange is not ZERO and (row.t > self._until or all(
+            abs(w - before) <= BACK_SHARE * size for w, before, size in zip(
+                row.w_b, self._before, self._strange, strict=True) if size))
+
+    def _implausible_part(self, last: Row, row: Row, alone: Sequence[bool]) -> Vector:
+        """Return the implausible part of a rate, rad/s: the size of the step at its start."""
+        if self._is_over(row):
+            self._strange = ZERO
+        elif self._strange is ZERO:
+            most = max(TURN_CHANGE * (row.t - last.t), USUAL_STEPS * TURN_STEP * self._usual[0])
+            if any(alone) or _largest(last.w_b, row.w_b) > most:
+                steps = (abs(b - a) for a, b in zip(last.w_b, row.w_b, strict=True))
+                x, y, z = (size if odd or size > most else 0.0
+                           for size, odd in zip(steps, alone or ZERO, strict=True))
+                self._strange, self._before = (x, y, z), last.w_b
+                self._until = row.t + STRANGE_TURN_TIME
+        return self._strange
+
+    def _leaves(self, step: Pair) -> tuple[bool, bool]:
+        """Return True for gyro and force if the step is implausible for a vehicle."""
+        (turn, force), (usual_turn, usual_force) = step, self._usual
+        return (turn > max(1.0, USUAL_STEPS * usual_turn),
+                force > max(1.0, USUAL_STEPS * usual_force))
+
+    def _learn(self, step: Pair) -> None:
+        """Update the mean step; a single spike has little effect."""
+        (turn, force), (usual_turn, usual_force) = step, self._usual
+        self._usual = (
+            usual_turn + (min(turn, 4 * usual_turn + 1 / USUAL_STEPS) - usual_turn) / USUAL_ROWS,
+            usual_force + (min(force, 4 * usual_force + 1 / USUAL_STEPS) - usual_force)
+            / USUAL_ROWS)
+
+    def _back(self, last: Row, rows: Sequence[Row], step: Pair) -> int | None:
+        """Return the number of the row where the values are back after a step, None without."""
+        leaves = self._leaves(step)
+        for k, row in enumerate(rows):
+            if all(left <= BACK_SHARE * size for left, size, bound in zip(
+                    _step(last, row), step, leaves, strict=True) if bound):
+                return k
+        return None
+
+
+def _largest(a: Vector, b: Vector) -> float:
+    """Return the largest difference between elements of two vectors; NaN for NO_FORCE."""
+    (x, y, z), (u, v, w) = a, b
+    return max(abs(u - x), abs(v - y), abs(w - z))
+
+
+def _step(last: Row, row: Row) -> Pair:
+    """Return the steps of gyro and force over TURN_STEP and FORCE_STEP; 0 for NO_FORCE."""
+    force = _largest(last.f_b, row.f_b) / FORCE_STEP
+    return _largest(last.w_b, row.w_b) / TURN_STEP, force if force == force else 0.0
+
+
+def is_single(rows: Sequence[Row]) -> bool:
+    """
+    Return True if the row before the last of SINGLE_ROWS is an isolated outlier.
+
+    As ``screening.glitches.isolated``, but by earlier rows only.
+    """
+    if len(rows) < SINGLE_ROWS:
+        return False
+    before, row, after = rows[-3:]
+    leaves = 1 - EQUAL_NEIGHBOURS / 2      # least step to an outlier, in distances to the mean
+    if not (_largest(before.w_b, row.w_b) > leaves * SINGLE_TURN
+            or _largest(before.f_b, row.f_b) > leaves * SINGLE_FORCE):
+        return False
+    values = [(*one.w_b, *one.f_b) for one in (before, row, after)]
+    for k, (a, b, c, least) in enumerate(zip(*values, SINGLES, strict=True)):
+        far = abs(b - (a + c) / 2)
+        if far > least and abs(c - a) < EQUAL_NEIGHBOURS * far:
+            x = [(*one.w_b, *one.f_b)[k] for one in rows[:-2]]
+            if all(far > SINGLE_TIMES * abs(x[i] - (x[i - 1] + x[i + 1]) / 2)
+                   for i in range(1, len(x) - 1)):
+                return True
+    return False
 
 
 class ImuStream:
@@ -31,9 +224,9 @@ class ImuStream:
         self._accel = (config.imu.accel_scale * C_bi).tolist()
         self._offset_ns = round(config.imu.time_offset * 1e9)
         self._notes = notes
-        self._screen = spikes.SpikeScreen()
-        self._held: list[spikes.Row] = []
-        self.rows: list[spikes.Row] = []
+        self._screen = SpikeScreen()
+        self._held: list[Row] = []
+        self.rows: list[Row] = []
         self.zero_ns = 0
         self.at = 0
         self.usual = 0.0
@@ -46,10 +239,10 @@ class ImuStream:
             w_b, f_b = rotated(self._gyro, w_i), rotated(self._accel, f_i)
             if not any(f_i) or sum(f_b) != sum(f_b):
                 f_b = NO_FORCE
-            if spikes.is_possible(w_b, f_b):
+            if is_possible(w_b, f_b):
                 self.zero_ns = self.zero_ns or stamp + self._offset_ns
                 stamp += self._offset_ns
-                rows.append(spikes.Row((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
+                rows.append(Row((stamp - self.zero_ns) * 1e-9, stamp, w_b, f_b))
         self._say_dropped(before + len(readings) - len(rows),
                           'hold NaN or impossible values')
         kept, self._held = self._screen.sift(rows)
@@ -57,7 +250,7 @@ class ImuStream:
                           'jump and return, or repeat one value')
         for row in kept:
             self.rows.append(row)
-            if len(self.rows) - 2 > self.at and spikes.is_single(self.rows[-spikes.SINGLE_ROWS:]):
+            if len(self.rows) - 2 > self.at and is_single(self.rows[-SINGLE_ROWS:]):
                 self._say_dropped(1, 'are isolated outliers')
                 del self.rows[-2]
         self._unmeasured += len(kept)
@@ -77,7 +270,7 @@ class ImuStream:
 
     def from_time(self, t: float, low: int = 0) -> int:
         """Return the number of the first row at or after t, s, not before row ``low``."""
-        return bisect_left(self.rows, t, low, key=spikes.time_of)
+        return bisect_left(self.rows, t, low, key=time_of)
 
     def drop(self, row: int) -> None:
         """Drop the rows before a row; the current row must not be one of them."""

@@ -121,7 +121,6 @@ class Wheel:
         return sag**2
 
     def forget(self, t: float) -> None:
-        """Drop rows before a time that are no longer needed."""
         while len(self.t) > 2 and self.t[1] < t:
             self.t.popleft()
             self.s.popleft()
@@ -172,12 +171,7 @@ class Wheel:
         self._add(t, self.s[-1] + step)
 
     def _is_false(self, t: float, dt: float, step: float, shown: float, off: float) -> bool:
-        """
-        Return True if a row is not motion.
-
-        step : m.   shown : m/s, speed of the row.   off : m, deviation of the step from the speed.
-        Possible values that remain for REFUSED_TIME are accepted.
-        """
+        """Return True if a row (step in m, speed in m/s, deviation in m) is not motion."""
         possible = abs(step) <= self._most(dt) and (
             self.form.quantity != 'rate' or abs(shown) <= FASTEST)
         usual = off <= self._limit(dt) or self._rows <= SURE_ROWS
@@ -189,11 +183,9 @@ class Wheel:
             t - self._refused_since < REFUSED_TIME)
 
     def _most(self, dt: float) -> float:
-        """Return the largest possible travel between two rows, m."""
         return FASTEST * max(dt, STAMP_BURST) + self.quantum
 
     def _hangs(self, dt: float, step: float) -> bool:
-        """Return True if a counter stops abruptly: it hangs, or the wheel locks."""
         return not step and not self._unsure and self.form.quantity != 'rate' and (
             abs(self.speed) * dt > self._limit(dt, SPEED_CHANGE, HUNG_JITTERS))
 
@@ -204,7 +196,6 @@ class Wheel:
                 + (jitters * self._jitter + T - dt) * abs(self.speed))
 
     def _speed_time(self) -> float:
-        """Return the averaging time of the speed, s, longer for coarse counts."""
         counts = SPEED_COUNTS * self.quantum
         coarse = counts / max(abs(self.speed), counts) if counts else 0.0
         return min(SPEED_TIME, LEAST_TIME + coarse)
@@ -236,7 +227,6 @@ class Wheel:
         self.speed += min(max(change, -WHEEL_CHANGE * dt), WHEEL_CHANGE * dt)
 
     def _add_speed_variance(self, dt: float) -> None:
-        """Add the variance of the travel in dt s by the unexplained speed."""
         path_length = self._unsure_travel + self._unsure * dt
         self._add_variance((path_length**2 - self._unsure_travel**2) / 3)
         self._unsure_travel = path_length
@@ -267,7 +257,6 @@ class Wheel:
         self.s.append(s)
 
     def _step(self, value: float, before: float, dt: float) -> float:
-        """Return the travel between two rows, scale units."""
         if self.form.quantity == 'rate':
             return (before + value) / 2 * dt
         if self.form.quantity == 'increment':

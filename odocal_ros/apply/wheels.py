@@ -35,7 +35,6 @@ class Wheels:
         self.quantum = 0.0                   # m, size of a count of the travel
 
     def feed(self, slot: str, rows: Sequence[Reading], form: OdometerForm) -> None:
-        """Add rows of a slot."""
         self._waiting.append((slot, rows, form))
         if not self.zero_ns:
             self._waiting = self._waiting[-100:]
@@ -57,23 +56,19 @@ class Wheels:
         self.quantum = math.hypot(*(w.quantum for w in self._wheels.values())) / len(self._wheels)
 
     def _scale(self, form: OdometerForm) -> None:
-        """Set the scale of each of two wheels."""
         scales = self._vehicle.wheel_scales
         if len(self._wheels) == 2 and scales is not None and form.sides:
             for slot, scale in zip(SIDES, scales, strict=True):
                 self._wheels[slot].rescale(scale)
 
     def ready(self) -> bool:
-        """Return True if every wheel has rows."""
         return bool(self._wheels) and all(w.t for w in self._wheels.values()) and (
             not self._two or len(self._wheels) == 2)
 
     def newest(self) -> float:
-        """Return the newest time for which every wheel has travel, s."""
         return min(w.t[-1] for w in self._wheels.values())
 
     def oldest(self) -> float:
-        """Return the oldest time for which every wheel has travel, s."""
         return max(w.t[0] for w in self._wheels.values())
 
     def at(self, t: float) -> float:
@@ -95,7 +90,6 @@ class Wheels:
 
     @property
     def delay_s(self) -> float:
-        """Return the sigma of the constant delay of the travel, s."""
         return max(w.delay_s for w in self._wheels.values())
 
     def still(self, t_from: float, t_to: float) -> bool:
@@ -104,6 +98,5 @@ class Wheels:
                    <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum for w in self._wheels.values())
 
     def forget(self, t: float) -> None:
-        """Drop rows before a time."""
         for wheel in self._wheels.values():
             wheel.forget(t)

@@ -73,41 +73,37 @@ def test_a_sender_that_stalls_keeps_its_rhythm(even, stalls):
     assert rhythm.error_s < 1e-3
 
 
-def test_a_delay_at_rest_that_ends_is_no_lost_row(even):
-    t, arrivals = even
-    late = arrivals.copy()
-    late[1000:1050] = np.maximum(late[1000:1050], t[1000:1050] + 0.1)
-    times, _ = placed(in_order(late), 0.0 * t, speed=0.0, quantum=COUNT)
+# rows that are lost, others that are late until a time, speed, and the largest error of the rows
+# from one on
+LOST = {
     # four rows at once follow the last late one: 0.1 s are five intervals
-    assert np.abs(times - t)[1055:].max() < 0.25 / RATE
+    'a delay at rest that ends is no lost row': (
+        [], slice(1000, 1050), lambda t: t + 0.1, 0.0, 1055, 0.25 / RATE),
+    # a burst, of which none is lost
+    'travel shows the rows that are lost and those that are late': (
+        [700, 701, 1500, 2200], slice(1000, 1006), lambda t: t[-1] + 1 / RATE, 10.0, 500, 4e-3),
+    'rows lost at rest shift the line within half a second': (
+        [1000, 1001, 1002], slice(0, 0), lambda t: t, 0.0, 1040, 0.25 / RATE)}
 
 
-def test_travel_shows_the_rows_that_are_lost_and_those_that_are_late(even):
-    t, arrivals = even
-    kept = np.ones(len(t), bool)
-    kept[[700, 701, 1500, 2200]] = False
-    late = arrivals.copy()
-    late[1000:1006] = np.maximum(late[1000:1006], t[1006])     # a burst, of which none is lost
-    times, _ = placed(in_order(late)[kept], 10.0 * t[kept])
-    assert np.abs(times - t[kept] - np.median(times - t[kept]))[500:].max() < 4e-3
-
-
-def test_rows_lost_at_rest_shift_the_line_within_half_a_second(even):
-    t, arrivals = even
-    kept = np.ones(len(t), bool)
-    kept[1000:1003] = False
-    times, _ = placed(arrivals[kept], 0.0 * t[kept], speed=0.0, quantum=COUNT)
-    off = times - t[kept] - np.median(times - t[kept])
-    assert np.abs(off[1040:]).max() < 0.25 / RATE
+@pytest.mark.parametrize('case', LOST)
+def test_lost_rows(even, case):
+    (t, arrivals), (lost, rows, until_s, speed, first, most) = even, LOST[case]
+    kept, late = np.delete(np.arange(len(t)), lost), arrivals.copy()
+    late[rows] = np.maximum(late[rows], until_s(t[rows]))
+    times, _ = placed(in_order(late)[kept], speed * t[kept], speed, 0.0 if speed else COUNT)
+    off = times - t[kept]
+    off -= np.median(off) if lost else 0.0
+    assert np.abs(off[first:]).max() < most
 
 
 def test_another_rate_is_another_rhythm(even):
     t, arrivals = even
     slow = t[-1] + 1.0 + np.arange(1000) / (RATE / 2)
-    late = in_order(slow + np.random.default_rng(2).exponential(5e-3, len(slow)))
-    times, _ = placed(np.append(arrivals, late), 10.0 * np.append(t, slow))
-    off = (times - np.append(t, slow))[-500:]
-    assert np.std(off) < 2e-3
+    after = in_order(slow + np.random.default_rng(2).exponential(5e-3, len(slow)))
+    both = np.append(t, slow)
+    times, _ = placed(np.append(arrivals, after), 10.0 * both)
+    assert np.std((times - both)[-500:]) < 2e-3
 
 
 def test_uneven_times_and_even_stamps_are_kept():
