@@ -134,11 +134,9 @@ def quantities_ok(now: SessionView) -> dict[str, str]:
     session = now.session
     if session.state is State.RECORDING:
         return quantities.of_forecast(now.forecast, now.config, now.two_wheels, now.lost_cause)
-    if session.state is State.COMPUTING:
-        return quantities.nothing_known()
-    if session.calibration is not None:
+    if session.state is not State.COMPUTING and session.calibration is not None:
         return quantities.of_calibration(session.calibration, now.config, now.two_wheels)
-    if session.restored is not None:
+    if session.state is not State.COMPUTING and session.restored is not None:
         return quantities.of_estimates(session.restored.estimates, now.config, now.two_wheels,
                                        session.restored.valid)
     return quantities.nothing_known()
@@ -206,17 +204,14 @@ def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
 
 
 def _fault(now: SessionView) -> str:
-    """Return the reason that would reject the leg, and its remedy."""
     worst = now.faults[0]
+    text = f'{worst.code.name}: {worst.text}. {worst.remedy.rstrip(".")}'
     if now.session.by_itself:
-        return (f'the leg will not be used: {worst.code.name}: {worst.text}. '
-                f'{worst.remedy.rstrip(".")}; the next leg starts automatically')
-    return (f'call ~/cancel_leg and start again: the leg would be rejected: {worst.code.name}: '
-            f'{worst.text}. {worst.remedy.rstrip(".")}')
+        return f'the leg will not be used: {text}; the next leg starts automatically'
+    return f'call ~/cancel_leg and start again: the leg would be rejected: {text}'
 
 
 def _end(now: SessionView) -> str:
-    """Return the instruction that ends the leg."""
     if now.session.by_itself:
         left = now.session.config.leg.automatic_minutes - now.duration_s / 60
         return (f'the leg ends automatically at a standstill, or within {max(1, round(left))} min')
@@ -235,20 +230,16 @@ def after_result(now: SessionView) -> str:
         return f'drive {lacking} more leg{"s" * (lacking > 1)}'
     if grave := cautions(reasons):
         return grave[0].remedy
-    saved = config.output.autosave or now.saved
-    text = 'drive on: legs start and end automatically'
-    if not config.leg.automatic:
-        text = f'{"" if saved else "call ~/save, or "}drive another leg for a smaller sigma'
-    notes = _notes(reasons, quantities_ok(now))
-    return '; '.join([text, *notes])
+    save = '' if config.output.autosave or now.saved else 'call ~/save, or '
+    text = ('drive on: legs start and end automatically' if config.leg.automatic else
+            f'{save}drive another leg for a smaller sigma')
+    return '; '.join([text, *_notes(reasons, quantities_ok(now))])
 
 
 def _notes(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:
     """Return the remedies of the reasons about quantities that exceed their limits."""
     wanted = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
               if value == quantities.NO for part in quantities.QUANTITIES[name].estimates}
-    advice: dict[str, None] = {}
-    for r in reasons:
-        if ABOUT.get(r.code) in wanted:
-            advice[f'for the {wanted[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'] = None
-    return list(advice)
+    return list(dict.fromkeys(
+        f'for the {wanted[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'
+        for r in reasons if ABOUT.get(r.code) in wanted))

@@ -77,7 +77,6 @@ class DrivePattern(SettledNode):
             executor.spin_once(timeout_sec=PERIOD_S)
 
     def destroy_node(self) -> None:
-        """Stop the robot, and end."""
         if getattr(self, '_route', ()) or getattr(self, '_zeros', 0):
             self._halt('the node ends')
             for _ in range(LAST_ZEROS if self.context.ok() else 0):
@@ -112,15 +111,14 @@ class DrivePattern(SettledNode):
         if not why and others:
             why = (f'{self._publisher.topic_name} has {others} other publisher'
                    f'{"s" * (others != 1)}: end the other node, or remap one of them')
+        response.success, response.message = not why, why
         if why:
             self.get_logger().warning(f'~/start refused: {why}')
-            response.success, response.message = False, why
             return response
         assert self._pose is not None
         self._route = pattern.route_of(self.config, self._pose[:2])
         self._progress, self._begun, self._zeros = pattern.Progress(), time.monotonic(), 0
         self._moved = None
-        response.success = True
         response.message = (f'driving: {self.config.pattern}, '
                             f'{sum(piece.length for piece in self._route):.1f} m')
         self.get_logger().info(response.message)
@@ -155,15 +153,13 @@ class DrivePattern(SettledNode):
                                                       time.monotonic(), self.config)
         if self._progress.piece == len(self._route):
             self._halt('the pattern is complete')
-            return
-        if self._stuck(speed or rate):
+        elif self._stuck(speed or rate):
             self._halt(f'the pose has not changed for {STUCK_S:g} s: the wheels are blocked, or '
                        'the position is frozen')
-            return
-        self._send(speed, rate)
+        else:
+            self._send(speed, rate)
 
     def _stuck(self, asked: float) -> bool:
-        """Return True if the robot has not moved for STUCK_S in spite of commands."""
         pose, now = self._pose, time.monotonic()
         assert pose is not None
         if not asked or self._moved is None or pattern.moved(self._moved[0], pose):
@@ -173,13 +169,11 @@ class DrivePattern(SettledNode):
     def _send(self, speed: float, rate: float) -> None:
         twist = Twist()
         twist.linear.x, twist.angular.z = float(speed), float(rate)
-        if not self.config.stamped:
-            self._publisher.publish(twist)
-            return
-        stamped = TwistStamped(twist=twist)
-        stamped.header.stamp = self.get_clock().now().to_msg()
-        stamped.header.frame_id = 'base_link'
-        self._publisher.publish(stamped)
+        if self.config.stamped:
+            stamped = TwistStamped(twist=twist)
+            stamped.header.stamp = self.get_clock().now().to_msg()
+            stamped.header.frame_id = 'base_link'
+        self._publisher.publish(stamped if self.config.stamped else twist)
 
 
 main = partial(run, DrivePattern, HELP)

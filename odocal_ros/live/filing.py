@@ -200,19 +200,11 @@ class Filing:
 
     @property
     def busy(self) -> bool:
-        """Return True while files are being written."""
         return self._under_way > 0 or self._artist.busy
 
     def _write(self, calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
                imu_frame: str, now_ns: int, force: bool) -> tuple[Path, str]:
-        """
-        Write the result files into a folder named by the time; runs in the worker.
-
-        imu_frame : frame_id of the IMU, for an empty ``frames.imu``. Returns the folder, and the
-        reason if ``latest`` stays unchanged, else empty (``force`` moves it).
-
-        Raises OdocalError: the folder cannot be written.
-        """
+        """Write files into a folder named by the time; return it, and why ``latest`` stays."""
         from odocal_ros.output.files import Results
         from odocal_ros.output.ros_files import framed
         calibration, config = framed(calibration, config, imu_frame)

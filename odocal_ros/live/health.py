@@ -31,18 +31,22 @@ class Health:
         self.lost = 0          # by the middleware's sequence numbers
         self.lost_before = 0   # of them before the leg
         self.gaps = 0
-        self.newest_ns = 0
         self.stampless = False    # no stamp in the last messages
         self.received_ns = 0
         self.delay_s = 0.0     # arrival minus stamp of the newest row
-        self.jumped_back = False
         self.fix_status: int | None = None
+        self._last_sequence: int | None = None
+        self._interval_s = 0.0
+        self.forget()
+
+    def forget(self) -> None:
+        """Restart after a jump of time; counts of losses stay."""
+        self.newest_ns = 0
+        self.jumped_back = False
         self._ahead: list[int] = []      # unconfirmed stamps far ahead
         self._behind = 0                 # stale rows at the end of the last block
-        self._last_sequence: int | None = None
         # count and stamp after each block
         self._ends: deque[tuple[int, int]] = deque(maxlen=RATE_BLOCKS)
-        self._interval_s = 0.0
 
     def arrived(self, sequences: Sequence[int | None], now_ns: int) -> None:
         """Count lost messages; sequences: publisher's numbers in order of arrival, or None."""
@@ -105,12 +109,9 @@ class Health:
         self._ends.append((self.count, newest))
 
     def _newest(self, known: list[int], steps: list[int]) -> int:
-        """
-        Return the newest stamp after a block, and note whether time has restarted.
-
-        One or two stale stamps are a driver error, more a restart of time. If a block ends with
-        few stale stamps, or has one row only, the next block decides.
-        """
+        """Return the newest stamp after a block, and note whether time has restarted."""
+        # one or two stale stamps are a driver error, more a restart of time; if a block ends with
+        # few of them, or has one row only, the next block decides
         behind, self._behind = self._behind, 0
         if not steps or min(steps) >= -TIME_ANEW_NS:
             return known[-1]
@@ -147,10 +148,3 @@ class Health:
         if len(recent) < 2 or recent[-1][1] <= recent[0][1]:
             return 0.0
         return (recent[-1][0] - recent[0][0]) / ((recent[-1][1] - recent[0][1]) * 1e-9)
-
-    def forget(self) -> None:
-        """Restart after a jump of time; counts of losses stay."""
-        self.newest_ns = 0
-        self.jumped_back = False
-        self._ahead, self._behind = [], 0
-        self._ends.clear()

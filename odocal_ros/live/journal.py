@@ -174,8 +174,8 @@ def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, s
     return HEAD + parameters(flat(config)) + parameters(about, 'odocal_journal')
 
 
-def replay_command(folder: str, start_ns: int) -> str:
-    """Return the command that computes a cancelled leg from its mark to the journal's end."""
+def replay_command(folder: str, start_ns: int = 0) -> str:
+    """Return the command that computes a leg from its mark, if given, to the journal's end."""
     seconds, nanoseconds = divmod(start_ns, 10**9)
     start = f'{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{nanoseconds // 1000:06}'
-    return for_shell(['odocal', 'replay', folder, '--leg', f'{start}/'])
+    return for_shell(['odocal', 'replay', folder, *(['--leg', f'{start}/'] if start_ns else [])])

@@ -47,7 +47,6 @@ def clear_empty(root: Path) -> None:
 
 
 def size_of(folder: Path) -> int:
-    """Return the size of a journal, bytes."""
     total = 0
     with suppress(FileNotFoundError):
         for path in folder.iterdir():
@@ -123,7 +122,6 @@ class LegJournal:
 
     @property
     def folder(self) -> str:
-        """Return the folder of the journal, empty before it exists."""
         return str(self._bag.folder) if self._bag else ''
 
     def put(self, chunks: list[Chunk]) -> None:
@@ -185,7 +183,6 @@ class LegJournal:
         self._bag.join_some()
 
     def _open(self) -> SegmentedBag:
-        """Make the folder, with the settings in it."""
         root = self.plan.root
         root.mkdir(parents=True, exist_ok=True)
         clear_empty(root)

@@ -126,7 +126,6 @@ class JournalWriter:
             self._leg.put(chunks * self._listening + ([self._packed(marks)] if marks else []))
 
     def restart(self) -> None:
-        """Forget the pre-roll, as after a jump of time."""
         self._preroll.clear()
 
     def begin(self, plan: Plan) -> None:

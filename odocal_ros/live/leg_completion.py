@@ -28,7 +28,6 @@ from odocal_ros.live.recording import Recording
 from odocal_ros.live.running_estimate import RunningEstimate
 from odocal_ros.live.session import Session, SessionView, State
 from odocal_ros.output.figures import iso
-from odocal_ros.outside.names import for_shell
 from odocal_ros.pipeline.floor_marks import with_marks
 from odocal_ros.settings.config import Config
 
@@ -86,19 +85,16 @@ class LegCompletion:
 
     def _report_silence(self) -> None:
         """Publish the status immediately when the IMU falls silent or returns."""
-        silent = self._recording.imu_silent_s() > SILENT_TIME
-        if silent is not self._silent:
-            self._silent = silent
+        before, self._silent = self._silent, self._recording.imu_silent_s() > SILENT_TIME
+        if self._silent is not before:
             self.show_status()
 
     def pump(self) -> None:
-        """Decode the received messages."""
         running = self._watch.forecast and self._watch.forecast.estimates.get('scale_factor')
         found = running.value if running else None
         self._recording.pump(self._config(), found or self._publishing.scale_factor())
 
     def close(self) -> bool:
-        """Let the worker end; return True if it ended."""
         self._watch.end()
         grace_s = worker.FILES_GRACE_S if self._filing.busy else worker.JOB_GRACE_S
         until = time.monotonic() + grace_s
@@ -109,13 +105,15 @@ class LegCompletion:
         """Return the folder and replay command of a leg that was not stopped, else empty."""
         if self.session.state is not State.RECORDING:
             return ''
+        return f'leg {self.session.leg_id} was not stopped: {self._kept()}'
+
+    def _kept(self, start_ns: int = 0) -> str:
+        """Return the place of the newest leg's data and how to compute it from a mark."""
         folder = self._journal.folder
-        kept = (f'the data is in {folder}; compute it with '
-                f'{for_shell(["odocal", "replay", folder])}') if folder else 'it has no journal'
-        return f'leg {self.session.leg_id} was not stopped: {kept}'
+        return (f'the data is in {folder}; compute it with {replay_command(folder, start_ns)}'
+                if folder else 'it has no journal')
 
     def _restart_after_jump(self) -> None:
-        """Drop all samples from before a jump of time; a running leg is cancelled."""
         jump = 'time jumped back (a bag restarted, or a clock was set)'
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
             self._log.warning(f'{jump}: leg {self.session.leg_id} is cancelled')
@@ -154,7 +152,6 @@ class LegCompletion:
             local=recording.local, imu=not inputs.without_imu)
 
     def show_status(self) -> None:
-        """Publish the current status and log its changes."""
         now = self.view()
         self._console.report(now, time.monotonic_ns())
         self._journal.receive(self.session, self._publishing.show_status(now))
@@ -168,10 +165,9 @@ class LegCompletion:
 
     def _stop_when_too_long(self) -> None:
         session = self.session
-        if session.state is not State.RECORDING:
-            return
         limit = session.config.leg.max_duration
-        if (self._recording.newest_ns - session.start_ns) * 1e-9 > limit:
+        if session.state is State.RECORDING and (
+                self._recording.newest_ns - session.start_ns) * 1e-9 > limit:
             self._log.warning(
                 f'leg {session.leg_id} is stopped: it reached leg.max_duration, {limit:g} s')
             self.end_leg_now()
@@ -257,7 +253,6 @@ class LegCompletion:
 
     def _take_result(self, calibration: Calibration, paths: worker.Paths,
                      parts: Sequence[LegResult] = ()) -> tuple[bool, str]:
-        """Publish a result and answer the waiting callers."""
         self._publishing.set_results(calibration)
         self._publishing.show_paths(paths)
         now = self.view()
@@ -271,13 +266,9 @@ class LegCompletion:
     def _lost_leg(self) -> str:
         """Return the text on a leg that was dropped automatically, empty without one."""
         session = self.session
-        if not session.lost:
-            return ''
-        folder = self._journal.folder
-        kept = (f'the data is in {folder}; compute it with '
-                f'{replay_command(folder, session.start_ns)}' if folder else 'it has no journal')
-        return (f'leg {session.leg_id} was cancelled: {session.lost}; {kept}; call ~/start_leg '
-                'for a new leg')
+        return session.lost and (
+            f'leg {session.leg_id} was cancelled: {session.lost}; {self._kept(session.start_ns)}; '
+            'call ~/start_leg for a new leg')
 
     def _drop_leg(self, text: str = '', lost: str = '') -> None:
         self.session.cancel(lost)
@@ -289,7 +280,6 @@ class LegCompletion:
         self._computing.answer(False, text or self._lost_leg())
 
     def _save(self, calibration: Calibration, asked: bool = False) -> Future:
-        """Write the result files in the worker; the future has the answer."""
         inputs = self._recording.inputs
         config = replace(self.session.config, output=self._config().output)   # may be new
         return self._filing.save(calibration, config, inputs.topics,

@@ -63,14 +63,10 @@ def definition_of(kind: type) -> str:
 
 def _collect(kind: Any, name: str, texts: dict[str, str]) -> None:
     """Add the texts of a class and of all types that it uses."""
-    lines, used = [], []
-    for field, about in kind.get_fields_and_field_types().items():
-        base, whole = _in_msg(about)
-        lines.append(f'{whole} {field}\n')
-        used += [base] if '/' in base else []
-    texts[name] = ''.join(lines)
-    for base in used:
-        if base not in texts:
+    fields = {field: _in_msg(about) for field, about in kind.get_fields_and_field_types().items()}
+    texts[name] = ''.join(f'{whole} {field}\n' for field, (_, whole) in fields.items())
+    for base, _ in fields.values():
+        if '/' in base and base not in texts:
             package, _, leaf = base.rpartition('/')
             _collect(getattr(importlib.import_module(f'{package}.msg'), leaf), base, texts)
 
@@ -96,7 +92,6 @@ class Gate(MutuallyExclusiveCallbackGroup):
         self.is_open = False
 
     def can_execute(self, entity: object) -> bool:
-        """Return True if the executor can wait for the entity."""
         return self.is_open and bool(
             super().can_execute(entity))  # type: ignore[no-untyped-call]
 
@@ -150,11 +145,8 @@ class WaitingMessages:
                 [info['publication_sequence_number'] for info in infos])
 
     def _fetch(self, subscription: Subscription) -> None:
-        """
-        Take all messages in the middleware's queue.
-
-        The executor takes one message per topic at a time: under load the IMU would lag most.
-        """
+        # all of the queue: the executor takes one message of a topic at a time, and under load
+        # the IMU would lag most
         handle, kind = subscription.handle, subscription.msg_type
         with handle:
             for _ in range(self._most):

@@ -17,12 +17,12 @@ from std_srvs.srv import Trigger
 from odocal_ros.data.inputs import TOPICS
 from odocal_ros.errors import OdocalError
 from odocal_ros.live import params
-from odocal_ros.live.inputs import LOOK_AROUND_S
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
 from odocal_ros.live.process import complain, run, SettledNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
+from odocal_ros.live.topic_input import LOOK_AROUND_S
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.floor_marks import check_points
 
@@ -85,7 +85,6 @@ class Calibrator(SettledNode):
         self._timer = self.steady_timer(TURN_S, self._tick)
 
     def destroy_node(self) -> None:
-        """End worker, journal and clock callbacks with the node."""
         for part in ('operation', 'journal', 'recording'):
             if hasattr(self, part) and getattr(self, part).close() is False:
                 self.at_work = True
@@ -99,19 +98,16 @@ class Calibrator(SettledNode):
         """Refuse parameters that cannot be set now; changes nothing."""
         if self.publishing.setting_results:
             return SetParametersResult(successful=True)
-        refused = params.refused(self.config, self.publishing.results(), parameters)
-        if refused:
-            return SetParametersResult(successful=False, reason=refused)
+        why = params.refused(self.config, self.publishing.results(), parameters)
         session = self.operation.session
-        if session.busy:
-            return SetParametersResult(successful=False, reason=(
-                f'leg {session.leg_id} is {session.state.value}: its configuration is fixed; end '
-                'it with ~/stop_leg or ~/cancel_leg first'))
+        if not why and session.busy:
+            why = (f'leg {session.leg_id} is {session.state.value}: its configuration is fixed; '
+                   'end it with ~/stop_leg or ~/cancel_leg first')
         try:
             params.changed(self.config, parameters)
         except OdocalError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+            why = why or str(error)
+        return SetParametersResult(successful=not why, reason=why)
 
     def _take_parameters(self, parameters: list[Parameter]) -> None:
         self.config = params.changed(self.config, parameters)

@@ -25,10 +25,9 @@ from odocal_ros.data.inputs import WHEELS
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS, TopicReport
-from odocal_ros.live.inputs import LOOK_AROUND_S
 from odocal_ros.live.messages import message_class
 from odocal_ros.live.process import run, SettledNode
-from odocal_ros.live.topic_input import Input
+from odocal_ros.live.topic_input import Input, LOOK_AROUND_S
 from odocal_ros.messages.cdr import layout_of
 from odocal_ros.messages.sensor_types import types_of
 from odocal_ros.outside.names import said_by
@@ -131,7 +130,6 @@ class OdometryNode(SettledNode):
             time.sleep(max(0.0, until - time.monotonic()))
 
     def _turn(self) -> None:
-        """Publish the poses that are due."""
         now_ns = time.monotonic_ns()
         if now_ns - self._look_ns > LOOK_AROUND_S * 1e9:
             self._look_ns = now_ns
@@ -174,14 +172,10 @@ class OdometryNode(SettledNode):
             self.get_logger().warning(text)
 
     def _pump(self, source: Input) -> None:
-        """Feed the new messages of a topic to the odometry."""
         raws, sent_ns = source.take()
-        if not raws:
-            return
-        for slot, rows in source.readings(raws, sent_ns):
-            if slot == 'imu_other':
-                continue
-            self._odometry.feed(slot, rows, source.reader.form if source.reader else None)
+        for slot, rows in source.readings(raws, sent_ns) if raws else ():
+            if slot != 'imu_other':
+                self._odometry.feed(slot, rows, source.reader.form if source.reader else None)
         if source.health.jumped_back:
             source.health.forget()
 
@@ -217,7 +211,6 @@ class OdometryNode(SettledNode):
             self._tf(transform_of(pose, self.config.frames))
 
     def _transforms(self) -> Callable[[TransformStamped], None]:
-        """Return a function that sends a transform, or raise BadConfig without its message."""
         try:
             kind = message_class('tf2_msgs/msg/TFMessage')
         except BadConfig:

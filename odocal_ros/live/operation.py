@@ -43,7 +43,6 @@ class AutomaticLegs(LegCompletion):
         self._recording.tap = self._receive
 
     def tick(self) -> None:
-        """Process finished jobs, new messages and timeouts."""
         super().tick()
         self._keep_search()
         if self._search is not None and self._search.spans:
@@ -138,7 +137,6 @@ class Operation(AutomaticLegs):
     """
 
     def start_leg(self) -> tuple[bool, str]:
-        """Open a leg at the newest stamp."""
         session, mark_ns = self.session, self._mark_ns()
         if session.state is State.RECORDING and not session.by_itself:
             return True, (f'recording since {iso(session.start_ns)}, leg '
@@ -182,7 +180,6 @@ class Operation(AutomaticLegs):
         return self._computing.promise(worker.PATIENCE_S)
 
     def _last_result(self) -> tuple[bool, str]:
-        """Return the answer to a stop without a leg."""
         session, now = self.session, self.view()
         if now.lost:
             raise Refused(now.lost)
@@ -203,7 +200,6 @@ class Operation(AutomaticLegs):
         return True, text
 
     def undo_leg(self) -> tuple[bool, str] | Future:
-        """Drop the last kept leg and combine the others again."""
         left = [one for leg in self.session.begin_undo() for one in leg.results]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
@@ -226,7 +222,6 @@ class Operation(AutomaticLegs):
         return self._computing.promise()
 
     def reset(self) -> tuple[bool, str]:
-        """Drop all legs and the result."""
         if self.session.state is State.FAILED and self.session.open_leg:
             self._drop_leg('reset')
         dropped = self.session.begin_reset()

@@ -51,7 +51,6 @@ def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
 
 
 def _of_result(status: dict[str, str]) -> dict[str, float]:
-    """Return the sigmas of the result in forecast units; 0 while recording or without one."""
     if status.get('state') == 'recording':
         return {'scale': 0.0, 'yaw': 0.0}
     relative = number(status, 'scale_factor_sigma') / (number(status, 'scale_factor') or nan)

@@ -186,14 +186,13 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
 
 
 def as_results(calibration: Calibration, stamp: str, vehicle: str) -> dict[str, Any]:
-    values = dict(RESULTS)
+    values = RESULTS | {
+        PREFIX + 'legs': len(calibration.legs), PREFIX + 'stamp': stamp,
+        PREFIX + 'valid': calibration.verdict is not Verdict.REJECTED, PREFIX + 'vehicle': vehicle}
     for name in ESTIMATES:
         estimate = calibration.estimates.get(name) or Estimate(None, None, '')
         for key, number in ((name, estimate.value), (f'{name}_sigma', estimate.sigma)):
             values[PREFIX + key] = math.nan if number is None else float(number)
-    values[PREFIX + 'legs'] = len(calibration.legs)
-    values[PREFIX + 'valid'] = calibration.verdict is not Verdict.REJECTED
-    values[PREFIX + 'stamp'], values[PREFIX + 'vehicle'] = stamp, vehicle
     return values
 
 
@@ -225,14 +224,12 @@ def restored_from(results: dict[str, Any],
 
 
 def _plain(value: Any) -> Any:
-    """Return a parameter's value in the types of settings/config.py: lists, arrays as tuples."""
     if isinstance(value, (bool, int, float, str)) or value is None:
         return value
     return tuple(value)
 
 
 def _refusal(name: str, setting: Setting, error: Exception) -> str:
-    """Return the refusal of rclpy as one line, with the action."""
     text = ' '.join(str(error).split()).removesuffix(f': {name}').split('Reason: ')[-1]
     if setting.kind in ('float', 'floats') and isinstance(error, InvalidParameterTypeException):
         return f'{text}; write it as a decimal number such as 3.0'

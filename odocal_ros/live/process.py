@@ -54,7 +54,6 @@ class SettledNode(Node):
         return self.create_timer(period_s, turn, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def spin(self, executor: Executor) -> None:
-        """Process callbacks until the context ends."""
         executor.spin()
 
     def _look_for_namesake(self) -> None:

@@ -50,7 +50,6 @@ class Publishing:
         self._before = self.results()    # without kept legs: the restored result, or none
 
     def results(self) -> dict[str, Any]:
-        """Return the ``result.*`` parameters in force."""
         return {name: self._node.get_parameter(name).value for name in params.RESULTS}
 
     def scale_factor(self) -> float:
@@ -72,16 +71,13 @@ class Publishing:
             self.setting_results = False
 
     def forget_restored(self) -> None:
-        """Discard the result restored at the start."""
         self._before = dict(params.RESULTS)
 
     def show_paths(self, messages: Paths) -> None:
-        """Publish dead reckoning and reference of a leg."""
         for publisher, message in zip(self._paths, messages, strict=True):
             publisher.publish(message)
 
     def show_status(self, now: SessionView) -> DiagnosticArray:
-        """Publish ``~/status`` and return it."""
         array = self._array([calibration_status(now)])
         # the hint first: receivers of the status then have it
         self._show(self._hint, String(data=action_first(now)))

@@ -47,17 +47,25 @@ class RunningEstimate:
 
     def __init__(self, worker: Worker, log: PlainLog) -> None:
         self._worker, self._log = worker, log
-        self._newest: Forecast | None = None     # of the current section
-        self._earlier: Forecast | None = None    # of earlier sections
-        self._faults: tuple[Reason, ...] = ()
-        self._gaps: leg_so_far.ImuGaps | None = None
-        self._thinned: ThinnedLeg | None = None
         self._smoother = leg_so_far.SmootherSoFar()
-        self._before: LegRecorder | None = None
-        self._fresh: list[Block] = []
         self._over = threading.Event()
         self._start_ns = self._due_ns = 0
         self._config = Config()
+        self.end()
+
+    def end(self) -> None:
+        self._forget()
+        self._thinned: ThinnedLeg | None = None
+        self._gaps: leg_so_far.ImuGaps | None = None
+        self._earlier: Forecast | None = None    # of earlier sections
+
+    def _forget(self) -> None:
+        """Stop a running update, and discard its data."""
+        self._over.set()
+        self._newest: Forecast | None = None     # of the current section
+        self._before: LegRecorder | None = None
+        self._faults: tuple[Reason, ...] = ()
+        self._fresh: list[Block] = []
         self._looking = self._warm = False
         self._pause_until = 0.0
 
@@ -69,22 +77,9 @@ class RunningEstimate:
         self._gaps = leg_so_far.ImuGaps(start_ns, config.leg.max_gap)
         self._gaps.feed(recorder.rows('imu'))      # leg.automatic sets marks in the past
 
-    def end(self) -> None:
-        self._forget()
-        self._thinned = self._gaps = self._earlier = None
-
     @property
     def forecast(self) -> Forecast | None:
         return better(self._earlier, self._newest)
-
-    def _forget(self) -> None:
-        """Stop a running update, and discard its data."""
-        self._over.set()
-        self._newest = self._before = None
-        self._faults = ()
-        self._fresh = []
-        self._looking = self._warm = False
-        self._pause_until = 0.0
 
     def _look_from(self, start_ns: int, form: OdometerForm) -> None:
         """Start a new section at a stamp."""
@@ -147,11 +142,7 @@ class RunningEstimate:
 def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], start_ns: int,
           config: Config, over: threading.Event, smoother: leg_so_far.SmootherSoFar,
           ) -> Look:
-    """
-    Return forecast, faults, CPU time in s, and the error; runs in the worker.
-
-    The CPU time excludes ``once_s``, that of cold starts, which become rare as a leg grows.
-    """
+    """Return forecast, faults, CPU time in s, and the error; runs in the worker."""
     begin = time.thread_time()
     forecast: Forecast | None = None
     found: tuple[Reason, ...] = ()
@@ -169,6 +160,7 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], s
         failure = error
     finally:
         leg_so_far.screened_in_cells.cache_clear()      # no later update uses this leg
+    # without the time of cold starts, which become rare as a leg grows
     return forecast, found, time.thread_time() - begin - smoother.once_s, failure
 
 

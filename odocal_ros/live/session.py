@@ -123,7 +123,6 @@ class Session:
         self.marks = [mark for mark in self.marks if mark.stamp_ns >= first_ns]
 
     def marks_of_leg(self) -> list[FloorMark]:
-        """Return the marks of the leg last started."""
         return [mark for mark in self.marks if mark.stamp_ns >= self.start_ns]
 
     def mark(self, stamp_ns: int, received_ns: int) -> FloorMark:
@@ -148,7 +147,6 @@ class Session:
         self.state, self.trouble = State.COMPUTING, ''
 
     def finish(self, results: tuple[LegResult, ...], calibration: Calibration) -> None:
-        """Keep the computed leg."""
         self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, results))
         if len(self.legs) > LEGS_HELD:
             old = self.legs[-LEGS_HELD - 1]
@@ -203,7 +201,6 @@ class Session:
         return dropped
 
     def dropped(self, leg: KeptLeg) -> None:
-        """Set a leg as undone, for the status."""
         self.leg_id, self.start_ns, self.stop_ns = leg.leg_id, leg.start_ns, leg.stop_ns
         self.event = 'undone'
 

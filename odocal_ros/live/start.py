@@ -18,7 +18,6 @@ NEEDS = {'rich': 'pip install rich (or apt install python3-rich)',
 
 
 def _run(command: str, module: str) -> int:
-    """Run a node; return its exit code, 2 without ROS 2."""
     try:
         main = import_module(module).main
     except ModuleNotFoundError as error:

@@ -35,7 +35,6 @@ VALUES = {f'{name}{end}{unit}': f'result.{name}{end}'      # key: parameter
 
 
 def calibration_status(now: SessionView) -> DiagnosticStatus:
-    """Return the one status of ``~/status``."""
     session, results = now.session, now.results
     text, ok = answers.hint(now), answers.quantities_ok(now)
     legs = results['result.legs'] if now.restored else len(session.legs)
@@ -75,21 +74,16 @@ def _of_wheels(now: SessionView) -> dict[str, object]:
     """Return the keys of more than two wheels: factor and sigma of each by its name."""
     calibration = now.session.calibration
     estimates = calibration.estimates if calibration else {}
-    return {key: value for name in wheel_factors(estimates) if name not in VALUES
-            for key, value in ((name, _or_nan(estimates[name].value)),
-                               (f'{name}_sigma', _or_nan(estimates[name].sigma)))}
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
+    return {f'{name}{end}': math.nan if value is None else value
+            for name in wheel_factors(estimates) if name not in VALUES
+            for end, value in (('', estimates[name].value), ('_sigma', estimates[name].sigma))}
 
 
 def in_force(now: SessionView, name: str) -> float:
     """Return a value or sigma of the result, or of the running estimate until the leg has one."""
     if now.session.state is not State.RECORDING and now.forecast is None:
         return float(now.results[f'result.{name}'])
-    estimates = now.forecast.estimates if now.forecast else {}
-    estimate = estimates.get(name.removesuffix('_sigma'))
+    estimate = (now.forecast.estimates if now.forecast else {}).get(name.removesuffix('_sigma'))
     if estimate is None or estimate.value is None:
         return math.nan
     found = estimate.sigma if name.endswith('_sigma') else estimate.value
@@ -139,26 +133,22 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
 
 
 def _computing(now: SessionView) -> dict[str, object]:
-    """Return the keys of the progress of the computation of a leg."""
     stage = now.computed if now.session.state is State.COMPUTING else Stage()
     return {'computing_stage': stage.name, 'computing_passes': stage.passes,
             'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done}
 
 
 def _changes(session: Session) -> list[str]:
-    """Return the warning on a scale that changed between legs."""
     reasons = session.calibration.reasons if session.calibration else ()
     return [r.text for r in reasons if r.code is Code.SCALE_CHANGED]
 
 
 def _unused(session: Session) -> str:
-    """Return the explanation why the last automatic leg is not used."""
     why = session.unused
     return f'a leg was not used: {why.code.name}: {why.text}' if why else ''
 
 
 def _automatic(now: SessionView) -> str:
-    """Return the state of leg.automatic, empty if it is off."""
     if not now.config.leg.automatic:
         return ''
     if now.session.state is not State.RECORDING:

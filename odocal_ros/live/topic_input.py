@@ -31,6 +31,7 @@ from odocal_ros.outside.names import one_line, said_by
 from odocal_ros.settings.config import Config
 
 MOST_TOPICS_MEANT, NAME_SIMILARITY = 2, 0.4      # judgement: suggestions; of difflib, 1: equal
+LOOK_AROUND_S = 1.0     # judgement: between two searches for publishers
 HEALTH_ROWS = 20       # judgement: readings per update of the health
 STATIC_DEPTH = 100     # judgement: publishers of static transforms
 Read = Callable[[list[bytes], list[int], Callable[[bytes], Any]], Sequence[tuple[str, Any]]]
@@ -137,11 +138,10 @@ class Input:
         """Subscribe once the type is known."""
         if self.reader is not None:
             return
+        published = [p.topic_type for p in self.publishers[:1]]
         try:
-            if len(self.allowed) == 1:
-                self.subscribe(self.allowed[0], config)
-            elif self.publishers:
-                self.subscribe(self.publishers[0].topic_type, config)
+            for msgtype in self.allowed if len(self.allowed) == 1 else published:
+                self.subscribe(msgtype, config)
         except (OdocalError, ParameterException, InvalidQosOverridesError) as error:
             trouble = said_by(error)
             if trouble != self.trouble:
@@ -235,7 +235,6 @@ class Input:
 
     @property
     def newest_ns(self) -> int:
-        """Return the newest stamp, ns, 0 before the first."""
         return self.health.newest_ns
 
     def flowing(self) -> bool:

@@ -93,12 +93,10 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
 
 def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,
               ) -> tuple[Calibration, Paths]:
-    """Return the combination of the remaining legs, and the paths of the last one."""
     return combine(kept, config, carried, known_imu(config)), leg_paths(kept[-1], config)
 
 
 def leg_paths(result: LegResult | None, config: Config) -> Paths:
-    """Return the two paths of a leg, empty ones without a leg."""
     header = Header(frame_id=config.frames.local)
     if result is None:
         return PathMessage(header=header), PathMessage(header=header)
@@ -107,7 +105,6 @@ def leg_paths(result: LegResult | None, config: Config) -> Paths:
 
 
 def _path(track_n: Floats | None, header: Header) -> PathMessage:
-    """Return a track, (m, 3) in n, as a Path of at most MOST_POSES, the last row included."""
     if track_n is None or not len(track_n):
         return PathMessage(header=header)
     upright = Quaternion(w=1.0)
@@ -141,7 +138,6 @@ class Worker:
         self._jobs.put((job, then))
 
     def poll(self) -> None:
-        """Call ``then`` of each finished job."""
         while not self._done.empty():
             then, result, error = self._done.get()
             then(result, error)
@@ -221,7 +217,6 @@ class Computing:
         self._worker.submit(job, then)
 
     def drop(self) -> None:
-        """Drop the job: its result will be ignored."""
         self._job = None
 
     def promise(self, patience_s: float = math.inf) -> Future:

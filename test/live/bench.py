@@ -78,7 +78,14 @@ def wait_for(condition, what: str, patience: float = PATIENCE):
 
 def given(settings: dict[str, object]) -> list[str]:
     """Return settings as ROS arguments."""
-    return [x for name, value in settings.items() for x in ('-p', f'{name}:={value}')]
+    return [x for name, value in settings.items() for x in (
+        '-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}')]
+
+
+def as_dict(status) -> dict:
+    """Return a DiagnosticStatus with its values by key."""
+    return {'level': status.level, 'name': status.name, 'message': status.message,
+            **{kv.key: kv.value for kv in status.values}}
 
 
 class Client:
@@ -125,15 +132,10 @@ class Client:
 
     def _on_status(self, array) -> None:
         self.arrays.append(array)
-        status, = array.status
-        self.statuses.append({'level': status.level, 'name': status.name,
-                              'message': status.message,
-                              **{kv.key: kv.value for kv in status.values}})
+        self.statuses += map(as_dict, array.status)
 
     def _on_health(self, array) -> None:
-        for status in array.status:
-            self.health[status.name] = {'level': status.level, 'message': status.message,
-                                        **{kv.key: kv.value for kv in status.values}}
+        self.health |= {status.name: as_dict(status) for status in array.status}
 
     @property
     def status(self) -> dict:
@@ -196,9 +198,8 @@ class Client:
         from rclpy.parameter import Parameter
         messages = [Parameter(k.replace('__', '.'), value=v).to_parameter_msg()
                     for k, v in values.items()]
-        answer = answer_of(self.send(SetParameters, 'set_parameters',
-                                     SetParameters.Request(parameters=messages)))
-        result, = answer.results
+        result, = answer_of(self.send(SetParameters, 'set_parameters', SetParameters.Request(
+            parameters=messages))).results
         return result
 
     def close(self) -> None:

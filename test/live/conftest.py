@@ -3,11 +3,12 @@
 
 """Fixtures of the node's tests: nodes and clients that end."""
 
+from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 import re
 
-from bench import Client, NodeProcess
+from bench import Client, given, NodeProcess
 import pytest
 
 HAVE_ROS = find_spec('rclpy') is not None
@@ -26,11 +27,12 @@ def pytest_report_header():
 
 @pytest.fixture
 def start(tmp_path):
-    """Return a function that starts the node as a process; all end with the test."""
+    """Return a function that starts the node with settings as a process; all end."""
     started = []
 
-    def run(*args: str, **kwargs) -> NodeProcess:
-        started.append(NodeProcess('-p', f'output.directory:={tmp_path}', *args, **kwargs))
+    def run(settings: dict | None = None, *words: str, **kwargs) -> NodeProcess:
+        started.append(NodeProcess(
+            *given({'output.directory': tmp_path} | (settings or {})), *words, **kwargs))
         return started[-1]
 
     yield run
@@ -41,12 +43,19 @@ def start(tmp_path):
 @pytest.fixture
 def connect():
     """Return a function that connects a client; all end with the test."""
-    connected = []
+    with ExitStack() as ends:
+        def run(name: str = 'calibrator') -> Client:
+            client = Client(name)
+            ends.callback(client.close)
+            return client
 
-    def run(name: str = 'calibrator') -> Client:
-        connected.append(Client(name))
-        return connected[-1]
+        yield run
 
-    yield run
-    for client in connected:
-        client.close()
+
+@pytest.fixture
+def play_to(start, connect):
+    """Return a function that starts a node which listens to a drive, and returns its Drive."""
+    def run(driven, settings: dict | None = None, speed: float = 20.0, **kwargs):
+        from player import Drive
+        return Drive(start(settings, **kwargs), connect(), driven, speed)
+    return run

@@ -4,14 +4,14 @@
 """Kill the node in the middle of a leg and look what its journal has left of it."""
 
 import contextlib
-from dataclasses import dataclass
 import io
 import json
 from pathlib import Path
 import time
+from types import SimpleNamespace
 
 from bench import wait_for
-from player import messages_of, part, playing_to
+from player import messages_of, playing_to, stamp_of, within
 
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.library.legs import marked_legs
@@ -24,23 +24,6 @@ BEFORE_S, START_S, LAST_S = 30.0, 60.0, 170.0    # of the drive: played from, ma
 NUMBERS = ('--set', 'output.formats=[params]')   # no report is drawn
 
 
-@dataclass(frozen=True)
-class Remains:
-    """What a killed leg has left."""
-
-    moment_s: float        # wall time from the mark to the kill
-    lost_s: float          # wall time from the newest IMU message in the journal to the kill
-    told_s: float          # how long the leg was by the last status, in the time that it played
-    short_s: float         # by how much the journal is shorter than that
-    files: int
-    marks: list            # (start, stop) as replay finds them
-    start_ns: int          # the mark, as the node had published it
-    code: int              # of odocal replay
-    legs: list             # of calibration.json
-    text: str              # what replay said
-    result: dict | None    # calibration.json
-
-
 def drive():
     """Return types and messages of a drive that starts at 60 s."""
     return messages_of(simulate(SimOptions(
@@ -48,23 +31,19 @@ def drive():
         odometer='speed', fix_noise='rtk', scale=SCALE)))
 
 
-def killed(driven, moment_s: float, folder: Path, *args: str) -> Remains:
+def killed(driven, moment_s: float, folder: Path) -> SimpleNamespace:
     """Kill a node that records a leg of a drive ``moment_s`` after its start mark."""
-    types, sent = driven
-    with playing_to(types, '-p', f'output.directory:={folder}', *args) as (node, client, player):
-        player.play(part(sent, BEFORE_S, START_S), 3 * SPEED)
-        client.until(state='idle')
-        answer = client.call('start_leg')
-        marked = time.monotonic()
-        assert answer.success, answer.message
-        with player.playing(part(sent, START_S, LAST_S), SPEED):
+    with playing_to(driven, {'output.directory': folder}, 3 * SPEED) as leg:
+        leg.record(BEFORE_S, START_S)
+        marked, client = time.monotonic(), leg.client
+        with leg.playing(START_S, LAST_S, SPEED):
             status = client.until(state='recording')
             time.sleep(max(0.0, moment_s - (time.monotonic() - marked)))
             # a busy machine: by then the node must have heard of most of it
             wait_for(lambda: told(client) >= moment_s - 1.0, 'the leg in the status')
             told_s, end_ns = told(client), time.time_ns()
-            node.process.kill()
-            node.wait()
+            leg.node.process.kill()
+            leg.node.wait()
             moment_s = time.monotonic() - marked
     journal, = (folder / 'journal').iterdir()
     return remains(journal, moment_s, end_ns, int(status['leg_start_ns']), told_s)
@@ -76,16 +55,30 @@ def told(client) -> float:
 
 
 def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int,
-            told_s: float = 0.0) -> Remains:
-    """Return what is left in a journal."""
+            told_s: float = 0.0) -> SimpleNamespace:
+    """
+    Return what is left in a journal: files, marks as replay finds them, and what replay gives.
+
+    moment_s : wall time from the mark to the kill.   end_ns : of the kill.   start_ns : the mark,
+    as the node had published it.   told_s : how long the leg was by the last status, as played.
+    """
     with open_bag(journal) as bag:
-        rows = [(time_ns, m.header.stamp) for time_ns, m in bag.messages('/imu/data')]
+        rows = [(time_ns, stamp_of(m)) for time_ns, m in bag.messages('/imu/data')]
         newest_ns = max(time_ns for time_ns, _ in rows)
-        kept_s = max(s.sec * 10**9 + s.nanosec - start_ns for _, s in rows) * 1e-9 / SPEED
+        kept_s = (max(stamp for _, stamp in rows) - start_ns) * 1e-9 / SPEED
         marks, files = marked_legs(bag), len(bag.files)
     code, result, said = replayed(journal, *NUMBERS)
-    return Remains(moment_s, (end_ns - newest_ns) * 1e-9, told_s, told_s - kept_s, files, marks,
-                   start_ns, code, result['legs'] if result else [], said, result)
+    return SimpleNamespace(
+        moment_s=moment_s, told_s=told_s, files=files, marks=marks, start_ns=start_ns, code=code,
+        text=said, results=[result] if result else [], legs=result['legs'] if result else [],
+        # wall time that is lost, and by how much the journal is shorter than what was told
+        lost_s=(end_ns - newest_ns) * 1e-9, short_s=told_s - kept_s)
+
+
+def stamps_of(journal: Path, topic: str) -> list[int]:
+    """Return the header stamps of a topic, ns."""
+    with open_bag(journal) as bag:
+        return [stamp_of(message) for _, message in bag.messages(topic)]
 
 
 def replayed(journal: Path, *more: str) -> tuple[int, dict | None, str]:
@@ -97,42 +90,35 @@ def replayed(journal: Path, *more: str) -> tuple[int, dict | None, str]:
     return code, json.loads(out.getvalue()) if out.getvalue() else None, said.getvalue()
 
 
-@dataclass(frozen=True)
-class Files:
-    """What a node that was killed at its files has left of results."""
+def killed_at_files(driven, stage: str, moment_s: float, folder: Path,
+                    **settings) -> SimpleNamespace:
+    """
+    Kill a node ``moment_s`` after ~/stop_leg was asked, or ~/save after that (stage).
 
-    whole: list            # calibration.json of each result folder that has one
-    half: list             # folders with files of a result, and no calibration.json or another's
-    latest: bool           # points at a whole one, or is not there
-    journal: tuple         # code, calibration.json and words of a replay of the journal
-
-
-def killed_at_files(driven, stage: str, moment_s: float, folder: Path, *args: str) -> Files:
-    """Kill a node ``moment_s`` after ~/stop_leg was asked, or ~/save after that (stage)."""
-    types, sent = driven
-    with playing_to(types, '-p', f'output.directory:={folder}', *args) as (node, client, player):
-        player.play(part(sent, BEFORE_S, START_S), 3 * SPEED)
-        client.until(state='idle')
-        client.start()
-        player.play(part(sent, START_S, LAST_S), 3 * SPEED)
-        asked, begin = client.ask('stop_leg'), time.monotonic()
-        player.play(part(sent, LAST_S, LAST_S + 2), 3 * SPEED)
+    Returns calibration.json of each whole result, folders with half of one, whether latest points
+    at a whole one or is not there, and code, calibration.json and words of the journal's replay.
+    """
+    with playing_to(driven, {'output.directory': folder} | settings, 3 * SPEED) as leg:
+        leg.record(BEFORE_S, START_S, LAST_S)
+        asked, begin = leg.client.ask('stop_leg'), time.monotonic()
+        leg.play(LAST_S, LAST_S + 2)
         if stage == 'save':
-            client.result(asked)
-            client.ask('save')
+            leg.client.result(asked)
+            leg.client.ask('save')
             begin = time.monotonic()
         time.sleep(max(0.0, moment_s - (time.monotonic() - begin)))
-        node.process.kill()
-        node.wait()
+        leg.node.process.kill()
+        leg.node.wait()
     journal, = (folder / 'journal').iterdir()
     results = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()
                and path.name != 'journal' and not path.name.startswith('.')]
     contents = {path: whole_content(path) for path in results}
     latest = folder / 'latest'
-    return Files([c for c in contents.values() if c],
-                 [path for path, c in contents.items() if c is None and any(path.iterdir())],
-                 not latest.is_symlink() or bool(whole_content(latest)),
-                 replayed(journal, *NUMBERS))
+    whole, replay = [c for c in contents.values() if c], replayed(journal, *NUMBERS)
+    return SimpleNamespace(
+        whole=whole, journal=replay, results=[*whole, *filter(None, [replay[1]])],
+        half=[path for path, c in contents.items() if c is None and any(path.iterdir())],
+        latest=not latest.is_symlink() or bool(whole_content(latest)))
 
 
 def same_result(live: dict, offline: dict, *more: str) -> None:
@@ -152,13 +138,11 @@ def check_replay(live: dict, journal: Path) -> str:
     return said
 
 
-def wrong(left: Files | Remains) -> list[float]:
-    """Return by how many sigmas values that were not rejected miss the truth, where too many."""
-    found = [*left.whole, left.journal[1]] if isinstance(left, Files) else [left.result]
-    scales = [one['result']['scale_factor'] for one in found
-              if one and one['verdict'] != 'rejected']
-    off = [abs(scale['value'] - SCALE) / scale['sigma'] for scale in scales if scale['value']]
-    return [sigmas for sigmas in off if sigmas > 5]
+def wrong(left: SimpleNamespace) -> list[float]:
+    """Return the scales that were not rejected and miss the truth by more than 5 sigmas."""
+    scales = [one['result']['scale_factor'] for one in left.results
+              if one['verdict'] != 'rejected']
+    return [scale['value'] for scale in scales if scale['value'] and not within(scale, SCALE, 5)]
 
 
 def whole_content(folder: Path) -> dict | None:

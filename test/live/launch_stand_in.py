@@ -3,7 +3,8 @@
 
 """What a launch file would start, found without the packages launch and launch_ros."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 import re
 import sys
@@ -11,9 +12,8 @@ from types import ModuleType
 from unittest.mock import patch
 from xml.etree import ElementTree
 
+from bench import given as as_arguments, ROOT
 import yaml
-
-ROOT = Path(__file__).resolve().parents[2]     # config/ and launch/ lie alike in share/odocal_ros
 
 
 @dataclass
@@ -26,15 +26,13 @@ class Started:
     namespace: str
     remappings: dict[str, str]
     parameters: list                # paths and dicts, later ones win
-    arguments: list[str] = field(default_factory=list)
+    arguments: list[str]
 
     def command_line(self) -> list[str]:
         """Return the ROS arguments that launch_ros makes of it."""
         words = [] if not self.namespace else ['-r', f'__ns:=/{self.namespace}']
-        for given in self.parameters:
-            words += ['--params-file', given] if isinstance(given, str) else [
-                w for name, value in given.items() for w in (
-                    '-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}')]
+        for one in self.parameters:
+            words += ['--params-file', one] if isinstance(one, str) else as_arguments(one)
         return words + [w for pair in self.remappings.items() for w in ('-r', ':='.join(pair))]
 
 
@@ -103,8 +101,7 @@ def _wanted(node, arguments) -> bool:
 
 
 def _started(node, arguments) -> Started:
-    def words(value):
-        return text_of(value, arguments)
+    words = partial(text_of, arguments=arguments)
     return Started(
         node['package'], node['executable'], node.get('name'), words(node['namespace']),
         {a: words(b) for a, b in node.get('remappings', ())},
@@ -118,37 +115,31 @@ def of_xml(path: Path, given: dict[str, str]) -> tuple[dict, list[Started]]:
     declared = {a.get('name'): (_filled(a.get('default', ''), {}), a.get('description'))
                 for a in root.findall('arg')}
     arguments = {name: default for name, (default, _) in declared.items()} | given
-    nodes: list[Started] = []
-    _walk(root, arguments, {}, nodes)
-    return declared, nodes
+    return declared, list(_walk(root, partial(_filled, arguments=arguments), {}))
 
 
-def _walk(element, arguments, remaps, nodes) -> None:
+def _walk(element, filled, remaps):
     remaps = dict(remaps)          # those of a group end with it
     for child in element:
-        if not _truth(_filled(child.get('if', 'true'), arguments)) or _truth(
-                _filled(child.get('unless', 'false'), arguments)):
+        if not _truth(filled(child.get('if', 'true'))) or _truth(
+                filled(child.get('unless', 'false'))):
             continue
         if child.tag == 'group':
-            _walk(child, arguments, remaps, nodes)
+            yield from _walk(child, filled, remaps)
         elif child.tag == 'set_remap':
-            remaps[child.get('from')] = _filled(child.get('to'), arguments)
+            remaps[child.get('from')] = filled(child.get('to'))
         elif child.tag == 'node':
-            nodes.append(_of_element(child, arguments, remaps))
+            files = [filled(p.get('from')) for p in child.findall('param') if p.get('from')]
+            values = {p.get('name'): yaml.safe_load(filled(p.get('value')))
+                      for p in child.findall('param') if p.get('name')}
+            yield Started(child.get('pkg'), child.get('exec'), child.get('name'),
+                          filled(child.get('namespace')), dict(remaps), [*files, values],
+                          filled(child.get('args', '')).split())
         elif child.tag != 'arg':
             raise ValueError(f'the stand-in knows no <{child.tag}>')
 
 
-def _of_element(node, arguments, remaps) -> Started:
-    files = [_filled(p.get('from'), arguments) for p in node.findall('param') if p.get('from')]
-    values = {p.get('name'): yaml.safe_load(_filled(p.get('value'), arguments))
-              for p in node.findall('param') if p.get('name')}
-    return Started(node.get('pkg'), node.get('exec'), node.get('name'),
-                   _filled(node.get('namespace'), arguments), dict(remaps), [*files, values],
-                   _filled(node.get('args', ''), arguments).split())
-
-
 def _filled(text: str, arguments) -> str:
-    text = re.sub(r'\$\(find-pkg-share odocal_ros\)', str(ROOT), text)
+    text = text.replace('$(find-pkg-share odocal_ros)', str(ROOT))
     text = re.sub(r'\$\(var (\w+)\)', lambda m: arguments[m.group(1)], text)
     return re.sub(r'\$\(eval "([^"]*)"\)', lambda m: str(eval(m.group(1))), text)

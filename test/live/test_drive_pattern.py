@@ -60,9 +60,13 @@ class Robot:
         message.pose.orientation.w = math.cos(self.pose[2] / 2)
         self._publisher.publish(message)
 
-    def bump(self, pressed: bool) -> None:
+    @contextlib.contextmanager
+    def bumped(self):
+        """Press the bumper as long as the block lasts."""
         wait_for(self._bumper.get_subscription_count, 'the node at the bumper')
-        self._bumper.publish(Bool(data=pressed))
+        self._bumper.publish(Bool(data=True))
+        yield
+        self._bumper.publish(Bool(data=False))
 
     def close(self) -> None:
         self._over.set()
@@ -72,17 +76,16 @@ class Robot:
 @contextlib.contextmanager
 def ready(kind=Twist, before=lambda client: None, **settings):
     """Yield node, client and robot; all end.   before : called before the node starts."""
-    client = Client('drive_pattern')
-    robot = Robot(client, kind)
-    before(client)
-    node = NodeProcess(*given(SETTINGS | settings), module='drive_pattern')
-    try:
+    with contextlib.ExitStack() as ends:
+        client = Client('drive_pattern')
+        ends.callback(client.close)
+        robot = Robot(client, kind)
+        ends.callback(robot.close)
+        before(client)
+        node = NodeProcess(*given(SETTINGS | settings), module='drive_pattern')
+        ends.callback(node.end)
         wait_for(lambda: 'ready: ' in node.text, 'the node')
         yield node, client, robot
-    finally:
-        node.end()
-        robot.close()
-        client.close()
 
 
 @contextlib.contextmanager
@@ -119,18 +122,10 @@ def test_a_pattern_is_driven_to_its_end_inside_the_rectangle():
         assert max(abs(rate) for _, rate in robot.commands) <= 3.0
 
 
-@contextlib.contextmanager
-def bumped(robot):
-    """Press the bumper as long as the block lasts."""
-    robot.bump(True)
-    yield
-    robot.bump(False)
-
-
 # the cause, how it is made, and whether a start is refused for it
 CAUSES = {
     'no pose for 0.5 s': (lambda robot: patch.object(robot, 'blind', True), True),
-    'the bumper is pressed': (bumped, True),
+    'the bumper is pressed': (Robot.bumped, True),
     'the robot is outside the rectangle, at x': (
         lambda robot: patch.object(robot, 'pose', [0.0, 1.2, 0.0]), True),
     'the pose has not changed for 2 s': (

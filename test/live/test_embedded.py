@@ -3,18 +3,18 @@
 
 """The node inside another program: its executor, its context, and a pipeline that fails."""
 
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 import threading
 from types import SimpleNamespace
 
-from bench import Client, wait_for
-from player import messages_of, part, Player
+from bench import answer_of, Client, wait_for
+from player import Drive, messages_of
 import pytest
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
-from odocal_ros.live import answers, operation, worker
+from odocal_ros.live import answers, worker
 from odocal_ros.live.messages import WaitingMessages
 from odocal_ros.live.node import AWAITED_TURN_S, TURN_S
 from odocal_ros.live.topic_input import Input
@@ -35,40 +35,34 @@ def embedded(tmp_path):
                       parameter_overrides=[
                           Parameter('output.directory', value=str(tmp_path)),
                           Parameter('leg.min_distance', value=20.0)])
-    stranger = rclpy.create_node('stranger', context=context)
     executor = SingleThreadedExecutor(context=context)
-    executor.add_node(stranger)
-    executor.add_node(node)
+    for one in (rclpy.create_node('stranger', context=context), node):
+        executor.add_node(one)
 
     def spin():
-        try:
+        with suppress(ExternalShutdownException):
             executor.spin()
-        except ExternalShutdownException:
-            return
-
     thread = threading.Thread(target=spin, daemon=True)
     thread.start()
     client = Client('second')
+    client.until(state='waiting')
     yield node, client
     executor.shutdown()
     thread.join(10)
     client.close()
     node.destroy_node()
-    stranger.destroy_node()
     context.try_shutdown()
 
 
 def test_name_overrides_and_remaps_pass_through(embedded):
     _, client = embedded
     assert client.get('leg.min_distance') == [20.0]
-    client.until(state='waiting')
     wait_for(lambda: '/gps/fix' in client.status['missing'], 'the remapped topic')
     wait_for(lambda: 'second: imu' in client.health, "diagnostics under the node's name")
 
 
 def test_messages_wait_in_the_queue_and_are_stamped_by_their_sender(embedded):
     node, client = embedded
-    client.until(state='waiting')
     imu = Input(node, 'imu', ('sensor_msgs/msg/Imu',))
     waiting = imu.waiting
     assert not waiting.gate.can_execute(imu)   # the executor is not woken for each message
@@ -81,7 +75,6 @@ def test_messages_wait_in_the_queue_and_are_stamped_by_their_sender(embedded):
 
 def test_without_take_message_the_executor_carries_all(embedded):
     node, client = embedded
-    client.until(state='waiting')
     waiting = WaitingMessages(node)
     waiting.subscribe(String, 'words', QoSProfile(depth=10))
     publisher = client.node.create_publisher(
@@ -108,7 +101,6 @@ def test_without_take_message_the_executor_carries_all(embedded):
 
 def test_turns_are_long_unless_somebody_waits(embedded):
     node, client = embedded
-    client.until(state='waiting')
     wait_for(lambda: node._timer.timer_period_ns == round(TURN_S * 1e9), 'long turns')
     gate = threading.Event()
     node.operation._filing._artist.submit(gate.wait, lambda *_: None)      # a report to be drawn
@@ -119,22 +111,17 @@ def test_turns_are_long_unless_somebody_waits(embedded):
 
 def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkeypatch):
     node, client = embedded
-    drive = simulate(SimOptions(duration=180.0, imu_rate=20.0, odometer_rate=10.0,
-                                odometer='speed', fix_noise='rtk'))
-    types, messages = messages_of(drive)
-    player = Player.connected(client, types, {'fix': 'gps/fix'})
-    player.play(part(messages, 45, 60), 30)
-    client.until(state='idle')
-    assert client.call('start_leg').success
-    player.play(part(messages, 60, 80), 30)
+    leg = Drive(node, client, messages_of(simulate(SimOptions(
+        duration=180.0, imu_rate=20.0, odometer_rate=10.0, odometer='speed', fix_noise='rtk'))),
+        names={'fix': 'gps/fix'})
+    leg.record(45, 60, 80)
 
     def explode(*_):
         raise MemoryError('not enough for this leg')
     monkeypatch.setattr(worker, 'compute', explode)
     stopping = client.ask('stop_leg')
-    player.play(part(messages, 80, 82), 30)
-    status = client.until(state='failed')
-    answer = stopping.result() if stopping.done() else wait_for(stopping.result, 'the answer')
+    leg.play(80, 82)
+    status, answer = client.until(state='failed'), answer_of(stopping)
     assert not answer.success
     for words in ('MemoryError: not enough for this leg', '~/stop_leg', '~/cancel_leg'):
         assert words in answer.message
@@ -142,7 +129,6 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
     assert 'not enough for this leg' in status['message']
     assert not client.call('start_leg').success
     monkeypatch.undo()
-    assert operation.worker.compute is worker.compute
     # a fault after the numbers are there is an answer, too, and the node lives
     monkeypatch.setattr(answers, 'outcome', explode)
     assert 'MemoryError: not enough for this leg' in client.result(client.ask('stop_leg')).message
@@ -151,16 +137,13 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
     assert 'scale factor' in client.call('stop_leg').message
     # of two legs undone at once none is left, though the first undoing is still combined
     assert client.call('start_leg').success
-    player.play(part(messages, 82, 100), 30)
-    stopping = client.ask('stop_leg')
-    player.play(part(messages, 100, 102), 30)
-    assert wait_for(lambda: stopping.done() and stopping.result(), 'the answer').message
+    leg.play(82, 100)
+    leg.ended(100)
     client.until(state='calibrated', leg_id='2', legs='2')
     gate = threading.Event()
     node.operation._worker.submit(gate.wait, lambda *_: None)
     undoing = [client.ask('undo_leg') for _ in range(2)]
     client.until(legs='0')
     gate.set()
-    for one in undoing:
-        assert wait_for(lambda one=one: one.done() and one.result(), 'the answer').success
+    assert all(answer_of(one).success for one in undoing)
     assert (client.call('save').success, client.status['scale_factor']) == (False, 'nan')

@@ -1,9 +1,10 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The worker, the answer of ~/save, and what it takes to replace a good result by a worse one."""
+"""The worker, the answer of ~/save, and what ``latest`` points at: never quietly a worse one."""
 
 import os
+from pathlib import Path
 import threading
 import time
 from types import SimpleNamespace
@@ -12,7 +13,8 @@ from bench import wait_for
 import pytest
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.live.filing import Filing
+from odocal_ros.live import filing as module
+from odocal_ros.live.filing import Filing, output_root, ResultFolders
 from odocal_ros.live.worker import Worker
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, with_settings
@@ -63,14 +65,18 @@ def test_what_cannot_be_saved_is_a_warning_until_it_is(filing, tmp_path):
     assert filing.filing.trouble == ''
 
 
-def test_the_saves_of_the_node_itself_do_not_count_nor_a_warning_of_another_result(save):
+def test_a_worse_result_needs_the_second_save_of_the_operator(save, tmp_path):
     assert save(GOOD, asked=False)[1]
     for _ in range(2):
         assert not save(BAD, asked=False)[1]
     assert not save(BAD)[1]
-    assert not save(Calibration(BAD.reasons, {}, {}, ()))[1]
-    assert not save(BAD)[1]
+    assert not save(Calibration(BAD.reasons, {}, {}, ()))[1]        # another result
+    text, latest = save(BAD)
+    assert not latest
+    assert 'latest is unchanged: the new result is rejected (NO_FIX)' in text
+    assert 'call ~/save again' in text
     assert save(BAD)[1]
+    assert not list(tmp_path.glob('.latest*'))
 
 
 def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(filing, tmp_path, monkeypatch):
@@ -89,15 +95,6 @@ def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(filing, tmp_p
     assert done + filing.said == ['a leg']
 
 
-def test_a_worse_result_needs_the_second_save(save):
-    assert save(GOOD)[1]
-    text, latest = save(BAD)
-    assert not latest
-    assert 'latest is unchanged: the new result is rejected (NO_FIX)' in text
-    assert 'call ~/save again' in text
-    assert save(BAD)[1]
-
-
 def test_what_a_killed_node_has_left_is_removed_by_the_next_save(save, tmp_path):
     empty, full, new = (tmp_path / f'2026-01-01T00-00-0{k}Z' for k in range(3))
     other = tmp_path / 'notes'
@@ -114,20 +111,126 @@ def test_what_a_killed_node_has_left_is_removed_by_the_next_save(save, tmp_path)
             or one.exists()} == {full.name, new.name, other.name, young.name}
 
 
-def test_jobs_given_before_the_end_are_done():
+def test_jobs_given_before_the_end_are_done_but_a_long_one_does_not_hold_it():
     done, gate, w = [], threading.Event(), Worker()
     w.submit(lambda: gate.wait(5.0), lambda *_: None)
     w.submit(lambda: done.append('saved'), lambda *_: None)
+    assert not w.close(0.05)       # returns though the first has not ended
     threading.Timer(0.05, gate.set).start()
     assert w.close()
     assert done == ['saved']
 
 
-def test_a_long_job_does_not_hold_the_end():
-    gate, w = threading.Event(), Worker()
-    w.submit(gate.wait, lambda *_: None)
-    began = time.monotonic()
-    assert not w.close(0.05)       # returns though the job has not ended
-    assert not gate.is_set()
-    assert time.monotonic() - began < 60.0
-    gate.set()
+def test_each_node_has_a_folder_of_its_own_in_the_ros_home(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    assert output_root(Config(), '/calibrator') == tmp_path / 'odocal/calibrator'
+    assert output_root(Config(), '/car4/calibrator') == tmp_path / 'odocal/car4/calibrator'
+    monkeypatch.delenv('ROS_HOME')
+    assert output_root(Config(), '/a') == Path('~/.ros/odocal/a').expanduser()
+    assert output_root(with_settings(Config(), {'output.directory': '/x'}), '/a') == Path('/x')
+
+
+@pytest.fixture
+def make(tmp_path, monkeypatch):
+    """Return a function that makes a result folder; a folder named bad is worse than others."""
+    monkeypatch.setattr(module, 'stored_in',
+                        lambda path: path.resolve().name if path.exists() else None)
+    monkeypatch.setattr(module, 'replacing', lambda old, new: (
+        'it is rejected' if old and 'bad' not in old and 'bad' in new.name else ''))
+
+    def folder(name):
+        (tmp_path / name).mkdir()
+        return tmp_path / name
+    return folder
+
+
+def latest(tmp_path):
+    link = tmp_path / 'latest'
+    return link.readlink() if link.is_symlink() else None
+
+
+def test_results_of_automatic_legs_are_bounded_but_for_the_good_and_the_operators(tmp_path,
+                                                                                  monkeypatch):
+    of = {}       # name: (automatic, usable)
+
+    def stored(path):
+        automatic, usable = of.get(path.resolve().name, (False, False))
+        return SimpleNamespace(config={'leg.automatic': automatic}, usable=usable)
+    monkeypatch.setattr(module, 'stored_in', stored)
+    monkeypatch.setattr(module, 'replacing',
+                        lambda old, new: '' if of[new.name][1] else 'it is rejected')
+    folders = ResultFolders()
+    for day, made in enumerate([(False, True), *[(True, True)] * 3, *[(True, False)] * 4], 1):
+        folder = tmp_path / f'2026-05-{day:02}T09-12-00Z'
+        folder.mkdir()
+        of[folder.name] = made
+        folders.file(folder, day, False)
+        folders.prune(folder, 0)
+    (tmp_path / 'journal').mkdir()
+    assert len(list(tmp_path.glob('2026*'))) == 8        # 0: all
+    folders.prune(folder, 2)
+    # the operator's; 4 is what latest shows, 3 what it would go back to; the last two
+    assert [p.name[8:10] for p in sorted(tmp_path.glob('2026*'))] == ['01', '03', '04', '07', '08']
+    assert latest(tmp_path) == Path('2026-05-04T09-12-00Z')
+    assert (tmp_path / 'journal').is_dir()
+
+
+def test_a_result_of_an_earlier_session_counts_too(make, tmp_path):
+    ResultFolders().file(make('old'), 1, False)
+    folders = ResultFolders()
+    assert folders.file(make('bad'), 2, False) == 'it is rejected'
+    assert latest(tmp_path) == Path('old')
+
+
+def test_undo_takes_latest_back_to_the_legs_left(make, tmp_path):
+    ResultFolders().file(make('old'), 0, False)
+    folders = ResultFolders()
+    a = make('a')
+    folders.file(a, 1, False)
+    folders.file(make('b'), 2, False)
+    folders.file(make('c'), 2, False)
+    assert folders.withdraw(2) == a
+    assert latest(tmp_path) == Path('a')
+    assert folders.withdraw(0) is None
+    assert latest(tmp_path) == Path('old')
+    assert folders.withdraw(0) is None
+
+
+def test_undo_links_no_target_that_is_gone_or_never_was(make, tmp_path):
+    old, folders = make('old'), ResultFolders()
+    folders.file(old, 1, False)
+    folders.withdraw(0)       # the first of all
+    assert latest(tmp_path) is None
+    assert old.is_dir()
+    ResultFolders().file(old, 0, False)
+    folders = ResultFolders()
+    folders.file(make('a'), 1, False)
+    old.rmdir()
+    folders.withdraw(0)
+    assert latest(tmp_path) is None
+
+
+def test_a_link_that_somebody_moved_is_left_alone(make, tmp_path):
+    folders = ResultFolders()
+    folders.file(make('a'), 1, False)
+    ResultFolders().file(make('other'), 5, False)
+    folders.withdraw(0)
+    assert latest(tmp_path) == Path('other')
+
+
+def test_two_nodes_file_one_after_the_other(make, tmp_path, monkeypatch):
+    """Whoever looks at what is there points at its own before the next looks."""
+    good, bad = make('good'), make('bad')
+    late = threading.Thread(target=lambda: ResultFolders().file(good, 1, False))
+    stored_in = module.stored_in
+
+    def slowly(path):
+        found = stored_in(path)
+        if not late.ident:          # bad has looked, and good comes
+            late.start()
+            late.join(0.3)
+        return found
+    monkeypatch.setattr(module, 'stored_in', slowly)
+    ResultFolders().file(bad, 2, False)
+    late.join()
+    assert latest(tmp_path) == Path('good')

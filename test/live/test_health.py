@@ -30,49 +30,40 @@ def decoded(health, block, **limits):
     return np.array(health.decoded(block.stamp_ns.tolist(), block.received_ns, **limits), bool)
 
 
+def health_of(*blocks, arrived=(), **limits):
+    """Return the health after blocks of stamps, s, and numbers that arrived after 1 s, 2 s."""
+    health = Health()
+    for second, numbers in enumerate(arrived, 1):
+        health.arrived(numbers, now_ns=second * SECOND)
+    for stamps in blocks:
+        decoded(health, rows(stamps), **limits)
+    return health
+
+
 def test_rate_is_by_stamps_and_silence_is_by_the_rate():
-    health = Health()
-    for begin in range(0, 100, 10):  # 50 Hz, blocks of ten
-        health.arrived([None] * 10, now_ns=5 * SECOND)
-        decoded(health, rows(100 + (begin + np.arange(10)) * 0.02))
-    assert health.rate_hz(5 * SECOND) == pytest.approx(50.0)
-    assert health.rate_hz(7 * SECOND + 1) == 0.0  # 2 s of silence at 50 Hz is the end
-    health = Health()
-    health.arrived([None] * 3, now_ns=SECOND)
-    decoded(health, rows([0.5, 1.5, 2.5]))
+    blocks = [100 + (begin + np.arange(10)) * 0.02 for begin in range(0, 100, 10)]  # 50 Hz
+    health = health_of(*blocks, arrived=[[None] * 100])
+    assert health.rate_hz(SECOND) == pytest.approx(50.0)
+    assert health.rate_hz(3 * SECOND + 1) == 0.0  # 2 s of silence at 50 Hz is the end
+    health = health_of([0.5, 1.5, 2.5], arrived=[[None] * 3])
     assert health.flowing(SECOND + 4 * SECOND)       # 5 intervals of 1 s
     assert not health.flowing(SECOND + 6 * SECOND)
-    health = Health()
-    health.arrived([1], now_ns=SECOND)
-    decoded(health, rows([0.0]))
-    assert not health.flowing(SECOND)
+    assert not health_of([0.0], arrived=[[1]]).flowing(SECOND)
 
 
 def test_losses_are_counted_across_batches_and_two_publishers_are_none():
-    health = Health()
-    health.arrived([5, 6, 9], now_ns=1)   # 7 and 8
-    health.arrived([10, 12], now_ns=2)    # 11
-    assert health.lost == 3
-    health = Health()
-    health.arrived([5, 900, 6, 901], now_ns=1)
-    health.arrived([1, 2], now_ns=2)
-    assert health.lost == 0
+    assert health_of(arrived=[[5, 6, 9], [10, 12]]).lost == 3       # 7, 8 and 11
+    assert health_of(arrived=[[5, 900, 6, 901], [1, 2]]).lost == 0
 
 
 def test_gaps_by_limit_and_by_median():
-    health = Health()
-    decoded(health, rows([1.0, 1.01, 1.6]), max_gap_s=0.5)
-    assert health.gaps == 1
-    other = Health()
-    decoded(other, rows(np.arange(1, 2, 0.1)))
-    decoded(other, rows([2.0, 2.45, 2.99]))  # 0.54 s is more than 5 of 0.1 s, 0.45 s is not
-    assert other.gaps == 1
+    assert health_of([1.0, 1.01, 1.6], max_gap_s=0.5).gaps == 1
+    # 0.54 s is more than 5 of 0.1 s, 0.45 s is not
+    assert health_of(np.arange(1, 2, 0.1), [2.0, 2.45, 2.99]).gaps == 1
 
 
 def test_one_stale_stamp_is_no_jump_of_time_a_block_of_them_is():
-    health = Health()
-    decoded(health, rows([10.0, 10.1]))
-    decoded(health, rows([3.0, 10.2]))
+    health = health_of([10.0, 10.1], [3.0, 10.2])
     assert not health.jumped_back
     decoded(health, rows([2.0, 2.1]))
     assert health.jumped_back
@@ -84,11 +75,7 @@ def test_one_stale_stamp_is_no_jump_of_time_a_block_of_them_is():
 def test_a_jump_within_a_block_is_seen_however_it_is_cut():
     stamps = [*np.arange(20.0, 21.0, 0.1), *np.arange(5.0, 6.0, 0.1)]
     for cut in range(1, len(stamps)):
-        health = Health()
-        decoded(health, rows([19.9]))
-        decoded(health, rows(stamps[:cut]))
-        decoded(health, rows(stamps[cut:]))
-        assert health.jumped_back, cut
+        assert health_of([19.9], stamps[:cut], stamps[cut:]).jumped_back, cut
 
 
 @pytest.mark.parametrize('rows_at_once', [1, 3, 20])
@@ -113,9 +100,7 @@ def test_lone_wild_stamps_are_no_time_however_they_come(rows_at_once, wild):
 
 @pytest.mark.parametrize('rows_behind', [1, 2])
 def test_a_stale_stamp_after_a_pause_is_no_time(rows_behind):
-    health = Health()
-    decoded(health, rows([1000.0, 1000.1]))
-    decoded(health, rows([1000.2, 1002.0, *[1.0] * rows_behind]))
+    health = health_of([1000.0, 1000.1], [1000.2, 1002.0, *[1.0] * rows_behind])
     assert (health.newest_ns, health.jumped_back) == (1002 * SECOND, False)
     decoded(health, rows([1002.1, 1002.2]))
     assert (health.newest_ns * 1e-9, health.jumped_back) == (pytest.approx(1002.2), False)
@@ -123,81 +108,75 @@ def test_a_stale_stamp_after_a_pause_is_no_time(rows_behind):
 
 @pytest.mark.parametrize('before', [[], [10.0, 10.1]])
 def test_a_stamp_seconds_ahead_within_a_block_is_no_time(before):
-    health = Health()
-    decoded(health, rows([*before, 20.0, 10.2, 10.3, 10.4]))
+    health = health_of([*before, 20.0, 10.2, 10.3, 10.4])
     assert (health.newest_ns * 1e-9, health.jumped_back) == (pytest.approx(10.4), False)
 
 
 def test_stamps_that_go_on_far_ahead_are_a_time():
-    health = Health()
-    decoded(health, rows([10.0, 10.1]))
+    health = health_of([10.0, 10.1])
     assert decoded(health, rows([1e5])).tolist() == [False]
     assert decoded(health, rows([1e5 + 1, 1e5 + 2])).tolist() == [False, True]
     assert health.newest_ns == int((1e5 + 2) * SECOND)
     assert not health.jumped_back
 
 
-def test_a_clock_that_is_set_back_gives_no_negative_standstill():
-    travel = Travel(COUNTER)
-    travel.feed(rows([1000, 1001, 1002], np.array([0, 100, 200])), 0.02)
-    for t in (10, 11, 12):
-        travel.feed(rows([t], np.array([200])), 0.02)
-        assert travel.still_s() == t - 10
-        assert travel.rested_s(600.0) >= 0
-
-
 def test_after_a_jump_of_time_no_stamp_is_called_zero():
-    health = Health()
-    assert not health.stampless
-    decoded(health, rows([0.0, 0.0]))
-    assert health.stampless
-    decoded(health, rows([5.0, 5.1]))
+    assert not Health().stampless
+    assert health_of([0.0, 0.0]).stampless
+    health = health_of([0.0, 0.0], [5.0, 5.1])
     health.forget()
     assert (health.newest_ns, health.stampless) == (0, False)
 
 
+def travelled(*blocks, form=COUNTER, scale=0.02):
+    """Return the travel after blocks of (times, s, and values)."""
+    travel = Travel(form)
+    for times, values in blocks:
+        travel.feed(rows(times, np.array(values)), scale)
+    return travel
+
+
 def test_distance_survives_a_rollover_and_a_reset_is_none():
-    counts = np.array([65000, 65300, 64, 364, 664]) # 300 counts each, over 65536
+    counts = [65000, 65300, 64, 364, 664] # 300 counts each, over 65536
     for cut in range(1, 5):
-        travel = Travel(COUNTER)
-        travel.feed(rows(np.arange(cut), counts[:cut]), 0.02)
-        travel.feed(rows(np.arange(cut, 5), counts[cut:]), 0.02)
-        assert travel.total == 1200
-    travel = Travel(OdometerForm('cumulative', 2**64, 'm/pulse'))
-    travel.feed(rows([0, 1, 2, 3], np.array([900000, 900100, 0, 100])), 0.02)
+        assert travelled((range(cut), counts[:cut]), (range(cut, 5), counts[cut:])).total == 1200
+    travel = travelled((range(4), [900000, 900100, 0, 100]),
+                       form=OdometerForm('cumulative', 2**64, 'm/pulse'))
     assert travel.total == 200  # 18 km in a second is a reset
 
 
-@pytest.mark.parametrize(('quantity', 'unit', 'values', 'metres'), [
-    ('increment', 'm/pulse', np.array([7, 10, 10]), 0.4),   # the first row's belongs to before
-    ('rate', '1', np.array([2.0, 2.0, 3.0]), 5.0),
-    ('cumulative', 'm/rad', np.array([1.0, 2.0, 4.0]), 0.9)])
-def test_every_quantity_gives_metres(quantity, unit, values, metres):
-    scale = {'m/pulse': 0.02, '1': 1.0, 'm/rad': 0.3}[unit]
-    travel = Travel(OdometerForm(quantity, 0, unit))
-    travel.feed(rows([0, 1, 2], values), scale)
+@pytest.mark.parametrize(('quantity', 'unit', 'scale', 'values', 'metres'), [
+    ('increment', 'm/pulse', 0.02, [7, 10, 10], 0.4),   # the first row's belongs to before
+    ('rate', '1', 1.0, [2.0, 2.0, 3.0], 5.0), ('cumulative', 'm/rad', 0.3, [1.0, 2.0, 4.0], 0.9)])
+def test_every_quantity_gives_metres(quantity, unit, scale, values, metres):
+    travel = travelled((range(3), values), form=OdometerForm(quantity, 0, unit), scale=scale)
     assert travel.total * scale == pytest.approx(metres)
 
 
+def test_a_clock_that_is_set_back_gives_no_negative_standstill():
+    blocks = [([1000, 1001, 1002], [0, 100, 200])]
+    for t in (10, 11, 12):
+        blocks.append(([t], [200]))
+        travel = travelled(*blocks)
+        assert travel.still_s() == t - 10
+        assert travel.rested_s(600.0) >= 0
+
+
 def test_standing_is_told_from_moving_and_a_flickering_count_is_standing():
-    travel = Travel(COUNTER)
-    travel.feed(rows([0, 1, 2, 3, 4, 5], np.array([0, 100, 200, 200, 201, 201])), 0.02)
-    assert travel.still_s() == pytest.approx(3.0)
-    travel.feed(rows([6], np.array([301])), 0.02)
-    assert travel.still_s() == 0.0
+    standing = range(6), [0, 100, 200, 200, 201, 201]
+    assert travelled(standing).still_s() == pytest.approx(3.0)
+    assert travelled(standing, ([6], [301])).still_s() == 0.0
 
 
 def test_the_last_standstill_counts_as_long_as_the_preroll_reaches_back_to_it():
-    travel = Travel(COUNTER)
-    assert travel.rested_s(600.0) == 0.0
-    t = np.arange(0, 31)
+    assert travelled().rested_s(600.0) == 0.0
     counts = 100 * np.concatenate([np.arange(6), np.full(10, 5), np.arange(5, 20)])
-    travel.feed(rows(t, counts), 0.02)        # stands from 5 s to 16 s, drives on to 30 s
+    stood = np.arange(31), counts        # stands from 5 s to 16 s, drives on to 30 s
+    travel = travelled(stood)
     assert travel.still_s() == 0.0
     assert travel.rested_s(600.0) == pytest.approx(11.0, abs=1.0)
     assert travel.rested_s(10.0) == 0.0
-    travel.feed(rows([31, 40], np.array([1900, 1900])), 0.02)
-    assert travel.rested_s(10.0) == pytest.approx(10.0)
+    assert travelled(stood, ([31, 40], [1900, 1900])).rested_s(10.0) == pytest.approx(10.0)
 
 
 def fixes(latitude, **columns):
@@ -213,12 +192,11 @@ def test_fix_path_counts_steps_not_noise():
     north = 1e-7 * np.array([0.0, 1.0, 0.0, 1.0, 0.0])     # 0.6 m of jitter
     drive = 0.7 + np.concatenate([north, 10e-7 * np.arange(1, 11)])  # then 63.7 m in 6.4 m steps
     path = FixPath()
+    path.feed(fixes(drive, status=np.full(len(drive), -1)), 0, moving=True)
+    assert path.total == 0.0
     path.feed(fixes(drive), 0, moving=True)
     assert path.total == pytest.approx(63.6, abs=0.7)   # the jitter may shift the first anchor
     assert path.top == pytest.approx(6.36, abs=0.7)
-    nothing = FixPath()
-    nothing.feed(fixes(drive, status=np.full(len(drive), -1)), 0, moving=True)
-    assert nothing.total == 0.0
 
 
 @pytest.mark.parametrize('odd', [1e200, -1e308, np.inf, np.nan, 2.0])
@@ -253,11 +231,9 @@ def test_fix_noise_is_no_way_while_the_counter_stands():
 
 
 def test_counts_that_come_in_a_burst_are_no_speed():
-    travel = Travel(COUNTER)
     t = np.arange(0.0, 20.0, 0.02)
-    late = np.where(t % 5.0 < 0.12, t - t % 5.0 + 0.12 + (t % 5.0) / 100, t)
-    for k in range(len(t)):
-        travel.feed(rows(late[k:k + 1] + 1000, np.array([int(10 * t[k] / 0.02)])), 0.02)
+    late = np.where(t % 5.0 < 0.12, t - t % 5.0 + 0.12 + (t % 5.0) / 100, t) + 1000
+    travel = travelled(*(([late[k]], [int(10 * t[k] / 0.02)]) for k in range(len(t))))
     assert travel.top * 0.02 == pytest.approx(10.0, rel=0.15)
 
 

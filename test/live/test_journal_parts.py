@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of the journal that need no node: settings, space, pre-roll, message definitions."""
+"""Parts of the journal that need no node: settings, pre-roll, message definitions."""
 
 import json
 import math
@@ -12,16 +12,12 @@ import pytest
 import ros_bags
 import ros_messages as make
 
-from odocal_ros.bagio import segments
-from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import pack
-from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.errors import BadConfig
 from odocal_ros.library.read_bag import journal_notes
-from odocal_ros.live import journal_leg, journal_writer
+from odocal_ros.live import journal_writer
 from odocal_ros.live.journal import journal_text
-from odocal_ros.live.journal_leg import claim, journals, LegJournal, make_room, Plan, size_of
 from odocal_ros.live.journal_writer import PreRoll
 from odocal_ros.live.messages import _in_msg, definition_of, message_class
 from odocal_ros.offline.cli import main
@@ -51,103 +47,8 @@ def test_settings_come_back_to_the_last_bit(tmp_path):
     assert journal_notes(tmp_path.parent) is None
 
 
-def journal(root, name, size, age):
-    """Make a folder that looks like a journal of some bytes."""
-    folder = root / name
-    folder.mkdir(parents=True)
-    (folder / JOURNAL).touch()
-    os.utime(folder / JOURNAL, ns=(0, -age * SECOND + 10**18))
-    (folder / 'part.mcap').write_bytes(bytes(size))
-    return folder
-
-
-def test_the_oldest_journals_go_first_and_nothing_else(tmp_path):
-    old, middle, new = (journal(tmp_path, name, 1000, age)
-                        for name, age in (('c', 3), ('b', 2), ('a', 1)))
-    (tmp_path / 'calibration').mkdir()
-    (tmp_path / 'calibration' / 'result').write_bytes(bytes(5000))
-    (tmp_path / 'link').symlink_to(new)
-    assert journals(tmp_path) == [old, middle, new]
-    assert make_room(tmp_path, 3000) == 3000
-    assert make_room(tmp_path, 3000, needed=1) == 2000
-    assert journals(tmp_path) == [middle, new]
-    with claim(middle):                                 # a node is writing to it
-        assert make_room(tmp_path, 1500) == 1000
-        assert journals(tmp_path) == [middle]
-        assert make_room(tmp_path, 10) == 1000
-    assert make_room(tmp_path, 10) == 0
-    assert (tmp_path / 'calibration' / 'result').exists()
-    assert make_room(tmp_path / 'none', 10) == 0
-
-
 def chunk(k, size=100_000):
     return pack(1, [k * SECOND], [os.urandom(size)])
-
-
-def leg(root, limit, leg_id=1):
-    return LegJournal(Plan(leg_id, root, f'leg_{leg_id}', '', limit),
-                      {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
-
-
-def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
-    monkeypatch.setattr(segments, 'TOGETHER', 3)
-    limit, taken, write_file = 1_200_000, [], segments.write_file
-
-    def watched(*args):
-        size = write_file(*args)
-        taken.append(sum(size_of(folder) for folder in journals(tmp_path)))
-        return size
-    monkeypatch.setattr(segments, 'write_file', watched)   # joined and single files are there
-    for leg_id in range(1, 5):
-        one = leg(tmp_path, limit, leg_id)
-        for k in range(5):
-            one.put([chunk(k)])
-        one.finish()
-        assert one.trouble == ''
-    assert len(taken) == 4 * (5 + 1 + 1)
-    assert 900_000 < max(taken) <= limit
-    assert [f.name for f in journals(tmp_path)][-1] == 'leg_4'
-
-
-def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
-    journal(tmp_path, 'old', 1000, 1)
-    one = leg(tmp_path, 500_000)
-    for k in range(20):
-        one.put([chunk(k)])
-    assert 'raise journal.max_bytes' in one.trouble
-    one.finish()
-    folder, = journals(tmp_path)
-    assert size_of(folder) <= 500_000
-    with open_bag(folder) as bag:
-        # for each that is written, room to join it with those that stand is kept
-        assert bag.topics['/odometer'].count == 2
-        assert bag.start_ns == 0
-
-
-def test_what_the_disk_does_not_take_waits_but_not_without_bound(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'WAITING_BYTES', 350_000)
-    one = leg(tmp_path / 'file' / 'journal', 10**9)
-    (tmp_path / 'file').touch()
-    for k in range(3):
-        one.put([chunk(k)])
-    assert 'Not a directory' in one.trouble
-    (tmp_path / 'file').unlink()
-    one.put([chunk(3)])                # the disk is there again: nothing is lost
-    assert one.trouble == ''
-    with open_bag(one.folder) as bag:
-        assert bag.topics['/odometer'].count == 4
-    monkeypatch.setattr(one._bag, 'append', lambda _: (_ for _ in ()).throw(OSError(28, 'full')))
-    for k in range(4, 9):
-        one.put([chunk(k)])
-    assert 'no further attempt in this leg' in one.trouble
-    assert not one._waiting
-    monkeypatch.undo()
-    one.put([chunk(9)])                # a hole would be worse than an end
-    one.finish()
-    with open_bag(one.folder) as bag:
-        assert bag.topics['/odometer'].count == 4
 
 
 def test_the_preroll_reaches_back_far_enough_but_keeps_static_transforms():

@@ -6,7 +6,7 @@
 import math
 from pathlib import Path
 
-from bench import wait_for
+from bench import ROOT, wait_for
 from launch_stand_in import of_python, of_xml
 import pytest
 from rclpy.parameter import Parameter
@@ -18,7 +18,6 @@ from odocal_ros.messages.sensor_types import FIX, IMU
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.node_configs import ApplyConfig
 
-ROOT = Path(__file__).resolve().parents[2]
 PYTHON, XML = (ROOT / 'launch' / f'calibrator.launch.{kind}' for kind in ('py', 'xml'))
 CASES = [
     {}, {'rviz': 'true'}, {'method': 'two_point', 'use_sim_time': 'true'},
@@ -46,6 +45,10 @@ def test_every_input_can_be_remapped_and_stays_where_it_is_by_itself():
     assert node.remappings == {topic: topic for topic in TOPICS.values()}
     _, (node,) = of_python(PYTHON, CASES[-1])
     assert set(node.remappings.values()) == set(CASES[-1].values())
+    # an empty method leaves the one of the file
+    assert 'method' not in node.parameters[1]
+    _, (node,) = of_python(PYTHON, {'method': 'two_point'})
+    assert node.parameters[1]['method'] == 'two_point'
 
 
 def test_the_files_named_are_installed():
@@ -55,13 +58,6 @@ def test_the_files_named_are_installed():
         assert path.exists()
         assert f"glob('{path.parent.name}/*')" in setup
     assert f"'{node.executable} = odocal_ros.live.start:calibrator'" in setup
-
-
-def test_an_empty_method_leaves_the_one_of_the_file():
-    for read, path in ((of_python, PYTHON), (of_xml, XML)):
-        assert all('method' not in p for p in read(path, {})[1][0].parameters[1:])
-        _, (node,) = read(path, {'method': 'two_point'})
-        assert node.parameters[1]['method'] == 'two_point'
 
 
 @pytest.mark.parametrize(('read', 'path'), [(of_python, PYTHON), (of_xml, XML)],
@@ -76,7 +72,7 @@ def test_the_node_started_so_listens_where_it_is_told(start, connect, tmp_path, 
              'imu_topic': '/a/imu', 'odometer_topic': '/a/left', 'odometer_right_topic': 'right',
              'fix_topic': 'gps/fix', 'fix_velocity_topic': '/a/speed', 'heading_topic': 'compass'}
     _, (node,) = read(path, given)
-    start(*node.command_line())
+    start({}, *node.command_line())
     client = connect('/truck/calibrator')
     names = {'/a/imu': IMU, '/a/left': 'std_msgs/msg/Int64',
              '/truck/right': 'std_msgs/msg/Int64', '/truck/gps/fix': FIX,

@@ -6,20 +6,19 @@
 import importlib.util
 from types import SimpleNamespace
 
-from bench import Client, NodeProcess, ROOT, wait_for
+from bench import given, NodeProcess, ROOT, wait_for
 from drives import settings
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from launch_stand_in import of_xml
 from nav_msgs.msg import Odometry
 import numpy as np
-from player import messages_of, part, Player, sent_of, with_clock
+from player import messages_of, playing_to, stamp_of, with_clock
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile
 from test_shown_names import allowed, seen
 
 from odocal_ros.apply.pose import Pose
-from odocal_ros.bagio import encode
 from odocal_ros.live.odometry import transform_of
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -29,10 +28,8 @@ from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.settings.node_configs import OdomFrames
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
-SPEED = 20.0         # times real time
 BIAS, TILT = (2e-5, -1e-5, 3e-5), (0.01, -0.02)     # rad/s; rad: any, but one for both
-RESULT = ('-p', 'result.valid:=true', '-p', 'result.scale_factor:=1.0', '-p',
-          'result.scale_factor_sigma:=0.001')
+RESULT = {'result.valid': True, 'result.scale_factor': 1.0, 'result.scale_factor_sigma': 0.001}
 # the first path that has poses ends in an error
 FAILS = """
 from odocal_ros.apply.reckoning import Reckoning
@@ -74,48 +71,34 @@ def replayed(drive, tmp_path_factory):
     return SimpleNamespace(row=row, alignment=alignment, result=result, path=path)
 
 
-def given(replayed):
-    """Return the arguments that begin the node where replay begins."""
-    values = {'start.attitude': replayed.alignment.q_nb.tolist(), 'start.gyro_bias': list(BIAS),
-              'start.latitude': float(np.rad2deg(replayed.result.origin[0])), 'levelling': False}
-    # from the very first message on: one lost would be another start
-    values |= {f'qos_overrides./{topic}.subscription.reliability': 'reliable'
-               for topic in ('imu/data', 'odometer')}
-    return [x for name, value in values.items() for x in ('-p', f'{name}:={str(value).lower()}')]
+def begin(replayed):
+    """Return the settings that begin the node where replay begins."""
+    return {'start.attitude': replayed.alignment.q_nb.tolist(), 'start.gyro_bias': list(BIAS),
+            'start.latitude': float(np.rad2deg(replayed.result.origin[0])), 'levelling': False,
+            # from the very first message on: one lost would be another start
+            **{f'qos_overrides./{topic}.subscription.reliability': 'reliable'
+               for topic in ('imu/data', 'odometer')}}
 
 
 @pytest.fixture(scope='module')
 def received(drive, replayed):
     """Play the drive to a node with that calibration; keep what it publishes."""
-    node = NodeProcess('--params-file', str(replayed.path), *given(replayed), module='odometry')
-    client = Client('odometry')
-    seen = SimpleNamespace(odometry=[], twists=[], node=node)
-    try:
-        topics = {'imu': encode.imu('imu/data', drive.imu),
-                  'odometer': encode.twist('odometer', drive.odometer)}
-        begin_ns = int(drive.imu.stamp_ns[replayed.row])
-        early_ns = {'imu': 0, 'odometer': 10**9}
-        sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)
-                       if one.stamp_ns >= begin_ns - early_ns[slot]),
-                      key=lambda one: one.stamp_ns)
-        player = Player(client.node, {slot: topic.msgtype for slot, topic in topics.items()})
+    types, sent = messages_of(drive, fix=None)
+    early_ns = {'imu': 0, 'odometer': 10**9}
+    begin_ns = int(drive.imu.stamp_ns[replayed.row])
+    sent = [one for one in sent if one.stamp_ns >= begin_ns - early_ns[one.slot]]
+    with playing_to((types, sent), begin(replayed), 20.0, module='odometry',
+                    words=('--params-file', str(replayed.path))) as leg:
+        seen, node = SimpleNamespace(odometry=[], twists=[], node=leg.node), leg.client.node
         for kind, name, kept in ((Odometry, 'odometry', seen.odometry),
                                  (TwistWithCovarianceStamped, 'odometry/twist', seen.twists)):
-            client.node.create_subscription(kind, name, kept.append, QoSProfile(depth=5000))
-        wait_for(player.matched, 'subscriptions of the node')
-        wait_for(lambda: client.node.count_publishers('/odometry/twist'), 'its publishers')
-        player.play(sent, SPEED)
+            node.create_subscription(kind, name, kept.append, QoSProfile(depth=5000))
+        wait_for(lambda: node.count_publishers('/odometry/twist'), 'its publishers')
+        leg.play(0.0, np.inf)
         wait_for(lambda: seen.odometry and stamp_of(seen.odometry[-1]) > sent[-1].stamp_ns - 10**9,
-                 f'the last pose; the node says {node.text}')
-    finally:        # before any test: another of this name may come
-        seen.code = node.end()
-        client.close()
-    assert seen.code == 0
-    return seen
-
-
-def stamp_of(message):
-    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                 f'the last pose; the node says {leg.node.text}')
+        assert leg.node.end() == 0
+    return seen         # before any test: another of this name may come
 
 
 def test_its_path_is_that_of_replay_as_calibrated(received, drive, replayed):
@@ -167,18 +150,15 @@ def test_the_launch_file_starts_it_with_both_files():
 
 def test_the_node_takes_its_own_settings_file_and_is_what_the_policy_allows(replayed):
     wanted = allowed('/odometry')
-    node = NodeProcess('--params-file', str(ROOT / 'config' / 'odometry.yaml'),
-                       '--params-file', str(replayed.path), '-p', 'odometer.left:=topic', '-p',
-                       'odometer.right:=topic', '-p', 'use_sim_time:=true', '-p',
-                       'odometer.type:=std_msgs/msg/Int64', module='odometry')
-    client = Client('odometry')
-    try:
+    settings = {'odometer.left': 'topic', 'odometer.right': 'topic', 'use_sim_time': True,
+                'odometer.type': 'std_msgs/msg/Int64'}
+    with playing_to(({}, []), settings, module='odometry', words=(
+            '--params-file', str(ROOT / 'config' / 'odometry.yaml'), '--params-file',
+            str(replayed.path))) as leg:
         for kind in ('publish', 'subscribe'):
-            wait_for(lambda kind=kind: seen(client, kind, 'odometry') == wanted[kind],
+            wait_for(lambda kind=kind: seen(leg.client, kind, 'odometry') == wanted[kind],
                      f'{kind}: {wanted[kind]}')
-    finally:
-        assert node.end() == 0
-        client.close()
+        assert leg.node.end() == 0
 
 
 def test_the_ekf_of_robot_localization_listens_to_what_is_sent():
@@ -198,7 +178,7 @@ def test_the_ekf_of_robot_localization_listens_to_what_is_sent():
 def test_tf_without_its_message_says_what_to_install():
     if importlib.util.find_spec('tf2_msgs'):
         pytest.skip('tf2_msgs is installed')
-    node = NodeProcess(*RESULT, '-p', 'publish_tf:=true', module='odometry')
+    node = NodeProcess(*given(RESULT | {'publish_tf': True}), module='odometry')
     assert node.wait() == 1
     assert node.lines[-1:] == [
         'odometry: publish_tf needs the package tf2_msgs, which is not installed: install '
@@ -216,35 +196,25 @@ def test_the_transform_is_the_pose():
     assert (turn.x, turn.y, turn.z, turn.w) == (0.1, 0.2, 0.3, 0.9)
 
 
-@pytest.fixture(scope='module')
-def sent():
+@pytest.mark.parametrize('simulated', [False, True])
+def test_it_goes_on_after_an_error_of_its_own(simulated):
     types, messages = messages_of(simulate(SimOptions(
         scenario='out_and_back', duration=240.0, imu_rate=50.0, odometer_rate=20.0,
-        odometer='speed')))
-    return {slot: types[slot] for slot in ('imu', 'odometer')}, [
-        one for one in part(messages, 0, 40) if one.slot != 'fix']
-
-
-@pytest.mark.parametrize('simulated', [False, True])
-def test_it_goes_on_after_an_error_of_its_own(sent, simulated):
-
-    node = NodeProcess(*RESULT, '-p', f'use_sim_time:={str(simulated).lower()}', before=FAILS,
-                       module='odometry')
-    client, seen = Client('odometry'), []
-    try:
-        client.node.create_subscription(Odometry, 'odometry', seen.append, QoSProfile(depth=5000))
-        player = Player.connected(client, sent[0])
-        play = with_clock(client, player) if simulated else player.play
-        asked = client.node.create_client(GetParameters, 'odometry/get_parameters').call_async(
-            GetParameters.Request(names=['publish.rate']))
-        play(sent[1], *(() if simulated else (7.0,)))
-        wait_for(lambda: seen and seen[-1].header.stamp.sec > sent[1][-1].stamp_ns // 10**9 - 2,
-                 f'the last pose; the node says {node.text}')
+        odometer='speed')), fix=None)
+    found = []
+    with playing_to((types, messages), RESULT | {'use_sim_time': simulated}, 7.0,
+                    before=FAILS, module='odometry') as leg:
+        leg.client.node.create_subscription(Odometry, 'odometry', found.append,
+                                            QoSProfile(depth=5000))
+        play = with_clock(leg) if simulated else leg.play
+        asked = leg.client.send(GetParameters, 'get_parameters',
+                                GetParameters.Request(names=['publish.rate']))
+        play(0, 40)
+        last_s = leg.part(0, 40)[-1].stamp_ns // 10**9
+        wait_for(lambda: found and found[-1].header.stamp.sec > last_s - 2,
+                 f'the last pose; the node says {leg.node.text}')
         assert asked.result().values[0].double_value == 20.0
-    finally:
-        code = node.end()
-        client.close()
-    assert code == 0
+        assert leg.node.end() == 0
     assert 'restarts from the origin: internal error, please report it: ZeroDivisionError' in (
-        node.text)
-    assert len(seen) > 500
+        leg.node.text)
+    assert len(found) > 500

@@ -9,7 +9,7 @@ import time
 from types import SimpleNamespace
 
 from bench import answer_of, PATIENCE, wait_for
-from player import messages_of, part, playing_to
+from player import messages_of, playing_to, within
 import pytest
 
 from odocal_ros.live import answers
@@ -20,8 +20,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
-SPEED = 30.0                         # times real time
-FIRST_S, MARK_S, STOP_S = 10, 25, 140    # of the drive: played from, start mark, stop mark
+STOP_S = 140                         # of the drive
 MOST_S = 5.0                         # of an answer, as docs/node.md promises
 # until a file is there, the first leg's fit makes three passes and the next leg's none
 HELD = """
@@ -51,51 +50,49 @@ def seen(tmp_path_factory):
     gate = folder / 'go on'
     drive = simulate(SimOptions(scenario='town', duration=160.0, imu_rate=50.0, odometer='speed',
                                 odometer_rate=25.0, fix_noise='rtk', imu_grade='industrial'))
-    found, (types, sent) = SimpleNamespace(truth=drive.truth), messages_of(drive)
+    found = SimpleNamespace(truth=drive.truth)
     with ExitStack() as ends:
-        _, client, player = ends.enter_context(playing_to(
-            types, '-p', f'output.directory:={folder}', before=HELD.format(str(gate))))
+        leg = ends.enter_context(playing_to(messages_of(drive), {'output.directory': folder},
+                                            before=HELD.format(str(gate))))
         ends.callback(gate.touch)      # the node's end waits for what its worker was given
-        player.play(part(sent, FIRST_S, MARK_S), SPEED)
-        client.until(state='idle')
-        client.start()
-        player.play(part(sent, MARK_S, STOP_S), SPEED)
-        wait_for(lambda: client.status['estimate_yaw_mounting_angle_rad'] != 'nan',
+        leg.record(10, 25, STOP_S)
+        wait_for(lambda: leg.client.status['estimate_yaw_mounting_angle_rad'] != 'nan',
                  'a running estimate', 4 * PATIENCE)
-        _held_leg(found, client, player, sent, gate)
-        _without_estimate(found, client, player, sent, gate)
-        yield found
+        _held_leg(found, leg, leg.client, gate)
+        _without_estimate(found, leg, leg.client, gate)
+        return found
 
 
-def _held_leg(found, client, player, sent, gate):
-    found.first = _answered(client, player, sent, STOP_S, STOP_S + 2)
+def _held_leg(found, leg, client, gate):
+    found.first = _answered(leg, STOP_S)
     found.computing = client.until(state='computing', computing_passes='3')
     found.valid_before = client.get('result.valid')
-    found.again = _answered(client)
+    found.again = _answered(leg)
     waiting = client.ask('stop_leg')
     gate.touch()
     found.last = client.result(waiting)
     found.calibrated = client.until(state='calibrated')
-    found.valid, found.scale, found.sigma = client.get(
+    found.valid, *scale = client.get(
         'result.valid', 'result.scale_factor', 'result.scale_factor_sigma')
+    found.scale = dict(zip(('value', 'sigma'), scale, strict=True))
 
 
-def _without_estimate(found, client, player, sent, gate):
+def _without_estimate(found, leg, client, gate):
     gate.unlink()
-    player.play(part(sent, STOP_S + 2, STOP_S + 4), SPEED)
+    leg.play(STOP_S + 2, STOP_S + 4)
     client.start()
-    player.play(part(sent, STOP_S + 4, STOP_S + 8), SPEED)
-    found.short = _answered(client, player, sent, STOP_S + 8, STOP_S + 10)
+    leg.play(STOP_S + 4, STOP_S + 8)
+    found.short = _answered(leg, STOP_S + 8)
     waiting = client.ask('stop_leg')
     client.until(state='computing', leg_id='2')
     client.call('cancel_leg')
     found.cancelled = answer_of(waiting)
 
 
-def _answered(client, player=None, sent=(), first_s=0.0, last_s=0.0):
-    begin, asked = time.monotonic(), client.ask('stop_leg')
-    if player:
-        player.play(part(sent, first_s, last_s), SPEED)
+def _answered(leg, stop_s=0.0):
+    begin, asked = time.monotonic(), leg.client.ask('stop_leg')
+    if stop_s:
+        leg.play(stop_s, stop_s + 2)
     return SimpleNamespace(answer=answer_of(asked), seconds=time.monotonic() - begin)
 
 
@@ -145,10 +142,10 @@ def test_the_result_follows_on_the_status_in_the_parameters_and_to_who_asks_agai
     assert seen.last.success
     assert 'accepted: scale factor ' in seen.last.message
     assert seen.valid
-    assert with_sigma(seen.scale, seen.sigma) in seen.last.message
-    assert float(seen.calibrated['scale_factor']) == seen.scale
+    assert with_sigma(**seen.scale) in seen.last.message
+    assert float(seen.calibrated['scale_factor']) == seen.scale['value']
     assert seen.calibrated['estimate_scale_factor'] == 'nan'
-    assert abs(seen.scale - seen.truth.scale) < 4 * seen.sigma
+    assert within(seen.scale, seen.truth.scale)
 
 
 def test_a_leg_without_running_estimate_says_so_and_may_be_dropped(seen):

@@ -10,16 +10,16 @@ import signal
 import time
 
 from bench import answer_of, wait_for
-from kills import drive, killed_at_files, LAST_S, START_S, whole_content, wrong
+from kills import drive, killed_at_files, LAST_S, SCALE, START_S, whole_content, wrong
 import numpy as np
-from player import ended, messages_of, part, Player, recording
+from player import Drive, messages_of, within
 import pytest
 
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 pytestmark = pytest.mark.slow
-SCALE, SPEED = 1.02, 30.0
-QUICK = ('-p', 'method:=two_point')     # the files are the same
+SPEED = 30.0
+QUICK = {'method': 'two_point'}     # the files are the same
 OBEY = (f'import sys; sys.path.insert(0, {str(Path(__file__).resolve().parents[1])!r})\n'
         'from faults import obey_permissions; obey_permissions()\n')
 # a report that takes as long as that of a long leg on a busy machine
@@ -33,29 +33,27 @@ def driven():
     return drive()
 
 
-def leg(driven, clients, between=lambda: None):
+def leg(driven, nodes, clients, between=lambda: None):
     """Drive a leg for nodes that hear the same topics; return their answers."""
-    types, sent = driven
-    player = Player(clients[0].node, types)
+    drives = [Drive(*one, driven, SPEED) for one in zip(nodes, clients, strict=True)]
+    first = drives[0]
     wait_for(lambda: all(p.get_subscription_count() == len(clients)
-                         for p in player.publishers.values()), 'subscriptions')
-    player.play(part(sent, 30, START_S), SPEED)
+                         for p in first.player.publishers.values()), 'subscriptions')
+    first.play(30, START_S)
     for client in clients:
         client.until(state='idle')
         client.start()
-    player.play(part(sent, START_S, 100), SPEED)
+    first.play(START_S, 100)
     between()
-    player.play(part(sent, 100, LAST_S), SPEED)
+    first.play(100, LAST_S)
     asked = [client.ask('stop_leg') for client in clients]
-    player.play(part(sent, LAST_S, LAST_S + 2), SPEED)
+    first.play(LAST_S, LAST_S + 2)
     answers = [client.result(one) for client, one in zip(clients, asked, strict=True)]
     assert all(answer.success for answer in answers), answers
-    return answers
 
 
 def true(content):
-    scale = content['result']['scale_factor']
-    return abs(scale['value'] - SCALE) < 5 * scale['sigma']
+    return within(content['result']['scale_factor'], SCALE, 5)
 
 
 def results(folder):
@@ -68,16 +66,24 @@ def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
     folder = tmp_path / 'shut'
     folder.mkdir()
     folder.chmod(0o555)
-    node = start('-p', f'output.directory:={folder}', *QUICK, before=OBEY)
+    node = start({'output.directory': folder} | QUICK, before=OBEY)
     client = connect()
-    leg(driven, [client])
+    leg(driven, [node], [client])
     status = wait_for(lambda: client.status['save_trouble'] and client.status, 'the warning')
     assert 'Permission denied' in status['save_trouble']
     assert str(folder) in status['save_trouble']
     assert 'Permission denied' in status['journal_trouble']
+    assert 'output.directory' in status['journal_trouble']
     assert status['level'] == b'\x01'
+    for words in ('the journal cannot be written: ', 'the result is not saved: '):
+        assert words in status['message']
+    assert node.text.count('the journal cannot be written') == 1
     assert abs(float(status['scale_factor']) - SCALE) < 5 * float(status['scale_factor_sigma'])
+    assert not client.call('save').success
     assert list(folder.iterdir()) == []
+    # and no journal is missed where none is wanted
+    assert client.set(journal__max_bytes=0).successful
+    client.until(journal='', journal_trouble='')
     folder.chmod(0o755)
     answer = client.call('save')
     assert answer.success, answer.message
@@ -97,13 +103,12 @@ def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
 
 def test_a_folder_removed_while_a_leg_is_driven_is_made_again(start, connect, driven, tmp_path):
     folder = tmp_path / 'gone'
-    start('-p', f'output.directory:={folder}', *QUICK)
-    client = connect()
+    node, client = start({'output.directory': folder} | QUICK), connect()
 
     def remove():
         wait_for(lambda: list(folder.glob('journal/*/*.mcap')), 'the journal')
         shutil.rmtree(folder)
-    leg(driven, [client], remove)
+    leg(driven, [node], [client], remove)
     wait_for(lambda: client.status['journal_trouble'] or (folder / 'journal').exists(),
              'a warning, or the journal anew')
     wait_for((folder / 'latest').exists, 'the result')
@@ -115,12 +120,12 @@ def test_a_folder_removed_while_a_leg_is_driven_is_made_again(start, connect, dr
 def test_two_nodes_that_save_into_one_folder_have_a_result_each(
         start, connect, driven, tmp_path):
     names = ('first', 'second')
-    nodes = [start('-r', f'__node:={name}', '-p', 'output.formats:=[params, transform]', *QUICK)
+    nodes = [start({'output.formats': '[params, transform]'} | QUICK, '-r', f'__node:={name}')
              for name in names]
     clients = [connect(name) for name in names]
-    leg(driven, clients)
-    saves = [client.ask('save') for client in clients for _ in range(3)]
-    answers = [answer_of(one) for one in saves]
+    leg(driven, nodes, clients)
+    answers = [answer_of(one) for one in [
+        client.ask('save') for client in clients for _ in range(3)]]
     assert all(answer.success for answer in answers), answers
     folders = results(tmp_path)
     assert len(folders) == 8              # each node saved by itself, too
@@ -144,14 +149,12 @@ def sent():
 @pytest.mark.parametrize(('how', 'before'), [
     (signal.SIGINT, ''), (signal.SIGTERM, SLOW)])
 def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
-        start, connect, sent, tmp_path, how, before):
-    node = start('-p', 'alignment.heading_source:=fixed', '-p', 'alignment.heading:=0.7',
-                 '-p', 'method:=two_point', '-p', 'output.formats:=[params, report]',
-                 before=before)
-    client = connect()
-    player = recording(client, sent, 40, 60, 30)
-    player.play(part(sent[1], 60, 115), 30)
-    answer = ended(client, player, part(sent[1], 115, 117), 30)
+        play_to, sent, tmp_path, how, before):
+    leg = play_to(sent, QUICK | {
+        'alignment.heading_source': 'fixed', 'alignment.heading': 0.7,
+        'output.formats': '[params, report]'}, SPEED, before=before)
+    leg.record(40, 60, 115)
+    answer, node = leg.ended(115), leg.node
     assert answer.success, answer.message
     if before:      # the numbers are there, the report is being drawn
         wait_for(lambda: list(tmp_path.glob('2*/calibration.json')), 'the numbers')
@@ -170,8 +173,7 @@ def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
     *(('stop', m) for m in np.random.default_rng(12).uniform(0.0, 4.0, 2).round(3)),
     *(('save', m) for m in np.random.default_rng(13).uniform(0.0, 0.4, 2).round(3))])
 def test_a_node_killed_at_its_files_leaves_whole_ones(driven, tmp_path, stage, moment_s):
-    # the quick method: the files are the same
-    left = killed_at_files(driven, stage, moment_s, tmp_path, '-p', 'method:=two_point')
+    left = killed_at_files(driven, stage, moment_s, tmp_path, **QUICK)
     assert left.half == []
     assert left.latest
     code, result, said = left.journal

@@ -33,12 +33,16 @@ def calibration(*codes):
     return Calibration(tuple(Reason(c, 'seen') for c in codes), {}, {}, ())
 
 
+def drive_leg(session, start_ns, *codes, by_itself=False):
+    session.start(start_ns, CONFIG, by_itself)
+    session.stop(start_ns + 4)
+    session.finish(result(), calibration(*codes))
+
+
 def with_legs(count):
     session = Session()
     for leg in range(count):
-        session.start(10 * leg + 1, CONFIG)
-        session.stop(10 * leg + 5)
-        session.finish(result(), calibration())
+        drive_leg(session, 10 * leg + 1)
     return session
 
 
@@ -50,17 +54,9 @@ def test_a_leg_goes_from_mark_to_mark():
     session.stop(200)
     assert (session.state, session.event, session.stop_ns) == (State.COMPUTING, 'stopped', 200)
     session.finish(result(), calibration())
-    assert session.state is State.CALIBRATED
-    assert session.verdict() == 'accepted'
-
-
-def test_a_rejecting_reason_makes_the_state_rejected_and_keeps_the_leg():
-    session = Session()
-    session.start(1, CONFIG)
-    session.stop(2)
-    session.finish(result(), calibration(Code.LEG_TOO_SHORT))
-    assert session.state is State.REJECTED
-    assert len(session.legs) == 1
+    assert (session.state, session.verdict()) == (State.CALIBRATED, 'accepted')
+    drive_leg(session, 300, Code.LEG_TOO_SHORT)     # a reason that rejects
+    assert (session.state, len(session.legs)) == (State.REJECTED, 2)
 
 
 def test_a_failed_leg_stays_until_retried_or_cancelled():
@@ -89,10 +85,14 @@ def test_cancel_gives_back_the_state_before_the_leg():
 
 def test_undo_takes_the_last_leg_and_shows_its_marks():
     session = with_legs(2)
-    left = session.begin_undo()
-    assert [leg.leg_id for leg in left] == [1]
+    assert [leg.leg_id for leg in session.begin_undo()] == [1]
     assert (session.leg_id, session.start_ns, session.stop_ns) == (2, 11, 15)
     assert (session.event, session.state) == ('undone', State.COMPUTING)
+    # no start and no cancel while it is computed
+    with pytest.raises(Refused, match='is being computed'):
+        session.start(90, CONFIG)
+    with pytest.raises(Refused, match='no leg is running'):
+        session.cancel()
     session.settle(calibration(Code.LEG_TOO_SHORT))
     assert session.state is State.REJECTED
     assert session.begin_undo() == []
@@ -101,12 +101,10 @@ def test_undo_takes_the_last_leg_and_shows_its_marks():
 
 def test_a_reset_drops_all_legs_and_what_is_carried_on():
     session = with_legs(3)
-    assert [leg.leg_id for leg in session.begin_reset()] == [1, 2, 3]
-    assert (session.legs, session.calibration, session.state) == ([], None, State.IDLE)
-    session = with_legs(3)
     session.carry_on('two legs', 2)
     assert [leg.leg_id for leg in session.legs] == [3]
-    session.begin_reset()
+    assert [leg.leg_id for leg in session.begin_reset()] == [3]
+    assert (session.legs, session.calibration, session.state) == ([], None, State.IDLE)
     assert session.carried is None
 
 
@@ -127,15 +125,6 @@ def test_an_open_leg_must_be_ended_first(command):
         command(session)
 
 
-def test_no_start_and_no_cancel_while_an_undo_is_computed():
-    session = with_legs(2)
-    session.begin_undo()
-    with pytest.raises(Refused, match='is being computed'):
-        session.start(90, CONFIG)
-    with pytest.raises(Refused, match='no leg is running'):
-        session.cancel()
-
-
 def test_a_leg_that_nobody_asked_for_leaves_no_trace_when_it_is_no_good():
     session = with_legs(1)
     before = session.calibration
@@ -146,16 +135,19 @@ def test_a_leg_that_nobody_asked_for_leaves_no_trace_when_it_is_no_good():
         State.CALIBRATED, 'cancelled', False)
     assert session.calibration is before
     assert session.unused.text == '30 m'
-    session.start(70, CONFIG, by_itself=True)
-    session.stop(80)
-    session.finish(result(), calibration())
+    drive_leg(session, 70, by_itself=True)
     assert session.unused is None
 
 
-def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest():
+@pytest.fixture(scope='module')
+def town():
+    """Return the result of a drive through town, and its configuration."""
     made = drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
-    whole, config = calibrate(made.leg(), settings(made, method='auto')), settings(made)
-    session = Session()
+    return calibrate(made.leg(), settings(made, method='auto')), settings(made)
+
+
+def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest(town):
+    (whole, config), session = town, Session()
     for leg in range(LEGS_HELD + 2):
         session.start(10 * leg + 1, CONFIG)
         session.stop(10 * leg + 5)
@@ -173,10 +165,9 @@ def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest():
     assert {one['properties']['leg'] for one in json.loads(track)['features']} == {2}
 
 
-def test_legs_beyond_those_kept_stay_in_the_result(monkeypatch):
+def test_legs_beyond_those_kept_stay_in_the_result(town, monkeypatch):
     """A sigma may differ by 5 %: the scatter between legs is carried over on a grid."""
-    made = drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
-    whole, config = calibrate(made.leg(), settings(made, method='auto')), settings(made)
+    whole, config = town
     every = [replace(whole, methods=dict(whole.methods), start_ns=whole.start_ns + day * 10**14,
                      stop_ns=whole.stop_ns + day * 10**14) for day in range(4)]
     monkeypatch.setattr(worker, 'MARKED_LEGS_HELD', 3)

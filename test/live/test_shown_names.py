@@ -1,18 +1,25 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What layouts and the SROS2 policy name is what a node has: topics, types, keys, services."""
+"""What layouts, the SROS2 policy and each ros2 line of the docs name is what a node has."""
 
 from contextlib import suppress
 import re
+import shlex
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
-from bench import ROOT, wait_for
+from bench import answer_of, PATIENCE, ROOT, wait_for
+from launch_stand_in import of_python
+from pages import all_commands
+from player import messages_of, playing_to, straight, within
 import pytest
 from rclpy.node import NodeNameNonExistentError
 import shown
+import yaml
 
 from odocal_ros.live.messages import message_class
+from odocal_ros.offline import cli
 
 INPUT_TYPES = {'/imu/data': 'sensor_msgs/msg/Imu', '/fix': 'sensor_msgs/msg/NavSatFix',
                '/odometer': 'std_msgs/msg/Int64'}       # as a pulse counter
@@ -20,8 +27,8 @@ NAMES = {'publish': 'get_publisher_names_and_types_by_node',
          'subscribe': 'get_subscriber_names_and_types_by_node',
          'reply': 'get_service_names_and_types_by_node',
          'request': 'get_client_names_and_types_by_node'}
-ALL = ('-p', 'gnss.use_velocity:=true', '-p', 'odometer.left:=topic', '-p',
-       'odometer.right:=topic', '-p', 'use_sim_time:=true')
+ALL = {'gnss.use_velocity': True, 'odometer.left': 'topic', 'odometer.right': 'topic',
+       'use_sim_time': True}
 
 
 def has_field(msgtype, fields):
@@ -52,16 +59,12 @@ def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
 
     def of_node(what):
         # a message may be here before discovery knows the name of who sent it
-        try:
+        with suppress(NodeNameNonExistentError):
             return dict(getattr(node, f'get_{what}_names_and_types_by_node')('calibrator', '/'))
-        except NodeNameNonExistentError:
-            return {}
-
-    def publishers():
-        return of_node('publisher')
-    wait_for(lambda: set(shown.published()) <= set(publishers()), 'all publishers')
+        return {}
+    wait_for(lambda: set(shown.published()) <= set(of_node('publisher')), 'all publishers')
     for topic, kind in shown.published().items():
-        assert publishers()[topic] == [kind]
+        assert of_node('publisher')[topic] == [kind]
         # a node that has just ended may still be there
         info, = wait_for(lambda topic=topic: len(
             found := node.get_publishers_info_by_topic(topic)) == 1 and found,
@@ -78,9 +81,10 @@ def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
     array = client.arrays[-1].status[0]
     assert shown.status_names() == {(array.hardware_id, array.name)}
     wait_for(lambda: set(shown.services()) <= set(of_node('service')), 'all services')
-    served = of_node('service')
     for service in shown.services():
-        assert served[service] == ['std_srvs/srv/Trigger']
+        assert of_node('service')[service] == ['std_srvs/srv/Trigger']
+    for kind, names in allowed('/calibrator').items():      # an ordinary node stays within it
+        assert seen(client, kind) <= names
 
 
 @pytest.mark.parametrize(('topic', 'fields'), sorted(shown.of_inputs()))
@@ -116,7 +120,7 @@ def test_the_policy_is_the_graph_of_a_node_that_is_asked_for_everything(start, c
     from geometry_msgs.msg import TwistStamped
     from sensor_msgs.msg import FluidPressure, Imu, NavSatFix
     from std_msgs.msg import Int64
-    start(*ALL)
+    start(ALL)
     client = connect()
     for kind, name in ((Imu, 'heading'), (NavSatFix, 'fix'), (Int64, 'odometer'),
                        (Int64, 'odometer_right'),
@@ -130,17 +134,6 @@ def test_the_policy_is_the_graph_of_a_node_that_is_asked_for_everything(start, c
                  f'{kind}: {sorted(names)}')
 
 
-def test_an_ordinary_node_stays_within_it(start, connect):
-    start()
-    client = connect()
-    client.until(state='waiting')
-    wanted = allowed('/calibrator')
-    for kind, names in wanted.items():
-        if names:
-            wait_for(lambda kind=kind: seen(client, kind), kind)
-        assert seen(client, kind) <= names
-
-
 def test_the_operator_may_ask_what_the_node_answers():
     node, operator = allowed('/calibrator'), allowed('/calibrator_operator')
     assert operator['request'] <= node['reply']
@@ -152,3 +145,131 @@ def test_the_operator_may_ask_what_the_node_answers():
 def test_security_names_files_that_are_there(name):
     assert (ROOT / name).exists()
     assert name in (ROOT / 'SECURITY.md').read_text()
+
+
+LINES = [(page, shlex.split(line)) for page, line in all_commands('ros2')]
+FOREIGN = {'foxglove_bridge': 'a package of Foxglove, installed apart'}
+TOPICS = {'imu': '/my_imu', 'odometer': '/ticks', 'fix': '/gps/fix'}
+LEG = '/calibrator/start_leg', '/calibrator/stop_leg'
+
+
+def of(*start):
+    """Return what follows the first words in the lines that begin with them."""
+    found = [words[1 + len(start):] for _, words in LINES if words[1:1 + len(start)] == [*start]]
+    assert found, f'no line with ros2 {" ".join(start)}: take its test away'
+    return found
+
+
+@pytest.fixture(scope='module')
+def driven(tmp_path_factory):
+    """Start the node as the README does and drive a leg with the services as written there."""
+    run = next(words for words in of('run') if words[1] == 'calibrator')     # the README's
+    made = straight(imu_grade='industrial')
+    with playing_to(messages_of(made), {'output.directory': tmp_path_factory.mktemp('out')},
+                    words=tuple(run[run.index('--ros-args') + 1:])) as leg:
+        leg.names, client = TOPICS, leg.client
+        seen = SimpleNamespace(client=client, answers={}, truth=made.truth.scale)
+        # others belong to runs of their own: test_references_live.py, test_drive_pattern.py
+        kinds = dict(of('service', 'call'))
+        # standing; driving to the next stop, and a little on: a leg ends with its last message
+        for name, (begin, mark, end) in zip(LEG, [(45, 60, 60), (60, 117, 119)], strict=True):
+            leg.play(begin, mark)
+            future = ask(client.node, name, kinds[name])
+            leg.play(mark, end)
+            seen.answers[name] = client.result(future)
+        client.until(leg_event='stopped')
+        seen.graph = lambda: dict(client.node.get_topic_names_and_types())
+        yield seen
+
+
+def ask(node, name, kind):
+    """Call a service as ``ros2 service call`` does, from its name and type as text."""
+    package, folder, leaf = kind.split('/')
+    service = getattr(__import__(f'{package}.{folder}', fromlist=[leaf]), leaf)
+    client = node.create_client(service, name)
+    assert client.wait_for_service(PATIENCE), f'no {name} of type {kind}'
+    return client.call_async(service.Request())
+
+
+def test_every_line_is_of_a_kind_that_is_tried_here():
+    alone = ('run', 'launch', 'odocal')
+    assert {(words[1],) if words[1] in alone else tuple(words[1:3])
+            for _, words in LINES} == {*((word,) for word in alone), ('service', 'call'),
+                                       ('topic', 'echo'), ('param', 'get'), ('param', 'set'),
+                                       ('param', 'dump'), ('bag', 'record')}
+
+
+def test_run_and_odocal_name_commands_of_the_package():
+    entries = re.findall(r"'(\w+) = odocal_ros", (ROOT / 'setup.py').read_text())
+    for package, executable, *_ in of('run'):
+        assert package == 'odocal_ros'
+        assert executable in entries
+    for command, *options in of('odocal'):
+        assert cli._parser({command}).parse_args([command, *options]).command == command
+
+
+def test_launch_names_a_file_and_arguments_that_are_there():
+    for package, name, *arguments in of('launch'):
+        if package in FOREIGN:
+            continue
+        assert package == 'odocal_ros'
+        given = dict(word.split(':=', 1) for word in arguments if word != '--show-args')
+        declared, nodes = of_python(ROOT / 'launch' / name, given)
+        assert set(given) <= set(declared)
+        assert nodes
+
+
+def test_the_calls_start_and_stop_a_leg(driven):
+    assert tuple(driven.answers) == LEG
+    assert all(answer.success for answer in driven.answers.values()), driven.answers
+    assert 'scale factor' in driven.answers['/calibrator/stop_leg'].message
+
+
+def test_what_is_echoed_comes(driven):
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    node = driven.client.node
+    for words in of('topic', 'echo'):
+        topic = next(word for word in words if word.startswith('/'))
+        if topic in INPUT_TYPES:          # what the operator's drivers send
+            assert has_field(INPUT_TYPES[topic], words[words.index('--field') + 1].split('.'))
+            continue
+        kind, = wait_for(lambda topic=topic: driven.graph().get(topic), f'the type of {topic}')
+        got = []
+        # as ros2 topic echo does: latched where all that is offered is
+        # messages may be here before discovery knows who sends them
+        publishers = wait_for(
+            lambda topic=topic: node.get_publishers_info_by_topic(topic), f'who sends {topic}')
+        offered = {p.qos_profile.durability for p in publishers}
+        latched = offered == {DurabilityPolicy.TRANSIENT_LOCAL}
+        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL if latched
+                         else DurabilityPolicy.VOLATILE)
+        subscription = node.create_subscription(message_class(kind), topic, got.append, qos)
+        wait_for(lambda got=got: got, f'a message on {topic}')
+        node.destroy_subscription(subscription)
+
+
+def test_parameters_are_there_hold_the_result_and_can_be_set(driven):
+    from rcl_interfaces.srv import ListParameters
+    client, values = driven.client, {}
+    for name, parameter in of('param', 'get'):
+        assert name == '/calibrator'
+        values[parameter], = client.get(parameter)
+    assert values['result.valid'] is True
+    assert within({'value': values['result.scale_factor'],
+                   'sigma': values['result.scale_factor_sigma']}, driven.truth)
+    for name, parameter, value in of('param', 'set'):
+        assert name == '/calibrator'
+        assert client.set(**{parameter: yaml.safe_load(value)}).successful
+        assert client.get(parameter) == [yaml.safe_load(value)]
+    assert of('param', 'dump') == [['/calibrator']]
+    listed = answer_of(client.send(ListParameters, 'list_parameters',
+                                   ListParameters.Request())).result.names
+    assert {'method', 'odometer.nominal_scale', 'result.scale_factor'} <= set(listed)
+
+
+def test_what_is_recorded_is_published(driven):
+    # a bag to inspect holds no leg yet, and needs no status
+    for words, status in zip(of('bag', 'record'), (set(), {'/calibrator/status'}), strict=True):
+        topics = [word for word in words if word.startswith('/')]
+        assert set(topics) == {*TOPICS.values(), *status}
+        wait_for(lambda topics=topics: set(topics) <= set(driven.graph()), 'the topics')

@@ -11,7 +11,7 @@ import sys
 
 from bench import answer_of, Client, NodeProcess, wait_for
 from kills import SCALE
-from player import part, Player, Sent
+from player import Drive, Sent
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'fuzz'))
 import mutations
@@ -42,15 +42,12 @@ class Wire:
     """A node and who is hostile to it, through rounds of one drive whose stamps go on."""
 
     def __init__(self, driven, folder: Path, speed: float) -> None:
-        types, self._sent = driven
-        self.node = NodeProcess('-p', f'output.directory:={folder}', '-p',
-                                'output.formats:=[params]')
-        self._client, self._speed, self._rounds = Client(), speed, 0
-        self._player = Player(self._client.node, types)
-        wait_for(self._player.matched, 'subscriptions')
+        self._client, self._rounds = Client(), 0
+        self._drive = Drive(NodeProcess('-p', f'output.directory:={folder}'), self._client, driven,
+                            speed)
 
     def close(self) -> int:
-        code = self.node.end()
+        code = self._drive.node.end()
         self._client.close()
         return code
 
@@ -78,14 +75,14 @@ class Wire:
 
     def _play(self, rng, seen, first, last, share) -> None:
         messages = []
-        for one in part(self._sent, first, last):
+        for one in self._drive.part(first, last):
             stamp_ns = one.stamp_ns + self._rounds * 200 * 10**9
             raw = one.raw[:4] + struct.pack('<iI', *divmod(stamp_ns, 10**9)) + one.raw[12:]
             if rng.random() < share:
                 raw, seen.hostile = self._hostile(rng, raw), seen.hostile + 1
             messages.append(Sent(stamp_ns, one.slot, raw))
         seen.sent += len(messages)
-        self._player.play(messages, self._speed)
+        self._drive.player.play(messages, self._drive.speed)
 
     @staticmethod
     def _hostile(rng, raw: bytes) -> bytes:
@@ -129,18 +126,18 @@ class Wire:
 
     def _look(self, seen) -> None:
         """See that the node lives and has said nothing wrong."""
-        client, seen_before = self._client, len(self._client.statuses)
+        client, node, seen_before = self._client, self._drive.node, len(self._client.statuses)
         wait_for(lambda: len(client.statuses) > seen_before, 'a status')
-        if self.node.process.poll() is not None:
-            seen.wrong.append(f'the node ended with {self.node.process.returncode}')
-        seen.wrong += [line for line in self.node.lines if any(word in line for word in BAD_WORDS)]
+        if node.process.poll() is not None:
+            seen.wrong.append(f'the node ended with {node.process.returncode}')
+        seen.wrong += [line for line in node.lines if any(word in line for word in BAD_WORDS)]
         for status in client.statuses:
             seen.wrong += [f'{key} {status[key]}' for key in SPANS if float(status[key]) < 0]
-            value, sigma = (float(status[k]) for k in ('scale_factor', 'scale_factor_sigma'))
             if status['verdict'] == 'accepted':
                 seen.accepted += 1
+                value, sigma = (float(status[f'scale_factor{end}']) for end in ('', '_sigma'))
                 if not abs(value - SCALE) <= SIGMAS * sigma:
                     seen.wrong.append(f'accepted: scale {value} +- {sigma}, {SCALE} is true')
         seen.wrong = list(dict.fromkeys(seen.wrong))
         client.statuses[:] = client.statuses[-1:]
-        self.node.lines.clear()
+        node.lines.clear()

@@ -1,0 +1,245 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The journal of a leg: within its limit, and whole on a disk that refuses any step."""
+
+import errno
+from itertools import count
+import os
+
+from faults import Refusing
+import pytest
+
+from odocal_ros.bagio import segments
+from odocal_ros.bagio.channels import Channel
+from odocal_ros.bagio.chunks import pack
+from odocal_ros.bagio.read import open_bag
+from odocal_ros.bagio.segments import JOURNAL
+from odocal_ros.live import journal_leg
+from odocal_ros.live.journal_leg import (
+    claim,
+    clear_empty,
+    journals,
+    LegJournal,
+    make_room,
+    Plan,
+    size_of,
+)
+
+SECOND = 10**9
+NAME = '2026-01-02T03-04-05Z_leg_1'
+CHUNKS = 6
+
+
+def journal(root, name=NAME, limit=10**9):
+    return LegJournal(Plan(1, root, name, 'a: 1\n', limit),
+                      {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
+
+
+def driven(root):
+    """Write a leg of six seconds and a mark added later; return its journal."""
+    one = journal(root)
+    said = []
+    for k in range(CHUNKS):
+        one.put([chunk(k)])
+        said.append(one.trouble)
+    one.finish()
+    said.append(one.trouble)
+    one.add([chunk(CHUNKS)])
+    return one, [*said, one.trouble]
+
+
+def chunk(k):
+    return pack(1, times_of(k), [b'\0\1\0\0' + bytes(8)] * 2)
+
+
+def times_of(*seconds):
+    """Return the times of the messages in some chunks."""
+    return [k * SECOND + i for k in seconds for i in (0, 1)]
+
+
+def large(k):
+    return pack(1, [k * SECOND], [os.urandom(100_000)])
+
+
+def times(folder):
+    with open_bag(folder) as bag:
+        return [time_ns for time_ns, _ in bag.messages('/odometer')]
+
+
+@pytest.fixture(autouse=True)
+def joined_soon(monkeypatch):
+    """Join files already after three."""
+    monkeypatch.setattr(segments, 'TOGETHER', 3)
+
+
+def test_one_refused_step_loses_nothing_but_what_it_says(tmp_path, monkeypatch):
+    wanted, without_mark = times_of(*range(CHUNKS + 1)), 0
+    for step in count(1):
+        with monkeypatch.context() as patch:
+            disk = Refusing(step, errno.EIO).put_in(patch)
+            one, said = driven(tmp_path / str(step))
+        if len(disk.steps) < step:
+            break
+        name = disk.steps[step - 1]
+        found = times(one.folder)
+        without_mark += found == wanted[:-2]    # of the added mark, until it is tried again
+        assert found in (wanted, wanted[:-2]), (step, name)
+        one.retry()
+        assert sorted(set(times(one.folder))) == wanted, (step, name)
+        assert one.trouble == '' or found == wanted, (step, name)
+        folders = os.listdir(tmp_path / str(step))
+        assert len(folders) == 1, folders
+        assert not [n for n in os.listdir(one.folder) if n.endswith('.part')], name
+        if any(said):
+            assert os.strerror(errno.EIO) in ''.join(said)
+        else:
+            assert found == wanted
+    assert step > 60
+    assert 0 < without_mark < 20
+
+
+@pytest.mark.parametrize('code', [errno.ENOSPC, errno.EIO, errno.EROFS])
+def test_a_disk_that_takes_no_more_keeps_what_it_took(tmp_path, monkeypatch, code):
+    for step in count(1):
+        root = tmp_path / str(step)
+        with monkeypatch.context() as patch:
+            disk = Refusing(step, code, for_ever=True).put_in(patch)
+            _, said = driven(root)
+        if len(disk.steps) < step:
+            break
+        assert os.strerror(code) in said[-1] or os.strerror(code) in said[-2]
+        folders = list(root.iterdir())
+        if not folders:
+            continue        # nothing of it could be written, and nothing is left
+        found = times(folders[0])
+        assert found == times_of(*range(CHUNKS + 1))[:len(found)]
+        assert found
+    assert step > 60
+
+
+@pytest.mark.parametrize('where', ['root', 'leg'])
+def test_a_folder_that_is_removed_or_read_only_is_told_and_used_again(tmp_path, where):
+    root = tmp_path / 'journal'
+    one = journal(root)
+    one.put([chunk(0)])
+    folder = root if where == 'root' else root / NAME
+    away = tmp_path / 'away'
+    folder.rename(away)
+    one.put([chunk(1)])
+    assert 'No such file or directory' in one.trouble
+    assert NAME in one.trouble
+    away.rename(folder)
+    one.put([chunk(2)])
+    assert one.trouble == ''
+    one.finish()
+    assert times(one.folder) == times_of(*range(3))
+
+
+def test_two_nodes_on_one_folder_have_journals_of_their_own(tmp_path):
+    both = [journal(tmp_path) for _ in range(2)]
+    for k in range(CHUNKS):
+        for n, one in enumerate(both):
+            one.put([chunk(10 * n + k)])
+    for one in both:
+        one.finish()
+        assert one.trouble == ''
+    assert [times(one.folder)[0] for one in both] == [0, 10 * SECOND]
+    assert sorted(os.listdir(tmp_path)) == [NAME, f'{NAME}-2']
+
+
+def test_empty_journals_do_not_pile_up(tmp_path):
+    def aged(name, *files):
+        (tmp_path / name).mkdir()
+        for file in files:
+            (tmp_path / name / file).touch()
+        os.utime(tmp_path / name, (10**9, 10**9))
+    aged(NAME)
+    aged(f'{NAME}-2', JOURNAL)
+    aged(f'{NAME}-3', JOURNAL, '.part_000000.mcap.part')
+    aged(f'{NAME}-4', JOURNAL, 'part_000000.mcap')
+    aged('mine')
+    (tmp_path / f'{NAME}-5').mkdir()
+    clear_empty(tmp_path)
+    assert sorted(os.listdir(tmp_path)) == [f'{NAME}-4', f'{NAME}-5', 'mine']
+
+
+def folder_of(root, name, size, age):
+    """Make a folder that looks like a journal of some bytes."""
+    folder = root / name
+    folder.mkdir(parents=True)
+    (folder / JOURNAL).touch()
+    os.utime(folder / JOURNAL, ns=(0, -age * SECOND + 10**18))
+    (folder / 'part.mcap').write_bytes(bytes(size))
+    return folder
+
+
+def test_the_oldest_journals_go_first_and_nothing_else(tmp_path):
+    old, middle, new = (folder_of(tmp_path, name, 1000, age)
+                        for name, age in (('c', 3), ('b', 2), ('a', 1)))
+    (tmp_path / 'calibration').mkdir()
+    (tmp_path / 'calibration' / 'result').write_bytes(bytes(5000))
+    (tmp_path / 'link').symlink_to(new)
+    assert journals(tmp_path) == [old, middle, new]
+    assert make_room(tmp_path, 3000) == 3000
+    assert make_room(tmp_path, 3000, needed=1) == 2000
+    assert journals(tmp_path) == [middle, new]
+    with claim(middle):                                 # a node is writing to it
+        assert make_room(tmp_path, 1500) == 1000
+        assert journals(tmp_path) == [middle]
+        assert make_room(tmp_path, 10) == 1000
+    assert make_room(tmp_path, 10) == 0
+    assert (tmp_path / 'calibration' / 'result').exists()
+    assert make_room(tmp_path / 'none', 10) == 0
+
+
+def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
+    limit, taken, write_file = 1_200_000, [], segments.write_file
+
+    def watched(*args):
+        size = write_file(*args)
+        taken.append(sum(size_of(folder) for folder in journals(tmp_path)))
+        return size
+    monkeypatch.setattr(segments, 'write_file', watched)   # joined and single files are there
+    for leg_id in range(1, 5):
+        one = journal(tmp_path, f'leg_{leg_id}', limit)
+        for k in range(5):
+            one.put([large(k)])
+        one.finish()
+        assert one.trouble == ''
+    assert len(taken) == 4 * (5 + 1 + 1)
+    assert 900_000 < max(taken) <= limit
+    assert [f.name for f in journals(tmp_path)][-1] == 'leg_4'
+
+
+def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
+    folder_of(tmp_path, 'old', 1000, 1)
+    one = journal(tmp_path, limit=500_000)
+    for k in range(20):
+        one.put([large(k)])
+    assert 'raise journal.max_bytes' in one.trouble
+    one.finish()
+    folder, = journals(tmp_path)
+    assert size_of(folder) <= 500_000
+    with open_bag(folder) as bag:
+        # for each that is written, room to join it with those that stand is kept
+        assert bag.topics['/odometer'].count == 2
+        assert bag.start_ns == 0
+
+
+def test_what_the_disk_does_not_take_waits_but_not_without_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal_leg, 'WAITING_BYTES', 350_000)
+    one = journal(tmp_path)
+    one.put([large(0)])
+    with monkeypatch.context() as patch:
+        Refusing(1, for_ever=True).put_in(patch)
+        for k in range(1, 6):
+            one.put([large(k)])
+    assert 'no further attempt in this leg' in one.trouble
+    assert not one._waiting
+    one.put([large(6)])                # a hole would be worse than an end
+    one.finish()
+    with open_bag(one.folder) as bag:
+        assert bag.topics['/odometer'].count == 1
