@@ -78,8 +78,9 @@ class ResultFolders:
         """
         root = newest.parent
         with locked(root):
-            names = sorted((p.name for p in root.iterdir() if RESULT_NAME.fullmatch(p.name)),
-                           key=_age)
+            made = filter(None, (RESULT_NAME.fullmatch(p.name) for p in root.iterdir()))
+            # by the time, and the count within that second
+            names = [m[0] for m in sorted(made, key=lambda m: (m[1], int(m[2] or 1)))]
             old = names[:-kept] if kept else []
             shown = _target(root / LATEST)
             stay = {newest.name, shown, *(f.before for f in self._filed if f.folder.name == shown)}
@@ -111,12 +112,6 @@ class ResultFolders:
             else:
                 link.unlink(missing_ok=True)
         return self._filed[-1].folder if self._filed else None
-
-
-def _age(name: str) -> tuple[str, int]:
-    """Return the sort key of a result name: its time, and the count within that second."""
-    when, count = RESULT_NAME.findall(name)[0]
-    return when, int(count or 1)
 
 
 def _clear(root: Path) -> None:

@@ -36,22 +36,6 @@ class Started:
         return words + [w for pair in self.remappings.items() for w in ('-r', ':='.join(pair))]
 
 
-class Late:
-    """A substitution: text only once the arguments are known."""
-
-    def __init__(self, text) -> None:
-        self.text = text            # function of the arguments
-
-
-def text_of(value, arguments):
-    """Return what a value is for some arguments, lists joined as launch does."""
-    if isinstance(value, Late):
-        return value.text(arguments)
-    if isinstance(value, list | tuple):
-        return ''.join(str(text_of(v, arguments)) for v in value)
-    return value
-
-
 def _truth(text) -> bool:
     word = str(text).strip().lower()
     if word not in ('true', '1', 'false', '0'):
@@ -60,30 +44,28 @@ def _truth(text) -> bool:
 
 
 def of_python(path: Path, given: dict[str, str]) -> tuple[dict, list[Started]]:
-    """Return declared arguments (default, description) and the nodes of a Python launch file."""
-    declared = {}
+    """
+    Return declared arguments (default, description) and the nodes of a Python launch file.
+
+    The defaults are those of its XML twin, so that substitutions are texts from the beginning.
+    """
+    twin, _ = of_xml(path.with_suffix('.xml'), {})
+    arguments, declared = {name: default for name, (default, _) in twin.items()} | given, {}
 
     def declare(name, default_value, description):
-        declared[name] = (text_of(default_value, {}), description)
-
-    def package_share(package):
-        return Late(lambda _: str(ROOT) if package == 'odocal_ros' else f'/share/{package}')
+        declared[name] = default_value, description
 
     stand_ins = {
         'launch': {'LaunchDescription': list},
         'launch.actions': {'DeclareLaunchArgument': declare},
-        'launch.conditions': {'IfCondition': lambda v: (v, True),
-                              'UnlessCondition': lambda v: (v, False)},
+        'launch.conditions': {'IfCondition': _truth, 'UnlessCondition': lambda t: not _truth(t)},
         'launch.substitutions': {
-            'LaunchConfiguration': lambda name: Late(lambda a: a[name]),
-            'PathJoinSubstitution': lambda parts: Late(
-                lambda a: '/'.join(text_of(p, a) for p in parts)),
-            'PythonExpression': lambda parts: Late(lambda a: str(eval(text_of(parts, a))))},
+            'LaunchConfiguration': arguments.__getitem__, 'PathJoinSubstitution': '/'.join,
+            'PythonExpression': lambda parts: str(eval(''.join(parts)))},
         'launch_ros': {}, 'launch_ros.actions': {'Node': dict},
-        'launch_ros.parameter_descriptions': {'ParameterValue': lambda value, value_type: Late(
-            lambda a: _truth(text_of(value, a)) if value_type is bool
-            else value_type(text_of(value, a)))},
-        'launch_ros.substitutions': {'FindPackageShare': package_share}}
+        'launch_ros.parameter_descriptions': {'ParameterValue': lambda value, value_type: (
+            _truth if value_type is bool else value_type)(value)},
+        'launch_ros.substitutions': {'FindPackageShare': {'odocal_ros': str(ROOT)}.__getitem__}}
     modules = {name: ModuleType(name) for name in stand_ins}
     for name, content in stand_ins.items():
         modules[name].__dict__.update(content)
@@ -91,22 +73,10 @@ def of_python(path: Path, given: dict[str, str]) -> tuple[dict, list[Started]]:
         scope: dict = {}
         exec(compile(path.read_text(encoding='utf-8'), str(path), 'exec'), scope)
         nodes = [e for e in scope['generate_launch_description']() if e is not None]
-    arguments = {name: default for name, (default, _) in declared.items()} | given
-    return declared, [_started(node, arguments) for node in nodes if _wanted(node, arguments)]
-
-
-def _wanted(node, arguments) -> bool:
-    value, sense = node.get('condition', ('true', True))
-    return _truth(text_of(value, arguments)) is sense
-
-
-def _started(node, arguments) -> Started:
-    words = partial(text_of, arguments=arguments)
-    return Started(
-        node['package'], node['executable'], node.get('name'), words(node['namespace']),
-        {a: words(b) for a, b in node.get('remappings', ())},
-        [{k: words(v) for k, v in p.items()} if isinstance(p, dict) else words(p)
-         for p in node['parameters']], [words(a) for a in node.get('arguments', ())])
+    return declared, [
+        Started(node['package'], node['executable'], node.get('name'), node['namespace'],
+                dict(node.get('remappings', ())), node['parameters'], node.get('arguments', []))
+        for node in nodes if node.get('condition', True)]
 
 
 def of_xml(path: Path, given: dict[str, str]) -> tuple[dict, list[Started]]:
