@@ -14,7 +14,7 @@ from odocal_ros.calib.result import BESIDE, Calibration
 from odocal_ros.data.arrays import Floats
 from odocal_ros.output import device_files
 from odocal_ros.output.geojson import geojson, TRACK
-from odocal_ros.output.summary import as_configured
+from odocal_ros.output.summary import not_estimated
 from odocal_ros.output.tables import leg_table, LEGS
 from odocal_ros.outside import names
 from odocal_ros.outside.yaml_files import no_date, parameters
@@ -124,7 +124,7 @@ def _transform(calibration: Calibration, config: Config,
                            name=name, args=names.for_launch(words))
     assumed = '' if any(config.imu.lever_arm) else ' (not set)'
     head = (f'{device_files.about(calibration, content)}\ntranslation: imu.lever_arm{assumed}; '
-            f'{as_configured(calibration)} as configured')
+            f'{not_estimated(calibration)} as configured')
     command = (names.for_comment(
         f'{head}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
         'this command publishes;\n'

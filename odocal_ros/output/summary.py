@@ -140,20 +140,19 @@ def _values(calibration: result.Calibration, width: int) -> list[str]:
     if all(bias.value is not None for bias in biases):
         shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
         lines.append(_line('gyro bias x, y, z', f'{shown} deg/h'))
-    if rpy := rotation_text(calibration):
-        lines.append(_line('IMU on the vehicle',
-                           rpy if width >= WIDTH else rpy.partition('   ')[0]))
+    if rpy := rotation_text(calibration, width):
+        lines.append(_line('IMU on the vehicle', rpy))
     return [line for line in lines if line]
 
 
-def rotation_text(calibration: result.Calibration) -> str:
+def rotation_text(calibration: result.Calibration, width: int = WIDTH) -> str:
     """Return roll, pitch and yaw of the IMU on the vehicle, empty without them."""
     angles = ', '.join(f'{angle * DEG:z.3f}' for angle in calibration.imu_rotation_rpy or ())
-    return angles and (f'roll, pitch, yaw {angles} deg   ({as_configured(calibration)} as '
-                       'configured)')
+    note = f'   ({not_estimated(calibration)} as configured)' * (width >= WIDTH)
+    return angles and f'roll, pitch, yaw {angles} deg{note}'
 
 
-def as_configured(calibration: result.Calibration) -> str:
+def not_estimated(calibration: result.Calibration) -> str:
     """Return the mounting angles that are not estimated; the roll never is."""
     pitch = known(calibration.estimates, 'pitch_mounting_angle').value
     return 'roll and pitch' if pitch is None else 'roll'
@@ -208,7 +207,6 @@ def _arm(estimates: dict[str, result.Estimate], arm: str, word: str, width: int)
     found = {axis: known(estimates, f'{arm}_{axis}') for axis in 'xyz'}
     found = {axis: e for axis, e in found.items() if e.value is not None}
     shown = ', '.join(with_sigma(e.value, e.sigma, signed=True) for e in found.values())
-    # a wheel that slides in turns seems to be elsewhere (docs/report.md)
     where = '   (without sliding)' * (arm.startswith('odometer') and width >= WIDTH)
     return _line(f'{word} {", ".join(found)}', f'{shown} m{where}') if found else ''
 
