@@ -38,6 +38,7 @@ class Pieces(NamedTuple):
     off: Floats      # rad, direction of the track minus course by the fixes
     length: Floats   # m, by the fixes
     stretch: Floats  # length of the track over ``length``, median 1
+    course: Floats   # rad, direction by the fixes
 
 
 def level_track(travel: Floats, turned: Floats) -> Floats:
@@ -57,13 +58,14 @@ def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats, sigma: float) -> Piece
     # the sigma of a direction is then sqrt(2) / 20 rad
     knots = np.array(knots_of(fixes_2d, max(10.0, 20 * sigma)), int)
     if len(knots) < 2:
-        return Pieces(*(np.empty(0),) * 4)
+        return Pieces(*(np.empty(0),) * 5)
     a, b = knots[:-1], knots[1:]
     track, fix = track_2d[b] - track_2d[a], fixes_2d[b] - fixes_2d[a]
     length, middle = np.hypot(*fix.T), (t[a] + t[b]) / 2
     stretch = np.hypot(*track.T) / length
-    off = wrap(arctan2(*track.T[::-1]) - arctan2(*fix.T[::-1]))
-    return Pieces(middle, off, length, stretch / (np.median(stretch) or 1.0))
+    course = arctan2(*fix.T[::-1])
+    off = wrap(arctan2(*track.T[::-1]) - course)
+    return Pieces(middle, off, length, stretch / (np.median(stretch) or 1.0), course)
 
 
 def backwards(found: Pieces) -> Bools:
@@ -110,16 +112,20 @@ def _opposite(off: Floats) -> Bools:
 
 
 def _stays_back(found: Pieces, run: Ints, forward: Ints) -> bool:
-    """Return True if the fixes stay behind after a run of pieces, as after a reversal."""
+    """
+    Return True if the fixes stay behind after a run of pieces, as after a reversal.
+
+    Over ERROR_LASTS to each side, the displacement of the fixes is then nearer to that of the
+    track with the run reversed; after a fix error, which disappears, to that of the track.
+    """
     t = found.t
-    about = (t >= t[run[0]] - ERROR_LASTS) & (t <= t[run[-1]] + ERROR_LASTS)
-    about[run] = False
+    about = np.flatnonzero((t >= t[run[0]] - ERROR_LASTS) & (t <= t[run[-1]] + ERROR_LASTS))
     # without heading drift: the offset of a piece is relative to the nearest forward one
     nearest = forward[np.argmin(np.abs(t[about][:, None] - t[forward]), axis=1)]
-    ahead = found.length[about] * (
-        np.cos(found.off[about] - found.off[nearest]) - found.stretch[about])
-    # after an error the fixes catch up by twice the run, after a reversal by nothing
-    return bool(ahead.sum() < found.length[run].sum())
+    track = found.stretch[about] * found.length[about] * np.exp(
+        1j * (found.course[about] + found.off[about] - found.off[nearest]))
+    off = np.sum(found.length[about] * np.exp(1j * found.course[about])) - track.sum()
+    return bool(abs(off + 2 * track[np.isin(about, run)].sum()) < abs(off))
 
 
 def against_travel(found: Pieces, signed: bool) -> tuple[Reason, ...]:

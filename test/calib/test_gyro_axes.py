@@ -254,7 +254,7 @@ def test_a_false_course_of_two_pieces_does_not_turn_the_rest_around():
     """Its begin changes the direction by 136 deg, its end by less, as in a zoo drive."""
     off = np.deg2rad(np.repeat([-86.0, 138.0, -93.0], [60, 2, 50]))
     t = np.arange(len(off)) * 1.0
-    assert not np.delete(backwards(Pieces(t, off, *np.ones((2, len(t))))), [60, 61]).any()
+    assert not np.delete(backwards(Pieces(t, off, *np.ones((3, len(t))))), [60, 61]).any()
 
 
 def test_errors_of_the_gyro_are_no_reversing_and_hide_none():
@@ -280,6 +280,17 @@ def test_fixes_that_run_back_and_on_again_are_no_reversing(drift):
     # the same pieces, but that the fixes do not come back
     stay = found.t < 626.0
     assert against_travel(Pieces(*(x[stay] for x in found)), signed=True)
+
+
+def test_an_error_that_disappears_after_a_turn_is_no_reversing():
+    """The fixes jump back by 40 m, and on again by as much when the vehicle drives north."""
+    path = np.arange(0.0, 1200.0, 5.0)
+    true = np.stack([np.minimum(path, 600.0), np.maximum(path - 600.0, 0.0)], -1)
+    wrong = (path > 500.0) & (path < 700.0)
+    fixes = true - 40.0 * np.stack([wrong, np.zeros(len(path))], -1)
+    found = pieces(true, fixes, path / 10.0, 0.3)
+    assert (np.abs(found.off) > 3.0).sum() == 1
+    assert not backwards(found).any()
 
 
 def test_fixes_that_jump_have_no_direction():
