@@ -18,8 +18,13 @@ NEVER = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagno
 COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # to a vehicle, not measured
 # poses that a person sets: Nav2 and RViz
 GOALS = ('goal', 'initialpose', 'initial_pose', 'clicked')
-# estimates from GNSS or all sensors: no odometer while there is another
+# estimates from GNSS or all sensors: no odometer if there is another
 FUSED = ('filtered', 'fused', 'gps', 'gnss', 'fix', 'global', 'ground_truth', 'ekf')
+# parts of names of INS, SLAM, cameras and localisation, and of joints that do not drive. Judgement
+ESTIMATED = re.compile(
+    '(?:^|[/_])(?:ins|nav|map|local|imu|vio|lio|dlio|dlo|icp|ndt|sbg|arm|reference|zed[0-9a-z]*|'
+    'camera[0-9]*|t265|slam|rtabmap|novatel|oem7|vectornav|applanix|microstrain|xsens)(?=[/_]|$)|'
+    'localiz|mapping|kinematic_state|estimat|visual|lidar|laser|vins|steer')
 GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
 
 # an Odometry is the reference only if it is named: most are the wheel odometry itself
@@ -80,8 +85,9 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     if slot in ('odometer', 'odometer_right'):
         found = [name for name in found if not _has(name, COMMANDS)]
         found = _unless_all(found, FUSED)
+        found = [name for name in found if not ESTIMATED.search(name.lower())] or found
         if config.odometer.own_topics:
-            found = [name for name in found if ('right' in _last(name)) == (slot != 'odometer')]
+            found = [name for name in found if ('right' in name) == (slot != 'odometer')]
     elif slot == 'heading':
         if config.alignment.heading_source == 'auto':    # by the name of the node's input
             return [name for name in found if _last(name) == 'heading']
@@ -172,7 +178,7 @@ def _trouble(topics: Topics, slot: str, found: list[str], config: Config,
     if found:
         hint = ''
         if slot == 'odometer' and {'left', 'right'} <= {
-                side for name in found for side in ('left', 'right') if side in _last(name)}:
+                side for name in found for side in ('left', 'right') if side in name}:
             hint = '; for two wheels set odometer.left and odometer.right to topic'
         return (f'{len(found)} topics can be the {INPUTS[slot].label}; choose one with '
                 f'{topic_option(slot)}: {_described(topics, found)}{hint}')

@@ -83,7 +83,10 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     lists = {name: tap.values.facts(turn, fixes) for name, tap in taps.items() if tap.values}
     if fixes and config.odometer.quantity == 'auto':
         _set_meanings(bag, taps, lists, fixes)
-    idle = odometer_search.still(_matches(taps, lists, fixes) if fixes else {})
+    matches = _matches(taps, lists, fixes) if fixes else {}
+    idle = odometer_search.still(matches)
+    none_follows = 'odometer' not in overrides and matches and not any(
+        match.follows for match in matches.values())
     mapping, config = likely_mapping(bag.topics, config, overrides, idle)
     topics = [_topic(bag, info, taps.get(name), refused.get(name, ''))
               for name, info in bag.topics.items()]
@@ -104,8 +107,9 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
             facts['fields'] = tried.facts(fixes)
     odometer_search.only_near_best([facts['fields'] for facts in topics if 'fields' in facts])
     own = config
-    if mapping.get('odometer') not in taps and (
+    if (mapping.get('odometer') not in taps or none_follows) and (
             best := odometer_search.best_topic(topics, overrides.get('odometer', ''))):
+        mapping.pop('odometer_right', None)
         mapping['odometer'] = best['name']
         extra = search[best['name']].settings(best['fields']['found'], turn)
     else:

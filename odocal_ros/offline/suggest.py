@@ -13,7 +13,10 @@ from odocal_ros.messages.sensor_types import FIX
 from odocal_ros.outside.names import for_shell
 from odocal_ros.settings.config import Config, with_settings
 
-COUNTER_WORDS = ('pulse', 'tick', 'encoder', 'odom', 'wheel', 'count')
+# judgement: names of wheels and their electronics before those of any odometry
+WHEEL_WORDS = ('pulse', 'tick', 'encoder', 'wheel', 'count', 'chassis', 'controller', 'vehicle',
+               '/can', 'obd')
+OF_ANOTHER = ('zed', 'camera', 'lidar', 'livox', 'ouster')     # judgement: IMUs in other sensors
 
 
 def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
@@ -24,10 +27,11 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     still : odometer topics that do not grow with the path of the fixes, while another does.
     """
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
-    free = candidates(topics, 'odometer', config, chosen)
-    sides = [next((t for t in free if side in t), '') for side in ('left', 'right')]
-    if not config.odometer.keys and 'odometer' not in chosen and all(sides) and len(free) == 2:
+    if not config.odometer.keys and not {'odometer', 'odometer_right'} & chosen.keys() and (
+            pair := _pair(topics, [t for t in candidates(topics, 'odometer', config, chosen)
+                                   if t not in still])):
         config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
+        chosen['odometer'], chosen['odometer_right'] = pair
     for slot in wanted(config):
         found = [] if slot in chosen else candidates(topics, slot, config, chosen)
         if found:
@@ -35,20 +39,30 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     return chosen, config
 
 
+def _pair(topics: dict[str, TopicInfo], free: list[str]) -> tuple[str, str] | None:
+    """Return the topics of the left and the right wheel if two differ in this word only."""
+    pairs = [(left, right) for left in free if 'left' in left
+             and (right := left.replace('left', 'right')) in free
+             and topics[left].msgtype == topics[right].msgtype]
+    return pairs[0] if len(pairs) == 1 else None
+
+
 def _rank(slot: str, info: TopicInfo, still: Collection[str]) -> tuple[int | str, ...]:
     """Return a sort key: moving topics, counters, usual names, more messages first."""
     usual = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
     kinds = [i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype]
-    worded = any(word in info.name.lower() for word in COUNTER_WORDS)
+    name = info.name.lower()
+    worded = int('rtk' in name if slot == 'fix' else not any(w in name for w in OF_ANOTHER))
+    if 'odometer' in slot:
+        worded = 2 * any(word in name for word in WHEEL_WORDS) or 'odom' in name
     return (info.name in still, kinds[0] if 'odometer' in slot else 0,
-            not info.name.endswith(usual), not worded if 'odometer' in slot else 0, -info.count,
-            info.name)
+            not info.name.endswith(usual), -worded, -info.count, info.name)
 
 
 # reasons for a topic, by the first element of the ranks that differs
 WHY = ('it grows with the distance between the fixes',
        'counts are preferred to joint angles, and angles to speeds', 'it has the usual name',
-       'its name is that of an odometer', 'it has the most messages', 'it is the first by name')
+       'its name fits', 'it has the most messages', 'it is the first by name')
 
 
 def others(topics: dict[str, TopicInfo], slot: str, config: Config,

@@ -8,6 +8,7 @@ import pytest
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.topics import choose_topics, local_reference
+from odocal_ros.offline.suggest import likely_mapping
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
@@ -180,3 +181,45 @@ def test_a_reference_that_is_named_is_taken_and_goals_are_none():
     assert choose(topics(fix=None, tf='tf2_msgs/msg/TFMessage'), {'fix': '/tf'})['fix'] == '/tf'
     assert choose(topics(fix=None, lidar_odometry=ODOM), {'fix': '/lidar_odometry'}) == {
         'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/lidar_odometry'}
+
+
+VELOCITY = 'autoware_vehicle_msgs/msg/VelocityReport'
+JOINTS = 'sensor_msgs/msg/JointState'
+
+
+@pytest.mark.parametrize(('right', 'wrong'), [
+    ({'/vehicle/status/velocity_status': VELOCITY}, {'/localization/kinematic_state': ODOM}),
+    ({'/wheel/odom': ODOM}, {'/zed/zed_node/odom': ODOM}),
+    ({'/mavros/wheel_odometry/odom': ODOM}, {'/mavros/local_position/odom': ODOM}),
+    ({'/odom': ODOM}, {'/lio_sam/mapping/odometry_incremental': ODOM}),
+    ({'/odom': ODOM}, {'/camera/odom/sample': ODOM}),
+    ({'/wheel/odometry': ODOM}, {'/odometry/local': ODOM, '/odometry/filtered': ODOM}),
+    ({'/vehicle/odometry': ODOM}, {'/ins/odometry': ODOM}),
+    ({'/wheel_encoder': INT}, {'/applanix/odom': ODOM}),
+    ({'/base/joint_states': JOINTS}, {'/arm/joint_states': JOINTS}),
+    ({'/instrument_cluster/speed': TWIST}, {'/reference/velocity': TWIST})])
+def test_wheels_are_preferred_to_estimates_at_higher_rates(right, wrong):
+    found = {n: TopicInfo(n, t, 5) for n, t in (BASE | right).items() if n != '/odometer'} | {
+        n: TopicInfo(n, t, 500) for n, t in wrong.items()}
+    assert likely_mapping(found, Config(), {})[0]['odometer'] == next(iter(right))
+
+
+@pytest.mark.parametrize('names', [('/encoders/left', '/encoders/right'),
+                                   ('/left_wheel/rpm', '/right_wheel/rpm')])
+def test_topics_of_left_and_right_are_a_pair_beside_others(names):
+    kind = 'std_msgs/msg/Float64'
+    found = {n: TopicInfo(n, t, 5) for n, t in (
+        BASE | dict.fromkeys((*names, '/motor_current/left'), kind) | {'/odom': ODOM}).items()
+        if n != '/odometer'}
+    mapping, config = likely_mapping(found, Config(), {})
+    assert (mapping['odometer'], mapping['odometer_right']) == names
+    assert config.odometer.left == config.odometer.right == 'topic'
+
+
+def test_imus_of_cameras_and_lidars_come_last():
+    found = {n: TopicInfo(n, t, count) for n, t, count in (
+        ('/zed/zed_node/imu/data', IMU, 400), ('/livox/imu', IMU, 200),
+        ('/xsens/imu/data', IMU, 100), ('/odometer', INT, 5), ('/fix', FIX, 5),
+        ('/gps_rtk/fix', FIX, 1))}
+    mapping, _ = likely_mapping(found, Config(), {})
+    assert (mapping['imu'], mapping['fix']) == ('/xsens/imu/data', '/gps_rtk/fix')
