@@ -17,7 +17,8 @@ SPEED_UNITS = {1.0: 'm/s', 1 / 3.6: 'km/h', 0.44704: 'mph', 1852 / 3600: 'knots'
                0.01: 'cm/s', 1e-3: 'mm/s'}
 # likely cause of a ratio to the nominal scale, by unit of the scale. Physical, definitions
 MISTAKEN = {
-    '1': {factor: f'speeds in {name}' for factor, name in SPEED_UNITS.items() if factor != 1},
+    '1': {factor: f'speeds in {name}' for factor, name in SPEED_UNITS.items() if factor != 1}
+    | {0.3048: 'speeds in ft/s, or for rad/s of a wheel of this radius in m'},
     'm/rad': {np.pi / 180: 'angles in degrees', 2 * np.pi: 'whole turns',
               np.pi / 30: 'rates in rpm'},
     'm/pulse': {0.25: 'counting four edges per pulse (x4)',

@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from odocal_ros.bagio.read import Bag
     from odocal_ros.settings.config import Config
 
+# what to do if a slot has no topic
+MISSING = {'imu': 'record sensor_msgs/Imu', 'odometer': 'select an odometer of another type with '
+           f'{topic_option("odometer")} TOPIC', 'fix': 'convert positions of another type to '
+           'sensor_msgs/NavSatFix'}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options: the calibration options of replay, and --no-browser."""
@@ -40,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
         say(text(found))
         missing = [slot for slot in ('imu', 'odometer', 'fix') if slot not in found['mapping']]
         labels = ', '.join(INPUTS[slot].label for slot in missing)
-        raise BadData(f'{args.bag}: no topic was found for: {labels}; if one has another type, '
-                      f'select it with its option, such as {topic_option(missing[0])} TOPIC')
+        raise BadData(f'{args.bag}: no topic was found for: {labels}; '
+                      + '; '.join(MISSING[slot] for slot in missing))
     options = [*_suggested(found['command'], bool(args.leg)), *_own_options(args)]
     say('\n'.join(_overview(found, choices, options)))
     parser = argparse.ArgumentParser()

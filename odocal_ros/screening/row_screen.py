@@ -26,6 +26,8 @@ LABEL = {slot: one.label for slot, one in INPUTS.items()}
 NOTHING = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
            **dict.fromkeys(WHEELS, Code.NO_ODOMETER)}
 
+UNSTAMPED = ('Let the driver stamp its messages with the time of measurement. A recording can be '
+             'repaired by writing the arrival time into the header.')
 NO_RECEPTION = ('Drive under open sky if possible: the likely cause is a tunnel, buildings or '
                 'trees. The leg stays valid; missing data increases the uncertainties.')
 
@@ -86,8 +88,10 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
             spikes |= _damaged(wild, good, slot, found)[at]
         clean, t = take(clean, ~spikes), t[~spikes]
     if len(sent.stamp_ns) and not len(t) and slot in NOTHING:
-        found.append(Reason(NOTHING[slot], f'none of the {len(sent.stamp_ns)} {LABEL[slot]} '
-                            'messages is usable'))
+        zero = int((sent.stamp_ns <= 0).sum())
+        found.append(Reason(
+            NOTHING[slot], f'none of the {len(sent.stamp_ns)} {LABEL[slot]} messages is usable'
+            + f': {zero} have no stamp (0)' * (zero > 0), UNSTAMPED * (zero > 0)))
     return clean, t
 
 
