@@ -12,21 +12,24 @@ STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 T0 = 1_700_000_000 * 10**9
 
 
-def write(path, rows, storage='mcap', compression='none', types=None):
+def write(path, rows, storage='mcap', compression='none', types=None, store=None):
     """
     Write (topic, bag time, message or CDR bytes) rows in the order given; return the path.
 
-    Bytes need the type of their topic in ``types``. ``rosbag1`` gives a file.
+    Bytes need the type of their topic in ``types``, foreign ones in ``store``. ``rosbag1`` gives a
+    file.
     """
     types = {topic: getattr(m, '__msgtype__', '') for topic, _, m in rows} | (types or {})
     if storage == 'rosbag1':
         bag = rosbag1.Writer(path)
+        if compression != 'none':
+            bag.set_compression(bag.CompressionFormat[compression.upper()])
     else:
         bag = Writer(path, version=9, storage_plugin=STORAGES[storage])
         if compression != 'none':
             bag.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
     with bag:
-        ends = {topic: bag.add_connection(topic, kind, typestore=make.store())
+        ends = {topic: bag.add_connection(topic, kind, typestore=store or make.store())
                 for topic, kind in types.items()}
         for topic, time_ns, message in rows:
             raw = message if isinstance(message, bytes) else make.cdr(message)

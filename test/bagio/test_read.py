@@ -133,31 +133,25 @@ def test_changes_still_in_the_wal(tmp_path, wanted):
 
 def test_foreign_types_come_with_the_bag(tmp_path):
     from rosbags.typesys import get_types_from_msg, get_typestore, Stores
-    store = get_typestore(Stores.ROS2_JAZZY)
-    store.register(get_types_from_msg('std_msgs/Header header\nint32 ticks_left\n',
-                                      'create_msgs/msg/WheelTicks'))
-    kind = store.types['create_msgs/msg/WheelTicks']
-    from rosbags.rosbag2 import Writer
+    name, store = 'create_msgs/msg/WheelTicks', get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg('std_msgs/Header header\nint32 ticks_left\n', name))
+    rows = [('/ticks', T0 + i, bytes(store.serialize_cdr(store.types[name](
+        header=make.header(T0 + i), ticks_left=10 * i), name))) for i in range(5)]
+    settings = with_settings(Config(), {'odometer.field': 'ticks_left'})
     for storage in ('mcap', 'sqlite3'):
-        with Writer(tmp_path / storage, version=9,
-                    storage_plugin=ros_bags.STORAGES[storage]) as bag:
-            topic = bag.add_connection('/ticks', kind.__msgtype__, typestore=store)
-            for i in range(5):
-                message = kind(header=make.header(T0 + i), ticks_left=10 * i)
-                bag.write(topic, T0 + i, store.serialize_cdr(message, kind.__msgtype__))
-        settings = with_settings(Config(), {'odometer.field': 'ticks_left'})
-        with open_bag(tmp_path / storage) as bag:
-            reader, recorder = make_reader('odometer', kind.__msgtype__, settings), LegRecorder()
+        path = ros_bags.write(tmp_path / storage, rows, storage, types={'/ticks': name},
+                              store=store)
+        with open_bag(path) as bag:
+            reader, recorder = make_reader('odometer', name, settings), LegRecorder()
             bag.read({'/ticks': reader}, recorder.feed)
             assert recorder.rows('odometer').value.tolist() == [0, 10, 20, 30, 40]
             assert recorder.rows('odometer').stamp_ns.tolist() == [T0 + i for i in range(5)]
     # without the definition nothing can be done, and it is said
     with closing(sqlite3.connect(tmp_path / 'sqlite3' / 'sqlite3.db3')) as db, db:
         db.execute('DELETE FROM message_definitions')
-    with open_bag(tmp_path / 'sqlite3') as bag:
-        reader = make_reader('odometer', kind.__msgtype__, settings)
-        with pytest.raises(BadData, match='holds no definition'):
-            bag.read({'/ticks': reader}, print)
+    with open_bag(tmp_path / 'sqlite3') as bag, pytest.raises(
+            BadData, match='holds no definition'):
+        bag.read({'/ticks': make_reader('odometer', name, settings)}, print)
 
 
 def test_sums_are_those_of_sha256sum(data_dir, plain):

@@ -13,6 +13,7 @@ from bag_content import chunks_of
 from drives import drive
 import pytest
 import ros_bags
+from ros_bags import T0
 from rosbags import rosbag1
 from rosbags.rosbag1 import reader
 from rosbags.rosbag2 import storage_mcap
@@ -40,22 +41,15 @@ def test_the_reader_of_rosbag1_is_as_we_take_it(tmp_path):
     assert set(reader.Chunk._fields) == {'datasize', 'datapos', 'decompressor'}
     assert list(inspect.signature(rosbag1.Reader.read_index_data).parameters) == [
         'self', 'pos', 'indexes']
-    bag = rosbag1.Writer(tmp_path / 'a.bag')
-    bag.set_compression(bag.CompressionFormat.BZ2)
-    with bag:
-        topic = bag.add_connection('/imu', 'sensor_msgs/msg/Imu', typestore=ros_bags.make.store())
-        for i in range(3):
-            raw = ros_bags.make.cdr(ros_bags.make.imu(ros_bags.T0 + i))
-            bag.write(topic, ros_bags.T0 + i,
-                      ros_bags.make.store().cdr_to_ros1(raw, 'sensor_msgs/msg/Imu'))
+    path = ros_bags.write(tmp_path / 'a.bag', [
+        ('/imu', T0 + i, ros_bags.make.imu(T0 + i)) for i in range(3)], 'rosbag1', 'bz2')
     taken = []
 
     class Counted(Allowance):
         def unpack(self, packing, data, size=None):
             taken.append(packing)
             return super().unpack(packing, data, size)
-    file = rosbag1_file.Rosbag1File(tmp_path / 'a.bag', Counted(tmp_path / 'a.bag', 1),
-                                    lambda raw, _: raw)
+    file = rosbag1_file.Rosbag1File(path, Counted(path, 1), lambda raw, _: raw)
     assert len(list(file.messages({'/imu': 'sensor_msgs/msg/Imu'}))) == 3
     assert taken == ['bz2']
     file.close()
