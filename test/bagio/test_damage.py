@@ -80,8 +80,9 @@ def test_large_rows_of_a_cut_database_span_pages(tmp_path):
 def test_what_is_left_is_no_bag(tmp_path, storage):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(1.0), storage)
     data, rng = file_of(path).read_bytes(), np.random.default_rng(2)
+    magics = (data[:16], b'#ROSBAG V2.0\n', b'(\xb5/\xfd', b'')
     for left in (*(data[:size] for size in (0, 5, 100, 1000)),
-                 *(data[:16] + rng.bytes(3000) for _ in range(20))):
+                 *(magic + rng.bytes(3000) for magic in magics for _ in range(20))):
         file_of(path).write_bytes(left)
         with pytest.raises(BadBag, match=r'empty|not a bag|cannot be read'), open_bag(path):
             pass
