@@ -34,6 +34,10 @@ def texts(calibration, **changes):
     return ros_files.texts(calibration, config, as_json(calibration, config, [], CREATED))
 
 
+def with_estimates(calibration, **changed):
+    return replace(calibration, estimates=calibration.estimates | changed)
+
+
 def estimates(unit='m/pulse', scale=0.05, ratio=1.25):
     """Return what a two-point leg gives."""
     return {

@@ -7,7 +7,7 @@ from dataclasses import replace
 from math import tau
 import re
 
-from conftest import texts
+from conftest import texts, with_estimates
 from drives import drive, settings
 import foreign_keys
 import numpy as np
@@ -24,10 +24,6 @@ TWIST, IMU = 'wheel_odometry_covariance.yaml', 'imu_errors.yaml'
 def controllers(calibration, **settings):
     written = yaml.safe_load(texts(calibration, **settings)['ros2_controllers.yaml'])
     return {name: block['ros__parameters'] for name, block in written.items()}
-
-
-def with_estimates(good, **changed):
-    return replace(good, estimates=good.estimates | changed)
 
 
 def wheels(good):

@@ -10,7 +10,7 @@ import sys
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
-from conftest import texts
+from conftest import texts, with_estimates
 from pages import fenced, ROOT
 import pytest
 import yaml
@@ -66,26 +66,22 @@ def test_a_rejected_result_is_no_file_to_drive_by(rejected):
 
 
 def test_autoware_gets_the_ratio_for_pulses_and_the_factor_for_speeds(good):
-    by_pulses = parameters(texts(good)['vehicle_velocity_converter.param.yaml'])
-    assert by_pulses == {'speed_scale_factor': 1.25, 'velocity_stddev_xx': 0.2,
-                         'angular_velocity_stddev_zz': 0.1, 'frame_id': 'base_link'}
-    speed = good.estimates | {'scale_factor': Estimate(0.98, 1e-3, '1'),
-                              'scale_ratio': Estimate(0.49, 5e-4, '1')}
-    by_speed = texts(replace(good, estimates=speed))['vehicle_velocity_converter.param.yaml']
-    assert parameters(by_speed)['speed_scale_factor'] == 0.98
-    speed['scale_factor_as_sent'] = Estimate(0.99, 1e-3, '1')
-    truncated = texts(replace(good, estimates=speed))['vehicle_velocity_converter.param.yaml']
-    assert parameters(truncated)['speed_scale_factor'] == 0.99
-    unknown = good.estimates | {'scale_ratio': Estimate(None, None, '1')}
-    assert 'vehicle_velocity_converter.param.yaml' not in texts(replace(good, estimates=unknown))
+    by_speed = with_estimates(good, scale_factor=Estimate(0.98, 1e-3, '1'),
+                              scale_ratio=Estimate(0.49, 5e-4, '1'))
+    truncated = with_estimates(by_speed, scale_factor_as_sent=Estimate(0.99, 1e-3, '1'))
+    name = 'vehicle_velocity_converter.param.yaml'
+    for calibration, factor in ((good, 1.25), (by_speed, 0.98), (truncated, 0.99)):
+        assert parameters(texts(calibration)[name]) == {
+            'speed_scale_factor': factor, 'velocity_stddev_xx': 0.2,
+            'angular_velocity_stddev_zz': 0.1, 'frame_id': 'base_link'}
+    assert name not in texts(with_estimates(good, scale_ratio=Estimate(None, None, '1')))
 
 
 def test_the_gyro_bias_goes_back_to_the_axes_and_unit_of_the_message(good):
     assert 'imu_corrector.param.yaml' not in texts(good)
     bias = {f'gyro_bias_{a}': Estimate(v, 1e-5, 'rad/s') for a, v in zip(
         'xyz', (1.0, 2.0, 3.0), strict=True)}
-    text = texts(replace(good, estimates=good.estimates | bias), imu__gyro_scale=0.5)[
-        'imu_corrector.param.yaml']
+    text = texts(with_estimates(good, **bias), imu__gyro_scale=0.5)['imu_corrector.param.yaml']
     # C_bi is Rz(-90 deg): the body's x is the sensor's y, the body's y its -x
     assert parameters(text) == {
         'angular_velocity_offset_x': -4.0, 'angular_velocity_offset_y': 2.0,
@@ -160,10 +156,10 @@ def same(a, b):
 
 def parameter_texts(smoothed):
     """Return every parameter text by name: written files, files of config/, blocks of docs."""
-    levers = smoothed.estimates | {'rotation_lever': Estimate(0.4, 1e-3, 'm')}
     written = texts(smoothed, **SIZES)
     found = {name: text for name, text in written.items() if name.endswith('.yaml')}
-    rover = texts(replace(smoothed, estimates=levers), odometer__drive='mecanum', **SIZES)
+    rover = texts(with_estimates(smoothed, rotation_lever=Estimate(0.4, 1e-3, 'm')),
+                  odometer__drive='mecanum', **SIZES)
     found['mecanum'] = rover['ros2_controllers.yaml']
     found |= {path.name: path.read_text(encoding='utf-8') for path in (
         ROOT / 'config').glob('*.yaml')}
