@@ -31,22 +31,16 @@ NO_MEMORY = ("can't start new thread", 'failed to map segment')
 
 @dataclass(frozen=True)
 class BagJob:
-    """
-    The job of a worker for one bag.
-
-    topics, config, legs : arguments of ``library.calibrate_bag``.   settings : hash of all that
-    affects a leg.
-    seconds, memory : limits, s and bytes; 0: none.
-    """
+    """The job of a worker for one bag."""
 
     bag: FleetBag
-    topics: dict[str, str]
+    topics: dict[str, str]        # arguments of ``library.calibrate_bag``, as the next two
     config: dict[str, object]
     legs: tuple[str, ...]
-    settings: str
+    settings: str                 # hash of all that affects a leg
     folder: str
-    seconds: float = 0.0
-    memory: int = 0
+    seconds: float = 0.0          # limit; 0: none
+    memory: int = 0               # limit, bytes; 0: none
 
     @property
     def place(self) -> str:

@@ -35,16 +35,11 @@ class Change:
 
 @dataclass(frozen=True)
 class History:
-    """
-    The history of a value.
+    """The history of a value."""
 
-    changes : in order.   odd : single outlier legs.   slope, slope_sigma : per unit of ``t``;
-    None if not determined.
-    """
-
-    changes: tuple[Change, ...] = ()
-    odd: tuple[int, ...] = ()
-    slope: float | None = None
+    changes: tuple[Change, ...] = ()       # in order
+    odd: tuple[int, ...] = ()              # single outlier legs
+    slope: float | None = None             # per unit of ``t``; None if not determined
     slope_sigma: float | None = None
 
 
@@ -134,18 +129,12 @@ def _fit(z: Floats, X: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """
-    Values of one model's vehicles.
+    """Values of one model's vehicles."""
 
-    mean, sigma : robust mean and its sigma.   spread : between vehicles, in addition to their
-    sigmas, 1 sigma.   deviates : (n,) deviation of each vehicle over the sigma from spread and
-    its own sigma; nan for too few vehicles.
-    """
-
-    mean: float
-    sigma: float
-    spread: float
-    deviates: Floats
+    mean: float           # robust
+    sigma: float          # of the mean
+    spread: float         # between vehicles, in addition to their sigmas, 1 sigma
+    deviates: Floats      # (n,) deviations over spread and own sigma; nan for too few vehicles
 
 
 def population(values: Floats, sigmas: Floats) -> Population:

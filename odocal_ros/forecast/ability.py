@@ -35,21 +35,15 @@ ALL_SAMPLES = 'smoother'   # the method that needs no external heading
 
 @dataclass(frozen=True)
 class Received:
-    """
-    Samples received before the start mark.
+    """Samples received before the start mark."""
 
-    variances : of the yaw by ``heading_topic`` and ``imu_orientation``, rad^2; inf if none is
-    sent.   rested_s : length of the current or last standstill.   latitude : rad.   height : the
-    fixes have a height.   has_accelerometer : of the IMU.   imu : an IMU is present.
-    """
-
-    variances: dict[str, float]
-    rested_s: float = 0.0
-    latitude: float = 0.7
-    height: bool = True
+    variances: dict[str, float]     # of the yaw by its source, rad^2; inf if none is sent
+    rested_s: float = 0.0           # length of the current or last standstill
+    latitude: float = 0.7           # rad
+    height: bool = True             # the fixes have a height
     two_wheels: bool = False
     has_accelerometer: bool = True
-    imu: bool = True
+    imu: bool = True                # an IMU is present
 
 
 @dataclass(frozen=True)

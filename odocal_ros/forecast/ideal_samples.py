@@ -28,18 +28,12 @@ SENT = ('heading_topic', 'imu_orientation')
 
 @dataclass(frozen=True, eq=False)
 class Ideal:
-    """
-    A planned drive as input of the smoother, free of errors.
+    """A planned drive as input of the smoother, free of errors."""
 
-    leg : its samples; fixes and headings are thinned to one for each keyframe or so.
-    imu : their IMU steps with keyframes.     state : true state at the keyframes.
-    fixes_in_one : number of planned fixes that each fix of the leg replaces.
-    """
-
-    leg: SmootherLeg
-    imu: ImuSteps
-    state: State
-    fixes_in_one: float
+    leg: SmootherLeg        # fixes and headings are thinned to one for each keyframe or so
+    imu: ImuSteps           # with keyframes
+    state: State            # true state at the keyframes
+    fixes_in_one: float     # number of planned fixes that each fix of the leg replaces
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,18 +24,13 @@ Move = tuple[float, float, float]      # m forward, m to the left, rad to the le
 
 @dataclass(frozen=True, eq=False)
 class RobotMotion:
-    """
-    Motion of the centre of the wheels.
+    """Motion of the centre of the wheels."""
 
-    t : (n + 1,) s.   speed, side : (n + 1,) m/s forward and to the left.   rate : (n + 1,) rad/s.
-    rests : (r, 2) s, begin and end of the rests after moves.
-    """
-
-    t: Floats
-    speed: Floats
-    side: Floats
-    rate: Floats
-    rests: Floats
+    t: Floats           # (n + 1,) s
+    speed: Floats       # (n + 1,) m/s forward
+    side: Floats        # (n + 1,) m/s to the left
+    rate: Floats        # (n + 1,) rad/s
+    rests: Floats       # (r, 2) s, begin and end of the rests after moves
 
     @property
     def increments(self) -> Floats:

@@ -31,22 +31,15 @@ Drive = TypeVar('Drive', bound='PlannedDrive')
 
 @dataclass(frozen=True, eq=False)
 class PlannedDrive:
-    """
-    A drive by time; the start mark is at 0, the stop mark at the last time.
+    """A drive by time; the start mark is at 0, the stop mark at the last time."""
 
-    t : (m,) s, rising; times before 0 are for the alignment.
-    speed : (m,) m/s of the odometer's point, negative backwards.
-    yaw : (m,) rad, of the vehicle, ENU.    slope : (m,) rad, nose up.
-    latitude, longitude, height : rad, rad, m of the start.
-    """
-
-    t: NDArray[np.float64]
-    speed: NDArray[np.float64]
-    yaw: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    latitude: float = 0.7
+    t: NDArray[np.float64]         # (m,) s, rising; times before 0 are for the alignment
+    speed: NDArray[np.float64]     # (m,) m/s of the odometer's point, negative backwards
+    yaw: NDArray[np.float64]       # (m,) rad, of the vehicle, ENU
+    slope: NDArray[np.float64]     # (m,) rad, nose up
+    latitude: float = 0.7          # rad, of the start, as the longitude
     longitude: float = 0.0
-    height: float = 0.0
+    height: float = 0.0            # m
 
     def __post_init__(self) -> None:
         rows = {name: np.array(getattr(self, name), dtype=float)

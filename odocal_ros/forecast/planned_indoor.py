@@ -37,27 +37,19 @@ FASTEST_NODES = 10.0       # Hz, definition: of positions that the planar estima
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """
-    Robot and reference of a run.
+    """Robot and reference of a run."""
 
-    drive : as odometer.drive.   imu : has an IMU.   width : m, track width, of skid steering on
-    the spot; of HOLONOMIC twice the rotation lever.   straight_width : m, of skid steering
-    straight on.   wheels : number.   slip : m/sqrt(s) of each wheel while it moves.
-    white, rate : m and Hz of the positions.   drift : m, stationary sigma of their correlated
-    error of correlation length drift_length, m of path.   at_rests : positions in the rests only.
-    """
-
-    drive: str
-    imu: bool
-    width: float
-    straight_width: float = 0.0
+    drive: str                      # as odometer.drive
+    imu: bool                       # it has one
+    width: float                    # m, of skid steering on the spot; of HOLONOMIC twice the lever
+    straight_width: float = 0.0     # m, of skid steering straight on
     wheels: int = 2
-    slip: float = 1e-3
-    white: float = 0.02
-    rate: float = 10.0
-    drift: float = 0.0
-    drift_length: float = 10.0
-    at_rests: bool = False
+    slip: float = 1e-3              # m/sqrt(s) of each wheel while it moves
+    white: float = 0.02             # m, white error of the positions
+    rate: float = 10.0              # Hz, of the positions
+    drift: float = 0.0              # m, stationary sigma of their correlated error
+    drift_length: float = 10.0      # m of path, its correlation length
+    at_rests: bool = False          # positions in the rests only
 
 
 def planar_run(motion: RobotMotion, robot: Robot) -> tuple[Run, Floats, Floats]:

@@ -100,19 +100,12 @@ def fit_at(problem: Problem, made: Ideal, levels: Levels) -> Fit:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """
-    The prediction of a drive.
+    """The prediction of a drive."""
 
-    two_point : between the operator's marks, with alignment and drive.
-    methods : name -> predicted result.
-    estimates : each parameter from the method that will provide it, as in a result.
-    deciding : the methods of ``methods`` that may give a parameter.
-    """
-
-    two_point: Prediction
-    methods: dict[str, MethodResult]
-    estimates: dict[str, Estimate]
-    deciding: tuple[str, ...]
+    two_point: Prediction               # between the operator's marks, with alignment and drive
+    methods: dict[str, MethodResult]    # name -> predicted result
+    estimates: dict[str, Estimate]      # each from the method that will provide it, as in a result
+    deciding: tuple[str, ...]           # the methods that may give a parameter
 
     def sigma(self, parameter: str) -> float | None:
         """Return the sigma that will be stated, relative or rad; None: not determined."""

@@ -54,17 +54,15 @@ class Sigmas:
     config : grade of the IMU (imu.*), heading source and its sigma (alignment.*; ``auto`` uses
     the configured heading if it is set, else a gyrocompass if the gyro is good enough, else the
     course), lever arm, latencies, correlation time of the fixes (NaN: 60 s; 0: white).
-    fix, fix_up : m, error of one fix, east and north each, and up (None: twice that).
-    fix_rate : Hz.    quantum : m, size of an odometer count, 0 for speeds.
-    sway : m/s, white at 10 Hz, of the odometer's point to the side and up.    slip : m/sqrt(s) of
-    the wheels. Both apply while driving, and to the smoother only.
     """
 
     config: Config = Config()
-    fix: float = 1.5
-    fix_up: float | None = None
-    fix_rate: float = 5.0
-    quantum: float = 0.0
+    fix: float = 1.5                 # m, of one fix, east and north each
+    fix_up: float | None = None      # m, up; None: twice that
+    fix_rate: float = 5.0            # Hz
+    quantum: float = 0.0             # m, size of an odometer count, 0 for speeds
+    # while driving, for the smoother only: m/s, white at 10 Hz, of the odometer's point to the
+    # side and up; m/sqrt(s) of the wheels
     sway: float = SWAY
     slip: float = SLIP
 
@@ -97,22 +95,16 @@ class Sigmas:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """
-    The prediction of a drive by one method.
+    """The prediction of a drive by one method."""
 
-    method : as in a result; scale factor 1, angles 0, predicted sigmas and budget (scale
-    relative).    reasons : of drive and method.    of_drive : those of the drive, for all methods.
-    distance, chord : m.    duration : s.    standing : s of rest for each mark, 0 in motion.
-    """
-
-    method: MethodResult
-    reasons: tuple[Reason, ...]
+    method: MethodResult                  # as in a result; scale factor 1, angles 0
+    reasons: tuple[Reason, ...]           # of drive and method
     alignment: Alignment
-    distance: float
-    chord: float
-    duration: float
-    standing: tuple[float, float]
-    of_drive: tuple[Reason, ...] = ()
+    distance: float                       # m
+    chord: float                          # m
+    duration: float                       # s
+    standing: tuple[float, float]         # s of rest for each mark, 0 in motion
+    of_drive: tuple[Reason, ...] = ()     # those of the drive, for all methods
 
     def sigma(self, parameter: str) -> float | None:
         """Return the sigma of a parameter, relative or rad; None: it will not be determined."""

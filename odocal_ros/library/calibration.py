@@ -31,18 +31,13 @@ def frame_of(columns: dict[str, Any]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """
-    A calibration of a vehicle.
+    """A calibration of a vehicle."""
 
-    result : complete result of the pipeline.   config : its settings.
-    inputs : name, sha256 and topics of each bag.   notes : sentences from the computation.
-    created : ISO 8601 time.
-    """
-
-    result: result.Calibration
-    config: Config = Config()
-    inputs: tuple[dict[str, Any], ...] = ()
-    notes: tuple[str, ...] = ()
+    result: result.Calibration                  # complete result of the pipeline
+    config: Config = Config()                   # its settings
+    inputs: tuple[dict[str, Any], ...] = ()     # name, sha256 and topics of each bag
+    notes: tuple[str, ...] = ()                 # sentences from the computation
+    # ISO 8601
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec='seconds'))
 
     @property

@@ -34,17 +34,12 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class Difference:
-    """
-    A change of one parameter from one calibration to a later one.
+    """A change of one parameter from one calibration to a later one."""
 
-    change : in the parameter's unit; sigma : of the change; sigmas : change over sigma, None
-    if a sigma is unknown or zero.
-    """
-
-    since: int
-    change: float
-    sigma: float | None
-    sigmas: float | None
+    since: int                # number of the earlier one
+    change: float             # in the parameter's unit
+    sigma: float | None       # of the change
+    sigmas: float | None      # change over sigma, None if a sigma is unknown or zero
     sigmas_if_shared_cancels: float | None
 
     @property
@@ -150,18 +145,13 @@ def _difference(name: str, stored: list[Stored], since: int | None,
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """
-    Changes of values over calibrations, the oldest first.
+    """Changes of values over calibrations, the oldest first."""
 
-    stored : compared calibrations.   changes : of each parameter.   notes : on calibrations.
-    sentence : summary.   changed : whether any change is significant; None: nothing to compare.
-    """
-
-    stored: tuple[Stored, ...]
-    changes: tuple[Change, ...]
-    notes: tuple[str, ...]
-    sentence: str
-    changed: bool | None
+    stored: tuple[Stored, ...]       # compared calibrations
+    changes: tuple[Change, ...]      # of each parameter
+    notes: tuple[str, ...]           # on calibrations
+    sentence: str                    # summary
+    changed: bool | None             # any change is significant; None: nothing to compare
 
     def to_dict(self) -> dict[str, Any]:
         names = [s.name for s in self.stored]

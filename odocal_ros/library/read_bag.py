@@ -71,25 +71,18 @@ def journal_notes(bag: Path) -> JournalNotes | None:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """
-    A bag that was read.
-
-    name, sha256 : of the bag.   topics : slot -> topic.   imu_frame : frame_id of the IMU.
-    start_ns, end_ns : bag times of its first and last message.   marks : (start, stop) stamps of
-    the legs that a node marked, stop 0 if missing; dropped : a journal's leg was dropped.
-    notes : reasons from the bag for its results.   config : settings, including a journal's.
-    """
+    """A bag that was read."""
 
     name: str
     sha256: str
-    topics: dict[str, str]
-    imu_frame: str
-    start_ns: int
-    end_ns: int
-    marks: tuple[tuple[int, int], ...]
-    dropped: bool
-    notes: tuple[Reason, ...]
-    config: Config
+    topics: dict[str, str]                # slot -> topic
+    imu_frame: str                        # frame_id of the IMU
+    start_ns: int                         # bag time of its first message
+    end_ns: int                           # and of its last one
+    marks: tuple[tuple[int, int], ...]    # (start, stop) stamps by a node, stop 0 if missing
+    dropped: bool                         # a journal's leg was dropped
+    notes: tuple[Reason, ...]             # reasons from the bag for its results
+    config: Config                        # settings, including a journal's
     recorder: LegRecorder
 
     @property

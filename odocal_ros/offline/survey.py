@@ -132,17 +132,11 @@ def _grid_step(latitude: Floats) -> float | None:
 
 @dataclass(frozen=True)
 class Match:
-    """
-    Comparison of a travel with the path of the fixes.
+    """Comparison of a travel with the path of the fixes."""
 
-    explained : share of the variance of the distances that the travel explains.   scale : m per
-    unit of travel, negative if it decreases with distance.   follows : it is proportional to the
-    distance, within the errors of the fixes.
-    """
-
-    explained: float
-    scale: float
-    follows: bool
+    explained: float     # share of the variance of the distances that the travel explains
+    scale: float         # m per unit of travel, negative if it decreases with distance
+    follows: bool        # it is proportional to the distance, within the errors of the fixes
 
 
 # definition: result without a comparison
@@ -151,15 +145,11 @@ NO_MATCH = Match(0.0, 0.0, False)
 
 @dataclass(frozen=True, eq=False)
 class FixPath:
-    """
-    Path of the fixes in cells of equal duration.
+    """Path of the fixes in cells of equal duration."""
 
-    t_ns : (k + 1,) edges, arrival times.   length : (k,) m.   sigma : of a fix, m.
-    """
-
-    t_ns: Ints
-    length: Floats
-    sigma: float
+    t_ns: Ints          # (k + 1,) edges, arrival times
+    length: Floats      # (k,) m
+    sigma: float        # of a fix, m
 
     def match(self, t_ns: Ints, travel: Floats) -> Match:
         """Return the comparison with a travel, (n,) in any unit at (n,) rising arrival times."""

@@ -25,21 +25,17 @@ SAME_IMU = ('imu.mounting_rpy', 'imu.gyro_scale', 'imu.accel_scale', 'imu.grade'
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """
-    A calibration read from its file.
-
-    budget : parameter to {source: (one-sigma share in the parameter's unit, shared by all legs)},
-    of the method that gave the parameter. legs : (start, stop) ns. bags : sha256 of each known.
-    """
+    """A calibration read from its file."""
 
     name: str
     created: str
     verdict: Verdict
     reasons: tuple[str, ...]
     estimates: dict[str, Estimate]
-    legs: frozenset[tuple[int, int]]
-    bags: frozenset[str]
+    legs: frozenset[tuple[int, int]]    # (start, stop) ns
+    bags: frozenset[str]                # sha256 of each known
     config: dict[str, Any]
+    # parameter -> source -> one-sigma share in its unit, shared by all legs; of its method
     budget: dict[str, dict[str, tuple[float, bool]]] = field(default_factory=dict)
     vehicle: str = ''
     carried: Carried | None = None      # information for later legs, with leg.automatic

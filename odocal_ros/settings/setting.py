@@ -27,24 +27,19 @@ AnyConfig = TypeVar('AnyConfig', bound=Settings)
 
 @dataclass(frozen=True)
 class Setting:
-    """
-    One setting: source of a parameter descriptor, a YAML line and a table row.
-
-    default : if NaN, the value may be NaN.   ro : fixed at start-up.   frame : the value is the
-    name of a coordinate frame.   item : type of the values of a list.   many : any length.
-    """
+    """One setting: source of a parameter descriptor, a YAML line and a table row."""
 
     name: str
-    default: Any
+    default: Any              # if NaN, the value may be NaN
     unit: str = ''
     low: float | None = None
     high: float | None = None
     about: str = ''
     choices: Sequence[str] = ()
-    ro: bool = False
-    frame: bool = False
-    item: type = float
-    many: bool = False
+    ro: bool = False          # fixed at start-up
+    frame: bool = False       # the value is the name of a coordinate frame
+    item: type = float        # type of the values of a list
+    many: bool = False        # of any length
 
     @property
     def kind(self) -> str:
