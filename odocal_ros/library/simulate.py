@@ -47,7 +47,11 @@ def simulate(scenario: str | SimOptions = 'town', out: Path | str | None = None,
     drive = scenarios.simulate(asked)
     if out is not None:
         write_bag(out, drive_topics(drive), storage, compression, force, progress)
-        _write_beside(out, drive, heading_sigma)
+        truth, known = beside(out)
+        node = {'/**/calibrator': {'ros__parameters': settings(drive, heading_sigma)}}
+        with uninterrupted():      # a bag is never without its truth
+            write_yaml(truth, truth_entries(drive, out.name), f'Truth of {out.name}.')
+            write_yaml(known, node, f'Settings of the operator of {out.name}.')
     return drive
 
 
@@ -70,14 +74,6 @@ def _check_beside(path: Path, force: bool) -> None:
     if MADE_HERE not in path.read_text(encoding='utf-8', errors='replace'):
         raise BadUsage(f'{path} was not made by odocal simulate and is kept; give --out in '
                        'another folder')
-
-
-def _write_beside(out: Path, drive: Drive, heading_sigma: float | None) -> None:
-    truth, known = beside(out)
-    with uninterrupted():      # a bag is never without its truth
-        write_yaml(truth, truth_entries(drive, out.name), f'Truth of {out.name}.')
-        write_yaml(known, {'/**/calibrator': {'ros__parameters': settings(drive, heading_sigma)}},
-                   f'Settings of the operator of {out.name}.')
 
 
 def write_yaml(path: Path, content: dict[str, Any], title: str) -> None:

@@ -67,10 +67,6 @@ class _Choice:
     others: list[str]
     why: str
 
-    def words(self) -> str:
-        return (f'{INPUTS[self.slot].label}: {self.topic}, because {self.why}; other candidates: '
-                f'{", ".join(self.others)} ({topic_option(self.slot)})')
-
 
 def _look(args: argparse.Namespace) -> tuple[dict[str, Any], list[_Choice]]:
     """Return the result of inspect with the selected topics, and the choices."""
@@ -149,10 +145,11 @@ def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str])
     """Return the selected topics, settings and legs with reasons, as printed lines."""
     from odocal_ros.output.figures import wrapped
     from odocal_ros.settings.config import SETTINGS
-    chosen = {choice.slot: choice.words() for choice in choices}
+    because = {one.slot: f', because {one.why}; other candidates: {", ".join(one.others)} '
+               f'({topic_option(one.slot)})' for one in choices}
     lines = ['topics']
     for slot, topic in found['mapping'].items():
-        lines += wrapped(chosen.get(slot, f'{INPUTS[slot].label}: {topic}'))
+        lines += wrapped(f'{INPUTS[slot].label}: {topic}{because.get(slot, "")}')
     pairs = list(zip(options, options[1:], strict=False))
     settings = [value for option, value in pairs if option == '--set']
     lines += ['settings'] * bool(settings)
