@@ -28,24 +28,15 @@ class Abandoned(Exception):
 
 @dataclass(frozen=True)
 class Prospect:
-    """
-    The forecast of one parameter.
+    """The forecast of one parameter."""
 
-    sigma, asked : predicted, required sigma, relative or rad; None: not determined so far.
-    metres : remaining distance to the limit, m; 0: reached, None: unreachable.
-    sources : (name, sigma) of the largest errors, in order.
-    why : reason why more driving does not reach the limit.
-    now : the value so far, as text, if it is determined before the end.
-    lack : required manoeuvres, besides distance.
-    """
-
-    sigma: float | None
-    asked: float
-    metres: float | None
-    sources: tuple[tuple[str, float], ...] = ()
-    why: str = ''
-    now: str = ''
-    lack: str = ''
+    sigma: float | None     # predicted, relative or rad; None: not determined so far
+    asked: float            # required sigma
+    metres: float | None    # remaining distance to the limit; 0: reached, None: unreachable
+    sources: tuple[tuple[str, float], ...] = ()     # (name, sigma) of the largest errors, in order
+    why: str = ''           # reason why more driving does not reach the limit
+    now: str = ''           # the value so far, as text, if it is determined before the end
+    lack: str = ''          # required manoeuvres, besides distance
 
     def words(self, name: str, unit: str, factor: float, since: float = 0.0) -> str:
         """
@@ -86,25 +77,17 @@ class WheelsForecast:
 
 @dataclass(frozen=True)
 class Forecast:
-    """
-    The forecast of a leg that ends at the current position.
-
-    pitch : rad, sigma.   wheels : None with one counter, and before the first estimate.
-    methods : results of methods that need no end point.   estimates : the running estimate, each
-    value from the method that will provide it.   until_ns, distance_m : stamp of the newest sample
-    used, and path length of the leg there.
-    faults : reasons for which a method will reject the leg at any length.
-    """
+    """The forecast of a leg that ends at the current position."""
 
     scale: Prospect
     yaw: Prospect
-    pitch: float | None = None
-    wheels: WheelsForecast | None = None
-    methods: dict[str, MethodResult] = field(default_factory=dict)
-    estimates: dict[str, Estimate] = field(default_factory=dict)
-    until_ns: int = 0
-    distance_m: float = 0.0
-    faults: tuple[Reason, ...] = ()
+    pitch: float | None = None                # rad, sigma
+    wheels: WheelsForecast | None = None      # None with one counter, and before the first one
+    methods: dict[str, MethodResult] = field(default_factory=dict)    # those without end points
+    estimates: dict[str, Estimate] = field(default_factory=dict)      # so far, as in a result
+    until_ns: int = 0                         # stamp of the newest sample used
+    distance_m: float = 0.0                   # path length of the leg there
+    faults: tuple[Reason, ...] = ()           # for which the leg is rejected at any length
 
     def sigma(self, quantity: str) -> float | None:
         """Return the sigma of a quantity (scale, yaw, pitch, left_right, track_width)."""
