@@ -6,8 +6,8 @@
 from dataclasses import replace
 import math
 
-from conftest import foreseen, HEADING
 from drives import thinned
+from foreseeing import foreseen, HEADING
 import numpy as np
 import pytest
 

@@ -6,7 +6,7 @@
 import time
 from types import SimpleNamespace
 
-from conftest import foreseen
+from foreseeing import foreseen
 import pytest
 
 from odocal_ros.data.leg import LegRecorder

@@ -6,7 +6,7 @@
 from dataclasses import replace
 import math
 
-from conftest import looked
+from foreseeing import looked
 import numpy as np
 import pytest
 

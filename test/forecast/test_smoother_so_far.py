@@ -7,7 +7,7 @@ from dataclasses import replace
 import math
 import warnings
 
-from conftest import drive_of, looked
+from foreseeing import drive_of, looked
 import numpy as np
 import pytest
 
