@@ -3,16 +3,14 @@
 
 """Delays, slip of a coarse speed and lasting slip of one wheel: reported, and in the sigmas."""
 
-from dataclasses import replace
 import re
 from types import SimpleNamespace
 
-from drives import drive, everything_said, settings
+from drives import drive, everything_said, seconds, settings, spoilt
 import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.beyond_model import delay_notes
 from odocal_ros.pipeline.calibrate import calibrate
@@ -111,11 +109,10 @@ def test_slip_is_by_the_smoother_where_it_gives_the_value(smoother, said):
 
 def whole_kmh(leg, spun=0.0):
     """Return a leg of speeds in whole km/h, 10 Hz; spun: m in 2 s at 8 m/s and more."""
-    sent = leg.odometer
-    t, value = (sent.stamp_ns - leg.start_ns) * 1e-9, sent.value.copy()
+    t, value = seconds(leg, leg.odometer), leg.odometer.value
     fast = t[(value > 8.0) & (t > 60.0)][0]
-    value[(t > fast) & (t < fast + 2.0)] += spun / 2.0
-    return replace(leg, odometer=replace(sent, value=np.trunc(3.6 * value) / 3.6)), fast
+    value = value + spun / 2.0 * ((t > fast) & (t < fast + 2.0))
+    return spoilt(leg, 'odometer', value=(slice(None), np.trunc(3.6 * value) / 3.6)), fast
 
 
 @pytest.mark.parametrize('spun', [0.0, 4.0])
@@ -137,12 +134,10 @@ WHEELS = ('scale_factor_left', 'scale_factor_right')
 
 def with_slip(made, extra_m):
     """Return the leg, extra_m(t, way) more metres counted by the right wheel; way from 0 to 1."""
-    leg, right = made.leg(), made.odometer_right
-    t = (right.stamp_ns - leg.start_ns) * 1e-9
-    way = (right.value - right.value[0]) / (right.value[-1] - right.value[0])
-    more = extra_m(t, way) / made.truth.wheel_scales[1]
-    return replace(leg, odometer_right=OdometerSamples(
-        right.stamp_ns, right.received_ns, right.value + np.round(more).astype(np.int64)))
+    leg, count = made.leg(), made.odometer_right.value
+    way = (count - count[0]) / (count[-1] - count[0])
+    more = extra_m(seconds(leg, leg.odometer_right), way) / made.truth.wheel_scales[1]
+    return spoilt(leg, 'odometer_right', value=lambda n: n + np.round(more).astype(np.int64))
 
 
 def slow(made):
