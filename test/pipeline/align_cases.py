@@ -6,10 +6,9 @@
 from copy import copy
 from dataclasses import replace
 
-from drives import shifted
+from drives import kept, shifted
 import numpy as np
 
-from odocal_ros.data.samples import take
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import (
     heading_from_yaw,
@@ -42,9 +41,8 @@ class Case:
         leg = shifted(self.drive.leg(), start=later)
         start_ns = leg.start_ns
         if forget:     # no pre-roll: the recording begins at the mark
-            leg = leg.with_rows(**{slot: take(leg.rows(slot),
-                                              leg.rows(slot).stamp_ns >= start_ns)
-                                   for slot in ('imu', 'odometer', 'fix', 'heading')})
+            for slot in ('imu', 'odometer', 'fix', 'heading'):
+                leg = kept(leg, slot, leg.rows(slot).stamp_ns >= start_ns)
         self.mark = (start_ns - self.drive.options.start_ns) * 1e-9     # s of the motion
         self.inputs, _ = screen(leg, self.config)
         placed = place(self.inputs, self.config)

@@ -3,14 +3,11 @@
 
 """Two wheels in the pipeline: what comes out of a leg with two counters."""
 
-from dataclasses import replace
-
 import drives
 from drives import drive
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import take
 from odocal_ros.output.summary import screen as screen_text
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.pipeline.methods import found_by, METHODS, run_methods
@@ -80,7 +77,7 @@ def test_of_one_counter_nothing_is_said_of_two_wheels():
 def test_a_leg_that_is_refused_lists_both_wheels_as_unknown(made):
     leg = made.leg()
     inside = np.flatnonzero(leg.fix.stamp_ns > leg.start_ns)
-    few = replace(leg, fix=take(leg.fix, inside[::200]))        # one in 40 s: 7 of 10 wanted
+    few = drives.kept(leg, 'fix', inside[::200])        # one in 40 s: 7 of 10 wanted
     found = calibrate(few, settings(made)).methods['smoother'].estimates
     assert all(found[name].value is None for name in (*WHEELS, 'track_width'))
 
@@ -101,9 +98,8 @@ def test_a_fifth_held_back_is_not_in_the_fit_and_is_met_too(made, result):
     # nothing after the fifth's begin reaches the fit
     late = made.fix.stamp_ns > made.truth.start_ns + 0.9 * (
         made.truth.stop_ns - made.truth.start_ns)
-    latitude = made.fix.latitude + late * 2e-5      # 127 m north
-    again = calibrate(replace(made.leg(), fix=replace(made.fix, latitude=latitude)),
-                      settings(made), holdout=True)
+    moved = drives.spoilt(made.leg(), 'fix', latitude=lambda x: x + late * 2e-5)      # 127 m north
+    again = calibrate(moved, settings(made), holdout=True)
     # sums by BLAS differ in the last bit with where arrays lie in memory
     assert again.methods['smoother'].estimates['scale_factor_left'].value == pytest.approx(
         a.value, rel=1e-12)
@@ -140,10 +136,9 @@ def test_the_order_of_the_methods_does_not_matter(made):
 
 def test_a_slip_of_one_wheel_is_named_once_and_moves_neither_ratio_nor_mean(made, result):
     leg = made.leg()
-    t = (leg.odometer.stamp_ns - leg.start_ns) * 1e-9
+    t = drives.seconds(leg, leg.odometer)
     spun = np.rint(np.clip((t - 100.0) / 2.0, 0.0, 1.0) * 0.5 / made.options.scale)
-    slipped = replace(leg, odometer=replace(
-        leg.odometer, value=leg.odometer.value + spun.astype(np.int64)))
+    slipped = drives.spoilt(leg, 'odometer', value=lambda n: n + spun.astype(np.int64))
     clean, result = result, calibrate(slipped, settings(made))
     assert sum(r.code is Code.WHEEL_SLIP for r in result.reasons) == 1
     source = next(s for s in result.methods['two_point'].sources if s.name == 'wheel_slip')
