@@ -81,7 +81,7 @@ def test_signals_are_those_of_the_layout(session):
 
 def test_the_recorded_drive_comes_back(data_dir):
     """The bag of the recording as frames, and these as a bag: the same messages."""
-    kept, parts, said = {}, [], {}
+    kept, said = {}, {}
     with AnyReader([data_dir / 'canedge_car_165' / 'bag']) as bag:
         for link, stamp, raw in bag.messages():
             if link.topic == '/imu/data' and len(kept.get(link.topic, ())) == IMU_ROWS:
@@ -92,19 +92,19 @@ def test_the_recorded_drive_comes_back(data_dir):
     imu, fix, speed = (said[topic] for topic in ('/imu/data', '/fix', '/fix_speed'))
     turn, force = (np.array([[getattr(getattr(m, field), axis) for axis in 'xyz'] for m in imu])
                    for field in ('angular_velocity', 'linear_acceleration'))
-    parts.append((IMU, stamp['/imu/data'], frame(
-        IMU, **{f'w{a}': np.rad2deg(turn[:, n]) for n, a in enumerate('xyz')},
-        **{f'f{a}': force[:, n] for n, a in enumerate('xyz')})))
-    parts.append((REPLY, stamp['/vehicle/twist'], reply(
-        np.round([m.twist.linear.x * 3.6 for m in said['/vehicle/twist']]))))
-    parts.append((SPEED, stamp['/fix_speed'], frame(
-        SPEED, speed=[m.twist.linear.x for m in speed])))
     variance = np.array([m.position_covariance[[0, 8]] for m in fix])
-    parts.append((HEIGHT, stamp['/fix'], frame(
-        HEIGHT, height=[m.altitude for m in fix], accuracy=np.sqrt(variance[:, 1]))))
-    parts.append((POSITION, stamp['/fix'], frame(
-        POSITION, valid=[1] * len(fix), latitude=[m.latitude for m in fix],
-        longitude=[m.longitude for m in fix], accuracy=np.sqrt(2 * variance[:, 0]))))
+    parts = [
+        (IMU, stamp['/imu/data'], frame(
+            IMU, **{f'w{a}': np.rad2deg(turn[:, n]) for n, a in enumerate('xyz')},
+            **{f'f{a}': force[:, n] for n, a in enumerate('xyz')})),
+        (REPLY, stamp['/vehicle/twist'], reply(
+            np.round([m.twist.linear.x * 3.6 for m in said['/vehicle/twist']]))),
+        (SPEED, stamp['/fix_speed'], frame(SPEED, speed=[m.twist.linear.x for m in speed])),
+        (HEIGHT, stamp['/fix'], frame(
+            HEIGHT, height=[m.altitude for m in fix], accuracy=np.sqrt(variance[:, 1]))),
+        (POSITION, stamp['/fix'], frame(
+            POSITION, valid=[1] * len(fix), latitude=[m.latitude for m in fix],
+            longitude=[m.longitude for m in fix], accuracy=np.sqrt(2 * variance[:, 0])))]
     for topic in canedge_bag.topics(*together(parts)):
         found = topic.pack(slice(None))
         np.testing.assert_array_equal(topic.time_ns, stamp[topic.name])

@@ -27,11 +27,9 @@ PARTS = ('package.xml', 'setup.py', 'setup.cfg', 'pyproject.toml', 'README.md', 
          'resource', 'config', 'launch', 'odocal_ros')
 XML = ElementTree.parse(ROOT / 'package.xml').getroot()
 # import name: what package.xml and setup.py call it
-KEYS = {'numpy': ('python3-numpy', 'numpy'), 'yaml': ('python3-yaml', 'PyYAML'),
-        'jinja2': ('python3-jinja2', 'jinja2'),
-        'matplotlib': ('python3-matplotlib', 'matplotlib'), 'pyproj': ('python3-pyproj', 'pyproj'),
-        'rich': ('python3-rich', 'rich'), 'rosbags': ('rosbags', 'rosbags'),
-        'scipy': ('python3-scipy', 'scipy'), 'tqdm': ('python3-tqdm', 'tqdm')}
+KEYS = {name: (f'python3-{name}', name) for name in (
+    'numpy', 'jinja2', 'matplotlib', 'pyproj', 'rich', 'scipy', 'tqdm')} | {
+        'yaml': ('python3-yaml', 'PyYAML'), 'rosbags': ('rosbags', 'rosbags')}
 EXTRA = {'rich': 'watch'}     # import name: the extra of setup.py that brings it
 TABLES = {'pandas', 'pyarrow'}      # of the extra tables: who wants them is told what to install
 # of the extra for fleets, which pip alone brings: a vehicle's computer has no use for it
