@@ -86,7 +86,7 @@ def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
 
 def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
                t_stop: float, least: float) -> tuple[Reason, ...]:
-    """Return why wheels or fixes show no motion, () if both do; least : of fixes, m."""
+    """Return the reason if wheels or fixes do not move, () if both do; least : of fixes, m."""
     rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
     t_here, here = t_fix[rows], fixes_n[rows, :2]
     if len(here) < 2:

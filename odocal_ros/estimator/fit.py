@@ -66,7 +66,7 @@ class Convergence:
 
 
 CONVERGENCE = Convergence()
-# weights of steps of the constants, and sigmas from which they do not count
+# definition: weights of steps of the constants, and sigmas from which they do not count
 OF_ALL = np.where(np.arange(layout.M) < factor.WANTED, 1.0, CONVERGENCE.others)
 FLAT = np.full(layout.M, np.inf)
 FLAT[[layout.YAW, layout.PITCH]] = CONVERGENCE.flat_angle
