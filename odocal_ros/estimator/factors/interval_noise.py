@@ -152,7 +152,7 @@ def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Float
     # of unknown length, in the direction of rolling, without the pitching of the body
     size = np.linalg.norm(motion.rolled, axis=1, keepdims=True)
     along = np.where(size > 1e-3, motion.rolled / np.maximum(size, 1e-3), axes[:, 0])
-    turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)) * motion.T[:, 0]
+    turned = motion.turning * motion.T[:, 0]
     most = motion.state.scale * coarse.most * motion.T[:, 0]
     given = np.zeros((len(rest), ROWS, 2))
     given[:, D, 0] = along * np.sqrt(ABSENT_VARIANCE)
@@ -174,8 +174,7 @@ def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
         / motion.state.scale / T
     padded = np.pad(speed, 1, mode='edge')
     hard = np.abs(padded[2:] - padded[:-2]) > 0.5 * 2 * T
-    rate = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate))
-    return hard, rate > TURNING_RATE
+    return hard, motion.turning > TURNING_RATE
 
 
 def _extra(motion: Motion, leg: SmootherLeg) -> Floats:

@@ -133,6 +133,12 @@ class Motion:
         return part
 
     @property
+    def turning(self) -> Floats:
+        """Return the sizes of the mean turn rates about up: (K,) rad/s."""
+        out: Floats = np.abs(np.einsum('ki,ki->k', self.C[:, 2], self.sums.mean_rate))
+        return out
+
+    @property
     def f_n(self) -> Floats:
         """Return the forward axis times the scale at the begins: (K, 3)."""
         return self.C @ self.f

@@ -37,7 +37,7 @@ def exported(leg: SmootherLeg, problem: Problem, fit: Fit, near: JointMarginals,
     moving = ~problem.still[:-1] & ~problem.still[1:]
     moving = moving if moving.any() else ~moving
     speed = (path / motion.T[:, 0])[moving]
-    rate = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate))[moving]
+    rate = motion.turning[moving]
     t, coarse = leg.travel.t, leg.travel.coarse
     within = (t >= leg.t_begin) & (t <= leg.t_stop)
     least = 0.0 if leg.travel.quantum else problem.least['travel']      # no reading error

@@ -239,8 +239,6 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
     step = max(1, len(state.t) // KEPT_ROWS)
     t_fix = leg.t_fix[problem.use]
     speed = np.linalg.norm(motion.displacement, axis=1) / motion.T[:, 0]
-    turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)
-                    * motion.T[:, 0]).sum()
     return {
         'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
         'correlation': correlations(fit.covariance[:3, :3], PARAMETERS),
@@ -258,7 +256,8 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
                       'intervals_slipping': int((fit.spread[:, 0] > slip.SLIP_VARIANCE).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.displacement, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
-                       'turned': float(turned), 'in_turns': problem.turned,
+                       'turned': float((motion.turning * motion.T[:, 0]).sum()),
+                       'in_turns': problem.turned,
                        'standing': float(problem.still.sum())},
         'track_t': state.t[::step], 'track_n': (state.p_n + state.C_nb @ arm)[::step],
         'key_t': state.t, 'key_C_nb': state.C_nb, 'gyro_bias': state.gyro_bias.mean(axis=0),
