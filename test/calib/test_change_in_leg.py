@@ -35,17 +35,21 @@ AT = 70.0       # s
 STEPS = {'f_b': (0.06, 0.06, -0.05), 'w_b': (0.001, -0.001, 0.0014)}     # 10 mg, 0.1 deg/s
 
 
+def recounted(leg, factor):
+    """Return a leg whose odometer counts more by a factor of each interval."""
+    sent = leg.odometer
+    value = sent.value[0] + np.cumsum(np.append(0.0, np.diff(sent.value) * factor))
+    return leg.with_rows(odometer=replace(sent, value=np.round(value).astype(int)))
+
+
 def changed(turn=(0.0, 0.0, 0.0), scale=0.0, **limits):
     """Return truth, estimates, reasons of a drive with a change: IMU by rad, counts relatively."""
     drive, config, _ = made(**DRIVE)
     leg = drive.leg()
     begin, end = leg.imu.stamp_ns[[0, -1]]
     at = begin + AFTER * (end - begin)
-    value = leg.odometer.value.astype(float)
-    first = int(np.searchsorted(leg.odometer.stamp_ns, at))
-    value[first:] = value[first] + (value[first:] - value[first]) * (1 + scale)
-    leg = leg.with_rows(imu=turned(leg.imu, at, turn),
-                        odometer=replace(leg.odometer, value=np.round(value).astype(int)))
+    leg = recounted(leg.with_rows(imu=turned(leg.imu, at, turn)),
+                    1 + scale * (leg.odometer.stamp_ns[:-1] >= at))
     result = smooth(leg_of(leg, config), with_settings(config, limits))
     return drive.truth, result.estimates, texts(result)
 
@@ -155,11 +159,8 @@ def test_a_scale_that_changes_gradually_has_no_step():
     """It rises and falls by 0.3 %; the best step alone is 6 to 7 sigma."""
     drive, config, _ = made(imu_grade='tactical', duration=400.0, fix_sigma=0.02)
     leg = drive.leg()
-    counts = np.diff(leg.odometer.value.astype(float))
-    arch = 0.003 * np.sin(np.pi * np.linspace(0.0, 1.0, len(counts)))
-    value = np.cumsum(np.append(0.0, counts * (1 + arch)))
-    leg = leg.with_rows(odometer=replace(leg.odometer, value=np.round(value).astype(int)))
-    said = texts(smooth(leg_of(leg, config), config))
+    arch = 0.003 * np.sin(np.pi * np.linspace(0.0, 1.0, len(leg.odometer.value) - 1))
+    said = texts(smooth(leg_of(recounted(leg, 1 + arch), config), config))
     assert 'from start to end' in said[Code.SCALE_VARIES]
     assert Code.CHANGE_IN_LEG not in said
 
@@ -198,10 +199,8 @@ def town():
 @pytest.mark.parametrize('factor', [1, 2, 4])
 def test_a_driver_that_decodes_each_edge_from_the_middle_of_the_drive_on(town, factor):
     leg = town.leg()
-    step = np.diff(leg.odometer.value, prepend=leg.odometer.value[:1])
-    late = leg.odometer.stamp_ns > (leg.start_ns + leg.stop_ns) // 2
-    counts = leg.odometer.value[0] + np.cumsum(step * np.where(late, factor, 1))
-    result = calibrate(replace(leg, odometer=replace(leg.odometer, value=counts)),
+    late = leg.odometer.stamp_ns[1:] > (leg.start_ns + leg.stop_ns) // 2
+    result = calibrate(recounted(leg, np.where(late, factor, 1)),
                        with_settings(Config(), {'imu.grade': town.options.imu_grade}))
     said = [r.text for r in result.reasons if f'{factor:.2f} times as much' in r.text]
     assert len(said) == (factor > 1)
