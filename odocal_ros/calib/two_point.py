@@ -25,7 +25,7 @@ from odocal_ros.calib.slip import slip_source
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
-from odocal_ros.nav.projection import geodesic_chord, plane_chord
+from odocal_ros.nav.projection import geodesic_chord, plane_chord, plane_for
 from odocal_ros.nav.rotations import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -249,7 +249,6 @@ def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
                  config: Config) -> dict[str, dict[str, float]]:
     """Return K and yaw by eq. (6)-(10) in the plane and by the geodesic: docs/method.md (T14)."""
     # the track has nominal_scale, yaw 0 and the estimated pitch, and begins at the start mark
-    from odocal_ros.nav.projection import plane_for
     K = np.linalg.norm(f)
     yaw, pitch = map(float, mounting_from_forward(f / K))
     turn = chord.track.C_nb_at(chord.end.t) - chord.track.C_nb_at(chord.start.t)

@@ -119,9 +119,8 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
     share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # not zero if a wheel hardly turns
     hard, turning = hard_and_turning(motion)
     spread = np.ones((K, SPREAD)) if spread is None else spread
-    left = motion.state.C_bv[:, 1]
-    pitching = np.sqrt(np.maximum(left @ motion.swings @ left, 0.0))
-    acting = (share * ~hard, share * hard, share * ~turning, share * turning, share, pitching)
+    acting = (share * ~hard, share * hard, share * ~turning, share * turning, share,
+              np.sqrt(2 * motion.swung))
     road = np.stack([size * ~rest * np.sqrt(spread[:, axis])
                      for axis, size in zip(ROAD.values(), acting, strict=True)], -1)
     extra = _extra(motion, leg)
