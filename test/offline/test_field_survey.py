@@ -132,6 +132,18 @@ def test_a_field_of_each_meaning(tmp_path, capsys, field, quantity, factor):
     assert content['result']['scale_factor']['value'] == pytest.approx(truth, rel=0.005)
 
 
+def test_a_plain_number_that_does_not_follow_gives_way_to_a_field(tmp_path, capsys):
+    made = town()
+    path = write(tmp_path / 'bag', made, encoders(made, ('delta',)) + [
+        ('/battery_voltage', stamp, make.real(24.0 + np.sin(stamp * 1e-9), 'Float32'))
+        for stamp in made.odometer.stamp_ns.tolist()])
+    found, _ = inspected(path, capsys)
+    assert found['mapping']['odometer'] == '/encoders'
+    # named by the user, it stays
+    found, _ = inspected(path, capsys, '--odometer-topic', '/battery_voltage')
+    assert found['mapping']['odometer'] == '/battery_voltage'
+
+
 def test_of_autoware_the_speed_is_the_odometer_and_the_steering_is_not(tmp_path, capsys):
     made = drive(scenario='town', duration=300.0, seed=4, imu_grade='tactical', fix_noise='rtk',
                  odometer='speed')
