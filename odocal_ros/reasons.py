@@ -18,16 +18,16 @@ class Verdict(Enum):
 
     @staticmethod
     def worst(verdicts: Iterable['Verdict']) -> 'Verdict':
-        """Return the gravest of many, accepted if there are none."""
-        return max(verdicts, key=GRAVITY.index, default=Verdict.ACCEPTED)
+        """Return the most severe of many, accepted if there are none."""
+        return max(verdicts, key=SEVERITY.index, default=Verdict.ACCEPTED)
 
 
-GRAVITY = tuple(Verdict)      # the gravest last
+SEVERITY = tuple(Verdict)      # the most severe last
 NOTE, CAUTION, REJECT = Verdict.ACCEPTED, Verdict.CAUTION, Verdict.REJECTED
 
 
 class Code(Enum):
-    """A reason code: (gravity, remedy)."""
+    """A reason code: (severity, remedy)."""
 
     # the data that came
     NO_IMU = REJECT, ('Check the IMU topic and its QoS, or name the topic with --imu-topic. A '
@@ -245,8 +245,8 @@ class Code(Enum):
     MORE_LEGS_NEEDED = CAUTION, 'Drive more legs. The required number is verdict.min_legs.'
     NO_METHOD = REJECT, 'See the reasons of the legs.'
 
-    def __init__(self, gravity: Verdict, remedy: str) -> None:
-        self.gravity = gravity
+    def __init__(self, severity: Verdict, remedy: str) -> None:
+        self.severity = severity
         self.remedy = remedy
 
     def __new__(cls, *args: object) -> 'Code':
@@ -272,16 +272,16 @@ class Reason:
         return {'code': self.code.name, 'text': self.text, 'remedy': self.remedy}
 
 
-def gravest_first(reasons: Iterable['Reason']) -> list['Reason']:
-    """Return reasons by their gravity; those of the same gravity stay in order."""
-    return sorted(reasons, key=lambda r: -GRAVITY.index(r.code.gravity))
+def most_severe_first(reasons: Iterable['Reason']) -> list['Reason']:
+    """Return reasons by their severity; those of the same severity stay in order."""
+    return sorted(reasons, key=lambda r: -SEVERITY.index(r.code.severity))
 
 
 def cautions(reasons: Iterable['Reason']) -> list['Reason']:
-    """Return the reasons that lower the verdict, the gravest first."""
-    return [r for r in gravest_first(reasons) if r.code.gravity is not NOTE]
+    """Return the reasons that lower the verdict, the most severe first."""
+    return [r for r in most_severe_first(reasons) if r.code.severity is not NOTE]
 
 
 def verdict_of(reasons: Iterable['Reason']) -> Verdict:
-    """Return the gravest verdict that the reasons ask for."""
-    return Verdict.worst(r.code.gravity for r in reasons)
+    """Return the most severe verdict that the reasons ask for."""
+    return Verdict.worst(r.code.severity for r in reasons)

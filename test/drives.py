@@ -164,7 +164,7 @@ def off(found, made, *names):
 
 def rejecting(result):
     """Return the codes for which a leg is rejected."""
-    return {c for c in everything_said(result) if c.gravity.value == 'rejected'}
+    return {c for c in everything_said(result) if c.severity.value == 'rejected'}
 
 
 def held_up(samples, every_s=15.0, how_long_s=0.12, drain_s=1e-3):

@@ -324,7 +324,8 @@ def reasons_md() -> str:
     for section, codes in MEANINGS.items():
         lines.append(f'## {section}\n')
         for code, meaning in codes.items():
-            lines += [f'### {code.name}\n', *_wrapped(f'*{WEIGHTS[code.gravity]}.* {meaning}'), '',
+            lines += [f'### {code.name}\n',
+                      *_wrapped(f'*{WEIGHTS[code.severity]}.* {meaning}'), '',
                       *_wrapped(f'**Do:** {code.remedy}'), '']
     return '\n'.join(lines).rstrip() + '\n'
 

@@ -84,7 +84,7 @@ def passed_over(methods: Mapping[str, MethodResult], asked: str | tuple[str, ...
     """Return METHOD_REJECTED of rejected methods before a usable one; said : by the leg."""
     found = [methods[name] for name in deciding(asked) if name in methods]
     sound = [i for i, m in enumerate(found) if m.verdict is not Verdict.REJECTED]
-    why = [(m.name, next(r for r in m.reasons if r.code.gravity is Verdict.REJECTED))
+    why = [(m.name, next(r for r in m.reasons if r.code.severity is Verdict.REJECTED))
            for m in found[:max(sound, default=0)] if m.verdict is Verdict.REJECTED]
     # a method without its data (a second wheel) is not reported
     return [Reason(Code.METHOD_REJECTED, f'{name} is not used, because of {r.code.name}: {r.text}')

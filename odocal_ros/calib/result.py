@@ -14,7 +14,7 @@ import numpy as np
 from odocal_ros.calib.border import Border, Carried
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.data.arrays import Floats
-from odocal_ros.reasons import Code, GRAVITY, Reason, Verdict, verdict_of
+from odocal_ros.reasons import Code, Reason, SEVERITY, Verdict, verdict_of
 
 # keys of a result in calibration.json that are not estimates
 BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
@@ -75,7 +75,7 @@ class MethodResult:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Return the gravest verdict of the reasons."""
+        """Return the most severe verdict of the reasons."""
         return verdict_of(self.reasons)
 
 
@@ -135,9 +135,9 @@ class LegResult:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Return the gravest of the leg's reasons and its best deciding method's verdict."""
+        """Return the most severe of the leg's reasons and its best deciding method's verdict."""
         best = min((m.verdict for name, m in self.methods.items()
-                    if name in (self.deciding or self.methods)), key=GRAVITY.index,
+                    if name in (self.deciding or self.methods)), key=SEVERITY.index,
                    default=Verdict.REJECTED)
         return Verdict.worst([verdict_of(self.reasons), best])
 
@@ -164,7 +164,7 @@ class Calibration:
 
     @property
     def verdict(self) -> Verdict:
-        """Return the gravest verdict of the reasons."""
+        """Return the most severe verdict of the reasons."""
         return verdict_of(self.reasons)
 
 

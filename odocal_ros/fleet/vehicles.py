@@ -103,7 +103,7 @@ def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndar
 def rejecting(leg: LegResult) -> list[Reason]:
     """Return the reasons that reject a leg, empty if it is not rejected."""
     return [r for r in all_reasons(leg)
-            if r.code.gravity is Verdict.REJECTED and leg.verdict is Verdict.REJECTED]
+            if r.code.severity is Verdict.REJECTED and leg.verdict is Verdict.REJECTED]
 
 
 def all_rejected(lost: Sequence[Driven]) -> Reason:

@@ -150,7 +150,7 @@ class Plan:
                 own = tuple(r for r in self.reasons_of(name) if r in own
                             or r.code.name.endswith('_NOT_DETERMINED'))
             elif name not in self.giving:
-                own = tuple(r for r in own if r.code.gravity is Verdict.REJECTED)
+                own = tuple(r for r in own if r.code.severity is Verdict.REJECTED)
             said += [r for r in own if r not in said]
         return tuple(said)
 

@@ -69,7 +69,7 @@ def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
 def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str, str]:
     """Return yes, no or unknown for each quantity of a result; no yes for a rejected one."""
     doubted = {ABOUT[r.code] for r in calibration.reasons
-               if r.code in ABOUT and r.code.gravity is not Verdict.ACCEPTED}
+               if r.code in ABOUT and r.code.severity is not Verdict.ACCEPTED}
     return of_estimates(calibration.estimates, config, two_wheels,
                         calibration.verdict is not Verdict.REJECTED, doubted)
 

@@ -75,7 +75,7 @@ def with_running(forecast: Forecast, running: Running, config: Config) -> Foreca
     """Return a forecast with the running estimate for the values that it will give."""
     method = running.method
     faults = [r for r in method.reasons
-              if r.code.gravity is Verdict.REJECTED and r.code not in ABOUT]
+              if r.code.severity is Verdict.REJECTED and r.code not in ABOUT]
     if faults:      # its values are of no use then
         return replace(forecast, faults=tuple(faults))
     if method.verdict is not Verdict.REJECTED:
@@ -168,7 +168,7 @@ def planar_forecast(leg: Leg, config: Config, wanted: Callable[[], bool]) -> For
     if result.track_n is None:
         raise BadData(method.reasons[0].text)
     faults = tuple(r for r in (*result.reasons, *method.reasons)
-                   if r.code.gravity is Verdict.REJECTED and r.code not in {*ABOUT, *OPEN_YET})
+                   if r.code.severity is Verdict.REJECTED and r.code not in {*ABOUT, *OPEN_YET})
     estimates, _ = choose(result.methods, config.method)
     return Forecast(
         _planar_scale(result, config.verdict.max_scale_sigma),

@@ -20,7 +20,7 @@ from odocal_ros.live.answers import one_line
 from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import Worker
 from odocal_ros.pipeline.planar_run import is_planar
-from odocal_ros.reasons import Code, gravest_first, Reason
+from odocal_ros.reasons import Code, most_severe_first, Reason
 from odocal_ros.settings.config import Config
 
 # judgement: in IMU time, so that a fast replay has as many updates
@@ -100,7 +100,7 @@ class RunningEstimate:
 
     def faults(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
         """
-        Return the problems of the leg so far, one reason per code, the gravest first.
+        Return the problems of the leg so far, one reason per code, the most severe first.
 
         silent_s : time from the last IMU message to the newest of all, s.
         """
@@ -110,7 +110,7 @@ class RunningEstimate:
                       'better section') for r in self._gaps.reasons(silent_s)]
         seen = (*cut, *self._faults, *(self._newest.faults if self._newest else ()))
         first = {r.code: r for r in reversed(seen)}
-        return tuple(gravest_first(first.values()))
+        return tuple(most_severe_first(first.values()))
 
     def look(self, newest_ns: int, distance_m: float = 0.0) -> None:
         """Submit an update of the leg to a stamp, with its length, m, to the worker if due."""

@@ -245,7 +245,7 @@ class SessionView:
     two_wheels: bool = False                     # left and right wheel are known
     ability: Ability | None = None               # of the recorded leg
     forecast: Forecast | None = None               # of the recorded or computed leg
-    faults: tuple[Reason, ...] = ()              # of the recorded leg, gravest first
+    faults: tuple[Reason, ...] = ()              # of the recorded leg, most severe first
     forecast_age_s: float = nan                   # since its newest sample
     computed: Stage = Stage()                    # progress of the computation
     saved: str = ''
@@ -272,4 +272,4 @@ class SessionView:
     @property
     def lost_cause(self) -> bool:
         """Return True if the current leg would be rejected now."""
-        return any(r.code.gravity is Verdict.REJECTED for r in self.faults)
+        return any(r.code.severity is Verdict.REJECTED for r in self.faults)

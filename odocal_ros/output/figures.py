@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers, reasons and decisions as text: digits by sigma, gravest first."""
+"""Numbers, reasons and decisions as text: digits by sigma, most severe first."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -195,7 +195,7 @@ def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool) -> list[s
     lines = []
     for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'warnings'),
                            (Verdict.ACCEPTED, 'notes')):
-        found = [r for r in shared(reasons) if r.code.gravity is verdict]
+        found = [r for r in shared(reasons) if r.code.severity is verdict]
         if brief and found and verdict is Verdict.ACCEPTED:
             codes = ', '.join(dict.fromkeys(r.code.name for r in found))
             lines += wrapped(f'notes, see the report: {codes}', '  ', '   ', width)

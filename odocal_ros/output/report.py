@@ -94,7 +94,7 @@ def _context(calibration: Calibration, config: Config, content: dict[str, Any]) 
 
 
 def _why(reasons: tuple[Reason, ...]) -> Reason | None:
-    """Return the gravest reason against acceptance, None without one; those on a value first."""
+    """Return the most severe reason against acceptance, or None; those on a value first."""
     groups = grouped(reasons)
     if not groups or groups[0][0] == Verdict.ACCEPTED.value:
         return None
@@ -102,8 +102,8 @@ def _why(reasons: tuple[Reason, ...]) -> Reason | None:
 
 
 def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
-    """Return reasons by gravity, the gravest first: (gravity, title, reasons)."""
-    groups = [(v.value, title, [r for r in shared(reasons) if r.code.gravity is v])
+    """Return reasons by severity, the most severe first: (verdict, title, reasons)."""
+    groups = [(v.value, title, [r for r in shared(reasons) if r.code.severity is v])
               for v, title in TITLES.items()]
     return [group for group in groups if group[2]]
 

@@ -193,7 +193,7 @@ def is_worse(old: Stored, new: Stored) -> str:
         return ''
     if not new.usable:
         rejecting = [name for name in new.reasons if name in Code.__members__
-                     and Code[name].gravity is Verdict.REJECTED]
+                     and Code[name].severity is Verdict.REJECTED]
         codes = ', '.join(dict.fromkeys(rejecting[:3] or new.reasons[:3]))
         return f'the new result is rejected ({codes}), the old one is {old.verdict.value}'
     if old.legs and old.legs < new.legs \

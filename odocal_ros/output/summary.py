@@ -273,7 +273,7 @@ def _method_table(calibration: result.Calibration) -> list[str]:
 
 def _refused(method: result.MethodResult) -> str:
     """Return the first code for which a method is rejected, '' if it is not."""
-    codes = [r.code.name for r in method.reasons if r.code.gravity is Verdict.REJECTED]
+    codes = [r.code.name for r in method.reasons if r.code.severity is Verdict.REJECTED]
     return f': {codes[0]}' if codes else ''
 
 

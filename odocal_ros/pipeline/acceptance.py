@@ -91,9 +91,9 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
     barred = calibration.verdict is Verdict.REJECTED or (
         config.accept.strict and calibration.verdict is not Verdict.ACCEPTED)
     if calibration.verdict is Verdict.REJECTED or (barred and worst is Decision.PASS):
-        gravest = next(r for r in calibration.reasons if r.code.gravity is calibration.verdict)
+        why = next(r for r in calibration.reasons if r.code.severity is calibration.verdict)
         return Acceptance(Decision.UNDECIDED, values, f'{calibration.verdict.value}: '
-                          f'{gravest.code.name}: {gravest.text}', gravest.remedy)
+                          f'{why.code.name}: {why.text}', why.remedy)
     open_ones = [held for held in values if held.decision is Decision.UNDECIDED]
     if worst is not Decision.UNDECIDED:
         return Acceptance(worst, values)

@@ -157,7 +157,7 @@ def refusal(result: LegResult) -> Reason | None:
     if result.verdict is not Verdict.REJECTED:
         return None
     every = (*result.reasons, *(r for m in result.methods.values() for r in m.reasons))
-    return next((r for r in every if r.code.gravity is Verdict.REJECTED),
+    return next((r for r in every if r.code.severity is Verdict.REJECTED),
                 Reason(Code.NO_METHOD, 'no method could be run'))
 
 

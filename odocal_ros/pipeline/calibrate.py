@@ -90,7 +90,7 @@ def faults(seen: Screened, config: Config) -> tuple[Reason, ...]:
         config = settings_by_frame(seen.leg.fix, config)
         _, reasons = prepare(seen.leg, seen.inputs, config, reasons)
     return tuple(r for r in reasons
-                 if r.code.gravity is not Verdict.ACCEPTED and r.code not in NOT_YET)
+                 if r.code.severity is not Verdict.ACCEPTED and r.code not in NOT_YET)
 
 
 def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:

@@ -61,7 +61,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     reasons = _leg_reasons(legs, good, twice, giving, estimates, before is not None)
     if giving:
         known = {(r.code, r.text) for r in reasons}
-        rejecting = {r.code for r in reasons if r.code.gravity is Verdict.REJECTED}
+        rejecting = {r.code for r in reasons if r.code.severity is Verdict.REJECTED}
         nominal = nominal_scale(config, estimates['scale_factor'].unit)
         own = [r for n in giving for r in relevant_reasons(methods[n].reasons, n, estimates)
                if len(legs) == 1 or r.code in OF_ALL
@@ -73,7 +73,7 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     if len(good) < config.verdict.min_legs and good:
         reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(good)} usable leg'
                               f'{"s" * (len(good) > 1)}; required: {config.verdict.min_legs}'))
-    if not giving and not any(r.code.gravity is Verdict.REJECTED for r in reasons):
+    if not giving and not any(r.code.severity is Verdict.REJECTED for r in reasons):
         reasons.append(Reason(Code.NO_METHOD, 'no method could be run'))
     quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)
     return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy,
@@ -129,7 +129,7 @@ def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config
     if good or len(results) == 1:
         return whole
     why = dict.fromkeys(r for one in results for r in one.reasons
-                        if r.code.gravity is Verdict.REJECTED)
+                        if r.code.severity is Verdict.REJECTED)
     return replace(whole, reasons=(*whole.reasons, *why))
 
 
@@ -164,12 +164,12 @@ def _leg_reasons(legs: Sequence[LegResult], good: Sequence[LegResult], twice: Se
 
 def _further(method: MethodResult, leg: LegResult) -> list[Reason]:
     """Return a method's reasons, except those whose code already rejects the leg."""
-    known = {r.code for r in leg.reasons if r.code.gravity is Verdict.REJECTED}
+    known = {r.code for r in leg.reasons if r.code.severity is Verdict.REJECTED}
     return [r for r in method.reasons if r.code not in known]
 
 
 def _why(reasons: Sequence[Reason]) -> str:
-    return '; '.join(dict.fromkeys(r.text for r in reasons if r.code.gravity is Verdict.REJECTED))
+    return '; '.join(dict.fromkeys(r.text for r in reasons if r.code.severity is Verdict.REJECTED))
 
 
 def _imu_rotation(estimates: Mapping[str, Estimate],

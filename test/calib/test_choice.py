@@ -208,7 +208,7 @@ def test_what_sigmas_allow_is_no_other_vehicle(more):
 def test_the_combination_is_rejected_or_its_sigma_judged():
     whole = combine([driven(1), driven(2, scale=0.03)], Config())
     assert whole.verdict is Verdict.REJECTED
-    assert [r.code for r in whole.reasons if r.code.gravity is Verdict.REJECTED] == [
+    assert [r.code for r in whole.reasons if r.code.severity is Verdict.REJECTED] == [
         Code.LEGS_UNLIKE]
     # 3 % apart: one vehicle, but a mean good to no 0.1 %
     whole = combine([driven(1), driven(2, scale=0.0206)], Config())

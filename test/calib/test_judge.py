@@ -57,7 +57,7 @@ def test_each_limit_has_its_sentence(values, nominal, code, text):
     assert reason.code is code
     assert text in reason.text
     rejects = code is Code.SCALE_NOT_DETERMINED
-    assert code.gravity.value == ('rejected' if rejects else 'caution')
+    assert code.severity.value == ('rejected' if rejects else 'caution')
 
 
 @pytest.mark.parametrize(('kmh', 'unit', 'nominal', 'word', 'wanted'), [

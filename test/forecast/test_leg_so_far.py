@@ -54,7 +54,7 @@ def test_the_faults_so_far_are_those_of_the_result(made, wrong):
     result = calibrate(leg, config)
     # a slip is what a method makes of the hole
     lowering = {r.code for r in result.reasons
-                if r.code.gravity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
+                if r.code.severity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
     assert {r.code for r in faults(screened(leg, config), config)} == lowering
     assert {r.code for r in faults_in_cells(thinned(leg).leg(leg.start_ns), config)} == lowering
     assert (lowering == set()) == (wrong == 'sound')

@@ -215,7 +215,7 @@ def test_two_minutes_give_radius_ratio_width_and_yaw(reference, limit, noise):
                                               'verdict.max_scale_sigma': 0.02})
     result = calibrate(made.leg(), config)
     assert not {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW} & {r.code for r in result.reasons}
-    assert all(r.code.gravity is Verdict.ACCEPTED for r in result.reasons), result.reasons
+    assert all(r.code.severity is Verdict.ACCEPTED for r in result.reasons), result.reasons
     smoother = result.methods['smoother']
     assert smoother.details['iterations'] < 20
     found = smoother.estimates
