@@ -138,7 +138,7 @@ def test_an_axle_with_a_dead_wheel_is_left_out_with_a_caution(steers, dead):
     said = codes(result.reasons)
     assert Code.WHEEL_DEAD not in said
     assert FOUR[dead[0]] in said[Code.WHEEL_LEFT_OUT]
-    assert Code.WHEEL_LEFT_OUT.gravity is Verdict.CAUTION
+    assert Code.WHEEL_LEFT_OUT.severity is Verdict.CAUTION
     method = result.methods['smoother']
     left = FOUR[2:] if dead[0] < 2 else FOUR[:2]
     assert list(method.details['wheels']) == left

@@ -75,7 +75,7 @@ def test_the_screen_says_it_all_in_few_lines(good):
     assert max(len(line) for line in text.splitlines()) <= 98
 
 
-def test_the_gravest_reasons_come_first(rejected):
+def test_the_most_severe_reasons_come_first(rejected):
     text = screen(rejected)
     assert text.index('REJECTED: do not use') < text.index('rejected because')
     assert text.index('GYRO_SIGN') < text.index('notes') < text.index('TOPIC_GAP')

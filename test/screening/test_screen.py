@@ -138,7 +138,7 @@ def test_a_gap_far_beyond_a_topics_own_rhythm_is_a_note(leg, slot):
     _, codes = said(without(leg, slot, 30, 42))
     assert set(codes) == {Code.TOPIC_GAP}
     assert codes[Code.TOPIC_GAP].startswith(f'{slot} gap of 12.')
-    assert Code.TOPIC_GAP.gravity.value == 'accepted'
+    assert Code.TOPIC_GAP.severity.value == 'accepted'
 
 
 @pytest.mark.parametrize(('length', 'size'), [(1, 50.0), (2, 5.0), (5, 10.0), (15, 3.0)])
