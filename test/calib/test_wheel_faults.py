@@ -193,6 +193,18 @@ def test_a_slip_of_one_wheel_is_named_with_place_and_size(side, size):
     assert_place(slips, 120.0, 1.5, size, 0.5, 5 * COUNT * np.sqrt(4 / 12 / 10) + COUNT)
 
 
+def test_a_gyro_that_warms_up_is_no_slip():
+    made = drive(**TOWN | {'scenario': 'yard', 'odometer': 'angle', 'imu_grade': 'consumer',
+                           'duration': 600.0})
+    since = seconds(made.leg(), made.imu)
+    drift = np.deg2rad(0.4) * (1 - np.exp(-since / 100.0))      # real ones: 0.5 to 1.3 deg/s
+    warm = changed(made.imu, w_i=lambda w: w + drift[:, None] * [0, 0, 1])
+    leg = replace(made.leg(), imu=warm)
+    found = prepare(leg, screen(leg, settings(made))[0], settings(made))[0].wheel_slips
+    assert not len(found.t)
+    assert not found.change
+
+
 @pytest.mark.parametrize(('length', 'told'), [(8.0, True), (18.0, False)])
 def test_a_long_slip_is_seen_whole_and_no_wheel_is_blamed_without_evidence(length, told):
     """Acceleration tells of a slip's begin and end; over many seconds it drifts too far."""

@@ -30,6 +30,7 @@ from odocal_ros.calib.wheels.whole_drive import (
     swapped,
     unlike,
     WHOLE_DRIVE_SIGMAS,
+    without_drift,
 )
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import runs
@@ -67,6 +68,7 @@ def wheel_faults(axle: Sequence[Travel], imu: tuple[Floats, Floats, Floats],
                np.empty(0) if doubt_t is None else doubt_t)
     if two is None or not metres_per_unit:
         return (), NO_SLIPS
+    two = without_drift(two)
     signals = signals_of(two, metres_per_unit)
     x, covariance = fitted(two, signals, metres_per_unit)
     if x is None or covariance is None or x[0] <= 0:

@@ -9,9 +9,12 @@ This detects over the whole drive: swapped wheels, one counter published twice, 
 a ratio that changes during the drive.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import runs
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_pair import Pair, robust_fit
 from odocal_ros.settings.levels import TRACK_WIDTH
@@ -19,7 +22,27 @@ from odocal_ros.settings.levels import TRACK_WIDTH
 # statistical: sigmas of a significant difference of wheels: by chance once in 500 million windows;
 # a leg has tens of thousands, whose noise is not quite normal
 WHOLE_DRIVE_SIGMAS = 6.0
+# s, shortest standstill that gives the gyro bias: judgement, its sigma is then 0.01 deg/s
+REST = 5.0
+# rad/s: a faster turn at rest is that of a ferry or a turntable. Physical: consumer IMUs drift by
+# 0.5 to 1.3 deg/s
+MOST_DRIFT = np.deg2rad(2.0)
 MEAN_STEPS = 10     # steps over which speed, turn rate and the ends of a window are averaged: 1 s
+
+
+def without_drift(two: Pair) -> Pair:
+    """Return the wheels with the turn rate of standstills, the gyro bias, removed in between."""
+    still = two.known & (np.diff(two.left) == 0) & (np.diff(two.right) == 0)
+    # half a second after a stop and before a start the body rocks
+    rests = [(a + MEAN_STEPS // 2, b - MEAN_STEPS // 2) for a, b in runs(still)
+             if (b - a) * two.step >= REST]
+    if not rests:
+        return two
+    a, b = np.transpose(rests)
+    rate = (two.turn[b] - two.turn[a]) / (two.t[b] - two.t[a])
+    own = np.abs(rate - np.median(rate)) < MOST_DRIFT
+    bias = np.interp(two.t[:-1], ((two.t[a] + two.t[b]) / 2)[own], rate[own])
+    return replace(two, turn=two.turn - np.append(0.0, np.cumsum(bias * two.step)))
 
 
 def signals_of(two: Pair, metres_per_unit: float) -> Floats:
