@@ -25,7 +25,7 @@ def text(found: dict[str, Any]) -> str:
 
 
 def _head(found: dict[str, Any]) -> list[str]:
-    lines = [found['path'], f'  {found["duration"]:.1f} s from {found["start_utc"]}, '
+    lines = [one_line(found['path']), f'  {found["duration"]:.1f} s from {found["start_utc"]}, '
              f'{found["messages"]} messages in {counted(len(found["files"]), "file")}']
     return lines + [line for note in found['notes'] for line in wrapped(f'note: {note}')]
 
