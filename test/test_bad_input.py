@@ -63,6 +63,8 @@ def first(a):
 UNUSABLE = [
     (partial(spoilt, slot='imu', w_i=lambda a: a * np.nan), Code.NO_IMU,
      'none of the 10001 IMU messages is usable'),
+    (partial(spoilt, slot='imu', stamp_ns=lambda a: 0 * a), Code.NO_IMU,
+     'none of the 10001 IMU messages is usable: 10001 have no stamp (0)'),
     (partial(spoilt, slot='odometer', value=lambda a: a * np.nan), Code.NO_ODOMETER,
      'none of the 4000 odometer messages is usable'),
     (partial(spoilt, slot='fix', latitude=lambda a: a * np.nan), Code.FIXES_UNUSABLE,

@@ -169,8 +169,9 @@ def _apart(recorder: LegRecorder) -> str:
         f'{INPUTS[slot].label} {" to ".join(str(np.datetime64(ns, "ns"))[:19] for ns in ends)}'
         for slot, ends in _ends(recorder).items())
     return (f'the stamps of the topics have no time in common: {spans} (UTC); stamp all sensors '
-            'with one clock (likely causes: a time zone, time since boot, GPS time), or record '
-            'them together')
+            'with one clock (likely causes: a time zone, time since boot, GPS time), use arrival '
+            'times (imu.arrival_time, odometer.arrival_time, gnss.arrival_time), or record them '
+            'together')
 
 
 def _placed(span: LegSpan, bag: Recorded, first: int, last: int) -> tuple[int, int]:

@@ -9,6 +9,7 @@ others are read by ``deserialize``, with bitwise equal rows.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 import struct
 from typing import Any, Protocol
 
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.data.inputs import WHEELS
+from odocal_ros.data.inputs import INPUTS, WHEELS
 from odocal_ros.data.samples import OdometerForm, Reading, readings_of, Samples
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
@@ -58,6 +59,7 @@ class Reader:
         self.unreadable = 0
         self.trouble = ''
         self.frames: FrameFilter | None = None      # of an IMU
+        self.by_arrival = False      # the stamps of the messages are not used
         self._plan = plan
         self._layout: cdr.Layout | None = None      # the last one of a few messages
         self._record: np.dtype[Any] | None = None      # type with which they are read
@@ -98,6 +100,8 @@ class Reader:
                 raws = Raws.of(raws).take(keep)
                 received_ns = np.asarray(received_ns, np.int64)[keep]
         found = self._rows(raws, received_ns, deserialize)
+        if self.by_arrival:
+            found = [(slot, replace(block, stamp_ns=block.received_ns)) for slot, block in found]
         return found if other is None else [*found, ('imu_other', other)]
 
     def readings(self, raws: Sequence[bytes], received_ns: Sequence[int],
@@ -108,7 +112,7 @@ class Reader:
         A reading has stamp and arrival, ns, then the first columns of the samples.
         """
         fits = self._layout.fits if self._layout and self._unpackers else None
-        if fits and all(map(fits, raws)) and (
+        if fits and not self.by_arrival and all(map(fits, raws)) and (
                 self.frames is None or all(map(self.frames.is_used, raws))):
             return self._plan.readings(received_ns, [
                 [unpack(raw) for unpack in self._unpackers] for raw in raws])
@@ -237,12 +241,13 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
     the text contains the remedy.
     """
     msgtype = full_type(msgtype)
-    if slot in WHEELS:
-        return Reader(slot, msgtype, OdometerPlan(slot, msgtype, config))
     if slot == 'fix' and msgtype == TRANSFORMS:
         from odocal_ros.messages.transforms import TransformReader
         return TransformReader(config)
-    reader = Reader(slot, msgtype, sensor_plan(slot, msgtype, config))
+    reader = Reader(slot, msgtype, OdometerPlan(slot, msgtype, config) if slot in WHEELS
+                    else sensor_plan(slot, msgtype, config))
+    if clock := INPUTS[slot].clock:
+        reader.by_arrival = getattr(config, clock).arrival_time
     if slot == 'imu':
         reader.frames = FrameFilter(msgtype, config.imu.frame_id)
     return reader

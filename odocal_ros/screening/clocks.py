@@ -20,7 +20,8 @@ OFFSET_REACH = 1.0     # s, format: range of a time_offset setting
 # judgement, s: least step of a clock that is detected; rows on each side that give the lag
 CLOCK_SET, LAG_NEIGHBOURS = 0.01, 50
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
-TOO_FAR = ('Stamp all sensors with one clock: the difference exceeds the range of time_offset. '
+TOO_FAR = ('Stamp all sensors with one clock, or set arrival_time of imu, odometer or gnss: '
+           'the difference exceeds the range of time_offset. '
            'If a bag is played, use ros2 bag play --clock at normal speed and start the node '
            'with use_sim_time:=true.')
 

@@ -26,8 +26,7 @@ LABEL = {slot: one.label for slot, one in INPUTS.items()}
 NOTHING = {'imu': Code.NO_IMU, 'fix': Code.FIXES_UNUSABLE,
            **dict.fromkeys(WHEELS, Code.NO_ODOMETER)}
 
-UNSTAMPED = ('Let the driver stamp its messages with the time of measurement. A recording can be '
-             'repaired by writing the arrival time into the header.')
+UNSTAMPED = 'Set {}.arrival_time to true, or let the driver stamp its messages.'
 NO_RECEPTION = ('Drive under open sky if possible: the likely cause is a tunnel, buildings or '
                 'trees. The leg stays valid; missing data increases the uncertainties.')
 
@@ -91,7 +90,8 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
         zero = int((sent.stamp_ns <= 0).sum())
         found.append(Reason(
             NOTHING[slot], f'none of the {len(sent.stamp_ns)} {LABEL[slot]} messages is usable'
-            + f': {zero} have no stamp (0)' * (zero > 0), UNSTAMPED * (zero > 0)))
+            + f': {zero} have no stamp (0)' * (zero > 0),
+            UNSTAMPED.format(INPUTS[slot].clock or slot) * (zero > 0)))
     return clean, t
 
 

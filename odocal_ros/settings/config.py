@@ -36,6 +36,12 @@ def _place(about: str) -> Any:
     return setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=about)
 
 
+def _arrival() -> Any:
+    """Declare whether messages are stamped by their arrival."""
+    return setting(False, ro=True, about='Use the arrival time of messages in place of their '
+                   'stamp, if that is 0 or of another clock (time since boot).')
+
+
 def _figure(unit: str, high: float, about: str, nan: str = 'value of the grade') -> Any:
     """Declare an error figure of an IMU; ``nan`` : meaning of NaN, its default."""
     return setting(NAN, unit, 0.0, high, about=f'{about}; NaN: {nan}.')
@@ -61,6 +67,7 @@ class OdometerConfig:
                                          'the nominal scale; beyond it the verdict is caution.')
     lever_arm: tuple[float, ...] = _place('Wheel contact point in base_link (forward, left, up).')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to odometer stamps.')
+    arrival_time: bool = _arrival()
     # latency of a bus and a middleware is rarely less; u-blox requires 10 ms or better
     time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown delay of the odometer, 1 '
                                 'sigma; matters in turns and at marks set in motion.')
@@ -136,6 +143,7 @@ class ImuConfig:
                              'are used like one more leg of the smoother.')
     lever_arm: tuple[float, ...] = _place('IMU position in base_link.')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to IMU stamps.')
+    arrival_time: bool = _arrival()
     nominal_yaw: float = setting(NAN, 'rad', about='Expected yaw mounting angle; a result far '
                                  'from it is a caution. NaN: not checked.')
 
@@ -147,6 +155,7 @@ class GnssConfig:
     lever_arm_sigma: float = setting(0.1, 'm', 0.0, 10.0, about='Uncertainty of the antenna '
                                      'position, each axis.')
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to fix stamps.')
+    arrival_time: bool = _arrival()
     time_sigma: float = setting(0.05, 's', 0.0, 1.0, about='Unknown delay of fixes, 1 sigma; '
                                 'matters at marks set in motion.')
     min_status: int = setting(0, '', -1, 2, about='Minimum NavSatStatus of a used fix.')

@@ -54,6 +54,19 @@ def test_imu():
     assert np.isnan(block.yaw_variance[1:]).all()   # -1 and the all-zero quaternion: none
 
 
+@pytest.mark.parametrize(('slot', 'group', 'message'), [
+    ('imu', 'imu', make.imu(0, w=(1, 2, 3))), ('fix', 'gnss', make.fix(5, 48.0, 11.0, 500.0)),
+    ('odometer', 'odometer', make.twist_stamped(3, 1, 2, 3))])
+def test_arrival_times_replace_stamps_where_set(slot, group, message):
+    assert read(slot, [message] * 2)[0][slot].stamp_ns.tolist() != [7, 8]
+    found, reader = read(slot, [message] * 2, **{f'{group}__arrival_time': True})
+    assert found[slot].stamp_ns.tolist() == found[slot].received_ns.tolist() == [7, 8]
+    raw, deserialize = make.cdr(message), make.deserializer(message.__msgtype__)
+    for _ in range(2):      # also once the layout is known
+        (_, (row,)), = reader.readings([raw], [9], deserialize)
+        assert row[:2] == (9, 9)
+
+
 @pytest.mark.parametrize(('slot', 'message', 'wanted'), [
     ('heading', make.imu(5, q=(0, 0, 1, 0), covariance=np.full(9, 0.1)),
      {'q_ni': [0, 0, 1, 0], 'yaw_variance': 0.1}),

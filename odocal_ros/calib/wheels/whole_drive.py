@@ -23,7 +23,7 @@ from odocal_ros.settings.levels import TRACK_WIDTH
 # a leg has tens of thousands, whose noise is not quite normal
 WHOLE_DRIVE_SIGMAS = 6.0
 # s, shortest standstill that gives the gyro bias: judgement, its sigma is then 0.01 deg/s
-REST = 5.0
+BIAS_REST = 5.0
 # rad/s: a faster turn at rest is that of a ferry or a turntable. Physical: consumer IMUs drift by
 # 0.5 to 1.3 deg/s
 MOST_DRIFT = np.deg2rad(2.0)
@@ -35,7 +35,7 @@ def without_drift(two: Pair) -> Pair:
     still = two.known & (np.diff(two.left) == 0) & (np.diff(two.right) == 0)
     # half a second after a stop and before a start the body rocks
     rests = [(a + MEAN_STEPS // 2, b - MEAN_STEPS // 2) for a, b in runs(still)
-             if (b - a) * two.step >= REST]
+             if (b - a) * two.step >= BIAS_REST]
     if not rests:
         return two
     a, b = np.transpose(rests)
