@@ -19,7 +19,7 @@ from odocal_ros.reasons import Code, Reason
 RESET_FACTOR = 5.0
 # s to each side of a row. Judgement: in which a vehicle accelerates evenly
 SMOOTHED = 0.2
-FEWEST_STEPS = 20     # judgement: least number of steps for a search for resets
+FEWEST_STEPS = 20     # judgement: least number of steps for a search for resets or a divisor
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +88,17 @@ def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool =
     else:
         step, reasons = _counter_steps(t, value, form.modulus, name)
     s = np.concatenate([[0.0], np.cumsum(step)]) if len(value) else np.empty(0)
-    quantum = 1.0 if whole and form.quantity != 'rate' else 0.0
+    quantum = _quantum(step) if whole and form.quantity != 'rate' else 0.0
     return Travel(t, -s if reversed_counts else s, quantum, coarse), reasons
+
+
+def _quantum(step: Floats) -> float:
+    """Return the common divisor of steps of a counter, 1 if they hardly change."""
+    size = np.abs(step)
+    changes = np.count_nonzero(np.diff(size)) > FEWEST_STEPS
+    if not changes or (size % 1).any() or size.max() > 2**53:
+        return 1.0
+    return float(np.gcd.reduce(size.astype(np.int64)))
 
 
 def _coarse(t: Floats, value: Floats) -> CoarseSpeed | None:

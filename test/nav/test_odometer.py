@@ -144,6 +144,15 @@ def test_an_angle_in_floats_and_its_reset():
     assert codes(reasons) == [Code.COUNTER_RESET]
 
 
+def test_a_counter_in_steps_of_five_has_a_quantum_of_five():
+    t = np.arange(400) * 0.1
+    s = 30.0 * t + 20.0 * np.sin(t)
+    form = OdometerForm('cumulative', 0, 'm/pulse')
+    assert travel(t, (5 * np.floor(s / 5)).astype(np.int64), form)[0].quantum == 5.0
+    assert travel(t, np.floor(s).astype(np.int64), form)[0].quantum == 1.0
+    assert travel(t, 6 * np.arange(400), form)[0].quantum == 1.0        # of one speed only
+
+
 def test_increments_add_up_and_rates_are_summed_by_trapezoids():
     found, _ = travel(np.arange(4.0), np.array([100, 1, 2, -1]),
                       OdometerForm('increment', 0, 'm/pulse'))
