@@ -114,7 +114,7 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
 def test_a_limit_that_model_errors_lower_is_explained():
     sigma = np.full(M, np.deg2rad(0.4))
     sigma[0] = 1e-4
-    for doubt, text in ((1.0, ''), (2.0, '0.40 deg; the limit is 0.25 deg (0.5 deg / 2 because ')):
+    for doubt, text in ((1.0, ''), (2.0, '0.40 deg; the limit is 0.25 deg (0.5 deg / 2, the ')):
         _, reasons = determined(np.zeros(M), sigma, np.zeros(M), '1', 1.0, Config(), doubt)
         said = [r.text for r in reasons if r.code is Code.YAW_NOT_DETERMINED]
         assert len(said) == bool(text)

@@ -105,7 +105,7 @@ def test_the_yaw_asks_for_stops_and_starts_until_it_is_there(looks):
     assert found.yaw.lack == 'for the yaw: stop and start 12 times, or make as many turns'
     assert found.yaw.metres == pytest.approx(1500.0)
     assert found.yaw.words('yaw', 'deg', math.degrees(1)).endswith(
-        ' ± 1.15 deg so far (limit 0.573)')
+        ' ± 1.15 deg so far (limit 0.57)')
     assert not found.complete
     assert of_sigmas(looks[-1], yaw=0.0105).yaw.lack.startswith('for the yaw: stop and start 1 ')
     assert of_sigmas(looks[-1], yaw=0.2).yaw.lack.startswith('for the yaw: stop and start often,')
@@ -121,7 +121,7 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     session = Session()
     session.start(1, Config())
     known = {'distance_m': 300.0, 'max_speed': 10.0}
-    far = of_sigmas(looks[-1], scale=2e-3, yaw=0.02)
+    far = replace(of_sigmas(looks[-1], scale=2e-3, yaw=0.02), distance_m=300.0)
     said = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
     # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
     assert (' m/pulse ± 2000 ppm so far; drive 660 m more to reach the limit of 1000 ppm; yaw '

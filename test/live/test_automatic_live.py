@@ -164,7 +164,7 @@ def test_the_operator_goes_before(seen):
     assert seen.start.success
     assert seen.start.message.startswith('recording leg 2 since')
     assert int(seen.operators['leg_id']) == 2
-    assert '~/stop_leg' in seen.operators['hint']
+    assert 'then drive on' in seen.operators['hint']
     assert seen.cancel.success
     assert 'start driving' in seen.waits['hint']
     assert seen.stop.success

@@ -181,8 +181,7 @@ def test_wheels_are_the_joints_that_follow_the_fixes(tmp_path, capsys):
     found, text = inspected(path, capsys)
     assert found['mapping']['odometer'] == '/joint_states'
     assert found['still'] == ['/arm/joint_states']
-    assert found['command'].endswith('--odometer-topic /joint_states --set odometer.left=b '
-                                     '--set odometer.right=a')
+    assert found['command'].endswith('--set odometer.left=b --set odometer.right=a')
     assert all(f'  {name} travels' in text for name in names)
     assert ': a wheel, 0.42' in text
     content = replayed(found['command'], tmp_path / 'out')
