@@ -120,10 +120,12 @@ def _stays_back(found: Pieces, run: Ints, forward: Ints) -> bool:
     """
     t = found.t
     about = np.flatnonzero((t >= t[run[0]] - ERROR_LASTS) & (t <= t[run[-1]] + ERROR_LASTS))
-    # without heading drift: the offset of a piece is relative to the nearest forward one
-    nearest = forward[np.argmin(np.abs(t[about][:, None] - t[forward]), axis=1)]
+    # the heading by most forward pieces: that of single ones contains the error
+    near = found.off[forward[np.isin(forward, about)]]
+    base = float(found.off[forward[np.argmin(np.abs(t[forward] - t[run[0]]))]])
+    usual = base + (float(np.median(wrap(near - base))) if len(near) else 0.0)
     track = found.stretch[about] * found.length[about] * np.exp(
-        1j * (found.course[about] + found.off[about] - found.off[nearest]))
+        1j * (found.course[about] + found.off[about] - usual))
     off = np.sum(found.length[about] * np.exp(1j * found.course[about])) - track.sum()
     return bool(abs(off + 2 * track[np.isin(about, run)].sum()) < abs(off))
 

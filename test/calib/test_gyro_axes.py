@@ -283,14 +283,17 @@ def test_fixes_that_run_back_and_on_again_are_no_reversing(drift):
 
 
 def test_an_error_that_disappears_after_a_turn_is_no_reversing():
-    """The fixes jump back by 40 m, and on again by as much when the vehicle drives north."""
+    """The fixes run back while the vehicle drives east, and catch up while it drives north."""
     path = np.arange(0.0, 1200.0, 5.0)
     true = np.stack([np.minimum(path, 600.0), np.maximum(path - 600.0, 0.0)], -1)
-    wrong = (path > 500.0) & (path < 700.0)
-    fixes = true - 40.0 * np.stack([wrong, np.zeros(len(path))], -1)
-    found = pieces(true, fixes, path / 10.0, 0.3)
-    assert (np.abs(found.off) > 3.0).sum() == 1
+    error = np.stack([-np.interp(path, [460.0, 500.0, 700.0, 800.0], [0.0, 80.0, 80.0, 0.0]),
+                      0.0 * path], -1)
+    found = pieces(true, true + error, path / 10.0, 0.3)
+    assert 2 <= (np.abs(found.off) > 3.0).sum() <= 4
     assert not backwards(found).any()
+    # if they do not catch up, it is a reversing
+    error[path > 500.0] = error[path == 500.0]
+    assert 2 <= backwards(pieces(true, true + error, path / 10.0, 0.3)).sum() <= 4
 
 
 def test_fixes_that_jump_have_no_direction():
