@@ -52,10 +52,6 @@ def sideways(a):
     return a[:, [2, 1, 0]] * [1, 1, -1]
 
 
-def in_degrees(a):
-    return a * 180 / np.pi
-
-
 def first(a):
     return np.full_like(a, a[0])
 
@@ -177,7 +173,7 @@ def test_a_counter_that_counts_down(made, leg, heading_sigma):
 
 @pytest.mark.parametrize(('drive', 'spoil', 'setting', 'value'), [
     ('made', partial(spoilt, slot='imu', f_i=lambda a: a / 9.80665), 'imu.accel_scale', 9.80665),
-    ('town', partial(spoilt, slot='imu', w_i=in_degrees), 'imu.gyro_scale', 0.017453292519943295)])
+    ('town', partial(spoilt, slot='imu', w_i=np.degrees), 'imu.gyro_scale', 0.017453292519943295)])
 def test_units_that_are_not_si_are_told_with_their_setting(request, drive, spoil, setting, value):
     made = request.getfixturevalue(drive)
     leg = spoil(made.leg())
@@ -188,12 +184,12 @@ def test_units_that_are_not_si_are_told_with_their_setting(request, drive, spoil
 
 
 def test_degrees_on_a_straight_road_are_told_by_the_noise_at_rest(made, leg):
-    leg = spoilt(leg, 'imu', w_i=in_degrees)
+    leg = spoilt(leg, 'imu', w_i=np.degrees)
     result, said = run(leg, made)
     assert 'so its unit is probably deg/s' in said[Code.IMU_WORSE_THAN_GRADE]
     assert 'imu.gyro_scale' in Code.IMU_WORSE_THAN_GRADE.remedy
     assert result.verdict.value == 'caution'
-    # the bias read at rest is believed, not that of a grade so clearly wrong: 50 sigmas else
+    # the bias at rest is used, not that of a grade so clearly wrong: 50 sigmas else
     sound(result, made.truth, sigmas=6)
     sound(run(leg, made, imu__gyro_scale=np.pi / 180)[0], made.truth)
 

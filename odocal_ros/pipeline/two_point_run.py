@@ -127,14 +127,12 @@ class TwoPointRun:
         factor = check.fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
         if factor.max() > 1.0:
             far = float(np.sqrt((residual[:, :2]**2).sum(axis=1).mean()))
-            # by differences of adjacent fixes; judgement: noise is not a third of its rms
-            drifts = far > 3 * check.steady(residual, 0.0)[1]
             self.reasons.append(Reason(
                 Code.FIXES_NOISIER_THAN_SAID, f'the fixes are {far:.1f} m (rms) from the '
                 f'dead-reckoned track, {factor[0]:.1f} times (in height {factor[2]:.1f} times) as '
-                'much as their covariance states' + '. Likely cause: gyro errors that accumulate '
-                'along the track' * drifts, 'Use the smoother, which estimates them, or a shorter '
-                'leg. Uncertainties were increased to match the residuals.' * drifts))
+                'much as their covariance states. Likely cause: time-correlated fix errors, or '
+                'gyro errors that accumulate along the track', 'Use the smoother, which estimates '
+                'both, or a shorter leg. Uncertainties were increased to match the residuals.'))
         if np.isnan(self.config.gnss.correlation_time):     # else configured
             start, end = marks_with_slow_errors(
                 (chord.start, chord.end), ready.spans, fixes[0], self.track.at(fixes[0]) @ f,

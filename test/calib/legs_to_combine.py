@@ -24,7 +24,7 @@ class Toy:
     def __init__(self, rng, legs=LEGS, states=STATES, rows=ROWS):
         self.A = rng.standard_normal((legs, rows, states))
         self.B = rng.standard_normal((legs, rows, len(NAMES)))
-        self.B[:, :, 0] *= 100.0          # of ln K much is told
+        self.B[:, :, 0] *= 100.0          # much information on ln K
         # one leg is blind to z0 and to z1 - z2, another to k
         self.B[1, :, 1] = 0.0
         self.B[1, :, 3] = -self.B[1, :, 2]

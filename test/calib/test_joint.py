@@ -61,8 +61,8 @@ def test_the_prior_counts_once(toy):
 
 def test_some_constants_of_a_leg_are_told_as_with_beliefs_about_the_rest(toy):
     whole = toy.border(0)
-    believed = np.where(np.isin(NAMES, ('z1', 'z2')), 0.0, PRIOR**-2.0)
-    H = whole.information + np.diag(believed)
+    prior = np.where(np.isin(NAMES, ('z1', 'z2')), 0.0, PRIOR**-2.0)
+    H = whole.information + np.diag(prior)
     x = np.linalg.solve(H, whole.pull + whole.information @ whole.value)
     some = whole.only(('z1', 'z2'))
     C = np.linalg.inv(some.information)
@@ -99,7 +99,7 @@ def test_chi_square_has_its_mean_and_variance():
     found = [of(small.walk(rng).borders(), usual=USUAL) for _ in range(400)]
     freedom, chi2 = found[0].freedom, np.array([f.chi2 for f in found])
     # ranks 5, 3, 4, 5, 5 and 4 of the walk, less 9 unknowns
-    # (priors take up a little of what these are told to)
+    # (priors take up a little of what these determine)
     assert freedom == pytest.approx(22 + 4 - 9, abs=0.05)
     assert chi2.mean() == pytest.approx(freedom, abs=4 * np.sqrt(2 * freedom / 400))
     assert chi2.var() == pytest.approx(2 * freedom, rel=0.33)      # 4 sigmas of it
@@ -116,7 +116,7 @@ def test_the_leg_and_the_constant_that_differ_are_named():
     constants = np.tile(TRUTH, (LEGS, 1))
     constants[3, 4] += 5.0
     borders = small.draw(rng, constants).borders()
-    # the prior of that leg has given way, as it does where data gainsay it
+    # the prior of that leg has given way, as it does where the data contradict it
     borders[3] = replace(borders[3], used=np.where(PRIOR == 1.0, 5.0, PRIOR))
     found = of(borders, usual=USUAL)
     assert found.disputed == ('z3',)

@@ -165,7 +165,7 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
     alone = math.sqrt(bound(replace(leg, outside={}), config,
                             truth(drive, config, leg), levels)[YAW, YAW])
     # two independent sources; linearised at the estimate or at the truth: 3 %. A heading that the
-    # drive gainsays, by 1.5 of its sigmas here, is believed less: up to 15 %
+    # drive contradicts, by 1.5 of its sigmas here, has less weight: up to 15 %
     both = 1 / np.hypot(1 / sigma, 1 / alone)
     assert 0.97 * both < sigma_of(method, 'yaw_mounting_angle') < 1.15 * both
     assert off(method, drive, *BOTH) < 3.3

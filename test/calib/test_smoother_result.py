@@ -96,10 +96,10 @@ def test_stated_sigma_is_the_bound_at_the_truth_and_the_sum_of_its_sources():
     drive, config, leg = made(**SHORT)
     _, method = result()
     details = method.details
-    believed = np.array([details[name]['sigma'] / details['posterior_to_prior'][name]
+    usual = np.array([details[name]['sigma'] / details['posterior_to_prior'][name]
                          for name in CONSTANTS[IMPERFECT]])
     problem = problem_of(leg, config)
-    problem.priors.constants[IMPERFECT] = believed
+    problem.priors.constants[IMPERFECT] = usual
     covariance = Equations(problem, truth(drive, config, leg), fitted=True).at(
         Levels.of_roots(details['noise'])).solved().covariance
     sigma = np.sqrt(np.diag(covariance))
@@ -131,7 +131,7 @@ def test_an_even_drive_straight_on_tells_no_yaw():
     assert off(method, drive) < 3.3
 
 
-def test_an_imu_said_to_be_without_noise_is_not_believed_so():
+def test_an_imu_said_to_be_without_noise_is_not_taken_so():
     drive, config, leg = made(**SHORT)
     zero = with_settings(config, {f'imu.{name}': 0.0 for name in (
         'gyro_noise', 'gyro_bias', 'gyro_bias_walk', 'accel_noise', 'accel_bias',
@@ -151,7 +151,7 @@ def test_an_imu_that_is_silent_at_rest_is_not_taken_for_perfect():
     assert off(method, drive, *BOTH) < 3.3
 
 
-def test_the_gyro_scale_is_believed_as_it_is_set():
+def test_the_gyro_scale_has_the_configured_sigma():
     _, config, leg = made(**SHORT)
     for asked, prior in ((np.nan, 3e-3), (0.02, 0.02), (0.0, 1e-12)):
         asking = with_settings(config, {'imu.gyro_scale_sigma': asked})

@@ -140,6 +140,15 @@ def test_without_heights_the_scale_stands_and_the_pitch_is_refused():
     assert e['scale_factor'].sigma / made.truth.scale > 5e-4
 
 
+def test_fixes_off_the_track_are_stated_in_metres_with_both_causes():
+    made = drives.drive(scenario='town', duration=300.0, imu_grade='tactical',
+                        fix_noise='correlated')
+    reason, = (r for r in drives.two_point(made.leg(), drives.settings(made)).reasons
+               if r.code is Code.FIXES_NOISIER_THAN_SAID)
+    assert reason.text.startswith('the fixes are 2.9 m (rms) from the dead-reckoned track')
+    assert 'time-correlated fix errors, or gyro errors' in reason.text
+
+
 def test_heights_that_give_a_pitch_beyond_the_limit_reject_the_method():
     made = drives.drive(scenario='straight', duration=200.0, imu_grade='tactical', pitch=20 * DEG)
     result = calibrate(made.leg(), drives.settings(made))

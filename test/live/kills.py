@@ -71,7 +71,7 @@ def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int,
     return SimpleNamespace(
         moment_s=moment_s, told_s=told_s, files=files, marks=marks, start_ns=start_ns, code=code,
         text=said, results=[result] if result else [], legs=result['legs'] if result else [],
-        # wall time that is lost, and by how much the journal is shorter than what was told
+        # wall time that is lost, and by how much the journal is shorter than the status said
         lost_s=(end_ns - newest_ns) * 1e-9, short_s=told_s - kept_s)
 
 

@@ -30,7 +30,7 @@ def drive(message):
 
 @pytest.fixture
 def look(tmp_path, capsys):
-    """Return a function: what is told of a drive with such an odometer, its wheels, the text."""
+    """Return a function: the findings on a drive with such an odometer, its wheels, the text."""
     def inspected(message):
         path = ros_bags.write(tmp_path / 'bag', drive(message))
         told, text = inspect(path, capsys)

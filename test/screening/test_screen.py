@@ -135,9 +135,10 @@ def test_poor_fixes_are_left_out_by_a_setting_no_gap_and_zero_takes_it_off(leg):
 
 @pytest.mark.parametrize('slot', ['odometer', 'fix'])
 def test_a_gap_far_beyond_a_topics_own_rhythm_is_a_note(leg, slot):
-    _, codes = said(without(leg, slot, 30, 42))
-    assert set(codes) == {Code.TOPIC_GAP}
-    assert codes[Code.TOPIC_GAP].startswith(f'{slot} gap of 12.')
+    _, (reason,) = screen(without(leg, slot, 30, 42), Config())
+    assert reason.code is Code.TOPIC_GAP
+    assert reason.text.startswith(f'{slot} gap of 12.')
+    assert ('tunnel' in reason.remedy) == (slot == 'fix')
     assert Code.TOPIC_GAP.severity.value == 'accepted'
 
 
