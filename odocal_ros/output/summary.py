@@ -207,7 +207,7 @@ def _arm(estimates: dict[str, result.Estimate], arm: str, word: str, width: int)
     found = {axis: known(estimates, f'{arm}_{axis}') for axis in 'xyz'}
     found = {axis: e for axis, e in found.items() if e.value is not None}
     shown = ', '.join(with_sigma(e.value, e.sigma, signed=True) for e in found.values())
-    where = '   (without sliding)' * (arm.startswith('odometer') and width >= WIDTH)
+    where = '   (if it does not slide)' * (arm.startswith('odometer') and width >= WIDTH)
     return _line(f'{word} {", ".join(found)}', f'{shown} m{where}') if found else ''
 
 
