@@ -133,7 +133,7 @@ setup(
         # ros2 odocal ...
         'ros2cli.command': ['odocal = odocal_ros.offline.cli:OdocalCommand'],
         # the header of two lines, which ament_copyright does not know
-        'ament_copyright.license': ['odocal_spdx = odocal_ros.outside.licence:SPDX'],
+        'ament_copyright.license': ['odocal_spdx = odocal_ros.safe_io.licence:SPDX'],
     },
     zip_safe=True,
 )

@@ -269,7 +269,7 @@ def silent_server():
 
 def spoilt(args):
     """Put a bag that unpacks to 2 GiB and one that hangs among a fleet's; compare the others."""
-    from odocal_ros.outside.limits import zstd_module
+    from odocal_ros.safe_io.limits import zstd_module
     folder = Path(tempfile.mkdtemp(prefix='fleet_spoilt_'))
     packer = zstd_module().ZstdCompressor()
     (folder / 'bomb.mcap').write_bytes(

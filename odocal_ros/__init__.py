@@ -17,7 +17,7 @@ Units    SI and radians unless the name says otherwise; latitude and longitude i
 Time     stamp_ns is int64 header time; t is float seconds since the start mark
 Terms    see the glossary in CONTRIBUTING.md
 Packages data       samples and legs         settings   settings and IMU grades
-         outside    input checks for names, YAML and files
+         safe_io    limits for untrusted files, safe text, atomic writing
          messages   bytes to samples         bagio      bags; the only user of rosbags
          screening  input checks             nav        strapdown, odometer, dead reckoning
          calib      two-point and planar methods, budgets, verdict, combination of legs

@@ -9,12 +9,12 @@ import os
 
 from odocal_ros.bagio import segments
 from odocal_ros.output import folder
-from odocal_ros.outside import whole
+from odocal_ros.safe_io import atomic_files
 
 
 class Refusing:
     """
-    Counts the steps of ``whole.disk`` and refuses some.
+    Counts the steps of ``atomic_files.disk`` and refuses some.
 
     at : the first that is refused, 0 for none.   for_ever : so are those after it.   error : what
     it raises, else an OSError with the code.
@@ -34,7 +34,7 @@ class Refusing:
 
     def put_in(self, monkeypatch) -> 'Refusing':
         """Take the place of the disk."""
-        for module in (whole, segments, folder):
+        for module in (atomic_files, segments, folder):
             monkeypatch.setattr(module, 'disk', self)
         return self
 

@@ -22,11 +22,11 @@ ROS = {'rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_m
        'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs'}
 # the rooms in the order of the data, and what each uses of those above it; all: errors, reasons
 ROOMS = {
-    'outside': '', 'data': '',
-    'settings': 'data outside',
+    'safe_io': '', 'data': '',
+    'settings': 'data safe_io',
     'nav': 'data settings',
     'messages': 'data nav settings',
-    'bagio': 'data messages outside',
+    'bagio': 'data messages safe_io',
     'screening': 'data nav settings',
     'calib': 'data nav screening settings',
     'estimator': 'calib data nav screening settings',
@@ -35,13 +35,13 @@ ROOMS = {
     'pattern': 'settings',
     'apply': 'calib data nav screening settings',
     'sim': 'data nav settings',
-    'output': 'calib data estimator nav outside pipeline settings',
-    'live': 'apply bagio calib data forecast messages output outside pattern pipeline settings',
-    'library': 'bagio calib data estimator forecast messages nav output outside pipeline '
+    'output': 'calib data estimator nav safe_io pipeline settings',
+    'live': 'apply bagio calib data forecast messages output safe_io pattern pipeline settings',
+    'library': 'bagio calib data estimator forecast messages nav output safe_io pipeline '
                'screening settings sim',
-    'offline': 'bagio calib data estimator forecast library messages nav output outside pipeline '
+    'offline': 'bagio calib data estimator forecast library messages nav output safe_io pipeline '
                'screening settings sim',
-    'fleet': 'bagio calib library nav offline outside output pipeline settings'}
+    'fleet': 'bagio calib library nav offline safe_io output pipeline settings'}
 COMMON = {'errors', 'reasons'}
 
 

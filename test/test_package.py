@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 import odocal_ros
-from odocal_ros.outside.licence import Licence, SPDX
+from odocal_ros.safe_io.licence import Licence, SPDX
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent

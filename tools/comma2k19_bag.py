@@ -19,7 +19,7 @@ from odocal_ros.bagio import encode
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.outside.whole import write_text
+from odocal_ros.safe_io.atomic_files import write_text
 from tools.converter import run
 
 GPS_EPOCH, WEEK, LEAP = 315_964_800.0, 604_800.0, 18.0    # s; GPS ahead of UTC since 2017

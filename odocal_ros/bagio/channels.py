@@ -14,7 +14,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.messages.raws import Raws
-from odocal_ros.outside.limits import LATEST_NS
+from odocal_ros.safe_io.limits import LATEST_NS
 
 LET_GO = 2**23      # judgement: bytes
 FORMATS = {'ros2msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl'}

@@ -21,8 +21,8 @@ import numpy as np
 
 from odocal_ros.bagio import mcap_records as mcap
 from odocal_ros.bagio.channels import Channel
-from odocal_ros.outside.limits import zstd_module
-from odocal_ros.outside.whole import whole_file, WholeFile
+from odocal_ros.safe_io.atomic_files import whole_file, WholeFile
+from odocal_ros.safe_io.limits import zstd_module
 
 HEADER, DATA_END = 1, 15      # format: opcodes not in mcap_records: mcap.dev/spec
 MESSAGE_HEAD = struct.Struct('<BQHIQQ')

@@ -13,7 +13,7 @@ import zlib
 from odocal_ros.bagio import mcap_records as mcap
 from odocal_ros.bagio.channels import Batch, Channel, FileBytes, FORMATS, overlapping, Recording
 from odocal_ros.bagio.mcap_gather import batches
-from odocal_ros.outside.limits import Allowance, Damaged, LATEST_NS
+from odocal_ros.safe_io.limits import Allowance, Damaged, LATEST_NS
 
 Entry = tuple[int, int, bytes]     # time, channel, message
 

@@ -21,7 +21,7 @@ from odocal_ros.bagio.channels import Batch, Channel
 from odocal_ros.bagio.mcap_records import Chunk, MESSAGE, MESSAGE_INDEX, Place, RECORD
 from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.messages.raws import Raws, Rows
-from odocal_ros.outside.limits import Damaged, LATEST_NS
+from odocal_ros.safe_io.limits import Damaged, LATEST_NS
 
 BLOCK = 2**21          # judgement: bytes of chunks unpacked at a time
 HEAD = np.dtype([('op', 'u1'), ('size', '<i8'), ('channel', '<u2'), ('sequence', '<u4'),

@@ -11,7 +11,7 @@ import zlib
 
 from odocal_ros.bagio.channels import FileBytes
 from odocal_ros.messages.raws import Bytes
-from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
+from odocal_ros.safe_io.limits import Allowance, Damaged, LimitReached
 
 MAGIC = b'\x89MCAP0\r\n'
 # format: opcodes of the records, mcap.dev/spec

@@ -19,7 +19,7 @@ from odocal_ros.bagio.rosbag1_file import Rosbag1File
 from odocal_ros.bagio.sqlite_file import SqliteFile
 from odocal_ros.errors import BadBag
 from odocal_ros.messages.raws import Raws
-from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
+from odocal_ros.safe_io.limits import Allowance, Damaged, LimitReached
 
 BLOCK = 20_000         # judgement: messages in a batch
 ZSTD = b'\x28\xb5\x2f\xfd'

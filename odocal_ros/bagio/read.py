@@ -20,8 +20,8 @@ from odocal_ros.bagio.types import Types
 from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Feed, RowReader
-from odocal_ros.outside.limits import is_file
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.safe_io.limits import is_file
 
 MISSING = 0.5   # s, judgement: shorter losses are not reported
 

@@ -12,7 +12,7 @@ from typing import Any
 from odocal_ros.bagio.channels import Channel, Recording
 from odocal_ros.bagio.types import rosbags_for
 from odocal_ros.errors import BadBag, OdocalError
-from odocal_ros.outside.limits import Allowance, LATEST_NS, LimitReached
+from odocal_ros.safe_io.limits import Allowance, LATEST_NS, LimitReached
 
 PACKINGS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
 

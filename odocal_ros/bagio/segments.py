@@ -19,7 +19,7 @@ from typing import Any
 
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file, Written
-from odocal_ros.outside.whole import disk, write_text
+from odocal_ros.safe_io.atomic_files import disk, write_text
 
 JOURNAL = 'journal.yaml'     # marks the folder as a journal, and has its settings
 # status of the node, by which a replay finds the marks; events of legs that it leaves out

@@ -14,9 +14,9 @@ from typing import Any
 from odocal_ros.bagio.channels import possible
 from odocal_ros.bagio.segments import JOURNAL, without_joined
 from odocal_ros.errors import BadBag
-from odocal_ros.outside import limits
-from odocal_ros.outside.yaml_files import loader
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.safe_io import limits
+from odocal_ros.safe_io.text_formats import safe_loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}
@@ -142,7 +142,7 @@ def _read_metadata(path: Path) -> Known:
     if not limits.is_file(path):
         return Known(trouble=f'{path}: is not a regular file and is ignored')
     try:
-        return _known(yaml.load(limits.read_text(path), Loader=loader(aliases=True)))
+        return _known(yaml.load(limits.read_text(path), Loader=safe_loader(aliases=True)))
     except (OSError, MemoryError):
         raise
     except limits.LimitReached as error:

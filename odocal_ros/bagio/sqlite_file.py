@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 from odocal_ros.bagio.channels import Channel, FileBytes, FORMATS, possible, Recording
 from odocal_ros.errors import BadBag
-from odocal_ros.outside.limits import Damaged, factor, MESSAGE
+from odocal_ros.safe_io.limits import Damaged, factor, MESSAGE
 
 LEAF = 0x0D                       # format: kind of page of rows, sqlite.org/fileformat2
 # format: of rosbag2, id (NULL: it is the row number), topic_id, timestamp, data

@@ -11,7 +11,7 @@ import threading
 from typing import Any
 
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.outside.limits import check, DEFINITION, ELEMENTS, factor, LimitReached, SECONDS
+from odocal_ros.safe_io.limits import check, DEFINITION, ELEMENTS, factor, LimitReached, SECONDS
 
 BAR = '=' * 80 + '\n'    # format: between definitions, of ros2msg in mcap.dev/spec/registry
 TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/@()]+|.',

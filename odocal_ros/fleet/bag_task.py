@@ -23,7 +23,7 @@ import numpy as np
 from odocal_ros.errors import OdocalError
 from odocal_ros.fleet.bags import at_hand, FleetBag, seen_as
 from odocal_ros.fleet.rows import changed_settings, FAILED, key_of, leg_text, Row, RowStore
-from odocal_ros.outside.names import said_by
+from odocal_ros.safe_io.text_formats import error_text
 
 # error texts without memory for the stack of a thread, or for a library
 NO_MEMORY = ("can't start new thread", 'failed to map segment')
@@ -81,9 +81,9 @@ def calibrate_bag(job: BagJob) -> Done:
             store.drop(job.place)
             return Done(row.key, row.status, computed)
         except OdocalError as error:
-            why = said_by(error)
+            why = error_text(error)
         except Exception as error:     # noqa: BLE001 one bag must not stop others
-            why = f'internal error ({type(error).__name__}: {said_by(error)}); please report it'
+            why = f'internal error ({type(error).__name__}: {error_text(error)}); please report it'
             if isinstance(error, MemoryError) or any(x in str(error) for x in NO_MEMORY):
                 why = f'exceeds the memory limit --task-memory ({job.memory / 2**20:g} MiB)'
     # outside the memory limit: the row needs memory

@@ -14,7 +14,7 @@ from typing import Any
 
 from odocal_ros.errors import BadBag, BadUsage
 from odocal_ros.fleet.rows import key_of
-from odocal_ros.outside.names import said_by
+from odocal_ros.safe_io.text_formats import error_text
 
 COLUMNS = ('vehicle', 'bag', 'config', 'legs', 'model', 'odometer_km')
 ENDINGS = ('.mcap', '.db3', '.bag')
@@ -102,7 +102,7 @@ def _of_manifest(name: str) -> list[FleetBag]:
             else:
                 table = parquet.ParquetFile(file).read(use_threads=False)
     except (OSError, pa.ArrowException) as error:
-        raise BadUsage(f'{name}: cannot be read as a manifest ({said_by(error)})') from None
+        raise BadUsage(f'{name}: cannot be read as a manifest ({error_text(error)})') from None
     lacking = {'vehicle', 'bag'} - set(table.column_names)
     if lacking or not table.num_rows:
         what = f'no column {" and ".join(sorted(lacking))}' if lacking else 'holds no bag'
@@ -134,7 +134,7 @@ def file_system(url: str) -> tuple[Any, str]:
         found: tuple[Any, str] = url_to_fs(url)
         return found
     except (ValueError, ImportError, OSError) as error:      # no such protocol, or its package
-        raise BadUsage(f'{url}: {said_by(error)}') from None
+        raise BadUsage(f'{url}: {error_text(error)}') from None
 
 
 def _bags_in(name: str) -> list[str]:
@@ -145,7 +145,7 @@ def _bags_in(name: str) -> list[str]:
         bags = [bag for found in sorted(paths) for bag in _in_folder(fs, found)]
         return [str(fs.unstrip_protocol(bag)) for bag in bags] if '://' in name else bags
     except OSError as error:
-        raise BadUsage(f'{name}: cannot be read ({said_by(error)})') from None
+        raise BadUsage(f'{name}: cannot be read ({error_text(error)})') from None
 
 
 def _in_folder(fs: Any, path: str) -> list[str]:
@@ -178,7 +178,7 @@ def seen_as(url: str, settings: str) -> str:
         if not files:
             raise FileNotFoundError(f'{url}: not found')
     except Exception as error:     # noqa: BLE001 each kind of server has errors of its own
-        raise BadBag(f'{url}: {said_by(error) or type(error).__name__}') from None
+        raise BadBag(f'{url}: {error_text(error) or type(error).__name__}') from None
     dates = ('mtime', 'ETag', 'etag', 'LastModified', 'last_modified', 'updated', 'modify', 'CRC')
     return key_of('seen', settings, url, sorted(
         [name, about.get('size'), *(str(about[d]) for d in dates if d in about)]
@@ -212,5 +212,5 @@ def at_hand(url: str, scratch: str | None) -> Iterator[Path]:
         except BadBag:
             raise
         except Exception as error:     # noqa: BLE001 as above
-            raise BadBag(f'{url}: {said_by(error) or type(error).__name__}') from None
+            raise BadBag(f'{url}: {error_text(error) or type(error).__name__}') from None
         yield copy

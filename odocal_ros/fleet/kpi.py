@@ -21,9 +21,9 @@ from typing import Any
 from odocal_ros.calib.result import Estimate
 from odocal_ros.fleet.tables import LEGS, VALUES
 from odocal_ros.output.figures import table_row
-from odocal_ros.outside.whole import locked, write_text
 from odocal_ros.pipeline.acceptance import Decision, hold
 from odocal_ros.reasons import Verdict
+from odocal_ros.safe_io.atomic_files import locked, write_text
 
 KPI = 'kpi.json'
 NORMAL = 1.4826                  # statistical: sigma over the median of absolute errors

@@ -20,9 +20,9 @@ from odocal_ros.fleet.engine import results
 from odocal_ros.fleet.page import fleet_page, remarks
 from odocal_ros.fleet.tables import VEHICLES
 from odocal_ros.output.figures import counted
-from odocal_ros.outside.names import for_table
-from odocal_ros.outside.whole import locked, write_text
 from odocal_ros.reasons import Verdict
+from odocal_ros.safe_io.atomic_files import locked, write_text
+from odocal_ros.safe_io.text_formats import for_table
 
 TABLE, PAGE = 'fleet.csv', 'fleet.html'
 

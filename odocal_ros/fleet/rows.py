@@ -24,9 +24,9 @@ from odocal_ros import __version__
 from odocal_ros.calib import result
 from odocal_ros.calib.border import Border
 from odocal_ros.errors import BadData
-from odocal_ros.outside.names import said_by
-from odocal_ros.outside.whole import locked, whole_file, write_text
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.safe_io.atomic_files import locked, whole_file, write_text
+from odocal_ros.safe_io.text_formats import error_text
 from odocal_ros.settings.config import Config, flat, with_settings
 
 DONE, FAILED = 'done', 'failed'
@@ -155,7 +155,7 @@ def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
                 table = pq.ParquetFile(file).read(use_threads=False)
                 rows = [Row(**entry) for entry in table.cast(row_schema()).to_pylist()]
             except (pa.ArrowException, OSError, TypeError, ValueError) as error:
-                raise BadData(f'{path} is not a fleet row ({said_by(error)}); remove it and '
+                raise BadData(f'{path} is not a fleet row ({error_text(error)}); remove it and '
                               'repeat the command') from None
         yield from rows
 

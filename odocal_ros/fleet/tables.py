@@ -12,9 +12,9 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.rows import legs_from, Row
-from odocal_ros.outside.names import one_line
-from odocal_ros.outside.whole import locked, whole_file
 from odocal_ros.reasons import Reason
+from odocal_ros.safe_io.atomic_files import locked, whole_file
+from odocal_ros.safe_io.text_formats import one_line
 
 LEGS, VEHICLES = 'legs.parquet', 'vehicles.parquet'
 VALUES = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')

@@ -13,8 +13,8 @@ from typing import Any
 
 from odocal_ros.data.inputs import TOPICS
 from odocal_ros.errors import BadUsage
-from odocal_ros.outside.limits import LATEST_NS
-from odocal_ros.outside.names import brief_line, said_by
+from odocal_ros.safe_io.limits import LATEST_NS
+from odocal_ros.safe_io.text_formats import brief_line, error_text
 from odocal_ros.settings.config import Config, with_settings
 
 # called with the fraction done, 0 to 1 or None if unknown, and the current stage
@@ -78,7 +78,7 @@ def paths_of(asked: Any) -> list[Path]:
                 Path(one).stat()       # the reader reports a missing file
         except (OSError, TypeError, ValueError) as error:
             raise BadUsage(f'{brief_line(repr(one)[:100])} is not the path of a bag: '
-                           f'{said_by(error)[:100]}') from None
+                           f'{error_text(error)[:100]}') from None
     return [Path(one) for one in several]
 
 

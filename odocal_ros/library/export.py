@@ -21,7 +21,7 @@ from odocal_ros.library import export_pictures
 from odocal_ros.library.calibration import TABLES
 from odocal_ros.library.series import Left, left_in, residuals, Series, stacked, states, trajectory
 from odocal_ros.output.drawing import PICTURES
-from odocal_ros.outside.whole import whole_file
+from odocal_ros.safe_io.atomic_files import whole_file
 
 RERUN = 'pip install rerun-sdk'
 IN_NAMES = {'m': 'm', 'rad/s': 'rad_per_s', 'm/s^2': 'm_per_s2'}     # units in names of joints

@@ -15,7 +15,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.forecast.planned_drive import DRIVE_STEP, from_rates, marked, PlannedDrive
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import arctan2
-from odocal_ros.outside.limits import read_bytes
+from odocal_ros.safe_io.limits import read_bytes
 from odocal_ros.settings.config import Config
 
 LONGEST_TRACK = 2**26        # bytes of a GPX file, judgement: a day at 1 Hz has a fifth of it

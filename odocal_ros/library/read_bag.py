@@ -21,8 +21,6 @@ from odocal_ros.library import asked
 from odocal_ros.library.legs import dropped_legs, find_legs, leg_statuses, marked_legs
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.transforms import with_static
-from odocal_ros.outside.limits import is_file
-from odocal_ros.outside.names import one_line
 from odocal_ros.pipeline.floor_marks import (
     check_points,
     FloorMark,
@@ -32,6 +30,8 @@ from odocal_ros.pipeline.floor_marks import (
     WITHIN,
 )
 from odocal_ros.reasons import Reason
+from odocal_ros.safe_io.limits import is_file
+from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config
 
 BLOCK = 'odocal_journal'

@@ -9,8 +9,8 @@ from typing import Any
 
 from odocal_ros.bagio.write import check_target, drive_topics, write_bag
 from odocal_ros.errors import BadUsage
-from odocal_ros.outside.names import for_comment, one_line
-from odocal_ros.outside.whole import uninterrupted, write_text
+from odocal_ros.safe_io.atomic_files import uninterrupted, write_text
+from odocal_ros.safe_io.text_formats import for_comment, one_line
 from odocal_ros.sim import scenarios
 from odocal_ros.sim.scenarios import Drive, SimOptions
 from odocal_ros.sim.truth import settings, truth_entries

@@ -13,8 +13,8 @@ from odocal_ros.forecast.forecast import REST_FORESEEN_S
 from odocal_ros.forecast.progress import clocks_differ
 from odocal_ros.live.session import Restored, SessionView, State
 from odocal_ros.output.summary import sentence, values_in_words
-from odocal_ros.outside.names import said_by
 from odocal_ros.reasons import cautions, Reason, Verdict
+from odocal_ros.safe_io.text_formats import error_text
 
 MOST_REASONS = 3     # judgement: in an answer
 KMH = 3.6    # definition: km/h per m/s
@@ -87,7 +87,7 @@ def _sentences(parts: Iterable[str]) -> str:
 
 def one_line(error: BaseException) -> str:
     """Return an error as one line; an unexpected one is reported as an internal error."""
-    text = said_by(error)
+    text = error_text(error)
     if isinstance(error, OdocalError):
         return text
     return f'internal error, please report it: {type(error).__name__}: {text}'

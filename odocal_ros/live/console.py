@@ -7,8 +7,8 @@ import re
 from typing import Any
 
 from odocal_ros.live.session import SessionView, State
-from odocal_ros.outside.names import brief_line
 from odocal_ros.reasons import Code
+from odocal_ros.safe_io.text_formats import brief_line
 
 # judgement: delay of the first log of missing inputs, and longest interval of its repetitions
 SILENCE_FIRST_NS, SILENCE_SELDOM_NS = 5 * 10**9, 3600 * 10**9

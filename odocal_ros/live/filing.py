@@ -24,7 +24,7 @@ from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import Worker
 from odocal_ros.output.figures import iso
 from odocal_ros.output.stored import replacing, stored_in
-from odocal_ros.outside.whole import locked, new_folder
+from odocal_ros.safe_io.atomic_files import locked, new_folder
 from odocal_ros.settings.config import Config
 
 LATEST = 'latest'

@@ -24,8 +24,7 @@ from odocal_ros.live.recording import PREROLL_MARGIN_S
 from odocal_ros.live.session import Session
 from odocal_ros.live.topic_input import Input, StaticTransforms
 from odocal_ros.output.figures import iso
-from odocal_ros.outside.names import for_shell
-from odocal_ros.outside.yaml_files import parameters
+from odocal_ros.safe_io.text_formats import for_shell, parameter_block
 from odocal_ros.settings.config import Config, flat
 
 BATCH_NS = 800_000_000    # judgement: including the writing, a kill loses about a second
@@ -171,7 +170,7 @@ def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, s
     about = {'software': f'odocal_ros {__version__}', 'node': node, 'leg_id': leg_id,
              'leg_start_ns': start_ns}
     about |= {f'topics.{slot}': topic for slot, topic in topics.items()}
-    return HEAD + parameters(flat(config)) + parameters(about, 'odocal_journal')
+    return HEAD + parameter_block(flat(config)) + parameter_block(about, 'odocal_journal')
 
 
 def replay_command(folder: str, start_ns: int = 0) -> str:

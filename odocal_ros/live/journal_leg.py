@@ -16,7 +16,7 @@ from typing import TextIO
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk
 from odocal_ros.bagio.segments import JOURNAL, SegmentedBag
-from odocal_ros.outside.whole import new_folder, PART, write_text
+from odocal_ros.safe_io.atomic_files import new_folder, PART, write_text
 
 JOURNAL_NAME = re.compile(r'\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ_leg_\d+(-\d+)?')     # of a journal
 FOLDER_NEW_S = 10.0       # judgement: a node may still be about to write into a younger folder

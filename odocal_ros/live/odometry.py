@@ -30,7 +30,7 @@ from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input, LOOK_AROUND_S
 from odocal_ros.messages.cdr import layout_of
 from odocal_ros.messages.sensor_types import types_of
-from odocal_ros.outside.names import said_by
+from odocal_ros.safe_io.text_formats import error_text
 from odocal_ros.settings.node_configs import ApplyConfig, OdomFrames
 
 # judgement, all in s: period of checks for a due pose (its largest delay), of the executor (which
@@ -141,7 +141,7 @@ class OdometryNode(SettledNode):
         except Exception as error:      # no message may stop the node
             poses = []
             self._odometry.restart(f'internal error, please report it: {type(error).__name__}: '
-                                   f'{said_by(error)}')
+                                   f'{error_text(error)}')
         for pose in poses:
             self._publish(pose)
         if poses:

@@ -18,8 +18,8 @@ from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.errors import BadConfig
 from odocal_ros.live.session import Restored
 from odocal_ros.output.stored import check_estimate
-from odocal_ros.outside.names import one_line
 from odocal_ros.reasons import Verdict
+from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config, SETTINGS, settings_of, with_settings
 from odocal_ros.settings.setting import Setting
 

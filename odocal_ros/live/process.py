@@ -24,7 +24,7 @@ from odocal_ros import __version__
 from odocal_ros.errors import BadConfig, OdocalError
 from odocal_ros.live.console import PlainLog
 from odocal_ros.live.worker import hold_little
-from odocal_ros.outside.names import brief_line, said_by
+from odocal_ros.safe_io.text_formats import brief_line, error_text
 
 LOOK_FOR_NAMESAKE_S = 5.0      # judgement: s between searches for another node of the same name
 
@@ -44,7 +44,7 @@ class SettledNode(Node):
                 self.destroy_node()  # type: ignore[no-untyped-call]
                 raise
         except (ParameterException, InvalidQosOverridesError) as error:
-            raise BadConfig(f'{said_by(error)}; correct the parameter and restart') from None
+            raise BadConfig(f'{error_text(error)}; correct the parameter and restart') from None
 
     def _build(self) -> None:
         raise NotImplementedError
@@ -95,7 +95,7 @@ def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> i
                             f'--ros-args (see {name} --help)')
         _init(args)
     except Exception as error:
-        text = said_by(error).split(', at /')[0]
+        text = error_text(error).split(', at /')[0]
         return complain(name, f'{text}; write parameters as --ros-args -p name:=value, remaps as '
                         '-r from:=to')
     executor, node, code = SingleThreadedExecutor(), None, 0
@@ -109,7 +109,7 @@ def run(kind: type[SettledNode], about: str, args: list[str] | None = None) -> i
         code = complain(name, str(error))
     except Exception as error:
         # during a shutdown, the publisher of a callback may be destroyed already
-        code = complain(name, said_by(error)) if rclpy.ok() else 0
+        code = complain(name, error_text(error)) if rclpy.ok() else 0
     finally:
         executor.shutdown()
         if node is not None:

@@ -24,7 +24,7 @@ from odocal_ros.live.status import calibration_status, in_force, input_status
 from odocal_ros.live.status_listener import LATCHED
 from odocal_ros.live.worker import Paths
 from odocal_ros.output.figures import iso
-from odocal_ros.outside.yaml_files import no_date
+from odocal_ros.safe_io.text_formats import date_text
 from odocal_ros.settings.config import Config
 
 PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle', 'yaw_mounting_angle_sigma')
@@ -60,7 +60,7 @@ class Publishing:
         """Set all ``result.*`` at once; None: to the restored result, if there is one."""
         results = self._before
         if calibration:
-            stamp = no_date(iso(self._node.get_clock().now().nanoseconds))
+            stamp = date_text(iso(self._node.get_clock().now().nanoseconds))
             results = params.as_results(calibration, stamp,
                                         self._node.get_parameter('vehicle').value)
         self.setting_results = True

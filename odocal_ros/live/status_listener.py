@@ -13,7 +13,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-from odocal_ros.outside.names import brief_line
+from odocal_ros.safe_io.text_formats import brief_line
 
 MOST_VALUES = 500      # judgement: keys of a status that are read; a calibrator sends 100
 # definition: of latched topics, publisher and subscriber

@@ -27,7 +27,7 @@ from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES
 from odocal_ros.messages.sensor_types import Pairs, TRANSFORMS
 from odocal_ros.messages.transforms import STATIC, StaticReader, TransformReader
-from odocal_ros.outside.names import one_line, said_by
+from odocal_ros.safe_io.text_formats import error_text, one_line
 from odocal_ros.settings.config import Config
 
 MOST_TOPICS_MEANT, NAME_SIMILARITY = 2, 0.4      # judgement: suggestions; of difflib, 1: equal
@@ -143,7 +143,7 @@ class Input:
             for msgtype in self.allowed if len(self.allowed) == 1 else published:
                 self.subscribe(msgtype, config)
         except (OdocalError, ParameterException, InvalidQosOverridesError) as error:
-            trouble = said_by(error)
+            trouble = error_text(error)
             if trouble != self.trouble:
                 self._node.get_logger().error(trouble)
             self.trouble = trouble
@@ -226,7 +226,7 @@ class Input:
                 self.frame = reader.frame or self.frame or deserialize(raws[0]).header.frame_id
         except Exception as error:  # no message may stop the node
             self._failed += len(raws)
-            self.trouble = f'{self.topic}: {said_by(error)}'
+            self.trouble = f'{self.topic}: {error_text(error)}'
             pairs = []
         self.health.unusable = self._failed + reader.unreadable
         if not pairs and reader.trouble:

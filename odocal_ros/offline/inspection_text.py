@@ -9,7 +9,7 @@ from typing import Any
 
 from odocal_ros.data.samples import LOCAL
 from odocal_ros.output.figures import counted, wrapped
-from odocal_ros.outside.names import for_shell, one_line
+from odocal_ros.safe_io.text_formats import for_shell, one_line
 
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK',
           str(LOCAL): 'positions in a local frame'}

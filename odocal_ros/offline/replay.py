@@ -15,7 +15,7 @@ from odocal_ros.data.inputs import INPUTS, topic_option, TOPICS
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.asked import legs_of, Listener
 from odocal_ros.offline.say import Phase, say, say_json, warn
-from odocal_ros.outside.names import one_line
+from odocal_ros.safe_io.text_formats import one_line
 
 if TYPE_CHECKING:
     from odocal_ros.calib.result import Calibration as Combined

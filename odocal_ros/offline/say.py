@@ -9,7 +9,7 @@ import sys
 import threading
 from typing import Any
 
-from odocal_ros.outside.names import brief_line, for_terminal
+from odocal_ros.safe_io.text_formats import brief_line, for_terminal
 
 BAR = '{desc:<26} {percentage:3.0f} % |{bar:24}| {elapsed}'
 CLOCK = '{desc:<26} {elapsed}'

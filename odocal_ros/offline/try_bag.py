@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     replay.add_arguments(parser)
     code = replay.run(parser.parse_args([args.bag, *options] + ['--force'] * args.force))
     _open(output / 'report.html', args.no_browser)
-    from odocal_ros.outside.names import for_shell
+    from odocal_ros.safe_io.text_formats import for_shell
     say(f'\nnext time:\n  {for_shell(["odocal", "replay", args.bag, *options, "--force"])}')
     return code
 

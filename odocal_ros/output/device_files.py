@@ -13,8 +13,7 @@ import numpy as np
 from odocal_ros.calib.result import Calibration
 from odocal_ros.output.figures import counted, inverse, known, with_sigma
 from odocal_ros.output.summary import sentence
-from odocal_ros.outside.names import for_comment, one_line
-from odocal_ros.outside.yaml_files import parameters
+from odocal_ros.safe_io.text_formats import for_comment, one_line, parameter_block
 from odocal_ros.settings.config import Config, DIFFERENTIAL, HOLONOMIC, MECANUM, OMNI, SKID
 from odocal_ros.settings.levels import INFORMED_SHARE
 from odocal_ros.settings.nominal import nominal_scale
@@ -52,7 +51,7 @@ def controllers(calibration: Calibration, config: Config,
              '# if other multipliers were active during the drive, multiply them by these.',
              '# Older releases call the radius rear_wheels_radius or rear_wheel_radius.']
     text = '\n'.join(lines) + '\n'
-    return {CONTROLLERS: text + ''.join(parameters(v, name) for name, v in blocks.items())}
+    return {CONTROLLERS: text + ''.join(parameter_block(v, name) for name, v in blocks.items())}
 
 
 def _blocks(calibration: Calibration, config: Config) -> dict[str, dict[str, Any]]:
@@ -184,7 +183,7 @@ def wheel_covariance(calibration: Calibration, config: Config,
         f'#   wheel_velocity_noise_sigma: {density:.3g}']
     diagonal = {'twist_covariance_diagonal': _diagonal(usual)}
     text = '\n'.join(lines) + '\n'
-    return {TWIST: text + parameters(diagonal, 'diff_drive_controller') + _table(noise)}
+    return {TWIST: text + parameter_block(diagonal, 'diff_drive_controller') + _table(noise)}
 
 
 def _diagonal(variances: np.ndarray[Any, Any]) -> list[float]:
@@ -202,7 +201,7 @@ def _table(noise: 'TwistNoise') -> str:
         name: [float(f'{noise.variances(v, rate)[column]:.3g}') for v in speeds]
         for name, column in (('x', 0), ('y', 1), ('yaw', 3)) if column < 3 or noise.has_turn_rate}
         for k, rate in enumerate(rates)}
-    return parameters({'period': float(f'{noise.period:.4g}'),
+    return parameter_block({'period': float(f'{noise.period:.4g}'),
                        'speed': [float(f'{v:.3g}') for v in speeds], **rows},
                       'wheel_odometry_covariance')
 
@@ -236,7 +235,7 @@ def imu_errors(calibration: Calibration, config: Config,
         'those at the',
         '# start of the leg: they change with temperature and at every start.']
     text = '\n'.join(lines) + '\n'
-    return {IMU_ERRORS: text + parameters(dict(sorted(found.items())), 'imu_errors')}
+    return {IMU_ERRORS: text + parameter_block(dict(sorted(found.items())), 'imu_errors')}
 
 
 def _known(details: Mapping[str, Any]) -> dict[str, dict[str, float]]:

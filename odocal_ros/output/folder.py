@@ -21,7 +21,14 @@ from typing import Any
 import uuid
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.outside.whole import disk, locked, PART, sync_folder, uninterrupted, write_text
+from odocal_ros.safe_io.atomic_files import (
+    disk,
+    locked,
+    PART,
+    sync_folder,
+    uninterrupted,
+    write_text,
+)
 
 NOT_BY_RENAME = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV)
 ASIDE = '.old'

@@ -16,9 +16,9 @@ from odocal_ros.output import device_files
 from odocal_ros.output.geojson import geojson, TRACK
 from odocal_ros.output.summary import not_estimated
 from odocal_ros.output.tables import leg_table, LEGS
-from odocal_ros.outside import names
-from odocal_ros.outside.yaml_files import no_date, parameters
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.safe_io import text_formats
+from odocal_ros.safe_io.text_formats import date_text, parameter_block
 from odocal_ros.settings.config import Config, with_settings
 
 PARAMS = 'calibration.yaml'
@@ -60,12 +60,12 @@ def _params(calibration: Calibration, content: dict[str, Any]) -> str:
             result |= {name: entry['value'], f'{name}_sigma': entry['sigma']}
     result |= {'legs': len(calibration.legs),
                'valid': calibration.verdict is not Verdict.REJECTED,
-               'stamp': no_date(content['created']), 'vehicle': content['vehicle']}
+               'stamp': date_text(content['created']), 'vehicle': content['vehicle']}
     return (device_files.head(calibration, content)
             + '# for the node calibrator at its start: --ros-args --params-file THIS_FILE\n'
             '# scale factor: metres of travel per pulse (per rad for joints, 1 for speeds)\n'
             '# angles: rad, of the IMU on the vehicle about fixed axes; yaw > 0: its x axis '
-            'points left of forward\n' + parameters({'result': result}))
+            'points left of forward\n' + parameter_block({'result': result}))
 
 
 def _autoware(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
@@ -82,7 +82,7 @@ def _autoware(calibration: Calibration, config: Config, content: dict[str, Any])
             f'angular_velocity_stddev_{axis}{axis}': 0.03 for axis in AXES}
     top = device_files.head(calibration, content)
     return {name: f'{top}# for autoware {node}, in place of its param file of this name;\n'
-            f'# {defaults} are its defaults, not measured here\n{parameters(values)}'
+            f'# {defaults} are its defaults, not measured here\n{parameter_block(values)}'
             for name, (node, defaults, values) in out.items()}
 
 
@@ -121,15 +121,15 @@ def _transform(calibration: Calibration, config: Config,
     ElementTree.SubElement(joint, 'child', link=imu)
     launch = ElementTree.Element('launch')
     ElementTree.SubElement(launch, 'node', pkg='tf2_ros', exec='static_transform_publisher',
-                           name=name, args=names.for_launch(words))
+                           name=name, args=text_formats.for_launch(words))
     assumed = '' if any(config.imu.lever_arm) else ' (not set)'
     head = (f'{device_files.about(calibration, content)}\ntranslation: imu.lever_arm{assumed}; '
             f'{not_estimated(calibration)} as configured')
-    command = (names.for_comment(
+    command = (text_formats.for_comment(
         f'{head}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
         'this command publishes;\n'
         'it is not the yaw_offset of navsat_transform, which corrects a compass.')
-        + f'ros2 run tf2_ros static_transform_publisher {names.for_shell(words)}\n')
+        + f'ros2 run tf2_ros static_transform_publisher {text_formats.for_shell(words)}\n')
     return {LAUNCH: '<?xml version="1.0"?>\n' + _xml(
                 launch, f'include it in the launch file of your vehicle\n{head}'),
             URDF: _xml(joint, f'put into your URDF in place of the joint that carries the IMU\n'
@@ -141,7 +141,7 @@ def _xml(root: Any, note: str) -> str:
     """Return an element as text after a comment."""
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding='unicode')
-    return f'<!-- {names.for_xml_comment(note)} -->\n{text}\n'
+    return f'<!-- {text_formats.for_xml_comment(note)} -->\n{text}\n'
 
 
 MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': device_files.controllers,
@@ -158,9 +158,10 @@ def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibr
     if config.frames.imu or not frame:
         return calibration, config
     taken = frame.lstrip('/')       # as ROS 1 wrote it
-    taken = taken if names.is_frame(taken) else IMU_FRAME
+    taken = taken if text_formats.is_frame(taken) else IMU_FRAME
     if taken != frame:
         note = Reason(Code.FRAME_REPLACED, 'the frame of the IMU messages, '
-                      f"'{names.one_line(frame[:60])}', is not valid in TF; {taken} is written")
+                      f"'{text_formats.one_line(frame[:60])}', is not valid in TF; "
+                      f'{taken} is written')
         calibration = replace(calibration, reasons=(*calibration.reasons, note))
     return calibration, with_settings(config, {'frames.imu': taken})

@@ -14,8 +14,8 @@ from odocal_ros.calib.result import BESIDE, Estimate, wheel_factors
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.figures import with_sigma, with_unit
 from odocal_ros.output.files import MAIN, plain, SCHEMA
-from odocal_ros.outside.limits import read_bytes
 from odocal_ros.reasons import Code, Verdict
+from odocal_ros.safe_io.limits import read_bytes
 from odocal_ros.settings.config import Config, flat
 
 T = TypeVar('T')

@@ -21,9 +21,9 @@ from odocal_ros.calib.result import (
     wheel_factors,
 )
 from odocal_ros.output.figures import iso, known, length, table_row, two_digits
-from odocal_ros.outside.names import for_table
 from odocal_ros.pipeline.combination import driven_twice
 from odocal_ros.reasons import Verdict, verdict_of
+from odocal_ros.safe_io.text_formats import for_table
 from odocal_ros.settings.config import Config
 
 LEGS = 'legs.csv'

@@ -15,8 +15,8 @@ import re
 from typing import Any
 
 from odocal_ros.errors import BadConfig, BadUsage
-from odocal_ros.outside.limits import read_text
-from odocal_ros.outside.yaml_files import composed
+from odocal_ros.safe_io.limits import read_text
+from odocal_ros.safe_io.text_formats import compose_yaml
 from odocal_ros.settings.config import Config, SETTINGS
 from odocal_ros.settings.setting import with_settings
 
@@ -46,7 +46,7 @@ def read_config_file(path: Path) -> dict[str, object]:
 
 def _root(path: Path) -> Node:
     try:
-        return composed(read_text(path), str(path))
+        return compose_yaml(read_text(path), str(path))
     except OSError as error:
         raise BadUsage(f'{path}: cannot be read ({error.strerror}); check --config') from None
     except UnicodeDecodeError:
@@ -90,7 +90,7 @@ def parse_set(text: str) -> tuple[str, object]:
     if not equals or not name:
         raise BadUsage(f'--set {text}: required: key=value, such as --set leg.min_distance=50')
     try:
-        node = composed(value, f'--set {name}')
+        node = compose_yaml(value, f'--set {name}')
     except BadConfig as error:
         raise BadUsage(str(error)) from None
     if name in SETTINGS and SETTINGS[name].kind == 'str' and not _is_quoted(node):

@@ -11,7 +11,7 @@ import math
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from odocal_ros.errors import BadConfig
-from odocal_ros.outside.names import is_frame, one_line
+from odocal_ros.safe_io.text_formats import is_frame, one_line
 
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
 

@@ -19,7 +19,7 @@ from odocal_ros.bagio import types
 from odocal_ros.bagio.mcap_records import MAGIC
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.errors import BadBag, BadData
-from odocal_ros.outside.limits import RAISE, zstd_module
+from odocal_ros.safe_io.limits import RAISE, zstd_module
 
 MOST = 2**28       # bytes: a quarter of what a reading may take over a clean bag's
 

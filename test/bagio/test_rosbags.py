@@ -23,7 +23,7 @@ from odocal_ros.bagio.encode import counter, fix, imu
 from odocal_ros.bagio.parts import Part
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.errors import BadBag
-from odocal_ros.outside.limits import Allowance, LimitReached
+from odocal_ros.safe_io.limits import Allowance, LimitReached
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import simulate
 

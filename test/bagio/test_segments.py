@@ -20,7 +20,7 @@ from odocal_ros.bagio.chunks import pack, read_chunks, write_file
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.segments import JOURNAL, part_name, SegmentedBag, whole_name
 from odocal_ros.errors import BadBag
-from odocal_ros.outside.whole import PART
+from odocal_ros.safe_io.atomic_files import PART
 
 pytestmark = pytest.mark.core
 T0 = ros_bags.T0

@@ -13,7 +13,7 @@ from sqlite_mutations import sqlite_oddities, sqlite_pages, sqlite_rows, sqlite_
 import yaml
 
 from odocal_ros.bagio.mcap_records import CHUNK, MAGIC
-from odocal_ros.outside.limits import zstd_module
+from odocal_ros.safe_io.limits import zstd_module
 
 VALUES = [None, True, -1, 0, 10**400, 2**63, float('inf'), float('nan'), '', 'text', '\0',
           '\x1b[2J', '$(command x)', '../../x', '/dev/zero', 'x' * 5000, [], [[]], {}, {'a': 1},

@@ -13,7 +13,7 @@ import pytest
 from odocal_ros.library.compare import CAUSES
 from odocal_ros.offline.cli import main
 from odocal_ros.output.stored import read_stored
-from odocal_ros.outside.limits import LimitReached
+from odocal_ros.safe_io.limits import LimitReached
 
 pytestmark = pytest.mark.core
 ENTRY = {'value': 0.02, 'sigma': 3e-6, 'unit': 'm/pulse', 'method': 'two_point'}

@@ -18,7 +18,7 @@ import pytest
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import folder as module
 from odocal_ros.output.folder import ResultFolder
-from odocal_ros.outside import whole
+from odocal_ros.safe_io import atomic_files
 
 MAIN, OURS = 'main.json', frozenset({'main.json', 'a.txt', 'b.txt', 'late.html'})
 
@@ -229,7 +229,8 @@ def test_ctrl_c_waits_for_the_exchange(tmp_path, monkeypatch):
 
 def test_the_shield_of_ctrl_c_is_for_the_main_thread_only():
     done = []
-    thread = threading.Thread(target=lambda: [done.append(1) for _ in [whole.uninterrupted()]])
+    thread = threading.Thread(
+        target=lambda: [done.append(1) for _ in [atomic_files.uninterrupted()]])
     thread.start()
     thread.join()
     assert done == [1]
@@ -237,14 +238,14 @@ def test_the_shield_of_ctrl_c_is_for_the_main_thread_only():
 
 def test_a_write_that_breaks_off_leaves_the_old_file_and_no_litter(tmp_path, refuse):
     path = tmp_path / 'a.json'
-    whole.write_text(path, 'old')
+    atomic_files.write_text(path, 'old')
     for step in range(1, 6):
         refuse(step)
         with pytest.raises(OSError, match='No space'):
-            whole.write_text(path, 'new')
+            atomic_files.write_text(path, 'new')
         assert path.read_text() == 'old'
         assert list(tmp_path.iterdir()) == [path]
     refuse(0)
     with path.open() as reader:
-        whole.write_text(path, json.dumps('new'))
+        atomic_files.write_text(path, json.dumps('new'))
         assert reader.read() == 'old'

@@ -17,7 +17,7 @@ import yaml
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.output import ros_files
-from odocal_ros.outside.yaml_files import number
+from odocal_ros.safe_io.text_formats import yaml_number
 
 SIZES = {'wheels__pulses_per_revolution': 60.0, 'odometer__nominal_scale': 0.04,
          'odometer__track_width': 1.5}
@@ -116,11 +116,11 @@ def test_every_file_written_is_known_for_removal(smoothed):
 
 @pytest.mark.parametrize('value', [1e-5, 1e22, -3e-7, 0.1, 0.0, 1.0, -123456.789])
 def test_numbers_stay_doubles_for_every_yaml_reader(value):
-    text = number(value)
+    text = yaml_number(value)
     assert yaml.safe_load(text) == value
     assert isinstance(yaml.safe_load(text), float)
     assert re.search(r'[.]', text)
-    assert number(None) == number(math.inf) == '.nan'       # what is not known
+    assert yaml_number(None) == yaml_number(math.inf) == '.nan'       # what is not known
 
 
 def flat(values, prefix=''):

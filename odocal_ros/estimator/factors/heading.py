@@ -37,7 +37,7 @@ class Heading(Outside):
     yaw: Floats         # (m,) rad
     noise: Floats       # (m,) rad
     sigma: float        # rad, of the error that is constant over the leg
-    said_by: str        # the heading source, as in the settings
+    error_text: str        # the heading source, as in the settings
 
 
 class HeadingRows(OutsideRows):
@@ -69,7 +69,7 @@ class HeadingRows(OutsideRows):
 
     @classmethod
     def details(cls, sent: Heading, constants: Floats, sigma: Floats) -> dict[str, Any]:
-        return {'source': sent.said_by, 'sigma_stated': sent.sigma,
+        return {'source': sent.error_text, 'sigma_stated': sent.sigma,
                 'error': float(constants[HEADING]), 'error_sigma': float(sigma[HEADING])}
 
     def rows(self, problem: Problem, point: LinearisationPoint) -> Rows:
@@ -96,7 +96,7 @@ class HeadingRows(OutsideRows):
 
 
 def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float, config: Config,
-          origin: Origin, C_ib: Floats, said_by: str) -> Heading | None:
+          origin: Origin, C_ib: Floats, error_text: str) -> Heading | None:
     """Return the heading of orientations q (m, 4) that an IMU or a topic publishes."""
     good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     t, q, variance = t[good], q[good], variance[good]
@@ -110,4 +110,4 @@ def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float,
         return None
     C = matrix_from_quat(q) @ C_ib
     yaw = arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + convergence(inputs, t, origin)
-    return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), said_by)
+    return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), error_text)

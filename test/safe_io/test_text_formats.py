@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names from outside in every format: what was sent is shown, nothing of it is acted on."""
+"""Untrusted names in every format: they are shown, and no program acts on their content."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +18,9 @@ from odocal_ros.output import ros_files
 from odocal_ros.output.files import as_json
 from odocal_ros.output.ros_files import framed
 from odocal_ros.output.tables import leg_table, LEGS
-from odocal_ros.outside import names as outside, whole
-from odocal_ros.outside.yaml_files import parameters, value_text
 from odocal_ros.reasons import Code
+from odocal_ros.safe_io import atomic_files, text_formats
+from odocal_ros.safe_io.text_formats import parameter_block, yaml_value
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
@@ -113,13 +113,14 @@ def test_the_name_of_a_bag_stays_within_its_comment(bag):
 
 def test_words_come_to_a_command_as_they_are():
     words = ['a b', "it's", '$(touch x)', '`x`', '', '-', 'ü']
-    out = subprocess.run(['bash', '-c', f'printf "%s\\0" {outside.for_shell(words)}'], text=True,
-                         stdout=subprocess.PIPE, check=True).stdout
+    script = f'printf "%s\\0" {text_formats.for_shell(words)}'
+    out = subprocess.run(['bash', '-c', script], text=True, stdout=subprocess.PIPE,
+                         check=True).stdout
     assert out.split('\0')[:-1] == words
 
 
 def test_launch_substitutes_nothing():
-    text = outside.for_launch(["$(command 'x')", '"', '\\'])
+    text = text_formats.for_launch(["$(command 'x')", '"', '\\'])
     # launch's grammar: $( begins a substitution unless a backslash stands before it
     assert '$(' not in text.replace('\\$(', '')
     assert text.replace('\\\\', '').count('"') == text.count('\\"')
@@ -128,20 +129,20 @@ def test_launch_substitutes_nothing():
 @pytest.mark.parametrize('text', ['0', 'on', '1e5', '.nan', 'a: b', '#', "it's", '"', '\\', '',
                                   'ü', '😀', '- x', '{a}', 'x ' * 200])
 def test_text_in_yaml_is_read_back_as_text(text):
-    assert yaml.safe_load(value_text(text)) == text
-    assert '\n' not in value_text(text)
-    assert yaml.safe_load(parameters({'a': {'b': text}})) == {
+    assert yaml.safe_load(yaml_value(text)) == text
+    assert '\n' not in yaml_value(text)
+    assert yaml.safe_load(parameter_block({'a': {'b': text}})) == {
         '/**': {'ros__parameters': {'a': {'b': text}}}}
 
 
 def test_a_terminal_shows_control_characters_and_keeps_the_style_of_the_verdict():
-    assert outside.for_terminal('\x1b[1;32mACCEPTED\x1b[0m\na\x1b[2Jb\rc\x9b') == (
+    assert text_formats.for_terminal('\x1b[1;32mACCEPTED\x1b[0m\na\x1b[2Jb\rc\x9b') == (
         '\x1b[1;32mACCEPTED\x1b[0m\na\\x1b[2Jb\\rc\\x9b')
-    assert outside.one_line('a\nb\udcff') == 'a\\nb\\udcff'
+    assert text_formats.one_line('a\nb\udcff') == 'a\\nb\\udcff'
 
 
 def test_all_commands_print_through_one_door():
-    folder = Path(outside.__file__).parents[1] / 'offline'
+    folder = Path(text_formats.__file__).parents[1] / 'offline'
     users = {path.name for path in folder.glob('*.py') if 'print(' in path.read_text()}
     assert users == {'say.py'}
 
@@ -161,16 +162,16 @@ def test_a_frame_that_nobody_names_leaves_all_as_it_is():
 
 def test_colours_of_others_are_shown_and_no_line_is_longer_than_a_screen():
     colours = '\x1b[1;31mstd_msgs/msg/Int64\x1b[0m'
-    assert '\x1b' not in outside.for_terminal(colours)
+    assert '\x1b' not in text_formats.for_terminal(colours)
     for text in ('x' * 2_000_000, '\x1b' * 2_000_000, '\n' * 2_000_000):
-        assert len(outside.brief_line(text)) <= outside.LONGEST_LINE + 4
-        assert len(outside.said_by(ValueError(text))) <= outside.LONGEST_LINE + 4
-    assert outside.brief_line('a\x1b]52;c;eA==\x07b') == r'a\x1b]52;c;eA==\x07b'
+        assert len(text_formats.brief_line(text)) <= text_formats.LONGEST_LINE + 4
+        assert len(text_formats.error_text(ValueError(text))) <= text_formats.LONGEST_LINE + 4
+    assert text_formats.brief_line('a\x1b]52;c;eA==\x07b') == r'a\x1b]52;c;eA==\x07b'
 
 
 def test_folders_of_one_name_are_numbered_up_to_a_bound(tmp_path, monkeypatch):
-    monkeypatch.setattr(whole, 'MOST_SAME_NAME', 3)
-    made = [whole.new_folder(tmp_path / 'root', 'leg').name for _ in range(3)]
+    monkeypatch.setattr(atomic_files, 'MOST_SAME_NAME', 3)
+    made = [atomic_files.new_folder(tmp_path / 'root', 'leg').name for _ in range(3)]
     assert made == ['leg', 'leg-2', 'leg-3']
     with pytest.raises(OSError, match='holds 3 folders named leg'):
-        whole.new_folder(tmp_path / 'root', 'leg')
+        atomic_files.new_folder(tmp_path / 'root', 'leg')
