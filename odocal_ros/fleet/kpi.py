@@ -21,7 +21,7 @@ from typing import Any
 from odocal_ros.calib.result import Estimate
 from odocal_ros.fleet.tables import LEGS, VALUES
 from odocal_ros.output.figures import table_row
-from odocal_ros.pipeline.acceptance import Decision, hold
+from odocal_ros.pipeline.acceptance import decide_value, Decision
 from odocal_ros.reasons import Verdict
 from odocal_ros.safe_io.atomic_files import locked, write_text
 
@@ -83,8 +83,8 @@ def _decision(row: dict[str, Any], limits: Limits) -> Decision:
     """Return the decision of the limits on a vehicle or a leg; rejected ones are undecided."""
     if row['verdict'] == Verdict.REJECTED.value:
         return Decision.UNDECIDED
-    return max((hold(name, Estimate(row[name], row[f'{name}_sigma'],
-                                    'rad' if 'angle' in name else ''), *ends).decision
+    return max((decide_value(name, Estimate(row[name], row[f'{name}_sigma'],
+                                            'rad' if 'angle' in name else ''), *ends).decision
                 for name, ends in limits.items()), key=list(Decision).index)
 
 

@@ -27,7 +27,7 @@ from odocal_ros.forecast.forecast import (
 from odocal_ros.forecast.leg_so_far import SmootherSoFar
 from odocal_ros.pipeline.calibrate import NOT_YET
 from odocal_ros.pipeline.planar_run import planar_leg
-from odocal_ros.pipeline.prepared import Stage
+from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.leg_kind import settings_by_frame
 from odocal_ros.settings.config import Config

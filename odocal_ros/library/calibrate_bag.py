@@ -24,7 +24,7 @@ from odocal_ros.library.asked import (
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.legs import cut_short, open_ended, OPEN_LEG
 from odocal_ros.library.read_bag import journal_notes, read_bag, readers_of, Recording
-from odocal_ros.pipeline.prepared import Stage
+from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config, flat

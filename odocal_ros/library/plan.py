@@ -21,7 +21,7 @@ from odocal_ros.forecast.predict import predict, Sigmas
 from odocal_ros.library import planned_drives
 from odocal_ros.library.asked import config_of, Settings
 from odocal_ros.output.figures import length, time_span
-from odocal_ros.pipeline.combination import together
+from odocal_ros.pipeline.combination import combine_results
 from odocal_ros.settings.config import GRADES, with_settings
 
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
@@ -119,8 +119,8 @@ def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Chang
             continue
         one = before.methods[name]
         # the smoother works in body axes: the direction of the drive does not matter
-        both = together(name, [_whole(one), _whole(other.get(name, one))],
-                        (0, round(drive.duration * 1e9)), sigmas.config)
+        both = combine_results(name, [_whole(one), _whole(other.get(name, one))],
+                               (0, round(drive.duration * 1e9)), sigmas.config)
         left[parameter] = both.estimates[parameter].sigma
     return [Change('a second leg in the other direction', left)]
 

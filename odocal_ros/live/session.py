@@ -15,7 +15,7 @@ from odocal_ros.forecast.ability import Ability
 from odocal_ros.forecast.forecast import Forecast
 from odocal_ros.output.summary import values_in_words
 from odocal_ros.pipeline.floor_marks import FloorMark, next_point
-from odocal_ros.pipeline.prepared import Stage
+from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.safe_io.text_formats import one_line
 from odocal_ros.settings.config import Config, LegConfig

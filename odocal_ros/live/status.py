@@ -16,7 +16,7 @@ from odocal_ros.live import answers
 from odocal_ros.live.console import losses_in_words
 from odocal_ros.live.health import Health
 from odocal_ros.live.session import Session, SessionView, State
-from odocal_ros.pipeline.prepared import Stage
+from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Verdict
 
 SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # short moves are not a fault

@@ -27,7 +27,7 @@ from odocal_ros.output.drawing import evenly
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold, refusal
 from odocal_ros.pipeline.calibrate import calibrate_parts, combine
-from odocal_ros.pipeline.prepared import Stage
+from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 

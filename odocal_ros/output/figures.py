@@ -13,7 +13,7 @@ import textwrap
 from typing import Any
 
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
-from odocal_ros.pipeline.acceptance import Acceptance, Held
+from odocal_ros.pipeline.acceptance import Acceptance, ValueDecision
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
@@ -225,7 +225,7 @@ def accept_words(acceptance: Acceptance) -> list[str]:
     return lines + ([f'  -> {acceptance.do}'] if acceptance.do else [])
 
 
-def _value(held: Held) -> str:
+def _value(held: ValueDecision) -> str:
     e, angle = held.estimate, held.estimate.unit == 'rad'
     factor = math.degrees(1.0) if angle else 1.0
     unit = ' deg' if angle else f' {e.unit}' * (e.unit not in ('', '1'))

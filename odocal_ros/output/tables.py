@@ -21,7 +21,7 @@ from odocal_ros.calib.result import (
     wheel_factors,
 )
 from odocal_ros.output.figures import iso, known, length, table_row, two_digits
-from odocal_ros.pipeline.combination import driven_twice
+from odocal_ros.pipeline.combination import overlapping_legs
 from odocal_ros.reasons import Verdict, verdict_of
 from odocal_ros.safe_io.text_formats import for_table
 from odocal_ros.settings.config import Config
@@ -117,7 +117,8 @@ def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
     legs : those of the values, whose reasons apply to each method; rejected ones count only if all
     are rejected.
     """
-    twice = driven_twice([leg for leg in legs if verdict_of(leg.reasons) is not Verdict.REJECTED])
+    twice = overlapping_legs([leg for leg in legs
+                              if verdict_of(leg.reasons) is not Verdict.REJECTED])
     of_data = [verdict_of(leg.reasons) for leg in legs if leg not in twice]
     used = [v for v in of_data if v is not Verdict.REJECTED] or of_data
     worst = Verdict.worst([method.verdict, *used])
@@ -128,7 +129,7 @@ def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
 
 def leg_verdicts(legs: tuple[LegResult, ...]) -> list[str]:
     """Return the verdict of each leg; 'not used' if an earlier good leg covers its time."""
-    twice = driven_twice([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
+    twice = overlapping_legs([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
     return ['not used' if leg in twice else leg.verdict.value for leg in legs]
 
 

@@ -36,21 +36,21 @@ class Decision(Enum):
 
 
 @dataclass(frozen=True)
-class Held:
-    """A value compared with its limits; sigma_wanted: the sigma with which it would pass."""
+class ValueDecision:
+    """A value compared with its limits; required_sigma: the sigma with which it would pass."""
 
     name: str
     estimate: Estimate
     low: float
     high: float
     decision: Decision
-    sigma_wanted: float | None = None
+    required_sigma: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         return {'decision': self.decision.value, **self.estimate.as_dict(),
                 'low': self.low if math.isfinite(self.low) else None,
                 'high': self.high if math.isfinite(self.high) else None,
-                'sigma_wanted': self.sigma_wanted}
+                'required_sigma': self.required_sigma}
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Acceptance:
     """The decision on a vehicle and on each value; if undecided, the cause and the remedy."""
 
     decision: Decision
-    values: tuple[Held, ...]
+    values: tuple[ValueDecision, ...]
     why: str = ''
     do: str = ''
 
@@ -69,10 +69,10 @@ class Acceptance:
 
 def decide(value: float, sigma: float, low: float, high: float) -> Decision:
     """Return PASS for a value certainly within its limits, FAIL if certainly outside."""
-    least, most = value - LIMIT_SIGMAS * sigma, value + LIMIT_SIGMAS * sigma
-    if low <= least and most <= high:
+    lower, upper = value - LIMIT_SIGMAS * sigma, value + LIMIT_SIGMAS * sigma
+    if low <= lower and upper <= high:
         return Decision.PASS
-    return Decision.FAIL if most < low or least > high else Decision.UNDECIDED
+    return Decision.FAIL if upper < low or lower > high else Decision.UNDECIDED
 
 
 def accept(calibration: Calibration, config: Config) -> Acceptance | None:
@@ -83,38 +83,38 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
     undecided, and with ``accept.strict`` one with a caution does not pass.
     """
     unknown = Estimate(None, None, '')
-    values = tuple(hold(name, calibration.estimates.get(name, unknown), low, high)
+    values = tuple(decide_value(name, calibration.estimates.get(name, unknown), low, high)
                    for name, (low, high) in config.accept.limits.items())
     if not values:
         return None
     worst = max((held.decision for held in values), key=list(Decision).index)
-    barred = calibration.verdict is Verdict.REJECTED or (
+    is_withheld = calibration.verdict is Verdict.REJECTED or (
         config.accept.strict and calibration.verdict is not Verdict.ACCEPTED)
-    if calibration.verdict is Verdict.REJECTED or (barred and worst is Decision.PASS):
+    if calibration.verdict is Verdict.REJECTED or (is_withheld and worst is Decision.PASS):
         why = next(r for r in calibration.reasons if r.code.severity is calibration.verdict)
         return Acceptance(Decision.UNDECIDED, values, f'{calibration.verdict.value}: '
                           f'{why.code.name}: {why.text}', why.remedy)
-    open_ones = [held for held in values if held.decision is Decision.UNDECIDED]
+    undecided = [held for held in values if held.decision is Decision.UNDECIDED]
     if worst is not Decision.UNDECIDED:
         return Acceptance(worst, values)
-    said = [_lacking(held, calibration.reasons) for held in open_ones]
-    return Acceptance(worst, values, '; '.join(why for why, _ in said),
-                      ' '.join(dict.fromkeys(do for _, do in said)))
+    explanations = [_explain_undecided(held, calibration.reasons) for held in undecided]
+    return Acceptance(worst, values, '; '.join(why for why, _ in explanations),
+                      ' '.join(dict.fromkeys(do for _, do in explanations)))
 
 
-def hold(name: str, found: Estimate, low: float, high: float) -> Held:
+def decide_value(name: str, found: Estimate, low: float, high: float) -> ValueDecision:
     value, sigma = found.value, found.sigma
     if value is None or sigma is None:
-        return Held(name, found, low, high, Decision.UNDECIDED)
+        return ValueDecision(name, found, low, high, Decision.UNDECIDED)
     if found.unit == 'rad':      # wrapped to within half a turn of the limits
         middle = low if math.isinf(high) else high if math.isinf(low) else (low + high) / 2
         value = middle + float(wrap(value - middle))
     room = min(value - low, high - value)
-    return Held(name, found, low, high, decide(value, sigma, low, high),
-                room / LIMIT_SIGMAS if room > 0 else None)
+    return ValueDecision(name, found, low, high, decide(value, sigma, low, high),
+                         room / LIMIT_SIGMAS if room > 0 else None)
 
 
-def _lacking(held: Held, reasons: tuple[Reason, ...]) -> tuple[str, str]:
+def _explain_undecided(held: ValueDecision, reasons: tuple[Reason, ...]) -> tuple[str, str]:
     """Return the explanation why a value is undecided, and the remedy."""
     name, found = held.name.replace('_', ' '), held.estimate
     if found.value is None or found.sigma is None:
@@ -124,14 +124,14 @@ def _lacking(held: Held, reasons: tuple[Reason, ...]) -> tuple[str, str]:
             return f'{name} is not known', 'Set odometer.nominal_scale.'
         return f'{name} is not determined', (reason or DRIVE_MORE[held.name]).remedy
     of, unit = (math.degrees(1.0), ' deg') if found.unit == 'rad' else (1.0, '')
-    if held.sigma_wanted is None:
+    if held.required_sigma is None:
         turn = math.tau if unit else math.inf
-        off, limit = min(((math.remainder(found.value - x, turn), x) for x in (
+        excess, limit = min(((math.remainder(found.value - x, turn), x) for x in (
             held.low, held.high) if math.isfinite(x)), key=lambda pair: abs(pair[0]))
-        return (f'{name} is {of * (limit + off):.5g}{unit}, beyond its limit of '
+        return (f'{name} is {of * (limit + excess):.5g}{unit}, beyond its limit of '
                 f'{of * limit:.5g}{unit} by less than {LIMIT_SIGMAS:g} sigma (sigma '
                 f'{of * found.sigma:.2g}{unit})', DRIVE_MORE[held.name].remedy)
-    times = (found.sigma / held.sigma_wanted)**2
+    factor = (found.sigma / held.required_sigma)**2
     return (f'{name} is within its limits, but its sigma is {of * found.sigma:.2g}{unit}; the '
-            f'limit is {of * held.sigma_wanted:.2g}{unit} (needs about {math.ceil(times)} times '
-            'as many such legs)', DRIVE_MORE[held.name].remedy)
+            f'limit is {of * held.required_sigma:.2g}{unit} (needs about {math.ceil(factor)} '
+            'times as many such legs)', DRIVE_MORE[held.name].remedy)

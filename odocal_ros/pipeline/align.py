@@ -43,7 +43,8 @@ from odocal_ros.settings.grades import G, Grade, grade_of, imu_as_seen, with_tur
 
 FEWEST_AT_REST = 20     # statistical: IMU rows; a sigma of 20 values has an error of 16 %
 Span = TypeVar('Span', Floats, tuple[float, float])
-Found = tuple[tuple[float, float] | None, str]      # (yaw, sigma) rad, or None and the reason
+# (yaw, sigma) rad, or None and the reason
+HeadingOrRefusal = tuple[tuple[float, float] | None, str]
 
 
 def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats, origin: Origin,
@@ -58,12 +59,12 @@ def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats
     gyro_noise = max(grade.gyro_noise, noise.get('gyro', 0.0))
     level, reasons = _level(inputs, span, metres_per_unit, origin.latitude, grade, gyro_noise)
     reasons += _against_grade(noise.get('gyro', 0.0), grade_of(config.imu))
-    level = replace(level, C_np=_from_place(inputs, level.standstill, fixes_n, origin))
-    yaw, sigma, source, shared, why = _heading(inputs, level, origin.latitude, grade, config)
-    reasons += why
+    level = replace(level, C_np=_place_rotation(inputs, level.standstill, fixes_n, origin))
+    yaw, sigma, source, shared, refusals = _heading(inputs, level, origin.latitude, grade, config)
+    reasons += refusals
     if source == 'course':
-        yaw, sigma, why = _course(inputs, level, metres_per_unit, fixes_n, origin, grade)
-        reasons += why
+        yaw, sigma, refusals = _course(inputs, level, metres_per_unit, fixes_n, origin, grade)
+        reasons += refusals
     return complete(level, yaw, sigma, source, shared, origin, grade, gyro_noise), reasons
 
 
@@ -74,18 +75,18 @@ def with_observed_walk(alignment: Alignment, inputs: Inputs, spans: Floats,
 
     A gyro warms up. spans : (k, 2) standstills, s.   epochs : attitude, t (m,) s and q_nb (m, 4).
     """
-    walked = []
+    walk_variances = []
     for begin, end in spans[spans[:, 0] > alignment.t] if alignment.standstill else ():
         rows = slice(*np.searchsorted(inputs.t_imu, (begin + REST_EDGE, end - REST_EDGE)))
         t = inputs.t_imu[rows]
         if len(t) < FEWEST_AT_REST:
             continue
         C_nb = matrix_from_quat(quat_at(np.mean(t, keepdims=True), *epochs))[0]
-        off = inputs.w_b[rows].mean(axis=0) - earth_rate_n @ C_nb - alignment.gyro_bias
+        residual_rate = inputs.w_b[rows].mean(axis=0) - earth_rate_n @ C_nb - alignment.gyro_bias
         variance = alignment.gyro_noise**2 / (t[-1] - t[0]) + alignment.gyro_bias_sigma**2
-        walked.append((off**2 - variance).mean() / (t.mean() - alignment.t))
-    seen = np.sqrt(max(np.median(walked), 0.0)) if walked else 0.0
-    return replace(alignment, gyro_bias_walk=max(alignment.gyro_bias_walk, float(seen)))
+        walk_variances.append((residual_rate**2 - variance).mean() / (t.mean() - alignment.t))
+    observed = np.sqrt(max(np.median(walk_variances), 0.0)) if walk_variances else 0.0
+    return replace(alignment, gyro_bias_walk=max(alignment.gyro_bias_walk, float(observed)))
 
 
 def choose_standstill(spans: Iterable[Span]) -> Span | None:
@@ -94,15 +95,15 @@ def choose_standstill(spans: Iterable[Span]) -> Span | None:
     return before[-1] if before else None
 
 
-def _from_place(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes_n: Floats,
-                origin: Origin) -> Floats:
+def _place_rotation(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes_n: Floats,
+                    origin: Origin) -> Floats:
     """Return C_np at a standstill, rotated from the origin by 0.16 mrad per kilometre."""
     if span is None or not len(fixes_n):
         return np.eye(3)
-    near = (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
-    if not near.any():
-        near = np.argmin(np.abs(inputs.t_fix - span[1]), keepdims=True)
-    place_n = np.nan_to_num(np.median(fixes_n[near], axis=0))
+    selected = (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
+    if not selected.any():
+        selected = np.argmin(np.abs(inputs.t_fix - span[1]), keepdims=True)
+    place_n = np.nan_to_num(np.median(fixes_n[selected], axis=0))
     latitude, longitude, _ = origin.to_geodetic(place_n)
     return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
 
@@ -154,21 +155,21 @@ def _noise_at_rest(inputs: Inputs, span: Floats) -> dict[str, float]:
 def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
              config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
     """Return yaw of the x axis of L, sigma, source, shared, reasons; 0, pi for a course."""
-    asked = config.alignment.source
-    order = [asked] if asked != 'auto' else [] if inputs.local else [
+    setting = config.alignment.source
+    order = [setting] if setting != 'auto' else [] if inputs.local else [
         'heading_topic', 'imu_orientation', 'gyrocompass']
     refusals = []
-    for source in order if asked != 'course' else ():
-        result, why = _from_source(source, inputs, level, latitude, grade, config)
+    for source in order if setting != 'course' else ():
+        result, refusal = _from_source(source, inputs, level, latitude, grade, config)
         if result is not None:
             return *result, source, source != 'gyrocompass', ()
         refusals.append(Reason(Code.GYROCOMPASS_REFUSED if source == 'gyrocompass'
-                               else Code.HEADING_UNAVAILABLE, f'heading from {source}: {why}'))
-    return 0.0, np.pi, 'course', True, tuple(refusals) if asked != 'auto' else ()
+                               else Code.HEADING_UNAVAILABLE, f'heading from {source}: {refusal}'))
+    return 0.0, np.pi, 'course', True, tuple(refusals) if setting != 'auto' else ()
 
 
 def _from_source(source: str, inputs: Inputs, level: Level, latitude: float, grade: Grade,
-                 config: Config) -> Found:
+                 config: Config) -> HeadingOrRefusal:
     if source == 'heading_topic':
         sent, t = inputs.outside['heading']
         return _from_quaternions(t, sent.q_ni, sent.yaw_variance, np.eye(3), level, config,
@@ -180,7 +181,7 @@ def _from_source(source: str, inputs: Inputs, level: Level, latitude: float, gra
         inputs, level, latitude, grade, config)
 
 
-def _fixed(inputs: Inputs, level: Level, config: Config) -> Found:
+def _fixed(inputs: Inputs, level: Level, config: Config) -> HeadingOrRefusal:
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
     mark_yaw = float(yaw_from_heading(config.alignment.heading))
@@ -202,13 +203,13 @@ def _turn_since(inputs: Inputs, level: Level) -> float:
 
 
 def _from_quaternions(t: Floats, q: Floats, variance: Floats, C_ib: Floats, level: Level,
-                      config: Config, offset: float = 0.0) -> Found:
+                      config: Config, offset: float = 0.0) -> HeadingOrRefusal:
     """Return (yaw, sigma) at the level's epoch from published orientations, or None, reason."""
     heading_reach = 0.5    # s, largest distance of a heading sample from a start in motion
     # a leg may have hours of rows: select the used ones first
     begin, end = level.standstill or (level.t - heading_reach, level.t + heading_reach)
-    near = slice(np.searchsorted(t, begin), np.searchsorted(t, end, side='right'))
-    t, q, variance = t[near], q[near], variance[near]
+    selected = slice(np.searchsorted(t, begin), np.searchsorted(t, end, side='right'))
+    t, q, variance = t[selected], q[selected], variance[selected]
     pick = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     if not level.standstill:
         away = np.where(pick, np.abs(t - level.t), np.inf)
@@ -226,7 +227,7 @@ def _from_quaternions(t: Floats, q: Floats, variance: Floats, C_ib: Floats, leve
 
 
 def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
-                 config: Config) -> Found:
+                 config: Config) -> HeadingOrRefusal:
     if inputs.local:
         return None, 'the positions are in a local frame, whose y axis does not point to north'
     if level.standstill is None:
@@ -236,11 +237,11 @@ def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
         return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) causes a '
                       f'heading uncertainty of {np.rad2deg(min(sigma, np.pi)):.1f} deg; '
                       f'the limit is {np.rad2deg(COMPASS_LIMIT):.1f} deg')
-    off = off_the_earth(level, latitude, grade)
+    deviation = off_the_earth(level, latitude, grade)
     no_earth_sigmas = 4.0    # sigmas: with a larger bias there is no gyrocompass
-    if off > no_earth_sigmas:
-        return None, (f'the turn rate at rest differs from the Earth rate by {off:.0f} sigma '
-                      f'(limit {no_earth_sigmas:.0f}): the gyro bias exceeds that of the '
+    if deviation > no_earth_sigmas:
+        return None, (f'the turn rate at rest differs from the Earth rate by {deviation:.0f} '
+                      f'sigma (limit {no_earth_sigmas:.0f}): the gyro bias exceeds that of the '
                       f'{config.imu.grade} grade')
     return (yaw, sigma), ''
 
@@ -254,12 +255,12 @@ def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Float
     t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - trial.gyro_bias, trial.q_nb,
                        origin.earth_rate_n)
     track = dead_reckon(t, q_nb, inputs.travel)
-    near = (inputs.t_fix >= max(t[0], 0.0)) & (inputs.t_fix <= t[-1])
-    if near.sum() >= 2:
-        true = fixes_n[near, :2] - fixes_n[near][0, :2]
-        dr = track.at(inputs.t_fix[near])[:, :2, 0] * metres_per_unit
+    selected = (inputs.t_fix >= max(t[0], 0.0)) & (inputs.t_fix <= t[-1])
+    if selected.sum() >= 2:
+        true = fixes_n[selected, :2] - fixes_n[selected][0, :2]
+        dr = track.at(inputs.t_fix[selected])[:, :2, 0] * metres_per_unit
         dr = dr - dr[0]
-        sigma_fix = np.sqrt(np.median(inputs.covariance_n[near, 0, 0]))
+        sigma_fix = np.sqrt(np.median(inputs.covariance_n[selected, 0, 0]))
         long_enough = np.hypot(*dr.T) >= max(COURSE_DISTANCE, 8 * sigma_fix)
         if long_enough.any():
             k = int(np.argmax(long_enough))

@@ -28,7 +28,7 @@ from odocal_ros.settings.config import Config
 SECOND = 10**9    # definition: ns
 LEG_END_REST_NS = 10 * SECOND    # judgement: standstill that ends a leg, for position and biases
 PARKED_NS = 120 * SECOND         # judgement: a longer standstill ends a leg of any length
-STOOD_NS = 1 * SECOND            # judgement: standstill before the first count of a start
+START_REST_NS = 1 * SECOND       # judgement: standstill before the first count of a start
 
 
 @dataclass
@@ -63,7 +63,7 @@ class LegSearch:
         self._needs_rest = False
 
     @property
-    def unended(self) -> Span | None:
+    def open_span(self) -> Span | None:
         """Return the leg that has not ended."""
         return self.spans[-1] if self.spans and not self.spans[-1].stop_ns else None
 
@@ -73,7 +73,7 @@ class LegSearch:
             return
         self._first_ns[slot] = self._first_ns[slot] or int(block.stamp_ns[0])
         if slot == 'imu':
-            self._receive(block.stamp_ns)
+            self._add_imu_stamps(block.stamp_ns)
         elif isinstance(block, OdometerSamples) and slot == 'odometer' and form is not None:
             self._steps = self._steps or Steps(form)
             self._still = self._steps.still
@@ -82,20 +82,20 @@ class LegSearch:
             if len(travel):
                 self._waiting.extend(zip(stamps.tolist(), travel.tolist(), strict=True))
                 self._travel = float(travel[-1])
-        self._decide()
+        self._evaluate()
 
     def restart(self, after_ns: int, at_rest: bool) -> None:
         """Remove the legs; the next begins after a stamp, at a start from rest or in motion."""
         self.spans.clear()
         self._from_ns, self._needs_rest = after_ns, at_rest
 
-    def _receive(self, stamps: Ints) -> None:
+    def _add_imu_stamps(self, stamps: Ints) -> None:
         known = np.append(self._imu_ns or stamps[0], stamps[stamps > self._imu_ns])
         for k in np.flatnonzero(np.diff(known) > self._max_gap_ns):
             self._gaps.append((int(known[k]), int(known[k + 1])))
         self._imu_ns = int(known.max())
 
-    def _decide(self) -> None:
+    def _evaluate(self) -> None:
         """Evaluate the odometer rows up to the newest IMU row."""
         if not all(self._first_ns.values()):
             return
@@ -104,39 +104,39 @@ class LegSearch:
             t, s = self._waiting.popleft()
             if t > self._newest_ns and t >= first_ns:
                 self._newest_ns = t
-                self._row(t, s)
+                self._evaluate_row(t, s)
 
-    def _row(self, t: int, s: float) -> None:
+    def _evaluate_row(self, t: int, s: float) -> None:
         while self._gaps and self._gaps[0][0] < t:
-            last, again = self._gaps.popleft()
+            last, resumed = self._gaps.popleft()
             self._close(last)
-            self._anchor, self._from_ns = None, max(self._from_ns, again)
+            self._anchor, self._from_ns = None, max(self._from_ns, resumed)
         if t < self._from_ns:
             return
         if self._anchor is None:
             self._anchor = t, s
         elif abs(s - self._anchor[1]) > self._still:
-            self._moves(t, self._anchor[0])
+            self._handle_motion(t, self._anchor[0])
             self._anchor = t, s
         else:
-            self._stands(t, self._anchor[0])
+            self._handle_standstill(t, self._anchor[0])
 
-    def _moves(self, t: int, stood_ns: int) -> None:
-        self._stands(t - STOOD_NS, stood_ns)
+    def _handle_motion(self, t: int, stood_ns: int) -> None:
+        self._handle_standstill(t - START_REST_NS, stood_ns)
         rested = t - stood_ns >= self._standstill_ns
-        leg, off_ns = self.unended, max(t - STOOD_NS, stood_ns, self._from_ns)
+        leg, motion_ns = self.open_span, max(t - START_REST_NS, stood_ns, self._from_ns)
         if leg is not None and rested and self._long_enough(leg, stood_ns):
-            self._close(off_ns)
+            self._close(motion_ns)
         elif leg is not None and t - leg.start_ns >= self._longest_ns:
             self._close(t)
-            off_ns = t
-        if self.unended is None and not self._needs_rest:
-            self.spans.append(Span(off_ns))
+            motion_ns = t
+        if self.open_span is None and not self._needs_rest:
+            self.spans.append(Span(motion_ns))
 
-    def _stands(self, t: int, since_ns: int) -> None:
+    def _handle_standstill(self, t: int, since_ns: int) -> None:
         stood_ns = t - since_ns
         self._needs_rest = self._needs_rest and stood_ns < self._standstill_ns
-        leg = self.unended
+        leg = self.open_span
         if leg is not None and (stood_ns >= PARKED_NS or stood_ns >= self._rest_ns
                                 and self._long_enough(leg, since_ns)):
             self._close(since_ns + self._rest_ns)
@@ -145,7 +145,7 @@ class LegSearch:
         return 2 * (until_ns - leg.start_ns) >= self._longest_ns
 
     def _close(self, stop_ns: int) -> None:
-        leg = self.unended
+        leg = self.open_span
         if leg is not None and stop_ns > leg.start_ns:
             leg.stop_ns = stop_ns
         elif leg is not None:
@@ -156,8 +156,8 @@ def refusal(result: LegResult) -> Reason | None:
     """Return the rejecting reason of a dropped automatic leg, None if it is kept."""
     if result.verdict is not Verdict.REJECTED:
         return None
-    every = (*result.reasons, *(r for m in result.methods.values() for r in m.reasons))
-    return next((r for r in every if r.code.severity is Verdict.REJECTED),
+    all_reasons = (*result.reasons, *(r for m in result.methods.values() for r in m.reasons))
+    return next((r for r in all_reasons if r.code.severity is Verdict.REJECTED),
                 Reason(Code.NO_METHOD, 'no method could be run'))
 
 

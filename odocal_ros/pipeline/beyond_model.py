@@ -16,13 +16,13 @@ import numpy as np
 from odocal_ros.calib.judge import judge, speed_unit
 from odocal_ros.calib.result import MethodResult, Source, wheel_factors
 from odocal_ros.nav.coarse_speed import CoarseSpeed
-from odocal_ros.pipeline.prepared import PreparedLeg
+from odocal_ros.pipeline.prepared_leg import PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.inputs import Inputs, Placed
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 SCALES = ('scale_factor', 'scale_ratio')
-WHAT = {'gnss': 'fix', 'odometer': 'odometer'}
+SENSOR_LABEL = {'gnss': 'fix', 'odometer': 'odometer'}
 
 
 def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
@@ -45,15 +45,15 @@ def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
                  for name_, e in method.estimates.items()}
     row = {name_: relative.get(name_, 0.0) * (method.estimates[name_].value or 0.0)
            for name_ in method.parameters} | {'shared': shared}
-    judged = [r for r in judge(estimates, prepared.nominal, prepared.config)
-              if r.code is Code.SCALE_SIGMA_TOO_LARGE]
+    sigma_reasons = [r for r in judge(estimates, prepared.nominal, prepared.config)
+                     if r.code is Code.SCALE_SIGMA_TOO_LARGE]
     return replace(
         method, estimates=estimates, sources=(*method.sources, Source(name, effects, shared)),
         details=method.details | {'budget': method.details.get('budget', {}) | {name: row}},
         border=method.border and method.border.loosened({'scale_factor':
                                                          relative['scale_factor']}),
         reasons=(*(r for r in method.reasons if r.code is not Code.SCALE_SIGMA_TOO_LARGE),
-                 *judged))
+                 *sigma_reasons))
 
 
 def with_wheel_change(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
@@ -74,17 +74,18 @@ def with_hills(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a path longer
     method = with_scale_error(method, prepared, 'hills', dict.fromkeys(SCALES, hills))
     # reported by NO_ACCELEROMETER, with another remedy
-    said = {Code.PITCH_NOT_DETERMINED} | (
+    dropped_codes = {Code.PITCH_NOT_DETERMINED} | (
         set() if prepared.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
     return replace(
-        method, reasons=tuple(r for r in method.reasons if r.code not in said), estimates={
+        method, reasons=tuple(r for r in method.reasons if r.code not in dropped_codes),
+        estimates={
             name: replace(e, value=None, sigma=None) if name == 'pitch_mounting_angle' else e
             for name, e in method.estimates.items()})
 
 
 def half_step(inputs: Inputs) -> float:
     """Return half a step relative to the mean speed, the bias if truncated; 0.0 without steps."""
-    coarse = _coarse(inputs)
+    coarse = _speed_grid(inputs)
     if coarse is None:
         return 0.0
     pick = (coarse.t >= 0.0) & (coarse.t <= inputs.t_stop) & (coarse.value != 0)
@@ -109,11 +110,11 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     if count > coarse_count_m:
         return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m, so each reading lags '
                        'by up to this distance')]
-    coarse = _coarse(inputs)
+    coarse = _speed_grid(inputs)
     coarse_worth = 5e-4    # of the scale: least half step that is reported
     if coarse is None or coarse.truncation and size < coarse_worth:
         return []
-    sent = _in_words(coarse.step, placed.rough, inputs.scale_unit)
+    sent = _speed_text(coarse.step, placed.rough, inputs.scale_unit)
     if not coarse.truncation:
         return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed is held until it has changed by '
                        f'{sent}; half a step is added in the direction of the last change')]
@@ -122,7 +123,7 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
                    f'the distance is {100 * size:.2g} % too short')]
 
 
-def _in_words(step: float, scale: float, scale_unit: str) -> str:
+def _speed_text(step: float, scale: float, scale_unit: str) -> str:
     """Return a step of speed in the published unit, and in another."""
     factor, unit = (scale, 'rad/s') if scale_unit == 'm/rad' else speed_unit(scale)
     speed = f'{factor * step:.3g} m/s'
@@ -130,30 +131,30 @@ def _in_words(step: float, scale: float, scale_unit: str) -> str:
         f'{step:.3g} {unit} ({speed})')
 
 
-def _coarse(inputs: Inputs) -> CoarseSpeed | None:
+def _speed_grid(inputs: Inputs) -> CoarseSpeed | None:
     """Return the grid of the speed, of the first wheel that has one, None if there is none."""
     return next((one.coarse for one in (inputs.travel, *inputs.travels) if one.coarse), None)
 
 
-def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
+def delay_notes(prepared: PreparedLeg, delays: Mapping[str, tuple[float, float]],
                 scale: float) -> list[Reason]:
     """Return DELAY_SEEN for each (delay, sigma), s, that is significant and has an effect."""
     speed = _speed(prepared) * scale
     notes = []
     least_delay_path = 0.1    # m, as the required accuracy of a lever arm
     hidden_by_fix = 0.25    # of a fix's sigma: smaller effects of a delay are not observable
-    for name, (late, sigma) in seen.items():
-        metres = abs(late) * speed
-        worth = max(least_delay_path, hidden_by_fix * prepared.fix_sigma)
+    for name, (delay, sigma) in delays.items():
+        metres = abs(delay) * speed
+        observable_m = max(least_delay_path, hidden_by_fix * prepared.fix_sigma)
         if name in prepared.inputs.aligned or not (
-                abs(late) > REMARK_SIGMAS * sigma and metres > worth):
+                abs(delay) > REMARK_SIGMAS * sigma and metres > observable_m):
             continue        # the first is reported: this is the rest of it
         set_to = getattr(prepared.config, name).time_offset
         notes.append(Reason(
-            Code.DELAY_SEEN, f'{WHAT[name]} stamps are {abs(late):.3f} s (± {sigma:.3f} s) '
-            f'{"late" if late > 0 else "early"} relative to the other sensors, {metres:.2g} m at '
-            f'{speed:.1f} m/s; accounted for. To remove the delay, set {name}.time_offset to '
-            f'{set_to - late:.3f}'
+            Code.DELAY_SEEN, f'{SENSOR_LABEL[name]} stamps are {abs(delay):.3f} s '
+            f'(± {sigma:.3f} s) {"late" if delay > 0 else "early"} relative to the other sensors, '
+            f'{metres:.2g} m at {speed:.1f} m/s; accounted for. To remove the delay, set '
+            f'{name}.time_offset to {set_to - delay:.3f}'
             + (f' (now {set_to:g})' if set_to else '')))
     return notes
 

@@ -27,7 +27,7 @@ from odocal_ros.pipeline.combination import combine
 from odocal_ros.pipeline.methods import leg_result, run_leg
 from odocal_ros.pipeline.planar_run import is_planar, planar_leg
 from odocal_ros.pipeline.prepare import prepare
-from odocal_ros.pipeline.prepared import Stage
+from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.clock_offset import screen_aligned
 from odocal_ros.screening.facing import imu_sanity, UNUSABLE

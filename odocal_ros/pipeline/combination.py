@@ -22,12 +22,14 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import DAY_NS, FAULT_SIGMAS, TYRE_SPREAD
 from odocal_ros.settings.nominal import nominal_scale
 
-PER_LEG = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE, Code.SCALE_FAR_FROM_NOMINAL}
-# the same for legs that are combined by marginal information: together they may determine more
-ON_BORDER = {Code.YAW_NOT_DETERMINED, Code.PITCH_NOT_DETERMINED, Code.PARAMETER_NOT_DETERMINED,
-             Code.YAW_FAR_FROM_NOMINAL}
-SMOOTHER = 'smoother'      # the method whose legs are combined on their border
-OF_ALL = {Code.LEGS_DISAGREE, Code.SCALE_CHANGED}
+# reasons of one leg that do not hold for several
+SINGLE_LEG_CODES = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE,
+                    Code.SCALE_FAR_FROM_NOMINAL}
+# the same for legs combined by marginal information: together they may determine more
+COMBINED_CODES = {Code.YAW_NOT_DETERMINED, Code.PITCH_NOT_DETERMINED,
+                  Code.PARAMETER_NOT_DETERMINED, Code.YAW_FAR_FROM_NOMINAL}
+SMOOTHER = 'smoother'      # the method whose legs are combined on their shared constants
+ACROSS_LEGS_CODES = {Code.LEGS_DISAGREE, Code.SCALE_CHANGED}
 
 
 def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None = None,
@@ -40,51 +42,53 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     information of other legs on its IMU, if nothing is carried.
     """
     legs = tuple(legs)
-    good = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]
-    twice = driven_twice(good)
-    good = [leg for leg in good if leg not in twice]
-    used = good or legs
-    names = dict.fromkeys(n for leg in used for n in leg.methods)
-    smoothed = [leg.methods[SMOOTHER] for leg in used if SMOOTHER in leg.methods]
+    usable = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]
+    overlapping = overlapping_legs(usable)
+    usable = [leg for leg in usable if leg not in overlapping]
+    used = usable or legs
+    method_names = dict.fromkeys(name for leg in used for name in leg.methods)
+    smoother_results = [leg.methods[SMOOTHER] for leg in used if SMOOTHER in leg.methods]
     # earlier legs with another scale unit, or not earlier, are of no use
     if carried and (min(leg.start_ns for leg in used) <= carried.last_ns or any(
-            m.estimates['scale_factor'].unit != carried.unit for m in smoothed)):
+            m.estimates['scale_factor'].unit != carried.unit for m in smoother_results)):
         carried = None
     # of other legs than those that determined the IMU constants
     before = carried or (imu if imu and not any(
         imu.first_ns <= leg.start_ns <= imu.last_ns for leg in used) else None)
-    methods = {n: _combined(n, [
-        (leg.methods[n], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
-        if leg in used and n in leg.methods], config, before) for n in names}
-    on_border = {n for leg in used for n, m in leg.methods.items() if m.border}
-    estimates, giving = choose(methods, config.method)
-    reasons = _leg_reasons(legs, good, twice, giving, estimates, before is not None)
-    if giving:
+    methods = {name: _combined(name, [
+        (leg.methods[name], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
+        if leg in used and name in leg.methods], config, before) for name in method_names}
+    on_border = {name for leg in used for name, m in leg.methods.items() if m.border}
+    estimates, estimating_methods = choose(methods, config.method)
+    reasons = _leg_reasons(legs, usable, overlapping, estimating_methods, estimates,
+                           before is not None)
+    if estimating_methods:
         known = {(r.code, r.text) for r in reasons}
         rejecting = {r.code for r in reasons if r.code.severity is Verdict.REJECTED}
         nominal = nominal_scale(config, estimates['scale_factor'].unit)
-        own = [r for n in giving for r in relevant_reasons(methods[n].reasons, n, estimates)
-               if len(legs) == 1 or r.code in OF_ALL
-               or n in on_border and r.code in ON_BORDER]
+        own = [r for name in estimating_methods
+               for r in relevant_reasons(methods[name].reasons, name, estimates)
+               if len(legs) == 1 or r.code in ACROSS_LEGS_CODES
+               or name in on_border and r.code in COMBINED_CODES]
         reasons += [r for r in (*own, *judge(estimates, nominal, config))
                     if (r.code, r.text) not in known and r.code not in rejecting]
         reasons = list(dict.fromkeys(reasons))
-    reasons += unlike_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in good])
-    if len(good) < config.verdict.min_legs and good:
-        reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(good)} usable leg'
-                              f'{"s" * (len(good) > 1)}; required: {config.verdict.min_legs}'))
-    if not giving and not any(r.code.severity is Verdict.REJECTED for r in reasons):
+    reasons += inconsistent_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in usable])
+    if len(usable) < config.verdict.min_legs and usable:
+        reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(usable)} usable leg'
+                              f'{"s" * (len(usable) > 1)}; required: {config.verdict.min_legs}'))
+    if not estimating_methods and not any(r.code.severity is Verdict.REJECTED for r in reasons):
         reasons.append(Reason(Code.NO_METHOD, 'no method could be run'))
     quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)
     return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy,
-                       _carried_on(methods, good, carried))
+                       _information_for_later_legs(methods, usable, carried))
 
 
-def _carried_on(methods: Mapping[str, MethodResult], good: Sequence[LegResult],
-                before: Carried | None) -> Carried | None:
+def _information_for_later_legs(methods: Mapping[str, MethodResult], usable: Sequence[LegResult],
+                                before: Carried | None) -> Carried | None:
     """Return the marginal information of legs for later ones, None without any."""
     whole = methods.get(SMOOTHER)
-    times = [leg.start_ns for leg in good if SMOOTHER in leg.methods
+    times = [leg.start_ns for leg in usable if SMOOTHER in leg.methods
              and leg.methods[SMOOTHER].verdict is not Verdict.REJECTED]
     if whole is None or whole.border is None or not times:
         return None
@@ -93,22 +97,24 @@ def _carried_on(methods: Mapping[str, MethodResult], good: Sequence[LegResult],
                    len(times) + (before.legs if before else 0))
 
 
-def driven_twice(legs: Sequence[LegResult]) -> list[LegResult]:
+def overlapping_legs(legs: Sequence[LegResult]) -> list[LegResult]:
     """Return legs that share over a tenth of their time with an earlier one: not independent."""
     start, stop = (np.array([getattr(leg, at) for leg in legs], np.int64)
                    for at in ('start_ns', 'stop_ns'))
-    twice = np.zeros(len(legs), bool)
+    overlapping = np.zeros(len(legs), bool)
     for i in range(len(legs)):
         shared = np.minimum(stop[i], stop[:i]) - np.maximum(start[i], start[:i])
-        twice[i] = (~twice[:i] & (shared > 0.1 * (stop[i] - start[i]))).any()
-    return [leg for leg, again in zip(legs, twice.tolist(), strict=True) if again]
+        overlapping[i] = (~overlapping[:i] & (shared > 0.1 * (stop[i] - start[i]))).any()
+    return [leg for leg, again in zip(legs, overlapping.tolist(), strict=True) if again]
 
 
-def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
-             numbers: Sequence[int] | None = None, carried: Carried | None = None) -> MethodResult:
+def combine_results(name: str, results: Sequence[MethodResult], times_ns: Sequence[int],
+                    config: Config, numbers: Sequence[int] | None = None,
+                    carried: Carried | None = None) -> MethodResult:
     """Return the result of a method for several legs, including carried ones if possible."""
     if carried and all(r.border for r in results):
-        unknown = {n: Estimate(None, None, e.unit) for n, e in results[0].estimates.items()}
+        unknown = {parameter: Estimate(None, None, e.unit)
+                   for parameter, e in results[0].estimates.items()}
         results = [MethodResult(name, (), unknown, border=carried.border), *results]
         numbers = [0, *(numbers or range(1, len(results)))]
         times_ns = [min(carried.last_ns, *times_ns), *times_ns]      # the scale is the last leg's
@@ -123,52 +129,56 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
 def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
               carried: Carried | None) -> MethodResult:
     """Return a method's combination of the legs without rejection; of all if all have one."""
-    good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
-    results, times_ns, numbers = zip(*(good or driven), strict=True)
-    whole = together(name, list(results), times_ns, config, numbers, carried if good else None)
-    if good or len(results) == 1:
+    usable = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
+    results, times_ns, numbers = zip(*(usable or driven), strict=True)
+    whole = combine_results(name, list(results), times_ns, config, numbers,
+                            carried if usable else None)
+    if usable or len(results) == 1:
         return whole
     why = dict.fromkeys(r for one in results for r in one.reasons
                         if r.code.severity is Verdict.REJECTED)
     return replace(whole, reasons=(*whole.reasons, *why))
 
 
-def _leg_reasons(legs: Sequence[LegResult], good: Sequence[LegResult], twice: Sequence[LegResult],
-                 giving: Sequence[str], estimates: Mapping[str, Estimate],
+def _leg_reasons(legs: Sequence[LegResult], usable: Sequence[LegResult],
+                 overlapping: Sequence[LegResult], estimating_methods: Sequence[str],
+                 estimates: Mapping[str, Estimate],
                  carried: bool) -> list[Reason]:
     """Return the legs' own reasons, numbered if there are several."""
-    alone = len(legs) == 1 and not carried
+    is_single = len(legs) == 1 and not carried
     reasons = []
     for number, leg in enumerate(legs, 1):
         prefix = f'leg {number}: ' if len(legs) > 1 else ''
-        methods = [leg.methods[n] for n in giving if n in leg.methods]
+        methods = [leg.methods[name] for name in estimating_methods if name in leg.methods]
         own = [*leg.reasons, *(r for m in methods
-                               for r in relevant_reasons(_further(m, leg), m.name, estimates)
-                               if alone or r.code not in PER_LEG
-                               and not (m.border and r.code in ON_BORDER))]
-        if leg in twice:
+                               for r in relevant_reasons(_additional_reasons(m, leg), m.name,
+                                                         estimates)
+                               if is_single or r.code not in SINGLE_LEG_CODES
+                               and not (m.border and r.code in COMBINED_CODES))]
+        if leg in overlapping:
             reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}overlaps an earlier leg; not used'))
-        elif good and leg not in good:
-            every = [*leg.reasons, *(r for m in leg.methods.values() for r in _further(m, leg))]
+        elif usable and leg not in usable:
+            all_reasons = [*leg.reasons,
+                           *(r for m in leg.methods.values() for r in _additional_reasons(m, leg))]
             reasons.append(Reason(Code.LEG_REJECTED, f'{prefix}rejected and not used: '
-                                  + _why(every)))
+                                  + _rejection_text(all_reasons)))
         else:
-            refused = [m for m in methods if good and m.verdict is Verdict.REJECTED]
+            refused = [m for m in methods if usable and m.verdict is Verdict.REJECTED]
             reasons += [Reason(Code.LEG_REJECTED, f'{prefix}not used for {m.name}: '
-                               + _why(m.reasons)) for m in refused]
+                               + _rejection_text(m.reasons)) for m in refused]
             reasons += [replace(r, text=prefix + r.text) for r in own
                         if not any(r in m.reasons for m in refused)
                         and not (refused and r.code is Code.METHOD_REJECTED)]
     return reasons
 
 
-def _further(method: MethodResult, leg: LegResult) -> list[Reason]:
+def _additional_reasons(method: MethodResult, leg: LegResult) -> list[Reason]:
     """Return a method's reasons, except those whose code already rejects the leg."""
     known = {r.code for r in leg.reasons if r.code.severity is Verdict.REJECTED}
     return [r for r in method.reasons if r.code not in known]
 
 
-def _why(reasons: Sequence[Reason]) -> str:
+def _rejection_text(reasons: Sequence[Reason]) -> str:
     return '; '.join(dict.fromkeys(r.text for r in reasons if r.code.severity is Verdict.REJECTED))
 
 
@@ -186,10 +196,10 @@ def _imu_rotation(estimates: Mapping[str, Estimate],
             tuple(float(x) for x in rpy_from_matrix(C_vi)))
 
 
-def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]:
+def inconsistent_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]:
     """Return LEGS_UNLIKE if scale or yaw of legs differ by more than those of one vehicle."""
     found = []
-    estimates = [(n, leg_estimates(leg)) for n, leg in numbered]
+    estimates = [(number, leg_estimates(leg)) for number, leg in numbered]
     scales = [scale for scale in _values('scale_factor', estimates) if scale.value]
     units = dict.fromkeys(scale.unit for scale in scales)
     if len(units) > 1:
@@ -225,8 +235,8 @@ class _LegValue(NamedTuple):
 
 
 def _values(name: str, estimates: Sequence[tuple[int, dict[str, Estimate]]]) -> list[_LegValue]:
-    every = ((n, of_leg.get(name)) for n, of_leg in estimates)
-    return [_LegValue(n, e.value, e.sigma, e.unit) for n, e in every
+    of_legs = ((leg, of_leg.get(name)) for leg, of_leg in estimates)
+    return [_LegValue(leg, e.value, e.sigma, e.unit) for leg, e in of_legs
             if e is not None and e.value is not None and e.sigma is not None]
 
 

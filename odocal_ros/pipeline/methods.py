@@ -1,7 +1,7 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The methods, each a pure function of a leg, and the result of the leg by theirs."""
+"""The methods, each a pure function of a leg, and the leg result from their results."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -24,8 +24,14 @@ from odocal_ros.pipeline.beyond_model import (
     with_wheel_change,
 )
 from odocal_ros.pipeline.prepare import checked_with_scale
-from odocal_ros.pipeline.prepared import MethodRun, Passed, PreparedLeg, Stage
-from odocal_ros.pipeline.tracks import check_of, tracks
+from odocal_ros.pipeline.prepared_leg import (
+    MethodRun,
+    PassCallback,
+    path_check,
+    PreparedLeg,
+    Stage,
+    track_results,
+)
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.fix_screen import origin_amid
@@ -36,9 +42,9 @@ METHOD_EFFORT = {'two_point': 1, 'smoother': 20}
 TRACKS = 2
 
 
-def _smoother(prepared: PreparedLeg, passed: Passed) -> MethodRun:
+def _smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     from odocal_ros.pipeline.smoother_run import smoother
-    return smoother(prepared, passed)
+    return smoother(prepared, report_pass)
 
 
 def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
@@ -47,32 +53,32 @@ def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
 
 
 # in the order of the output; two_point, by the operator's own marks, is always computed
-METHODS: dict[str, Callable[[PreparedLeg, Passed], MethodRun]] = {
+METHODS: dict[str, Callable[[PreparedLeg, PassCallback], MethodRun]] = {
     'two_point': two_point, 'smoother': _smoother}
-# the result of each if it refuses: (inputs, reason) to MethodResult
-UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
+# the result of a method that cannot estimate: (inputs, reason) to MethodResult
+REFUSED_RESULTS: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
            'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
            'smoother': _no_smoother}
 
 
 def run_methods(names: Iterable[str], prepared: PreparedLeg,
-                begun: Callable[[str], Passed]) -> dict[str, MethodRun]:
+                report_start: Callable[[str], PassCallback]) -> dict[str, MethodRun]:
     """Return the runs of methods on a leg; an error in one rejects this method, not the leg."""
     runs = {}
     for name in names:
-        passed = begun(name)
+        report_pass = report_start(name)
         let_go()
-        runs[name] = _guarded(name, prepared, partial(METHODS[name], prepared, passed))
-    return {name: _guarded(name, prepared, partial(_with_errors, run, prepared))
+        runs[name] = _run_guarded(name, prepared, partial(METHODS[name], prepared, report_pass))
+    return {name: _run_guarded(name, prepared, partial(_add_model_errors, run, prepared))
             for name, run in runs.items()}
 
 
-def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
+def reasons_on_data(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
     """
-    Return the reasons of methods on the data, each once.
+    Return the reasons on the data of a leg that the methods found, without duplicates.
 
-    Delays are by the best method that estimates them. Slip and delay of the odometer are by the
-    best method that checks them and is not rejected, otherwise by the first.
+    DELAY_SEEN is from the last method in METHODS that estimates delays. Reasons on slip and delay
+    of the odometer are from the last one that checks them and is not rejected, else the first.
     """
     found: list[Reason] = []
     notes: list[Reason] = []
@@ -82,21 +88,23 @@ def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
         scale = run.result.estimates['scale_factor'].value
         if run.delays is not None and scale is not None:
             notes = delay_notes(prepared, run.delays, scale)
-        sound = odometer is None or run.result.verdict is not Verdict.REJECTED
-        if run.odometer is not None and sound:
+        is_usable = odometer is None or run.result.verdict is not Verdict.REJECTED
+        if run.odometer is not None and is_usable:
             odometer = run.odometer
     return [*found, *(odometer or ()), *notes]
 
 
-def _with_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
+def _add_model_errors(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
     result = run.result
     for add in (with_wheel_change, with_truncation, with_hills):
         result = add(result, prepared)
-    about = (*prepared.about_alignment, *prepared.of_ends) if result.name == 'two_point' else ()
-    return run._replace(result=replace(result, reasons=(*about, *result.reasons)))
+    if result.name == 'two_point':
+        result = replace(result, reasons=(
+            *prepared.alignment_reasons, *prepared.end_reasons, *result.reasons))
+    return run._replace(result=result)
 
 
-def _guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) -> MethodRun:
+def _run_guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) -> MethodRun:
     inputs = prepared.inputs
     try:
         # divergence is detected by non-finite numbers, not by warnings
@@ -105,11 +113,11 @@ def _guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) ->
     except (OdocalError, MemoryError):
         raise
     except FloatingPointError:
-        return MethodRun(UNKNOWN[name](inputs, Reason(
-            Code.NOT_CONVERGED, f'{name} diverged: values grow without limit. Likely cause: '
-            'invalid or missing samples')))
+        return MethodRun(REFUSED_RESULTS[name](inputs, Reason(
+            Code.NOT_CONVERGED, f'{name} did not converge: an estimate became infinite or '
+            'NaN. Likely cause: invalid or missing samples')))
     except Exception as error:      # its reasons may be wrong too and are dropped
-        return MethodRun(failed(lambda why: UNKNOWN[name](inputs, why), name, error))
+        return MethodRun(failed(lambda why: REFUSED_RESULTS[name](inputs, why), name, error))
 
 
 def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
@@ -131,37 +139,37 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
 
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
     """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
-    leg, inputs, asked = prepared.leg, prepared.inputs, prepared.config.method
-    wanted = deciding(asked, shown=True)
-    names = [name for name in METHODS if name in wanted]      # in the order of the output
+    leg, inputs, selected_method = prepared.leg, prepared.inputs, prepared.config.method
+    computed = deciding(selected_method, shown=True)
+    names = [name for name in METHODS if name in computed]      # in the order of the output
     runs = run_methods(names, prepared, _progress_reporter(names, progress))
     progress(Stage('tracks', 1.0 - TRACKS / _effort(names)))
     methods = {name: run.result for name, run in runs.items()}
-    found = [*found_by(runs, prepared), *disagreements(methods)]
-    found += passed_over(methods, asked, {r.code for r in (*prepared.reasons, *found)})
-    estimates, _ = choose(methods, asked)
+    found = [*reasons_on_data(runs, prepared), *disagreements(methods)]
+    found += passed_over(methods, selected_method, {r.code for r in (*prepared.reasons, *found)})
+    estimates, _ = choose(methods, selected_method)
     scale = estimates.get('scale_factor')
     paths = None if scale is None else runs[scale.method].paths
-    shown: dict[str, Any] = {}
+    track_fields: dict[str, Any] = {}
     if scale is not None and paths is not None:
         distance_sigma = 0.05    # largest relative sigma of a scale for the distance
         # more accurate than the approximate scale; the travel is that of the uncorrected speed
         if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
             prepared = checked_with_scale(
                 prepared, estimates.get(AS_SENT, scale).value or scale.value)
-        shown, said = tracks(prepared, paths)
-        found += said
+        track_fields, track_reasons = track_results(prepared, paths)
+        found += track_reasons
         for name, run in runs.items():
             if run.paths is not None:
-                check, said = check_of(prepared, run.paths.after)
+                check, track_reasons = path_check(prepared, run.paths.after)
                 methods[name] = replace(run.result, details=run.result.details | check)
-                found += said
+                found += track_reasons
     # outlier fixes are reported once, by the first method or track
-    far = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
-    found = [r for k, r in enumerate(found) if k not in far[1:]]
+    of_outliers = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
+    found = [r for k, r in enumerate(found) if k not in of_outliers[1:]]
     return leg_result(leg, inputs, (*prepared.reasons, *found), methods,
-                      distance=prepared.distance, deciding=deciding(asked),
-                      path_ratio=prepared.path_ratio, **shown)
+                      distance=prepared.distance, deciding=deciding(selected_method),
+                      path_ratio=prepared.path_ratio, **track_fields)
 
 
 def _effort(names: Iterable[str]) -> int:
@@ -169,14 +177,14 @@ def _effort(names: Iterable[str]) -> int:
 
 
 def _progress_reporter(names: Iterable[str],
-            progress: Callable[[Stage], None]) -> Callable[[str], Passed]:
+                       progress: Callable[[Stage], None]) -> Callable[[str], PassCallback]:
     """Return a callback that reports the start of a method and returns one for its passes."""
     done = 0.0
 
-    def begun(name: str) -> Passed:
+    def report_start(name: str) -> PassCallback:
         nonlocal done
         stage = Stage(name, done)
         progress(stage)
         done += METHOD_EFFORT[name] / _effort(names)
         return lambda passes, change: progress(replace(stage, passes=passes, change=change))
-    return begun
+    return report_start

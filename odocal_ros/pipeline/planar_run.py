@@ -19,7 +19,7 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.pipeline.methods import leg_result
-from odocal_ros.pipeline.prepared import Stage
+from odocal_ros.pipeline.prepared_leg import Stage
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.inputs import Inputs
@@ -75,9 +75,10 @@ def _guarded(run: Run, inputs: Inputs, config: settings.Config, progress: Callab
                                shortened_by_slopes(inputs))
             return method, _tracks(run, found)
     except (FloatingPointError, np.linalg.LinAlgError):
-        return unknown(Reason(Code.NOT_CONVERGED, f'{PLANAR} diverged. Likely cause: the wheels '
-                              'do not belong to the positions, or the positions are too '
-                              'inaccurate for a drive without an IMU')), {}
+        return unknown(Reason(Code.NOT_CONVERGED, f'{PLANAR} did not converge: an estimate became '
+                              'infinite or NaN. Likely cause: the wheels do not belong to the '
+                              'positions, or the positions are too inaccurate for a '
+                              'drive without an IMU')), {}
     except (OdocalError, MemoryError):
         raise
     except Exception as error:

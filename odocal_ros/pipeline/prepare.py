@@ -5,6 +5,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.pipeline.align import align, with_observed_walk
 from odocal_ros.pipeline.beyond_model import coarse_reasons
-from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
+from odocal_ros.pipeline.prepared_leg import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening import facing
 from odocal_ros.screening.axles import axles_of
@@ -27,8 +28,8 @@ from odocal_ros.screening.inputs import Inputs, place, Placed
 from odocal_ros.screening.row_screen import imu_gap
 from odocal_ros.settings.config import Config
 
-BY_SCALE = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # limits in metres
-BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
+SCALE_LIMIT_CODES = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # limits in metres
+WHEEL_FAULT_CODES = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
 
 def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] = (),
@@ -43,68 +44,72 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     """
     placed = place(inputs, config)
     let_go()
-    still = _standing(inputs, placed)
-    if still is not None:
-        return None, (*reasons, *still)
-    pushed = facing.accelerations(inputs, placed.rough) if inputs.has_accelerometer else None
-    faces = None if pushed is None else facing.facing_of(pushed)
+    refusal_reasons = _missing_drive_reasons(inputs, placed)
+    if refusal_reasons is not None:
+        return None, (*reasons, *refusal_reasons)
+    accelerations = (facing.accelerations(inputs, placed.rough)
+                     if inputs.has_accelerometer else None)
+    orientation = None if accelerations is None else facing.facing_of(accelerations)
     reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop))
-    wrong = turned_about(pushed) or turning(inputs, placed, faces, config.imu.gyro_scale)[1]
-    if wrong:             # a mirrored axis turns the orientation around
-        return None, (*reasons, *wrong)
-    axes = facing.axes_reasons(faces, config.imu.nominal_yaw)
+    axis_faults = turned_about(accelerations) or turning(inputs, placed, orientation,
+                                                         config.imu.gyro_scale)[1]
+    if axis_faults:             # a mirrored axis turns the orientation around
+        return None, (*reasons, *axis_faults)
+    axes = facing.axes_reasons(orientation, config.imu.nominal_yaw)
     reasons = (*reasons, *with_axes(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
         return None, reasons
-    prepared = _reckoned(leg, inputs, config, placed, faces, reasons, alignment, holdout)
+    prepared = _dead_reckoned(leg, inputs, config, placed, orientation, reasons, alignment,
+                              holdout)
     return prepared, prepared.reasons
 
 
-def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed,
-              faces: facing.Facing | None, reasons: Sequence[Reason], alignment: Alignment | None,
-              holdout: bool) -> PreparedLeg:
+def _dead_reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed,
+                   orientation: facing.Facing | None, reasons: Sequence[Reason],
+                   alignment: Alignment | None, holdout: bool) -> PreparedLeg:
     spans = inputs.standstills(placed.rough, config)
-    about: tuple[Reason, ...] = ()
-    own = alignment is None
+    alignment_reasons: tuple[Reason, ...] = ()
+    is_own_alignment = alignment is None
     if alignment is None:
-        alignment, about = align(inputs, spans, placed.rough, placed.fixes_n, placed.origin,
-                                 config)
+        alignment, alignment_reasons = align(inputs, spans, placed.rough, placed.fixes_n,
+                                             placed.origin, config)
     let_go()
-    gap = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
+    gap_reasons = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
     epochs = attitude_of(inputs, placed.origin, alignment.t, alignment.q_nb, alignment.gyro_bias)
-    if own:
+    if is_own_alignment:
         alignment = with_observed_walk(alignment, inputs, spans, epochs,
                                        placed.origin.earth_rate_n)
     track = dead_reckon(*epochs, inputs.travel)
-    apart, slips = _wheels_beside(inputs, config, placed, track, reasons)
-    distance, judged = judge_drive(track, inputs.t_stop, placed.rough, config.leg)
+    wheel_reasons, wheel_slips = _compare_wheels(inputs, config, placed, track, reasons)
+    distance, drive_reasons = judge_drive(track, inputs.t_stop, placed.rough, config.leg)
     # only methods by end points need straight legs
-    of_ends = tuple(r for r in judged if r.code is Code.LEG_NOT_STRAIGHT)
+    end_reasons = tuple(r for r in drive_reasons if r.code is Code.LEG_NOT_STRAIGHT)
     return PreparedLeg(
-        **vars(placed), leg=leg, inputs=inputs, config=config, facing=faces,
+        **vars(placed), leg=leg, inputs=inputs, config=config, facing=orientation,
         lever_b=np.subtract(config.gnss.lever_arm, config.odometer.lever_arm), spans=spans,
-        alignment=alignment, about_alignment=about, epochs=epochs, track=track,
-        wheel_slips=slips, metres_per_unit=placed.rough, distance=distance,
-        t_fit=_four_fifths(track, inputs.t_stop) if holdout else inputs.t_stop, holdout=holdout,
-        reasons=(*reasons, *gap, *coarse_reasons(inputs, placed), *apart,
-                 *(r for r in judged if r not in of_ends)), of_ends=of_ends)
+        alignment=alignment, alignment_reasons=alignment_reasons, epochs=epochs, track=track,
+        wheel_slips=wheel_slips, metres_per_unit=placed.rough, distance=distance,
+        t_fit=_time_of_four_fifths(track, inputs.t_stop) if holdout else inputs.t_stop,
+        holdout=holdout,
+        reasons=(*reasons, *gap_reasons, *coarse_reasons(inputs, placed), *wheel_reasons,
+                 *(r for r in drive_reasons if r not in end_reasons)), end_reasons=end_reasons)
 
 
 def checked_with_scale(prepared: PreparedLeg, scale: float) -> PreparedLeg:
     """Return a leg with distance and speed checked by a more accurate scale."""
-    distance, judged = check_path(prepared.track, prepared.inputs.t_stop, scale,
-                                  prepared.config.leg)
+    distance, drive_reasons = check_path(prepared.track, prepared.inputs.t_stop, scale,
+                                         prepared.config.leg)
     return replace(prepared, metres_per_unit=scale, distance=distance, reasons=(
-        *(r for r in prepared.reasons if r.code not in BY_SCALE), *judged))
+        *(r for r in prepared.reasons if r.code not in SCALE_LIMIT_CODES), *drive_reasons))
 
 
-def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
+def _missing_drive_reasons(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
     """Return the reasons why there is no usable drive, None if there is one."""
-    still = not_moving(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
-                       inputs.t_stop, inputs.least_motion)
-    if still or not placed.rough:
-        return still or (Reason(Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a '
-                                'scale'),)
+    refusal_reasons = not_moving(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
+                                 inputs.t_stop, inputs.least_motion)
+    if refusal_reasons or not placed.rough:
+        return refusal_reasons or (Reason(
+            Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a scale'),)
     covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
     fewest_rows = 4    # of the IMU between the marks, for an attitude
     if covered.sum() < fewest_rows:
@@ -112,22 +117,22 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
     return None
 
 
-def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,
-                   reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
+def _compare_wheels(inputs: Inputs, config: Config, placed: Placed, track: Track,
+                    reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
     """Return the faults found by comparing left and right wheels, and the slips of one of them."""
     fixed = [axle for axle in axles_of(inputs.travels) if len(axle) > 1 and not axle[0].ahead]
-    if not fixed or not inputs.has_accelerometer or BROKEN & {r.code for r in reasons}:
+    if not fixed or not inputs.has_accelerometer or WHEEL_FAULT_CODES & {r.code for r in reasons}:
         return (), NO_SLIPS
     from odocal_ros.calib.wheels.slips import wheel_faults
-    odometer, count = config.odometer, sum(not one.ahead for one in inputs.travels)
-    found, slips = zip(*(wheel_faults(
+    odometer, count = config.odometer, sum(not wheel.ahead for wheel in inputs.travels)
+    found, wheel_slips = zip(*(wheel_faults(
         axle, (inputs.t_imu, inputs.w_b, inputs.f_b), (0.0, inputs.t_stop), track,
         placed.origin.latitude, placed.rough, odometer.track_width, inputs.doubt_t,
         odometer.max_scale_deviation, count) for axle in fixed), strict=True)
-    return tuple(reason for why in found for reason in why), of_axles(slips, count)
+    return tuple(chain(*found)), of_axles(wheel_slips, count)
 
 
-def _four_fifths(track: Track, t_stop: float) -> float:
+def _time_of_four_fifths(track: Track, t_stop: float) -> float:
     """Return the time at which four fifths of the distance are driven, s."""
     inside = (track.t >= 0) & (track.t <= t_stop)
     s = track.s[inside]

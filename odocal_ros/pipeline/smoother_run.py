@@ -21,70 +21,79 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.estimator import smooth, smoother_leg
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
-from odocal_ros.pipeline.prepared import attitude_of, MethodRun, Passed, Paths, PreparedLeg
-from odocal_ros.pipeline.tracks import as_configured, slip_check
+from odocal_ros.pipeline.prepared_leg import (
+    attitude_of,
+    configured_forward,
+    MethodRun,
+    PassCallback,
+    Paths,
+    PreparedLeg,
+    slip_check,
+)
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 
 
-def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
+def smoother(prepared: PreparedLeg, report_pass: PassCallback) -> MethodRun:
     """Run the smoother on a leg; the times of its paths are stamps of the fixes."""
-    leg = smoother_leg(ready.inputs, ready.config, ready.origin, ready.fixes_n, ready.spans,
-                       ready.rough, ready.t_fit)
-    t_slip, metres = ready.wheel_slips.doubts()
+    leg = smoother_leg(prepared.inputs, prepared.config, prepared.origin, prepared.fixes_n,
+                       prepared.spans, prepared.rough, prepared.t_fit)
+    t_slip, metres = prepared.wheel_slips.doubts()
     leg = replace(leg, doubt_t=np.append(leg.doubt_t, t_slip),
-                  doubt_sigma=np.append(leg.doubt_sigma, metres / ready.rough))
+                  doubt_sigma=np.append(leg.doubt_sigma, metres / prepared.rough))
     passes = count(1)
-    method = smooth(leg, ready.config, lambda *seen: passed(next(passes), seen[-1]))
+    method = smooth(leg, prepared.config,
+                    lambda *state: report_pass(next(passes), state[-1]))
     if method.estimates['scale_factor'].value is None:
         return MethodRun(method)
-    if ready.config.method == 'patent':
-        method = _with_search(method, ready)
+    if prepared.config.method == 'patent':
+        method = _with_search(method, prepared)
     delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}
-    seen = {name: (e.value, e.sigma) for name, e in delays.items()
-            if e.value is not None and e.sigma is not None}
+    observed_delays = {name: (e.value, e.sigma) for name, e in delays.items()
+                       if e.value is not None and e.sigma is not None}
     # stamps of odometer and fixes are corrected by the estimated delays, else by the settings
-    late = {name: e.value or 0.0 for name, e in delays.items()}
-    travel = ready.inputs.travel
-    t, q_nb = _attitude(ready, method.details)
-    track = dead_reckon(t, q_nb, replace(travel, t=travel.t - late['odometer']))
-    lever_b, f = _lever(method.estimates, ready.config), method.details['f']
-    sent = method.estimates.get('scale_factor_as_sent')
-    if sent is not None:        # the travel here is that of uncorrected speeds
-        f = f * (sent.value or 0.0) / np.linalg.norm(f)
-    before = ready.path(as_configured(ready, f, method.estimates), dead_reckon(t, q_nb, travel))
+    delays_s = {name: e.value or 0.0 for name, e in delays.items()}
+    travel = prepared.inputs.travel
+    t, q_nb = _attitude(prepared, method.details)
+    track = dead_reckon(t, q_nb, replace(travel, t=travel.t - delays_s['odometer']))
+    lever_b, f = _lever(method.estimates, prepared.config), method.details['f']
+    as_sent = method.estimates.get('scale_factor_as_sent')
+    if as_sent is not None:        # the travel here is that of uncorrected speeds
+        f = f * (as_sent.value or 0.0) / np.linalg.norm(f)
+    before = prepared.path(configured_forward(prepared, f, method.estimates),
+                           dead_reckon(t, q_nb, travel))
     # of coarse speeds the fit only uses the steps: slip is detected by this track
-    odometer = slip_reasons(slip_check(ready, track, f, (0.0, ready.t_fit)),
-                            ready.config.odometer.time_offset) if leg.by_steps else ()
-    return MethodRun(method, Paths(before, _late_path(track, f, lever_b, late['gnss'])),
-                     delays=seen, odometer=odometer)
+    odometer = slip_reasons(slip_check(prepared, track, f, (0.0, prepared.t_fit)),
+                            prepared.config.odometer.time_offset) if leg.by_steps else ()
+    return MethodRun(method, Paths(before, _delayed_path(track, f, lever_b, delays_s['gnss'])),
+                     delays=observed_delays, odometer=odometer)
 
 
-def _with_search(method: MethodResult, ready: PreparedLeg) -> MethodResult:
-    found = search_of(ready, method.estimates['pitch_mounting_angle'].value or 0.0)
-    if found is None:
+def _with_search(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
+    search_result = search_of(prepared, method.estimates['pitch_mounting_angle'].value or 0.0)
+    if search_result is None:
         return method
     # left and right may be separable by the gyro: the smoother reports that itself
-    said = (r for r in found.reasons if r.code is not Code.WHEELS_NOT_SEPARABLE)
-    return replace(method, reasons=(*method.reasons, *said),
-                   details=method.details | {'search': found.as_dict()})
+    search_reasons = (r for r in search_result.reasons if r.code is not Code.WHEELS_NOT_SEPARABLE)
+    return replace(method, reasons=(*method.reasons, *search_reasons),
+                   details=method.details | {'search': search_result.as_dict()})
 
 
-def _attitude(ready: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, Floats]:
+def _attitude(prepared: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, Floats]:
     """Return the smoother's attitude at the IMU's rate: t (m,) s, q_nb (m, 4)."""
     t_key, C_nb = details['key_t'], details['key_C_nb']
-    t, q_nb = attitude_of(ready.inputs, ready.origin, t_key[0], quat_from_matrix(C_nb[0]),
+    t, q_nb = attitude_of(prepared.inputs, prepared.origin, t_key[0], quat_from_matrix(C_nb[0]),
                           details['gyro_bias'])
     off = quat_multiply(quat_from_matrix(C_nb), quat_conjugate(quat_at(t_key, t, q_nb)))
     return t, quat_multiply(quat_at(t, t_key, off), q_nb)
 
 
-def _late_path(track: Track, f: Floats, lever_b: Floats, late: float) -> Path:
-    """Return the path for stamps that are ``late`` s late; extrapolated at the track's ends."""
+def _delayed_path(track: Track, f: Floats, lever_b: Floats, delay: float) -> Path:
+    """Return the path for stamps that are ``delay`` s late, extrapolated at the track's ends."""
     def path(t: Floats) -> Floats:
-        t = t - late
+        t = t - delay
         inside = np.clip(t, track.t[0], track.t[-1])
-        beyond = np.clip(t - inside, -abs(late), abs(late))
+        beyond = np.clip(t - inside, -abs(delay), abs(delay))
         P = track.at(inside)
         onward = 0.2    # s of extrapolation beyond the data, for the delay
         before = track.at(inside - np.copysign(onward, beyond))
@@ -106,30 +115,31 @@ def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
     return arm
 
 
-def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
+def planar_of(prepared: PreparedLeg, pitch: float) -> PlanarLeg | None:
     """Return a leg as input of the patent's search, None without two wheels or a first fix."""
-    inputs = ready.inputs
+    inputs = prepared.inputs
     if len(inputs.travels) != 2:
         return None
     left, right = inputs.travels
-    begin, end = (pick([float(x.t[at]) for x in (ready.track, left, right)])
+    begin, end = (pick([float(x.t[at]) for x in (prepared.track, left, right)])
                   for pick, at in ((max, 0), (min, -1)))
-    begin, end = max(0.0, begin), min(ready.t_fit, end)
-    start = ready.mark(begin, ready.path(np.array([ready.rough, 0.0, 0.0])), 'start')
+    begin, end = max(0.0, begin), min(prepared.t_fit, end)
+    start = prepared.mark(begin, prepared.path(np.array([prepared.rough, 0.0, 0.0])), 'start')
     if start is None or end <= begin:
         return None
     between = (inputs.t_fix >= begin) & (inputs.t_fix <= end)
-    scale = ready.nominal or ready.rough
-    return planar_leg(dead_reckon(*ready.epochs, left), dead_reckon(*ready.epochs, right),
-                      inputs.t_fix[between], ready.fixes_n[between], inputs.covariance_n[between],
-                      (start.t, start.position_n), (scale, scale), pitch, ready.lever_b)
+    scale = prepared.nominal or prepared.rough
+    return planar_leg(dead_reckon(*prepared.epochs, left), dead_reckon(*prepared.epochs, right),
+                      inputs.t_fix[between], prepared.fixes_n[between],
+                      inputs.covariance_n[between], (start.t, start.position_n),
+                      (scale, scale), pitch, prepared.lever_b)
 
 
-def search_of(ready: PreparedLeg, pitch: float) -> SearchResult | None:
+def search_of(prepared: PreparedLeg, pitch: float) -> SearchResult | None:
     """Return the result of the search, None with too few fixes; arguments as in planar_of."""
-    leg = planar_of(ready, pitch)
+    leg = planar_of(prepared, pitch)
     if leg is None:
         return None
-    a, wheels = ready.alignment, ready.config.wheels
+    a, wheels = prepared.alignment, prepared.config.wheels
     course = None if a.heading_separable else a.heading_sigma     # includes the mounting angle
     return search(leg, ranges_of(wheels, course), wheels.robust)

@@ -23,25 +23,32 @@ from odocal_ros.calib.two_point import (
     unsolved,
 )
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.pipeline.prepared import MethodRun, Passed, Paths, PreparedLeg
-from odocal_ros.pipeline.tracks import as_configured, near, slip_check
+from odocal_ros.pipeline.prepared_leg import (
+    configured_forward,
+    MethodRun,
+    PassCallback,
+    Paths,
+    PreparedLeg,
+    slip_check,
+    without_outliers,
+)
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import toward
 
 NAMES = ('start', 'end')
 
 
-def two_point(ready: PreparedLeg, passed: Passed | None = None) -> MethodRun:
+def two_point(prepared: PreparedLeg, report_pass: PassCallback | None = None) -> MethodRun:
     """Run the two-point method on a leg; it is not iterative."""
-    return TwoPointRun(ready).result()
+    return TwoPointRun(prepared).result()
 
 
 class TwoPointRun:
     """One run of the method over a leg."""
 
-    def __init__(self, ready: PreparedLeg) -> None:
-        self.ready, self.inputs = ready, ready.inputs
-        self.config, self.track = ready.config, ready.track
+    def __init__(self, prepared: PreparedLeg) -> None:
+        self.prepared, self.inputs = prepared, prepared.inputs
+        self.config, self.track = prepared.config, prepared.track
         self.reasons: list[Reason] = []     # of the method
         self.found: list[Reason] = []       # of the data
         self.slip: tuple[Reason, ...] = ()
@@ -49,59 +56,61 @@ class TwoPointRun:
     def result(self) -> MethodRun:
         """Return the method's result and the path."""
         chord = self._chord()
-        refused = tuple(self.reasons) if chord is None else refusal(chord, self.ready.rough)
+        refused = tuple(self.reasons) if chord is None else refusal(chord, self.prepared.rough)
         if chord is None or refused:
             return MethodRun(unsolved(refused, self.inputs.scale_unit), found=tuple(self.found))
         f, _ = solve(chord, np.inf)
         t_fix = self.inputs.t_fix
         between = (t_fix >= chord.start.t) & (t_fix <= chord.end.t)
-        inside, far = near(self.ready, self.ready.path(f), chord.start, between)
+        inside, outlier_reasons = without_outliers(self.prepared, self.prepared.path(f),
+                                                   chord.start, between)
         between &= inside
-        self.found += far
+        self.found += outlier_reasons
         factor = np.ones(3)
         if between.sum() >= 3:
-            chord, factor = self._judged(chord, f, between)
-        chord = replace(chord, slips=self._slips(chord, solve(chord, factor[2])[0]))
-        method = fit(chord, self.ready.nominal, self.inputs.scale_unit, self.inputs.travel.quantum,
-                     factor, self.config)
-        self._reversed(chord)
+            chord, factor = self._fit_noise(chord, f, between)
+        chord = replace(chord, slips=self._find_slips(chord, solve(chord, factor[2])[0]))
+        method = fit(chord, self.prepared.nominal, self.inputs.scale_unit,
+                     self.inputs.travel.quantum, factor, self.config)
+        self._check_counting_direction(chord)
         method = replace(method, reasons=(*method.reasons, *self.reasons, *judge(
-            method.estimates, self.ready.nominal, self.config)))
+            method.estimates, self.prepared.nominal, self.config)))
         f = method.details['f']
-        paths = Paths(*map(self.ready.path, (as_configured(self.ready, f, method.estimates), f)))
+        paths = Paths(*map(self.prepared.path,
+                           (configured_forward(self.prepared, f, method.estimates), f)))
         return MethodRun(method, paths, tuple(self.found), odometer=self.slip)
 
-    def _slips(self, chord: Chord, f: Floats) -> tuple[Floats, Floats]:
+    def _find_slips(self, chord: Chord, f: Floats) -> tuple[Floats, Floats]:
         """Return slips of the mean between the marks, s and m; set ``slip`` to their reasons."""
         if not self.inputs.has_accelerometer:
             return np.empty(0), np.empty(0)
         ends = chord.start.t, chord.end.t
-        slips = slip_check(self.ready, self.track, toward(self.ready.facing, f), ends)
+        slips = slip_check(self.prepared, self.track, toward(self.prepared.facing, f), ends)
         self.slip = slip_reasons(slips, self.config.odometer.time_offset)
-        one = self.ready.wheel_slips      # of one wheel: its share in the mean
+        one = self.prepared.wheel_slips      # of one wheel: its share in the mean
         inside = (one.t >= ends[0]) & (one.t <= ends[1])
         in_mean = one.size[inside] / one.count
         return np.append(slips.t, one.t[inside]), np.append(slips.size, in_mean)
 
     def _chord(self) -> Chord | None:
         """Return the chord between the marks; None, with a reason, without fixes."""
-        ready, track = self.ready, self.track
-        ends = (ready.covered[0], min(ready.t_fit, ready.covered[1]))
-        path = ready.path(np.array([ready.rough, 0.0, 0.0]))
-        start, end = (ready.mark(t, path, name) for t, name in zip(ends, NAMES, strict=True))
+        prepared, track = self.prepared, self.track
+        ends = (prepared.covered[0], min(prepared.t_fit, prepared.covered[1]))
+        path = prepared.path(np.array([prepared.rough, 0.0, 0.0]))
+        start, end = (prepared.mark(t, path, name) for t, name in zip(ends, NAMES, strict=True))
         for mark, name in zip((start, end), NAMES, strict=True):
             if mark is None:
                 self.reasons.append(Reason(Code.NO_FIX, f'no usable fix at the {name} mark'))
         if start is None or end is None:
             return None
-        chord = Chord(track, ready.origin, start, end, ready.lever_b,
-                      self._velocity_change((start, end)), ready.alignment,
+        chord = Chord(track, prepared.origin, start, end, prepared.lever_b,
+                      self._velocity_change((start, end)), prepared.alignment,
                       (self.inputs.doubt_t, self.inputs.doubt_sigma))
-        if all(m.standing or m.surveyed for m in (start, end)) or refusal(chord, ready.rough):
+        if all(m.standing or m.surveyed for m in (start, end)) or refusal(chord, prepared.rough):
             return chord
-        path = ready.path(solve(chord, np.inf)[0])      # marks in motion depend on the solution
-        return replace(chord, start=ready.mark(start.t, path, 'start') or start,
-                       end=ready.mark(end.t, path, 'end') or end)
+        path = prepared.path(solve(chord, np.inf)[0])      # marks in motion depend on the solution
+        return replace(chord, start=prepared.mark(start.t, path, 'start') or start,
+                       end=prepared.mark(end.t, path, 'end') or end)
 
     def _velocity_change(self, marks: Sequence[MarkFix]) -> Floats:
         """Return C_nb s' at the end mark minus that at the start, zero at rest: (3, 3)."""
@@ -114,61 +123,62 @@ class TwoPointRun:
                     high - low, 1e-6)
         return change
 
-    def _judged(self, chord: Chord, f: Floats, between: Bools) -> tuple[Chord, Floats]:
+    def _fit_noise(self, chord: Chord, f: Floats, between: Bools) -> tuple[Chord, Floats]:
         """Return the chord with realistic marks, the factor on fix sigmas; check the track."""
-        ready = self.ready
-        fixes = self.inputs.t_fix[between], ready.fixes_n[between]
+        prepared = self.prepared
+        fixes = self.inputs.t_fix[between], prepared.fixes_n[between]
         drift_n = self._drift(chord, f)
         drift = float(np.linalg.norm(drift_n))
-        residual = check.track_residuals(ready.path(f), chord.start, fixes)
-        up = check.track_residuals(ready.path(solve(chord)[0]), chord.start, fixes)
+        residual = check.track_residuals(prepared.path(f), chord.start, fixes)
+        up = check.track_residuals(prepared.path(solve(chord)[0]), chord.start, fixes)
         residual[:, 2] = up[:, 2]              # without the error of the pitch
         covariance = self.inputs.covariance_n[between]
         factor = check.fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
         if factor.max() > 1.0:
-            far = float(np.sqrt((residual[:, :2]**2).sum(axis=1).mean()))
+            distance_rms = float(np.sqrt((residual[:, :2]**2).sum(axis=1).mean()))
             self.reasons.append(Reason(
-                Code.FIXES_NOISIER_THAN_SAID, f'the fixes are {far:.1f} m (rms) from the '
+                Code.FIXES_NOISIER_THAN_SAID, f'the fixes are {distance_rms:.1f} m (rms) from the '
                 f'dead-reckoned track, {factor[0]:.1f} times (in height {factor[2]:.1f} times) as '
                 'much as their covariance states. Likely cause: time-correlated fix errors, or '
                 'gyro errors that accumulate along the track', 'Use the smoother, which estimates '
                 'both, or a shorter leg. Uncertainties were increased to match the residuals.'))
         if np.isnan(self.config.gnss.correlation_time):     # else configured
             start, end = marks_with_slow_errors(
-                (chord.start, chord.end), ready.spans, fixes[0], self.track.at(fixes[0]) @ f,
+                (chord.start, chord.end), prepared.spans, fixes[0], self.track.at(fixes[0]) @ f,
                 chord.M @ f, residual / factor[0], covariance, drift_n / factor[0])
             chord = replace(chord, start=start, end=end)
         f, _ = solve(chord, factor[2])
-        self._judge_track(chord, f, fixes, residual, drift)
+        self._check_track(chord, f, fixes, residual, drift)
         return chord, factor
 
     def _drift(self, chord: Chord, f: Floats) -> Floats:
         """Return the bend of a track, fixed at both ends, by gyro errors: (3, k) m, 1 sigma."""
         keep = epochs_between(self.track, chord.start.t, chord.end.t)
         D = displacement(self.track, keep, chord.start.t, f)
-        sources = drift_sources(self.track.t[keep], D, self.track.q_nb[keep], self.ready.alignment)
+        sources = drift_sources(self.track.t[keep], D, self.track.q_nb[keep],
+                                self.prepared.alignment)
         # the bow of a track fixed at both ends is a quarter of the drift of a free end
         return np.concatenate(list(sources.values()), axis=1) / 4
 
-    def _judge_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
+    def _check_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
                      drift: float) -> None:
-        ready, (t, p) = self.ready, fixes
-        keep, _ = check.steady(residual, ready.fix_sigma)     # track errors count as noise
-        sigma = max(ready.fix_sigma, white_noise(p[keep]))
-        found = against_travel(pieces(ready.level_path(t[keep]), p[keep, :2], t[keep], sigma),
+        prepared, (t, p) = self.prepared, fixes
+        keep, _ = check.steady(residual, prepared.fix_sigma)     # track errors count as noise
+        sigma = max(prepared.fix_sigma, white_noise(p[keep]))
+        found = against_travel(pieces(prepared.level_path(t[keep]), p[keep, :2], t[keep], sigma),
                                self.config.odometer.signed)
         self.found += found
         if not found:
-            off = check.track_residuals(ready.path(f), chord.start, fixes)
-            wrong = check.mismatch(check.track_check(off, ready.distance), ready.fix_sigma, drift,
-                                   ready.distance)
-            self.reasons += wrong or check.bent(t, off, chord.M @ f, ready.fix_sigma, drift,
-                                                ready.distance)
+            off = check.track_residuals(prepared.path(f), chord.start, fixes)
+            wrong = check.mismatch(check.track_check(off, prepared.distance), prepared.fix_sigma,
+                                   drift, prepared.distance)
+            self.reasons += wrong or check.bent(t, off, chord.M @ f, prepared.fix_sigma, drift,
+                                                prepared.distance)
 
-    def _reversed(self, chord: Chord) -> None:
+    def _check_counting_direction(self, chord: Chord) -> None:
         """Add the reason for an odometer that counts down without a known IMU orientation."""
         backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
-        if backwards and self.ready.facing is None and not chord.alignment.heading_separable:
+        if backwards and self.prepared.facing is None and not chord.alignment.heading_separable:
             self.found.append(Reason(
                 Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive counts '
                 'mean backwards, or the vehicle reversed during the whole leg'))

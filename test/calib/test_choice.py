@@ -10,7 +10,7 @@ import pytest
 
 from odocal_ros.calib.choice import choose, deciding, disagreements, passed_over, relevant_reasons
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
-from odocal_ros.pipeline.combination import combine, unlike_legs
+from odocal_ros.pipeline.combination import combine, inconsistent_legs
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.levels import REMARK_SIGMAS
@@ -174,7 +174,7 @@ def driven(number, scale=0.02, sigma=2e-6, yaw=0.01, yaw_sigma=1e-4, unit='m/pul
 
 
 def said(*legs):
-    return [r.text for r in unlike_legs(list(enumerate(legs, 1)))]
+    return [r.text for r in inconsistent_legs(list(enumerate(legs, 1)))]
 
 
 def test_legs_of_one_vehicle_are_fine():

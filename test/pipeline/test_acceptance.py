@@ -44,7 +44,7 @@ def test_a_value_that_is_not_sure_is_open_and_says_what_sigma_would_do():
     assert decided(1.004, 0.0004).decision is Decision.PASS
     found = decided(1.004, 0.0006)
     assert found.decision is Decision.UNDECIDED
-    assert found.values[0].sigma_wanted == pytest.approx(0.0005)
+    assert found.values[0].required_sigma == pytest.approx(0.0005)
     assert 'about 2 times as many' in found.why      # (6 / 5)^2 = 1.44
     assert found.do == Code.SCALE_SIGMA_TOO_LARGE.remedy
     assert decided(1.0055, 0.0003).why == (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
-from odocal_ros.pipeline.automatic import LEG_END_REST_NS, LegSearch, PARKED_NS, STOOD_NS
+from odocal_ros.pipeline.automatic import LEG_END_REST_NS, LegSearch, PARKED_NS, START_REST_NS
 from odocal_ros.settings.config import Config, with_settings
 
 pytestmark = pytest.mark.core
@@ -62,7 +62,7 @@ def in_seconds(search):
 
 # at 60 s off, a red light at 120, a stop at 260 that is long enough, then ten minutes on end
 TOWN = [(60, 0), (60, 10), (20, 0), (120, 10), (30, 0), (600, 10), (30, 0)]
-BEFORE, REST, PARKED = (x / SECOND for x in (STOOD_NS, LEG_END_REST_NS, PARKED_NS))
+BEFORE, REST, PARKED = (x / SECOND for x in (START_REST_NS, LEG_END_REST_NS, PARKED_NS))
 
 
 @pytest.mark.parametrize(('form', 'only_counts'), [(COUNTER, False), (SPEED, False),

@@ -14,8 +14,8 @@ from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.beyond_model import delay_notes
 from odocal_ros.pipeline.calibrate import calibrate
-from odocal_ros.pipeline.methods import found_by
-from odocal_ros.pipeline.prepared import MethodRun
+from odocal_ros.pipeline.methods import reasons_on_data
+from odocal_ros.pipeline.prepared_leg import MethodRun
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
@@ -104,7 +104,7 @@ def run(name, odometer, reasons=()):
     ([], [SPUN])])
 def test_slip_is_by_the_smoother_where_it_gives_the_value(smoother, said):
     runs = (*smoother, run('two_point', (SPUN,), REJECTED))
-    assert found_by({one.result.name: one for one in runs}, None) == said
+    assert reasons_on_data({one.result.name: one for one in runs}, None) == said
 
 
 def whole_kmh(leg, spun=0.0):

@@ -21,8 +21,8 @@ from odocal_ros.nav.earth import rate_without_north
 from odocal_ros.nav.local_frame import GNSS_MOVES, LOCAL_MOVES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate, combine
-from odocal_ros.pipeline.prepared import Stage
-from odocal_ros.pipeline.smoother_run import _late_path
+from odocal_ros.pipeline.prepared_leg import Stage
+from odocal_ros.pipeline.smoother_run import _delayed_path
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -199,7 +199,7 @@ def test_dead_reckoning_as_calibrated_allows_for_a_delay_of_the_fixes():
 def test_the_path_runs_on_for_the_delay_beyond_the_data():
     t = np.linspace(0.0, 10.0, 101)
     track = dead_reckon(t, np.tile([0.0, 0.0, 0.0, 1.0], (101, 1)), Travel(t, 5.0 * t, 0.0))
-    path = _late_path(track, np.array([2.0, 0.0, 0.0]), np.zeros(3), -0.3)
+    path = _delayed_path(track, np.array([2.0, 0.0, 0.0]), np.zeros(3), -0.3)
     assert path(np.array([0.0, 4.0, 9.9, 10.0]))[:, 0] == pytest.approx([3.0, 43.0, 102.0, 103.0])
     assert path(np.array(12.0))[0] == pytest.approx(103.0), 'no farther than the delay'
 

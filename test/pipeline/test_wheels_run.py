@@ -10,7 +10,7 @@ import pytest
 
 from odocal_ros.output.summary import screen as screen_text
 from odocal_ros.pipeline.calibrate import calibrate, combine
-from odocal_ros.pipeline.methods import found_by, METHODS, run_methods
+from odocal_ros.pipeline.methods import METHODS, reasons_on_data, run_methods
 from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code
 from odocal_ros.screening.screen import screen
@@ -131,7 +131,7 @@ def test_the_order_of_the_methods_does_not_matter(made):
     for name, run in onward.items():
         assert run.result.estimates == backward[name].result.estimates
         assert run.result.reasons == backward[name].result.reasons
-    assert found_by(onward, prepared) == found_by(backward, prepared)
+    assert reasons_on_data(onward, prepared) == reasons_on_data(backward, prepared)
 
 
 def test_a_slip_of_one_wheel_is_named_once_and_moves_neither_ratio_nor_mean(made, result):

@@ -1,0 +1,293 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A leg prepared for the methods, its tracks before and after calibration, and their checks."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from math import nan
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.check import check_worse, per_distance, track_check, track_residuals
+from odocal_ros.calib.evidence import evidence, KEPT_ROWS
+from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, Path, standing_at
+from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.reversal import level_track
+from odocal_ros.calib.sections import counter_change
+from odocal_ros.calib.slip import find_slips, rounding, Slips, SPIN_WINDOW
+from odocal_ros.calib.wheels.wheel_slips import WheelSlips
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.pieces import by_row
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.dead_reckoning import (
+    forward_b,
+    mounting_from_forward,
+    Origin,
+    section_ratio,
+    Track,
+)
+from odocal_ros.nav.integral import integral_at
+from odocal_ros.nav.strapdown import attitude
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.facing import Facing
+from odocal_ros.screening.inputs import Inputs, Placed
+from odocal_ros.settings.config import Config
+
+PassCallback = Callable[[int, float],
+                        None]      # called with the number of passes, and Stage.change
+WHOLE_FROM = 10.0     # judgement: sigmas, larger ones are shown without decimals
+
+
+class Paths(NamedTuple):
+    """
+    The antenna's path as configured and as calibrated: t (n,) to (n, 3) m, up to a constant.
+
+    Both have the same attitude and undetermined mounting angles: they only differ in the
+    calibrated values.
+    """
+
+    before: Path
+    after: Path
+
+
+class MethodRun(NamedTuple):
+    """A method's result and its other findings."""
+
+    result: MethodResult
+    paths: Paths | None = None         # None if it refuses
+    found: tuple[Reason, ...] = ()     # of the leg
+    # 'gnss' or 'odometer' to delay, s, and sigma; None from a method that estimates none
+    delays: dict[str, tuple[float, float]] | None = None
+    # on slip or delay of its track relative to the IMU, used unless a better method has checked;
+    # None: not checked
+    odometer: tuple[Reason, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of the work on a leg."""
+
+    name: str = ''         # the running method, or ``track_results``; empty before the first
+    done: float = 0.0      # share of the work in the stages before; a fit cannot be predicted
+    passes: int = 0        # of its fit so far
+    change: float = nan    # largest one of a constant in the last pass, sigmas; NaN: none yet
+
+    def words(self) -> str:
+        if not self.passes:
+            return self.name
+        change = f'{self.change:.0f}' if self.change >= WHOLE_FROM else f'{self.change:.2f}'
+        return (f'{self.name}, {self.passes} pass{"es" * (self.passes > 1)} done, remaining '
+                f'change {change} sigma')
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLeg(Placed):
+    """Input of all methods. They do not change it, so their order has no effect."""
+
+    leg: Leg                             # raw
+    inputs: Inputs                       # screened
+    config: Config
+    facing: Facing | None                # IMU orientation, None if not determined
+    lever_b: NDArray[np.float64]         # (3,) m, from the odometer's point to the antenna
+    spans: NDArray[np.float64]           # (s, 2) s, standstills
+    alignment: Alignment
+    alignment_reasons: tuple[Reason, ...]
+    epochs: tuple[Floats, Floats]        # attitude after alignment, t (m,) s and q_nb (m, 4)
+    track: Track                         # dead reckoned from these and the mean of the wheels
+    wheel_slips: WheelSlips              # of one wheel relative to the other
+    metres_per_unit: float               # approximate, until a method estimates a better one
+    distance: float                      # m, by it
+    t_fit: float                         # s; if ``holdout``, later fixes are held out
+    holdout: bool
+    reasons: tuple[Reason, ...]          # of the leg
+    end_reasons: tuple[Reason, ...]          # those that only concern methods by its ends
+
+    def path(self, f: Floats, track: Track | None = None) -> Path:
+        """Return the path of the antenna, t (n,) to (n, 3) m up to a constant, for f = K d."""
+        track = self.track if track is None else track
+
+        def at(t: Floats) -> Floats:
+            path = track.at(t) @ f
+            return path + track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
+        return at
+
+    def level_path(self, t: Floats) -> Floats:
+        """Return travel along the gyro's heading on level ground, up to a rotation: (n, 2)."""
+        inputs, epochs = self.inputs, self.track.t
+        turned = integral_at(epochs, inputs.t_imu, by_row(
+            lambda w_b: (w_b - self.alignment.gyro_bias) @ inputs.up_b, inputs.w_b))
+        path = level_track(self.track.s, turned)
+        return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
+
+    @property
+    def covered(self) -> tuple[float, float]:
+        """Return begin and end of the time with track and odometer, s."""
+        each = self.track.t, self.inputs.travel.t
+        return max(0.0, *(float(t[0]) for t in each)), min(float(t[-1]) for t in each)
+
+    @cached_property
+    def path_ratio(self) -> float | None:
+        """Return metres per unit of travel by fixes along ``level_path``, None if they stand."""
+        t, travel = self.inputs.t_fix, self.inputs.travel
+        k = (t >= max(travel.t[0], self.track.t[0])) & (t <= min(travel.t[-1], self.track.t[-1]))
+        return section_ratio(travel.at(t[k]), self.level_path(t[k]), self.fixes_n[k, :2],
+                             max(self.inputs.least_motion, 8 * self.fix_sigma))
+
+    def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
+        """Return the antenna's position at t by fixes or surveyed mark, None without either."""
+        point = self._surveyed(name, t)
+        if point:
+            position = np.array([np.deg2rad(point[0]), np.deg2rad(point[1]), point[2]])
+            return MarkFix(t, self.origin.to_n(position), np.eye(3) * point[3]**2,
+                           standing_at(t, self.spans) is not None, 0, 0, surveyed=True)
+        inputs, here = self.inputs, path(np.array(t))
+        rhythm = np.median(np.diff(inputs.t_fix)) if len(inputs.t_fix) > 1 else MARK_WINDOW
+        return fix_at(t, standing_at(t, self.spans),
+                      (inputs.t_fix, self.fixes_n, inputs.covariance_n),
+                      lambda times: path(times) - here,
+                      self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * rhythm))
+
+    def _surveyed(self, name: str, t: float) -> tuple[float, ...]:
+        """Return the reference point at a mark, () if the path does not start or end there."""
+        if not name or self.origin.local:      # surveyed points are geodetic
+            return ()
+        t_mark = 0.0 if name == 'start' else self.inputs.t_stop
+        span = standing_at(t_mark, self.spans)
+        at_mark = 0.05    # s, largest distance from a mark for its surveyed point
+        if abs(t - t_mark) <= at_mark or (span and span == standing_at(t, self.spans)):
+            point: tuple[float, ...] = getattr(self.config.reference, name)
+            return point
+        return ()
+
+
+def attitude_of(inputs: Inputs, origin: Origin, t_begin: float, q_nb: Floats,
+                gyro_bias: Floats) -> tuple[Floats, Floats]:
+    """Return the attitude from ``t_begin``, s, to the end: t (m,) s, q_nb (m, 4)."""
+    rows = slice(np.searchsorted(inputs.t_imu, t_begin - 1e-9),
+                 np.searchsorted(inputs.t_imu, inputs.t_stop + 1.0, side='right'))
+    t = inputs.t_imu[rows]
+    rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
+    epoch_rate = 50.0    # Hz, least rate of attitude epochs
+    return attitude(t, inputs.w_b[rows], q_nb, origin.earth_rate_n,
+                    max(1, int(rate / epoch_rate)), gyro_bias)
+
+
+FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
+
+
+def configured_forward(prepared: PreparedLeg, f: Floats,
+                       estimates: Mapping[str, Estimate]) -> Floats:
+    """
+    Return f = K0 d0 of the settings, (3,) m per unit of travel; without K0 the path ratio's.
+
+    f : as estimated; its angles are kept if ``estimates`` has no value of them.
+    """
+    found = mounting_from_forward(f)
+    determined = {name for name, e in estimates.items() if e.value is not None}
+    angles = [0.0 if name in determined else angle for name, angle in zip(
+        ('yaw_mounting_angle', 'pitch_mounting_angle'), found, strict=True)]
+    return (prepared.nominal or prepared.path_ratio or prepared.rough) * forward_b(*angles)
+
+
+def without_outliers(prepared: PreparedLeg, path: Path, pin: MarkFix,
+                     between: Bools) -> tuple[Bools, tuple[Reason, ...]]:
+    """Return a mask of fixes, (k,), without gross outliers from a fitted path, and reasons."""
+    if not between.any():
+        return between, ()
+    off = np.hypot(*track_residuals(path, pin, (prepared.inputs.t_fix, prepared.fixes_n))[:, :2].T)
+    usual = max(float(np.median(off[between])), prepared.fix_sigma)
+    track_outlier = 20.0    # times the usual distance from the track: a certain outlier
+    far = off > track_outlier * usual
+    found = (Reason(
+        Code.BAD_ROWS_DROPPED, f'{int((far & between).sum())} of {int(between.sum())} fixes are '
+        f'more than {track_outlier * usual:.0f} m from the track; not used in the check'),)
+    return ~far, found if (far & between).any() else ()
+
+
+def track_results(prepared: PreparedLeg, paths: Paths) -> tuple[dict[str, Any],
+                                                                tuple[Reason, ...]]:
+    """Return tracks, checks and evidence of a leg as fields of its result, and reasons."""
+    before, after = paths
+    start = _start_position(prepared, after)
+    if start is None:
+        return {}, ()
+    t = prepared.track.t[::max(1, len(prepared.track.t) // KEPT_ROWS)]
+    more: dict[str, Any] = {
+        name: start.position_n + path(t) - path(np.array(start.t))
+        for name, path in (('track_before_n', before), ('track_n', after))}
+    if not prepared.origin.local:       # else the position on the Earth is unknown
+        more |= {'origin': (prepared.origin.latitude, prepared.origin.longitude,
+                            prepared.origin.height)}
+    pin, between, path_length, found = _compared_section(prepared, after, start)
+    more['reference_n'] = prepared.fixes_n[between]
+    if pin is None or between.sum() < FEWEST_TRACK_FIXES:
+        return more, found
+    fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
+    more |= {name: track_check(track_residuals(path, pin, fixes), path_length)
+             for name, path in (('before', before), ('after', after))}
+    path_at = np.interp(fixes[0], *path_length_over_time(prepared))
+    off_before, off_after = (track_residuals(path, pin, fixes) for path in paths)
+    more['per_distance'] = per_distance(path_at, off_before, off_after)
+    kept, far = without_outliers(prepared, after, start, between)
+    found += (*check_worse(path_at, off_before, off_after, bool(prepared.nominal)), *far)
+    seen = evidence(prepared.leg, prepared.inputs, prepared.track, prepared.fixes_n, kept, start,
+                    paths, prepared.config, prepared.t_fit, prepared.covered)
+    found += counter_change(seen.sections, seen.t_fix, seen.fix_distance)
+    return more | {'evidence': seen}, found
+
+
+def path_check(prepared: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reason, ...]]:
+    """Return the check of a method's own path as an entry of its details, and reasons."""
+    start = _start_position(prepared, path)
+    if start is None:
+        return {}, ()
+    pin, between, path_length, found = _compared_section(prepared, path, start)
+    if pin is None or between.sum() < FEWEST_TRACK_FIXES:
+        return {}, found
+    fixes = prepared.inputs.t_fix[between], prepared.fixes_n[between]
+    return {'check': asdict(track_check(track_residuals(path, pin, fixes), path_length))}, found
+
+
+def _start_position(prepared: PreparedLeg, path: Path) -> MarkFix | None:
+    return prepared.mark(prepared.covered[0], path, 'start')
+
+
+def _compared_section(prepared: PreparedLeg, path: Path,
+                      start: MarkFix) -> tuple[MarkFix | None, Bools, float, tuple[Reason, ...]]:
+    """Return the pin of the path, a mask of fixes to compare, path length, m, and reasons."""
+    pin: MarkFix | None = start
+    begin, end = start.t, prepared.t_fit
+    found: tuple[Reason, ...] = ()
+    if prepared.holdout:
+        pin, begin, end = prepared.mark(prepared.t_fit,
+                                        path), prepared.t_fit, prepared.inputs.t_stop
+    end = min(end, prepared.covered[1])
+    between = (prepared.inputs.t_fix >= begin) & (prepared.inputs.t_fix <= end)
+    if pin is not None:
+        inside, found = without_outliers(prepared, path, pin, between)
+        between &= inside
+    a, b = np.interp([begin, end], *path_length_over_time(prepared))
+    return pin, between, b - a, found
+
+
+def path_length_over_time(prepared: PreparedLeg) -> tuple[Floats, Floats]:
+    """Return times of the track, s, and the path length up to them, m."""
+    path_length = np.append(0.0, np.cumsum(np.abs(np.diff(prepared.track.s))))
+    return prepared.track.t, path_length * prepared.metres_per_unit
+
+
+def slip_check(prepared: PreparedLeg, track: Track, f: Floats,
+               between: tuple[float, float]) -> Slips:
+    """Return the slips of the mean wheel between two times, s, except those of one wheel."""
+    if not prepared.inputs.has_accelerometer:
+        return Slips(np.empty(0), np.empty(0))
+    slips = find_slips(prepared.inputs.t_imu, prepared.inputs.f_b, track, f,
+                       prepared.origin.latitude, rounding(prepared.inputs.travel))
+    known = (np.abs(slips.t[:, None] - prepared.wheel_slips.t) < SPIN_WINDOW).any(axis=1)
+    held = (slips.t >= between[0]) & (slips.t <= between[1]) & ~known
+    return slips._replace(t=slips.t[held], size=slips.size[held], unforced=slips.unforced[held])
