@@ -36,8 +36,8 @@ QUICK = ['--method', 'two_point', '--reports', 'none', '--quiet']
 
 def rows_in(output):
     """Return the rows in an output folder by bag, but for how long each took."""
-    from odocal_ros.fleet.rows import rows_of
-    rows = list(rows_of(sorted((Path(output) / 'rows').rglob('*.parquet'))))
+    from odocal_ros.fleet.rows import read_rows
+    rows = list(read_rows(sorted((Path(output) / 'rows').rglob('*.parquet'))))
     by_bag = {row.bag: replace(row, seconds=0.0) for row in rows}
     assert len(by_bag) == len(rows), 'a bag has two rows'
     return by_bag
@@ -223,10 +223,10 @@ def by_replay(bags, folder, method):
 
 def by_engine(fleet, folder, method):
     """Return the time on two workers, that of cores of workers and of the command, s."""
+    from odocal_ros.fleet.bag_jobs import bag_jobs, computed_rows
     from odocal_ros.fleet.bags import find_bags
     from odocal_ros.fleet.command import add_arguments
     from odocal_ros.fleet.engine import engine
-    from odocal_ros.fleet.jobs import bag_jobs, computed_rows
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     asked = parser.parse_args([str(fleet / 'manifest.csv'), '--output', 'x', '--method', method])

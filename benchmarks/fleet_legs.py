@@ -23,8 +23,8 @@ import pyarrow.parquet as pq
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.engine import engine
-from odocal_ros.fleet.rows import leg_text, Row, row_schema
-from odocal_ros.fleet.second_stage import vehicle_jobs, vehicles_together
+from odocal_ros.fleet.fleet_results import compute_vehicles, vehicle_jobs
+from odocal_ros.fleet.rows import Row, row_schema, text_of_legs
 
 EACH = 50                    # legs of a vehicle
 DAY = 86_400 * 10**9         # ns
@@ -60,7 +60,7 @@ def write(folder, vehicles, rng):
     bags, files = [], []
     for v in range(vehicles):
         rows = [Row(key=f'{v}-{k}', bag=f'{v}/{k}', vehicle=f'v{v:06d}', model='synthetic',
-                    start_ns=leg.start_ns, legs=leg_text([leg]))
+                    start_ns=leg.start_ns, legs=text_of_legs([leg]))
                 for k, leg in enumerate(leg_of(scale, k, rng) for k, scale in enumerate(
                     scales(rng, v % 10 == 0)))]
         bags += [FleetBag(row.vehicle, row.bag, row.model) for row in rows]
@@ -86,7 +86,7 @@ def main():
         jobs = vehicle_jobs(*write(folder, n, np.random.default_rng(args.seed)), {})
         with engine(None, args.workers, 2**31, 3) as client:
             before, began = used()[1], time.monotonic()
-            vehicles = vehicles_together(client, jobs, folder / 'out', False)
+            vehicles = compute_vehicles(client, jobs, folder / 'out', False)
             took, own = time.monotonic() - began, used()[1] - before
             workers = list(client.run(used).values())
         size = sum(path.stat().st_size for path in folder.glob('*.parquet'))

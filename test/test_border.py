@@ -122,9 +122,10 @@ def test_dask_is_imported_in_fleet_only_and_never_at_the_top():
     users = {_part(p) for p in _modules() for name in _imports(p)
              if name.split('.')[0] in ('dask', 'distributed', 'fsspec')}
     assert users == {'fleet'}
-    probe = ('import odocal_ros.fleet.command, odocal_ros.fleet.outcome, odocal_ros.fleet.jobs, '
-             "sys; print([m for m in ('dask', 'distributed', 'fsspec', 'pandas', 'pyarrow') "
-             'if m in sys.modules])')
+    probe = ('import odocal_ros.fleet.command, odocal_ros.fleet.fleet_results, '
+             'odocal_ros.fleet.bag_jobs, sys; '
+             "heavy = ('dask', 'distributed', 'fsspec', 'pandas', 'pyarrow'); "
+             'print([m for m in heavy if m in sys.modules])')
     assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
 
 

@@ -4,6 +4,6 @@
 """Many vehicles: each bag is a Dask task with the pipeline of replay; then vehicles and a page."""
 
 
-from odocal_ros.fleet.notebook import calibrate_bags
+from odocal_ros.fleet.command import calibrate_bags
 
 __all__ = ['calibrate_bags']

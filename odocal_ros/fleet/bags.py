@@ -45,9 +45,9 @@ def find_bags(names: list[str], vehicle_from: str | None) -> list[FleetBag]:
     path.
     """
     if len(names) == 1 and names[0].endswith(('.csv', '.parquet')):
-        return _of_manifest(names[0])
+        return _read_manifest(names[0])
     pattern = _pattern(vehicle_from) if vehicle_from else None
-    bags = [_named(bag, pattern) for name in names for bag in _bags_in(name)]
+    bags = [_bag_of_path(bag, pattern) for name in names for bag in _bags_in(name)]
     unique = list(dict.fromkeys(bags))
     if not unique:
         raise BadUsage(f'{", ".join(names)}: no bag found; give a manifest, bags, or folders '
@@ -67,7 +67,7 @@ def _pattern(text: str) -> re.Pattern[str]:
     return pattern
 
 
-def _named(bag: str, pattern: re.Pattern[str] | None) -> FleetBag:
+def _bag_of_path(bag: str, pattern: re.Pattern[str] | None) -> FleetBag:
     if pattern is None:
         return FleetBag(PurePosixPath(bag).parent.name, bag)
     found = pattern.search(bag)
@@ -87,7 +87,7 @@ def _number(value: Any, where: str) -> float | None:
         raise BadUsage(f'{where}: odometer_km {value!r} is not a number') from None
 
 
-def _of_manifest(name: str) -> list[FleetBag]:
+def _read_manifest(name: str) -> list[FleetBag]:
     """Return the rows of a manifest; its paths are relative to its folder."""
     import pyarrow as pa
     from pyarrow import csv, parquet
@@ -116,14 +116,14 @@ def _of_manifest(name: str) -> list[FleetBag]:
         if not (text.get('vehicle') and text.get('bag')):
             raise BadUsage(f'{name}, row {number}: vehicle or bag is empty')
         bags.append(FleetBag(
-            text['vehicle'], _against(root, text['bag']), text.get('model', ''),
+            text['vehicle'], _resolve_path(root, text['bag']), text.get('model', ''),
             _number(text.get('odometer_km'), f'{name}, row {number}'),
-            _against(root, text['config']) if text.get('config') else '',
+            _resolve_path(root, text['config']) if text.get('config') else '',
             tuple(text.get('legs', '').split())))
     return bags
 
 
-def _against(root: str, path: str) -> str:
+def _resolve_path(root: str, path: str) -> str:
     return path if '://' in path or path.startswith('/') else root + path
 
 
@@ -142,13 +142,13 @@ def _bags_in(name: str) -> list[str]:
     fs, path = file_system(name)
     try:
         paths = fs.glob(path) if any(c in path for c in '*?[') else [path]
-        bags = [bag for found in sorted(paths) for bag in _in_folder(fs, found)]
+        bags = [bag for found in sorted(paths) for bag in _bags_in_folder(fs, found)]
         return [str(fs.unstrip_protocol(bag)) for bag in bags] if '://' in name else bags
     except OSError as error:
         raise BadUsage(f'{name}: cannot be read ({error_text(error)})') from None
 
 
-def _in_folder(fs: Any, path: str) -> list[str]:
+def _bags_in_folder(fs: Any, path: str) -> list[str]:
     if not fs.isdir(path):
         if not fs.exists(path):
             raise BadUsage(f'{path}: no such file or folder')
@@ -166,7 +166,7 @@ def is_local(url: str) -> bool:
     return get_protocol(url) in ('file', 'local')
 
 
-def seen_as(url: str, settings: str) -> str:
+def bag_fingerprint(url: str, settings: str) -> str:
     """
     Return a hash of the place, size and date of a bag, and of settings.
 
@@ -185,7 +185,7 @@ def seen_as(url: str, settings: str) -> str:
         for name, about in files.items()))
 
 
-def _fits(url: str, fs: Any, path: str, folder: str) -> None:
+def _check_disk_space(url: str, fs: Any, path: str, folder: str) -> None:
     """Raise BadBag if a copy would need more than half of the free disk space."""
     files = fs.find(path, detail=True) if fs.isdir(path) else {path: fs.info(path)}
     size = sum(int(about.get('size') or 0) for about in files.values())
@@ -197,7 +197,7 @@ def _fits(url: str, fs: Any, path: str, folder: str) -> None:
 
 
 @contextmanager
-def at_hand(url: str, scratch: str | None) -> Iterator[Path]:
+def local_copy(url: str, scratch: str | None) -> Iterator[Path]:
     """Yield a local path of a bag; of a remote one, that of a temporary copy in ``scratch``."""
     fs, path = file_system(url)
     if is_local(url):
@@ -207,7 +207,7 @@ def at_hand(url: str, scratch: str | None) -> Iterator[Path]:
         name = PurePosixPath(path).name
         copy = Path(folder) / (name if name not in ('', '.', '..') else 'bag')
         try:
-            _fits(url, fs, path, folder)
+            _check_disk_space(url, fs, path, folder)
             fs.get(path, str(copy), recursive=fs.isdir(path))
         except BadBag:
             raise

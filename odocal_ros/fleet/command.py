@@ -1,12 +1,18 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""odocal fleet: bags of many vehicles, each a task on Dask, then the vehicles compared."""
+"""
+odocal fleet, and calibrate_bags for notebooks: bags of many vehicles, each a task on Dask.
+
+Imports of Dask and the pipeline are inside functions, so that --help stays quick.
+"""
 
 import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 import re
 import sys
+import tempfile
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
@@ -14,13 +20,13 @@ from odocal_ros.offline.replay import add_calibration_arguments
 from odocal_ros.offline.say import say, warn
 
 if TYPE_CHECKING:
-    from odocal_ros.fleet.bag_task import BagJob
+    from odocal_ros.fleet.bag_jobs import BagJob
 
 TIMEOUT = 3600.0      # s, judgement: for a bag
 GIB = 2**30    # definition: bytes
 
 
-def _bytes(text: str) -> int:
+def _byte_count(text: str) -> int:
     found = re.fullmatch(r'(\d+(?:\.\d+)?) ?([KMG]?)(?:i?B)?', text)
     if not found or not float(found[1]):
         raise argparse.ArgumentTypeError(f'{text}: required: a size such as 2G or 500M')
@@ -28,7 +34,7 @@ def _bytes(text: str) -> int:
     return int(float(found[1]) * units[found[2]])
 
 
-def _positive(text: str) -> int:
+def _positive_count(text: str) -> int:
     try:
         number = int(text)
     except ValueError:
@@ -48,14 +54,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "group names the vehicle (default: the bag's folder)")
     add('--scheduler', metavar='ADDRESS', help='Dask cluster, such as tcp://host:8786 (default: '
         'local processes)')
-    add('--workers', type=_positive, metavar='N', help='number of local processes (default: '
+    add('--workers', type=_positive_count, metavar='N', help='number of local processes (default: '
         'limited by cores and memory)')
     add('--task-timeout', type=float, default=TIMEOUT, metavar='S', help='time limit per bag '
         f'(default {TIMEOUT:g})')
-    add('--task-memory', type=_bytes, default=2 * GIB, metavar='SIZE', help='memory limit per '
-        'bag (default 2G)')
-    add('--tries', type=_positive, default=3, metavar='N', help='retries of a bag that ends its '
-        'local worker (default 3)')
+    add('--task-memory', type=_byte_count, default=2 * GIB, metavar='SIZE', help='memory limit '
+        'per bag (default 2G)')
+    add('--tries', type=_positive_count, default=3, metavar='N', help='retries of a bag that '
+        'ends its local worker (default 3)')
     add('--again', action='store_true', help='retry bags that failed')
     add('--reports', choices=('flagged', 'all', 'none'), default='flagged', help='vehicles that '
         'get a report of their own')
@@ -70,11 +76,11 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate a fleet; return 0 without failures (with --accept: all pass), else 1."""
     from odocal_ros.fleet.engine import check_installed
     check_installed()
+    from odocal_ros.fleet.bag_jobs import bag_jobs, make_output_folder
     from odocal_ros.fleet.bags import find_bags
     from odocal_ros.fleet.engine import dashboard, engine
-    from odocal_ros.fleet.jobs import bag_jobs, writable
+    from odocal_ros.fleet.fleet_results import exit_code, run_settings, summary_text, write_outcome
     from odocal_ros.fleet.kpi import write_kpi
-    from odocal_ros.fleet.outcome import asked, exit_code, said, write_outcome
     from odocal_ros.output.figures import counted
     from odocal_ros.settings.config import Config, with_settings
     if not args.task_timeout > 0:
@@ -82,17 +88,17 @@ def run(args: argparse.Namespace) -> int:
     output = Path(args.output)
     bags = find_bags(args.bags, args.vehicle_from)
     jobs = bag_jobs(bags, args, output, args.task_timeout, args.task_memory)
-    limits = with_settings(Config(), asked(jobs)).accept.limits
+    limits = with_settings(Config(), run_settings(jobs)).accept.limits
     if args.kpi and not limits:
         raise BadUsage('--kpi needs limits: give --accept NAME=LOW:HIGH')
-    writable(output)
+    make_output_folder(output)
     with engine(args.scheduler, args.workers, args.task_memory, args.tries) as client:
         if not args.quiet:
             address = dashboard(client)
             warn(f'odocal: {counted(len(jobs), "bag")} of '
                  f'{counted(len({b.vehicle for b in bags}), "vehicle")}'
                  + f'; dashboard: {address}' * bool(address))
-        rows = _computed(client, jobs, args)
+        rows = _compute_rows(client, jobs, args)
         vehicles = write_outcome(client, jobs, rows, output, args)
     kpi = write_kpi(vehicles, limits, output) if args.kpi else ''
     if args.accept or any(row['decision'] for row in vehicles):
@@ -100,15 +106,15 @@ def run(args: argparse.Namespace) -> int:
             say(row['line'])
     if not args.quiet:
         shown = 20    # vehicles that are named on the terminal
-        say(said(vehicles, output, shown) + kpi)
+        say(summary_text(vehicles, output, shown) + kpi)
     return exit_code(vehicles, args.strict)
 
 
-def _computed(client: Any, jobs: 'list[BagJob]', args: argparse.Namespace) -> list[str]:
+def _compute_rows(client: Any, jobs: 'list[BagJob]', args: argparse.Namespace) -> list[str]:
     """Compute all rows; return the file of each, and show the progress."""
     from tqdm import tqdm
 
-    from odocal_ros.fleet.jobs import computed_rows
+    from odocal_ros.fleet.bag_jobs import computed_rows
     from odocal_ros.fleet.rows import FAILED, RowStore
     store, failed = RowStore(jobs[0].folder), 0
     files = [''] * len(jobs)
@@ -121,3 +127,71 @@ def _computed(client: Any, jobs: 'list[BagJob]', args: argparse.Namespace) -> li
             bar.set_postfix(failed=failed, refresh=False)
             bar.update()
     return files
+
+
+def calibrate_bags(bags: Any, config: Any = None, client: Any = None,
+                   output: str | Path | None = None, **options: Any) -> Any:
+    """
+    Calibrate bags separately, and return a pandas DataFrame with one row per leg.
+
+    bags : bags, folders, globs or URLs, or a manifest; a DataFrame has the manifest's columns.
+    config : Config, settings by dotted name, or a parameter file.   client : distributed.Client
+    of the workers; None: temporary local processes.   output : folder for the rows, which later
+    calls reuse; None: a temporary folder.   options : of ``replay`` by name: imu_topic, leg,
+    method and the like; vehicle_from.
+
+    Returns the columns of legs.parquet, and ``status`` and ``reason`` of the bag; a failed bag is
+    a row without values.
+    """
+    from odocal_ros.fleet.engine import check_installed, engine, MEMORY
+    check_installed()
+    from odocal_ros.fleet.bag_jobs import bag_jobs
+    from odocal_ros.fleet.bags import find_bags
+    vehicle_from = options.pop('vehicle_from', None)
+    if hasattr(bags, 'to_dict'):
+        found = [_bag_of_row(row) for row in bags.to_dict('records')]
+    else:
+        names = [bags] if isinstance(bags, (str, Path)) else bags
+        found = find_bags([str(name) for name in names], vehicle_from)
+    args = _arguments(options)
+    with tempfile.TemporaryDirectory(prefix='odocal_') as temporary:
+        jobs = bag_jobs(found, args, Path(output or temporary), TIMEOUT, MEMORY, config)
+        if client is not None:
+            return _data_frame(client, jobs)
+        with engine(None, None, MEMORY, 3) as own:
+            return _data_frame(own, jobs)
+
+
+def _bag_of_row(row: Mapping[str, Any]) -> Any:
+    from odocal_ros.fleet.bags import COLUMNS, FleetBag
+    known = {name: row[name] for name in COLUMNS if name in row and row[name] == row[name]
+             and row[name] is not None}
+    return FleetBag(**known | {'legs': tuple(str(known.get('legs', '')).split())})
+
+
+def _arguments(options: dict[str, Any]) -> Any:
+    parser = argparse.ArgumentParser()
+    add_calibration_arguments(parser)
+    args = parser.parse_args([])
+    unknown = set(options) - set(vars(args))
+    if unknown:
+        raise BadUsage(f'calibrate_bags has no option {", ".join(sorted(unknown))}; options: '
+                       f'{", ".join(sorted(vars(args)))}')
+    for name, value in options.items():
+        setattr(args, name, value)
+    return args
+
+
+def _data_frame(client: Any, jobs: Sequence[Any]) -> Any:
+    import pandas as pd
+
+    from odocal_ros.fleet.bag_jobs import computed_rows
+    from odocal_ros.fleet.rows import read_rows, RowStore
+    from odocal_ros.fleet.tables import table_rows
+    store = RowStore(jobs[0].folder)
+    files = {i: store.path(done.key) for i, done in computed_rows(client, jobs)}
+    table = []
+    for i in sorted(files):
+        row = next(read_rows([files[i]]))
+        table += table_rows(jobs[i].bag, row)
+    return pd.DataFrame(table)

@@ -15,8 +15,8 @@ from odocal_ros.errors import BadUsage, OdocalError
 NEEDS = ('cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
 MEMORY = 2 * 2**30       # judgement: bytes for a task, by default
 FEWEST = 50              # judgement: least tasks submitted: workers may be starting
-LOST = ('the connection to the Dask scheduler is lost; start it again and repeat the command: '
-        'finished bags are kept')
+CONNECTION_LOST = ('the connection to the Dask scheduler is lost; start it again and repeat the '
+                   'command: finished bags are kept')
 
 
 def check_installed() -> None:
@@ -48,18 +48,19 @@ def engine(scheduler: str | None, workers: int | None, memory: int, tries: int) 
         with client:
             yield client
         return
-    ours = {'distributed.scheduler.allowed-failures': tries - 1,
-            # above two bags a worker, one at a time: a bag that ends it affects no other bag
-            'distributed.scheduler.worker-saturation': 1.0,
-            'distributed.logging.distributed': 'critical',
-            'distributed.worker.memory.terminate': False,
-            # its profiling every 10 ms takes 5 % of a core
-            'distributed.worker.profile.enabled': False,
-            # without Dask's MALLOC_TRIM_THRESHOLD_: memory returned at once causes page faults at
-            # its next use, which took a quarter of a bag's time
-            'distributed.nanny.pre-spawn-environ': dict.fromkeys(
-                ('OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), 1)}
-    with dask.config.set(ours), LocalCluster(
+    local_settings = {
+        'distributed.scheduler.allowed-failures': tries - 1,
+        # above two bags a worker, one at a time: a bag that ends it affects no other bag
+        'distributed.scheduler.worker-saturation': 1.0,
+        'distributed.logging.distributed': 'critical',
+        'distributed.worker.memory.terminate': False,
+        # its profiling every 10 ms takes 5 % of a core
+        'distributed.worker.profile.enabled': False,
+        # without Dask's MALLOC_TRIM_THRESHOLD_: memory returned at once causes page faults at
+        # its next use, which took a quarter of a bag's time
+        'distributed.nanny.pre-spawn-environ': dict.fromkeys(
+            ('OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), 1)}
+    with dask.config.set(local_settings), LocalCluster(
             n_workers=workers or _workers(memory), threads_per_worker=1, processes=True,
             # access to a scheduler's port allows to run code: it requires the key of this run
             security=Security.temporary(), host='127.0.0.1',
@@ -80,8 +81,8 @@ def dashboard(client: Any) -> str:
     return client.dashboard_link if find_spec('bokeh') else ''
 
 
-def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: str,
-            keys: Sequence[str]) -> Iterator[tuple[int, Any, BaseException | None]]:
+def task_results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: str,
+                 keys: Sequence[str]) -> Iterator[tuple[int, Any, BaseException | None]]:
     """
     Yield (number of the job, result, error) as tasks end, in any order.
 
@@ -95,7 +96,7 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
     while left or number:
         error, found = None, None
         if left and len(number) <= fewest:
-            fewest = _ahead(client)
+            fewest = _batch_size(client)
             now, left = left[:fewest], left[fewest:]
             futures = client.map(task, [jobs[i] for i in now], pure=True, retries=0,
                                  key=[f'{name}-{keys[i]}' for i in now])
@@ -106,17 +107,17 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
         try:
             found = future.result()
         except CancelledError:
-            raise OdocalError(LOST) from None
+            raise OdocalError(CONNECTION_LOST) from None
         except Exception as what:     # noqa: BLE001 of the task, or that its workers were ended
             error = what
         yield number.pop(future.key), found, error
         future.release()
 
 
-def _ahead(client: Any) -> int:
+def _batch_size(client: Any) -> int:
     """Return the number of tasks to submit at a time, and the rest at which to submit more."""
     try:
         per_worker = 2    # tasks submitted at a time
         return max(FEWEST, per_worker * int(sum(client.nthreads().values())))
     except OSError:
-        raise OdocalError(LOST) from None
+        raise OdocalError(CONNECTION_LOST) from None

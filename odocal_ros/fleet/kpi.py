@@ -64,7 +64,7 @@ def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
     judged = {'good': 0, 'bad': 0, 'on_the_limit': 0}
     for row in vehicles:
         pieces = last.get(row['vehicle'], [])
-        decision = _decision(row | _widened(row, pieces, limits), limits)
+        decision = _decision(row | _sigmas_with_scatter(row, pieces, limits), limits)
         if decision is Decision.UNDECIDED or len(pieces) < FEWEST:
             judged['on_the_limit'] += 1
             continue
@@ -88,8 +88,8 @@ def _decision(row: dict[str, Any], limits: Limits) -> Decision:
                 for name, ends in limits.items()), key=list(Decision).index)
 
 
-def _widened(row: dict[str, Any], legs: Sequence[dict[str, Any]],
-             limits: Limits) -> dict[str, float]:
+def _sigmas_with_scatter(row: dict[str, Any], legs: Sequence[dict[str, Any]],
+                         limits: Limits) -> dict[str, float]:
     """Return the sigmas of a reference, increased by the scatter of its legs."""
     found = {}
     for name in limits:

@@ -13,9 +13,14 @@ from urllib.parse import quote
 import numpy as np
 
 from odocal_ros import __version__
-from odocal_ros.fleet.second_stage import by_model, COMPARED, file_name, flagged
 from odocal_ros.fleet.statistics import LEAST, Population, population
-from odocal_ros.fleet.tables import LEGS
+from odocal_ros.fleet.tables import (
+    COMPARED,
+    folder_name,
+    group_by_model,
+    LEGS,
+    needs_inspection,
+)
 from odocal_ros.output.drawing import BLUE, evenly, GREEN, GREY, look, PINK, RED, sheet, svg
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.report import rendered
@@ -35,73 +40,76 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[
             rows = [row for row in vehicles if row[name] is not None
                     and row[f'{COMPARED[name]}_deviate'] is not None]
             if rows:
-                drawn.append(_population(name, rows))
-        if chart := _control(vehicles, legs):
+                drawn.append(_population_figure(name, rows))
+        if chart := _history_figure(vehicles, legs):
             drawn.append(chart)
     return drawn
 
 
-def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
+def _population_figure(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
     """Draw each vehicle's value against its model's median, one column a model."""
     models = sorted({row['model'] for row in rows})
     figure, (ax,) = sheet(2.8)
-    scale, every = name == 'scale_factor', []
+    is_scale, points = name == 'scale_factor', []
     for k, model in enumerate(models):
-        some = [row for row in rows if row['model'] == model]
-        x, sigma = (np.array([row[key] for row in some], float) for key in (name, f'{name}_sigma'))
-        far = np.array([COMPARED[name] in row['outlier'].split() for row in some])
-        mean = np.median(x)
-        off, error = ((x / mean - 1) * 100, sigma / mean * 100) if scale else (
-            (x - mean) * DEG, sigma * DEG)
-        keep = np.union1d(evenly(len(x), MOST_POINTS // len(models)), np.flatnonzero(far))
-        at = k + 0.7 * (np.linspace(-0.5, 0.5, len(x)) if len(x) > 1 else np.zeros(1))
-        for which, colour in ((~far, BLUE), (far, RED)):
-            some_of = keep[which[keep]]
-            ax.errorbar(at[some_of], off[some_of], error[some_of], fmt='o', ms=3, lw=0.8,
+        same_model = [row for row in rows if row['model'] == model]
+        x, sigma = (np.array([row[key] for row in same_model], float)
+                    for key in (name, f'{name}_sigma'))
+        outlier = np.array([COMPARED[name] in row['outlier'].split() for row in same_model])
+        median = np.median(x)
+        deviation, error = ((x / median - 1) * 100, sigma / median * 100) if is_scale else (
+            (x - median) * DEG, sigma * DEG)
+        keep = np.union1d(evenly(len(x), MOST_POINTS // len(models)), np.flatnonzero(outlier))
+        position = k + 0.7 * (np.linspace(-0.5, 0.5, len(x)) if len(x) > 1 else np.zeros(1))
+        for which, colour in ((~outlier, BLUE), (outlier, RED)):
+            shown = keep[which[keep]]
+            ax.errorbar(position[shown], deviation[shown], error[shown], fmt='o', ms=3, lw=0.8,
                         color=colour)
-        every += [(at[i], off[i]) for i in keep]
-    _within(ax, np.array(every))
+        points += [(position[i], deviation[i]) for i in keep]
+    _limit_axis(ax, np.array(points))
     ax.set_xticks(range(len(models)), [model or 'no model' for model in models])
-    ax.set_ylabel('deviation from the median, ' + ('%' if scale else 'deg'))
+    ax.set_ylabel('deviation from the median, ' + ('%' if is_scale else 'deg'))
     title = f'{TITLES[name]} by model.'
-    says = ('One point per vehicle with its sigma; red: outlier of its model; arrow: outside the '
-            'plot.')
-    return svg(figure, f'population-{COMPARED[name]}', f'{title} {says}'), title, says
+    description = ('One point per vehicle with its sigma; red: outlier of its model; arrow: '
+                   'outside the plot.')
+    return svg(figure, f'population-{COMPARED[name]}', f'{title} {description}'), title, \
+        description
 
 
-def _within(ax: Any, points: np.ndarray) -> None:
+def _limit_axis(ax: Any, points: np.ndarray) -> None:
     """Scale the plot to most vehicles; those far beyond are arrows at its edge."""
-    wide = 6.0    # medians of the distance that a picture shows
-    usual = wide * float(np.median(np.abs(points[:, 1])))
+    shown_medians = 6.0    # of the distance from the median: half the height of the plot
+    usual = shown_medians * float(np.median(np.abs(points[:, 1])))
     beyond = np.abs(points[:, 1]) > 2 * usual
     if not beyond.any() or not usual:
         return
     most = 1.15 * max(usual, float(np.abs(points[~beyond, 1]).max()))
     ax.set_ylim(-most, most)
     for sign, mark in ((1, '^'), (-1, 'v')):
-        some = points[beyond & (sign * points[:, 1] > 0)]
-        ax.plot(some[:, 0], np.full(len(some), sign * 0.95 * most), mark, ms=6, color=RED)
+        hidden = points[beyond & (sign * points[:, 1] > 0)]
+        ax.plot(hidden[:, 0], np.full(len(hidden), sign * 0.95 * most), mark, ms=6, color=RED)
 
 
-def _control(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, str] | None:
+def _history_figure(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, str] | None:
     """Draw the scale of legs over dates, those that changed or drift highlighted."""
     base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
     most_lines = 6    # vehicles that are highlighted
     named = [row['vehicle'] for row in vehicles if row['vehicle'] in base and any(
         change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:most_lines]
-    named += [row['vehicle'] for row in vehicles if row['vehicle'] in base and flagged(row)
-             and row['vehicle'] not in named][:most_lines - len(named)]
-    found = _legs(legs, set(base), set(named))
-    if not found:
+    named += [row['vehicle'] for row in vehicles if row['vehicle'] in base
+              and needs_inspection(row) and row['vehicle'] not in named][:most_lines - len(named)]
+    points = _read_points(legs, set(base), set(named))
+    if not points:
         return None
     figure, (ax,) = sheet(3.4)
-    rest = np.array([(day, value / base[vehicle]) for vehicle, day, value, _ in found
+    rest = np.array([(day, value / base[vehicle]) for vehicle, day, value, _ in points
                      if vehicle not in named]).reshape(-1, 2)
     ax.plot(rest[:, 0].astype('datetime64[s]'), (rest[:, 1] - 1) * 100, '.', ms=2.5, color=GREY,
             label='others')
     styles = [(colour, mark) for mark in 'os' for colour in (BLUE, RED, GREEN, PINK)]
     for vehicle, (colour, mark) in zip(named, styles, strict=False):
-        own = sorted((day, value, sigma) for name, day, value, sigma in found if name == vehicle)
+        own = sorted((day, value, sigma) for name, day, value, sigma in points
+                     if name == vehicle)
         day, value, sigma = np.array(own).T
         ax.errorbar(day.astype('datetime64[s]'), (value / base[vehicle] - 1) * 100,
                     sigma / base[vehicle] * 100, fmt=f'{mark}-', ms=3.5, lw=1.0, color=colour,
@@ -112,12 +120,13 @@ def _control(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, 
     figure.legend(loc='upper center', borderaxespad=0.2, ncols=4, handlelength=1.4,
                   columnspacing=1.0)
     title = 'Scale over time.'
-    says = ('Legs relative to the current scale of their vehicle. Lines: vehicles that changed '
-            'or need inspection, the worst first.')
-    return svg(figure, 'control', f'{title} {says}'), title, says
+    description = ('Legs relative to the current scale of their vehicle. Lines: vehicles that '
+                   'changed or need inspection, the worst first.')
+    return svg(figure, 'control', f'{title} {description}'), title, description
 
 
-def _legs(path: Path, known: set[str], named: set[str]) -> list[tuple[str, float, float, float]]:
+def _read_points(path: Path, known: set[str],
+                 named: set[str]) -> list[tuple[str, float, float, float]]:
     """Return (vehicle, seconds since 1970, scale, sigma) of legs, thinned for other vehicles."""
     import pyarrow.parquet as pq
     columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
@@ -144,7 +153,7 @@ def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
     return rendered(
         'fleet', 'fleet.html', title=output.resolve().name, facts=_facts(vehicles),
         counts=sorted(counts.items()), models=[_model(*kind, rows) for kind, rows in sorted(
-            by_model(row for row in vehicles if row['legs']).items())],
+            group_by_model(row for row in vehicles if row['legs']).items())],
         figures=fleet_figures(vehicles, output / LEGS),
         vehicles=[_row(row) for row in vehicles[:most_rows]],
         left=max(0, len(vehicles) - most_rows))
@@ -176,9 +185,10 @@ def _model(model: str, unit: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
         else:
             cells += [_mean(found, few, DEG, signed=True),
                       '-' if few else f'{DEG * found.spread:.2f}']
-    far = sorted(row['vehicle'] for row in rows if row['outlier'])
-    return {'model': model, 'vehicles': len(rows), 'cells': cells, 'far': ', '.join(far[:20])
-            + (f' and {len(far) - 20} more' if len(far) > 20 else '')}
+    outliers = sorted(row['vehicle'] for row in rows if row['outlier'])
+    more = f' and {len(outliers) - 20} more' if len(outliers) > 20 else ''
+    return {'model': model, 'vehicles': len(rows), 'cells': cells,
+            'outliers': ', '.join(outliers[:20]) + more}
 
 
 def _mean(found: Population, few: bool, factor: float = 1.0, signed: bool = False) -> str:
@@ -190,15 +200,14 @@ def _mean(found: Population, few: bool, factor: float = 1.0, signed: bool = Fals
 def _row(row: dict[str, Any]) -> dict[str, Any]:
     values = [_cell(row, 'scale_factor', 1.0), _cell(row, 'yaw_mounting_angle', DEG),
               _cell(row, 'pitch_mounting_angle', DEG), _cell(row, 'drift_per_year', 100.0)]
-    drawn = row['report'] == ''
-    said = remarks(row)[1:]
+    no_report = [f'no report: {row["report"]}'] if row['report'] else []
     return {'vehicle': row['vehicle'], 'model': row['model'], 'cells': values,
-            'judged': row['decision'] or row['verdict'],
+            'verdict': row['decision'] or row['verdict'],
             'legs': f'{row["legs_good"]} of {row["legs"]}', 'km': f'{row["distance_km"]:.1f}',
             'since': f'{row["since"]:%Y-%m-%d}' if row['since'] else '',
-            'remarks': '; '.join(said + ([f'no report: {row["report"]}'] if row['report'] else
-                                         [])),
-            'link': f'reports/{quote(file_name(row["vehicle"]))}/report.html' if drawn else ''}
+            'remarks': '; '.join(remarks(row)[1:] + no_report),
+            'link': f'reports/{quote(folder_name(row["vehicle"]))}/report.html'
+                    if row['report'] == '' else ''}
 
 
 def _cell(row: dict[str, Any], name: str, factor: float) -> str:
@@ -208,6 +217,7 @@ def _cell(row: dict[str, Any], name: str, factor: float) -> str:
 
 
 def remarks(row: dict[str, Any]) -> list[str]:
+    """Return the verdict on a vehicle, and sentences for its inspection."""
     out = [row['decision'] or row['verdict']]
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+z.2f} %' if change['value'] == 'scale_factor' else

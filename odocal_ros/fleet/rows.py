@@ -32,12 +32,12 @@ from odocal_ros.settings.config import Config, flat, with_settings
 DONE, FAILED = 'done', 'failed'
 KEY, MAGIC = re.compile('[0-9a-f]{40}'), b'PAR1'
 # groups of settings that do not affect the legs of a bag
-NOT_OF_LEGS = ('accept', 'output', 'journal', 'publish', 'frames', 'diagnostic_updater')
+GROUPS_NOT_OF_LEGS = ('accept', 'output', 'journal', 'publish', 'frames', 'diagnostic_updater')
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Data of one bag; ``legs`` from ``leg_text``, ``settings`` that are not the default."""
+    """Data of one bag; ``legs`` from ``text_of_legs``, ``settings`` that are not the default."""
 
     key: str
     bag: str
@@ -76,7 +76,7 @@ def changed_settings(config: Config) -> dict[str, Any]:
 def settings_key(config: Config, *more: dict[Any, Any] | tuple[Any, ...]) -> str:
     """Return a hash of the settings that affect the legs of a bag, and of ``more``."""
     return key_of([[name, repr(value)] for name, value in flat(config).items()
-                   if name.partition('.')[0] not in NOT_OF_LEGS], *more)
+                   if name.partition('.')[0] not in GROUPS_NOT_OF_LEGS], *more)
 
 
 class RowStore:
@@ -102,7 +102,7 @@ class RowStore:
     def get(self, key: str) -> Row | None:
         """Return the row of a key, None without one or if the file is not a row."""
         try:
-            return next(rows_of([self.path(key)]), None)
+            return next(read_rows([self.path(key)]), None)
         except (BadData, FileNotFoundError):
             return None
 
@@ -120,7 +120,7 @@ class RowStore:
         """Return the key of the existing row of a bag, None without one."""
         try:
             key = self._seen(seen).read_text()
-            whole = KEY.fullmatch(key) and _whole(self.path(key))
+            whole = KEY.fullmatch(key) and _is_complete(self.path(key))
         except (OSError, UnicodeDecodeError):
             return None
         return key if whole else None
@@ -136,7 +136,7 @@ def row_schema() -> Any:
     return pa.schema([(f.name, kinds.get(f.type, pa.float64())) for f in fields(Row)])
 
 
-def _whole(path: Path) -> bool:
+def _is_complete(path: Path) -> bool:
     """Return True if a file starts and ends like Parquet; a truncated one does not."""
     with open(path, 'rb') as file:
         head = file.read(len(MAGIC))
@@ -144,7 +144,7 @@ def _whole(path: Path) -> bool:
         return head == file.read() == MAGIC
 
 
-def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
+def read_rows(paths: Iterable[Path | str]) -> Iterator[Row]:
     """Yield the rows of files in order; raise BadData if a file is not a fleet row."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -160,43 +160,44 @@ def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
         yield from rows
 
 
-KINDS = {kind.__name__: kind for kind in (
+STORED_TYPES = {kind.__name__: kind for kind in (
     Border, result.Estimate, result.LegResult, result.MethodResult, result.PerDistance, Reason,
     result.Source, result.TrackCheck)}
-IS = '~'      # the key of an object's type
+TYPE_KEY = '~'      # the key of an object's type
 
 
-def leg_text(legs: list[result.LegResult]) -> str:
+def text_of_legs(legs: list[result.LegResult]) -> str:
     """Return legs as JSON, without the rows that only a report draws."""
-    return json.dumps([_plain(leg.numbers()) for leg in legs], separators=(',', ':'))
+    return json.dumps([_to_json(leg.numbers()) for leg in legs], separators=(',', ':'))
 
 
-def legs_from(text: str) -> list[result.LegResult]:
-    """Return the legs of ``leg_text``."""
-    legs: list[result.LegResult] = json.loads(text, object_hook=_built)
+def legs_from_text(text: str) -> list[result.LegResult]:
+    """Return the legs of ``text_of_legs``."""
+    legs: list[result.LegResult] = json.loads(text, object_hook=_from_json)
     return legs
 
 
-def _plain(x: Any) -> Any:
+def _to_json(x: Any) -> Any:
     if is_dataclass(x):
-        return {IS: type(x).__name__, **{f.name: _plain(getattr(x, f.name)) for f in fields(x)}}
+        return {TYPE_KEY: type(x).__name__,
+                **{f.name: _to_json(getattr(x, f.name)) for f in fields(x)}}
     if isinstance(x, Code):
-        return {IS: 'Code', 'of': x.name}
+        return {TYPE_KEY: 'Code', 'of': x.name}
     if isinstance(x, np.ndarray):
-        return {IS: 'array', 'of': x.ravel().tolist(), 'shape': x.shape}
+        return {TYPE_KEY: 'array', 'of': x.ravel().tolist(), 'shape': x.shape}
     if isinstance(x, np.generic):
         return x.item()
     if isinstance(x, tuple):
-        return {IS: 'tuple', 'of': [_plain(y) for y in x]}
+        return {TYPE_KEY: 'tuple', 'of': [_to_json(y) for y in x]}
     if isinstance(x, dict):
-        if all(isinstance(key, str) and key != IS for key in x):
-            return {key: _plain(y) for key, y in x.items()}
-        return {IS: 'dict', 'of': [[_plain(key), _plain(y)] for key, y in x.items()]}
-    return [_plain(y) for y in x] if isinstance(x, list) else x
+        if all(isinstance(key, str) and key != TYPE_KEY for key in x):
+            return {key: _to_json(y) for key, y in x.items()}
+        return {TYPE_KEY: 'dict', 'of': [[_to_json(key), _to_json(y)] for key, y in x.items()]}
+    return [_to_json(y) for y in x] if isinstance(x, list) else x
 
 
-def _built(x: dict[str, Any]) -> Any:
-    kind = x.get(IS)
+def _from_json(x: dict[str, Any]) -> Any:
+    kind = x.get(TYPE_KEY)
     if kind is None:
         return x
     if kind == 'array':
@@ -207,4 +208,4 @@ def _built(x: dict[str, Any]) -> Any:
         return dict(x['of'])
     if kind == 'Code':
         return Code[x['of']]
-    return KINDS[kind](**{name: y for name, y in x.items() if name != IS})
+    return STORED_TYPES[kind](**{name: y for name, y in x.items() if name != TYPE_KEY})

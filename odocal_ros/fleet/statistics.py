@@ -56,7 +56,7 @@ def covariance(own: Floats, shared: Sequence[Floats] = (), days: Floats | None =
     return V if days is None else V + walk**2 * np.minimum.outer(days, days)
 
 
-def chance(n: int) -> float:
+def significance_limit(n: int) -> float:
     """Return the limit of steps, odd legs and slopes of n legs, in sigmas, for significance."""
     from scipy.special import ndtri
     false = 1e-3    # chance of a reported change for a vehicle without one
@@ -80,7 +80,7 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
         *([t - t[0]] if t is not None and drifts else [])]))
     z, level, W = white[:, 0], white[:, 1], white[:, 2:]
     slope = W.shape[1] - 1 if drifts else -1
-    found = sorted(_selected(z, level[:, None], W, chance(n)))
+    found = sorted(_selected(z, level[:, None], W, significance_limit(n)))
     known = [k for k in found if k != slope]
     size, sigma = _fit(z, np.column_stack([level, W[:, found]]))
     ratio = {k: (float(size[i]), float(sigma[i])) for i, k in enumerate(found, 1)}
@@ -98,10 +98,10 @@ def _selected(z: Floats, level: Floats, W: Floats, least: float) -> list[int]:
     """Return the columns of W that explain z significantly, in addition to the level."""
     found: list[int] = []
     while len(found) < (len(z) - 1) // 2 or not found:
-        rest, left = _without(np.column_stack([level, W[:, found]]), z, W)
+        rest, left = _remove_projection(np.column_stack([level, W[:, found]]), z, W)
         size = np.linalg.norm(left, axis=0)
         ratio = np.where(size > 1e-6 * np.linalg.norm(W, axis=0), left.T @ rest
-                        / np.maximum(size, 1e-300), 0.0)
+                         / np.maximum(size, 1e-300), 0.0)
         best = int(np.argmax(np.abs(ratio)))
         if abs(ratio[best]) <= least:
             break
@@ -115,7 +115,7 @@ def _selected(z: Floats, level: Floats, W: Floats, least: float) -> list[int]:
     return found
 
 
-def _without(X: Floats, z: Floats, W: Floats) -> tuple[Floats, Floats]:
+def _remove_projection(X: Floats, z: Floats, W: Floats) -> tuple[Floats, Floats]:
     """Return z and the columns of W minus their projections on the columns of X."""
     Q, _ = np.linalg.qr(X)
     return z - Q @ (Q.T @ z), W - Q @ (Q.T @ W)

@@ -1,23 +1,30 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The tables of a fleet: columns of legs.parquet and vehicles.parquet, a leg as a row, writing."""
+"""The tables of a fleet: rows of legs.parquet and vehicles.parquet, vehicles by model, writing."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime, UTC
+import hashlib
+import json
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
-from odocal_ros.fleet.rows import legs_from, Row
+from odocal_ros.fleet.rows import legs_from_text, Row
+from odocal_ros.fleet.statistics import FAR, population
 from odocal_ros.reasons import Reason
 from odocal_ros.safe_io.atomic_files import locked, whole_file
 from odocal_ros.safe_io.text_formats import one_line
 
 LEGS, VEHICLES = 'legs.parquet', 'vehicles.parquet'
 VALUES = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')
+COMPARED = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
+WORST_FIRST = ('FAIL', 'UNDECIDED', 'rejected', 'caution', 'PASS', 'accepted')
 VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in VALUES)
 
 
@@ -45,11 +52,11 @@ def value_cells(estimates: dict[str, Estimate]) -> dict[str, Any]:
     return cells | {'unit': estimates['scale_factor'].unit if 'scale_factor' in estimates else ''}
 
 
-def rows_of_legs(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
+def table_rows(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
     """Return the legs of a bag's row as rows of a table; of a failed bag a row without values."""
     of_bag = {'status': row.status, 'reason': row.reason}
     return [leg_row(bag.vehicle, bag.model, k, bag.odometer_km, leg) | of_bag
-            for k, leg in enumerate(legs_from(row.legs), 1)] or [
+            for k, leg in enumerate(legs_from_text(row.legs), 1)] or [
         {'vehicle': bag.vehicle, 'model': bag.model, 'bag': one_line(row.bag), **of_bag}]
 
 
@@ -79,13 +86,13 @@ def vehicle_schema() -> Any:
         'bags bags_failed legs legs_good', 'first last since rejected_since')
 
 
-def in_batches(rows: Sequence[dict[str, Any]]) -> Iterator[Any]:
+def vehicle_batches(rows: Sequence[dict[str, Any]]) -> Iterator[Any]:
     import pyarrow as pa
     for k in range(0, len(rows), 1000):
         yield pa.Table.from_pylist(rows[k:k + 1000], schema=vehicle_schema())
 
 
-def batches(parts: Sequence[Path]) -> Iterator[Any]:
+def part_batches(parts: Sequence[Path]) -> Iterator[Any]:
     import pyarrow.parquet as pq
     for part in parts:
         yield pq.ParquetFile(part).read(use_threads=False)
@@ -101,3 +108,54 @@ def write_table(path: Path, schema: Any, tables: Iterable[Any]) -> None:
             if table.num_rows:
                 writer.write_table(table)
 
+
+def folder_name(vehicle: str) -> str:
+    """Return a unique name for a vehicle's folder that is never a path."""
+    from urllib.parse import quote
+    name = quote(vehicle, safe=' ')
+    name = name.replace('.', '%2E', 1) if name.startswith('.') else name or '_'
+    most = 120    # characters: a file system allows 255, and temporary files have longer names
+    if len(name) > most:
+        name = f'{name[:most]}~{hashlib.sha256(vehicle.encode()).hexdigest()[:16]}'
+    return name
+
+
+def group_by_model(rows: Iterable[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """Return the vehicles of each model and unit of the scale, without rejected ones."""
+    models: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        if row['verdict'] != 'rejected':
+            models.setdefault((row['model'], row['unit']), []).append(row)
+    return models
+
+
+def compare_with_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows with each vehicle's deviations from its model in sigmas, the worst first."""
+    for name, short in COMPARED.items():
+        for row in rows:
+            row[f'{short}_deviate'] = None
+        for same_model in group_by_model(row for row in rows if row[name] is not None).values():
+            found = population(*(np.array([row[key] for row in same_model], float)
+                                 for key in (name, f'{name}_sigma')))
+            for row, deviate in zip(same_model, found.deviates.tolist(), strict=True):
+                row[f'{short}_deviate'] = None if deviate != deviate else deviate
+    for row in rows:
+        row['outlier'] = ' '.join(short for short in COMPARED.values()
+                                  if abs(row[f'{short}_deviate'] or 0.0) > FAR)
+    return sorted(rows, key=_severity)
+
+
+def needs_inspection(row: dict[str, Any]) -> bool:
+    """Return True if a vehicle needs inspection."""
+    return bool(row['outlier'] or row['bags_failed'] or row['odd_legs'] or row['rejected_for']
+                or json.loads(row['changes']) or row['verdict'] == 'rejected'
+                or row['decision'] in ('FAIL', 'UNDECIDED'))
+
+
+def _severity(row: dict[str, Any]) -> tuple[bool | float | str, ...]:
+    """Return the sorting key of a vehicle, the worst first."""
+    verdict = row['decision'] or row['verdict']
+    far = max(abs(row[f'{short}_deviate'] or 0.0) for short in COMPARED.values())
+    return (not row['legs'] and -1 or 0, WORST_FIRST.index(verdict), not row['outlier'],
+            row['rejected_since'] is None, -len(json.loads(row['changes'])), -row['bags_failed'],
+            not row['rejected_for'], -far, row['vehicle'])

@@ -3,7 +3,6 @@
 
 """A vehicle from the rows of its bags: legs combined as in replay, changes, pass or fail."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +17,7 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.combine import DRAWN_ANEW
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
-from odocal_ros.fleet.rows import DONE, legs_from, Row, rows_of
+from odocal_ros.fleet.rows import DONE, legs_from_text, read_rows, Row
 from odocal_ros.fleet.statistics import covariance, History, history
 from odocal_ros.fleet.tables import all_reasons, leg_row, utc, value_cells
 from odocal_ros.library.calibrate_bag import unique_names
@@ -36,7 +35,7 @@ LOOK_AT_BAGS = 'See the column failures of vehicles.parquet for the reason of ea
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
+class DrivenLeg:
     """A leg with the odometer reading of its bag, km."""
 
     leg: LegResult
@@ -48,40 +47,56 @@ class Driven:
         return leg_estimates(self.leg)
 
 
-def driven_legs(rows: Sequence[Row], known: dict[str, FleetBag]) -> list[Driven]:
+def driven_legs(rows: Sequence[Row], known: dict[str, FleetBag]) -> list[DrivenLeg]:
     """Return the legs of rows by time, with unique bag names as in replay."""
-    legs = [legs_from(row.legs) for row in rows]
-    entries = [{'bag': next((leg.bag for leg in some), row.bag)}
-               for row, some in zip(rows, legs, strict=True)]
+    legs = [legs_from_text(row.legs) for row in rows]
+    entries = [{'bag': next((leg.bag for leg in of_bag), row.bag)}
+               for row, of_bag in zip(rows, legs, strict=True)]
     named, _ = unique_names([Path(row.bag) for row in rows], legs, entries)
     km = [known[row.bag].odometer_km if row.bag in known else row.odometer_km
-          for row, some in zip(rows, legs, strict=True) for _ in some]
-    return sorted((Driven(leg, k) for leg, k in zip(named, km, strict=True)),
+          for row, of_bag in zip(rows, legs, strict=True) for _ in of_bag]
+    return sorted((DrivenLeg(leg, k) for leg, k in zip(named, km, strict=True)),
                   key=lambda one: one.leg.start_ns)
 
 
-def history_of(name: str, driven: Sequence[Driven],
-               config: Config) -> tuple[list[int], History, History]:
-    """Return the legs that determine a value, its history over days, and over kilometres."""
+@dataclass(frozen=True)
+class ValueHistory:
+    """The history of a value: numbers of the legs that determine it, changes over both axes."""
+
+    legs: tuple[int, ...] = ()
+    by_date: History = History()          # over years
+    by_distance: History = History()      # over 1000 km, of the scale only
+
+    @property
+    def first_after_change(self) -> list[int]:
+        """Return the numbers of the legs from which on the value is another one."""
+        return [self.legs[change.leg] for change in self.by_date.changes]
+
+    @property
+    def outlier_legs(self) -> list[int]:
+        return [self.legs[k] for k in self.by_date.odd]
+
+
+def history_of(name: str, driven: Sequence[DrivenLeg], config: Config) -> ValueHistory:
     found = []
     for k, one in enumerate(driven):
         e = one.estimates.get(name)
         if one.leg.verdict is not Verdict.REJECTED and e is not None and e.value is not None:
             found.append((k, e.value, one.leg.methods[e.method]))
     if not found:
-        return [], History(), History()
+        return ValueHistory()
     scale = name == 'scale_factor'
-    number, values, methods = (list(column) for column in zip(*found, strict=True))
+    numbers, values, methods = (list(column) for column in zip(*found, strict=True))
     value = np.array(values)
     y = np.log(value / value[0]) if scale else np.asarray(wrap(value - value[0]))
     own, shared = _errors(name, methods)
-    days = np.array([driven[k].leg.driven_ns for k in number]) / DAY_NS
+    days = np.array([driven[k].leg.driven_ns for k in numbers]) / DAY_NS
     days -= days[0]
     V = covariance(own, shared, days, config.verdict.scale_drift_per_day if scale else 0.0)
-    km = [driven[k].odometer_km for k in number]
+    km = [driven[k].odometer_km for k in numbers]
     by_distance = History() if not scale or None in km else history(y, V, np.array(km) / 1000)
     year = 365.25    # days
-    return number, history(y, V, days / year), by_distance
+    return ValueHistory(tuple(numbers), history(y, V, days / year), by_distance)
 
 
 def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -100,17 +115,17 @@ def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndar
     return own, list(shared.values())
 
 
-def rejecting(leg: LegResult) -> list[Reason]:
+def rejecting_reasons(leg: LegResult) -> list[Reason]:
     """Return the reasons that reject a leg, empty if it is not rejected."""
     return [r for r in all_reasons(leg)
             if r.code.severity is Verdict.REJECTED and leg.verdict is Verdict.REJECTED]
 
 
-def all_rejected(lost: Sequence[Driven]) -> Reason:
+def rejected_state(rejected: Sequence[DrivenLeg]) -> Reason:
     """Return the reason why the current state of a vehicle is unknown."""
-    last = rejecting(lost[-1].leg)[0]
-    since = f'{utc(lost[0].leg.start_ns):%Y-%m-%d}'
-    return replace(last, text=f'the last {len(lost)} legs, since {since}, are all rejected: '
+    last = rejecting_reasons(rejected[-1].leg)[0]
+    since = f'{utc(rejected[0].leg.start_ns):%Y-%m-%d}'
+    return replace(last, text=f'the last {len(rejected)} legs, since {since}, are all rejected: '
                    f'{last.text}')
 
 
@@ -136,7 +151,8 @@ class Vehicle:
 
 
 def vehicle_of(job: VehicleJob) -> Vehicle:
-    rows = [row for row in rows_of(job.rows) if row.vehicle == job.vehicle]
+    """Return the result of a vehicle from the rows of its bags."""
+    rows = [row for row in read_rows(job.rows) if row.vehicle == job.vehicle]
     known = {bag.bag: bag for bag in job.bags}
     done = sorted((row for row in rows if row.status == DONE), key=lambda row: row.start_ns)
     failed = [row for row in rows if row.status != DONE]
@@ -146,24 +162,24 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     driven = driven_legs(done, known)
     if not driven:
         limits = with_settings(Config(), job.settings).accept.limits
-        return Vehicle(_undriven(row, Decision.UNDECIDED.value if limits else ''), [])
+        return Vehicle(_row_without_legs(row, Decision.UNDECIDED.value if limits else ''), [])
     config = with_settings(done[-1].config(), job.settings)
     histories = {name: history_of(name, driven, config) for name in (
         'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')}
     # first legs of the periods without changes
-    starts = sorted({0} | {number[change.leg] for number, found, _ in histories.values()
-                           for change in found.changes})
-    now = driven[starts[-1]:]
-    calibration = combine([one.leg for one in now], config, imu=known_imu(config))
-    lost = driven[1 + max((k for k, one in enumerate(driven)
-                           if one.leg.verdict is not Verdict.REJECTED), default=-1):]
-    if len(lost) >= FEWEST_REJECTED and calibration.verdict is not Verdict.REJECTED:
-        calibration = replace(calibration, reasons=(all_rejected(lost), *calibration.reasons))
-    row |= _current(calibration, config, driven, starts) | _changes(histories, driven) \
+    starts = sorted({0}.union(*(past.first_after_change for past in histories.values())))
+    current = driven[starts[-1]:]
+    calibration = combine([one.leg for one in current], config, imu=known_imu(config))
+    rejected = driven[1 + max((k for k, one in enumerate(driven)
+                               if one.leg.verdict is not Verdict.REJECTED), default=-1):]
+    if len(rejected) >= FEWEST_REJECTED and calibration.verdict is not Verdict.REJECTED:
+        calibration = replace(
+            calibration, reasons=(rejected_state(rejected), *calibration.reasons))
+    row |= _current_state(calibration, config, driven, starts) | _changes(histories, driven) \
         | {'rejected_for': ' '.join(dict.fromkeys(
-            r.code.name for one in driven for r in rejecting(one.leg))),
-           'rejected_since': utc(lost[0].leg.start_ns) if lost else None}
-    since = now[0].leg.start_ns
+            r.code.name for one in driven for r in rejecting_reasons(one.leg))),
+           'rejected_since': utc(rejected[0].leg.start_ns) if rejected else None}
+    since = current[0].leg.start_ns
     row |= {'now': [r.bag for r in done if r.start_ns >= since or r is done[-1]], 'report': None}
     legs = [_leg_row(job, k, one, starts, histories) for k, one in enumerate(driven)]
     inputs = tuple({'bag': r.bag, 'sha256': r.sha256, 'topics': json.loads(r.topics)}
@@ -171,7 +187,7 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     return Vehicle(row, legs, calibration, config, inputs)
 
 
-def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
+def _row_without_legs(row: dict[str, Any], decision: str) -> dict[str, Any]:
     return row | value_cells({}) | dict.fromkeys((
         'first', 'last', 'since', 'rejected_since', 'drift_per_year', 'drift_per_year_sigma',
         'drift_per_1000_km', 'drift_per_1000_km_sigma', 'report')) | {
@@ -184,8 +200,8 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
 
 
-def _current(calibration: Calibration, config: Config, driven: Sequence[Driven],
-          starts: Sequence[int]) -> dict[str, Any]:
+def _current_state(calibration: Calibration, config: Config, driven: Sequence[DrivenLeg],
+                   starts: Sequence[int]) -> dict[str, Any]:
     """Return the calibration since the last change."""
     legs = [one.leg for one in driven]
     acceptance = accept(calibration, config)
@@ -203,30 +219,29 @@ def _current(calibration: Calibration, config: Config, driven: Sequence[Driven],
         'reasons': ' '.join(dict.fromkeys(r.code.name for r in calibration.reasons))}
 
 
-def _changes(histories: dict[str, Any], driven: Sequence[Driven]) -> dict[str, Any]:
+def _changes(histories: dict[str, ValueHistory], driven: Sequence[DrivenLeg]) -> dict[str, Any]:
     """Return the changes of all values by date, and the drift of the scale."""
     found = []
-    for name, (number, past, _) in histories.items():
-        for change in past.changes:
-            before, after = (driven[number[k]].leg for k in (change.leg - 1, change.leg))
+    for name, past in histories.items():
+        for change in past.by_date.changes:
+            before, after = (driven[past.legs[k]].leg for k in (change.leg - 1, change.leg))
             found.append({
                 'value': name, 'after': iso(before.start_ns), 'by': iso(after.start_ns),
-                'leg': number[change.leg] + 1,
+                'leg': past.legs[change.leg] + 1,
                 'size': math.expm1(change.size) if name == 'scale_factor' else change.size,
                 'sigma': change.sigma, 'unit': '1' if name == 'scale_factor' else 'rad'})
-    odd = Counter(number[k] + 1 for number, past, _ in histories.values() for k in past.odd)
-    _, by_date, by_distance = histories['scale_factor']
+    outliers = {k + 1 for past in histories.values() for k in past.outlier_legs}
+    by_date, by_distance = histories['scale_factor'].by_date, histories['scale_factor'].by_distance
     return {'changes': json.dumps(sorted(found, key=lambda change: change['by'])),
-            'odd_legs': ' '.join(map(str, sorted(odd))),
+            'odd_legs': ' '.join(map(str, sorted(outliers))),
             'drift_per_year': by_date.slope, 'drift_per_year_sigma': by_date.slope_sigma,
             'drift_per_1000_km': by_distance.slope,
             'drift_per_1000_km_sigma': by_distance.slope_sigma}
 
 
-def _leg_row(job: VehicleJob, k: int, one: Driven, starts: Sequence[int],
-             histories: dict[str, Any]) -> dict[str, Any]:
+def _leg_row(job: VehicleJob, k: int, one: DrivenLeg, starts: Sequence[int],
+             histories: dict[str, ValueHistory]) -> dict[str, Any]:
     model = next((b.model for b in job.bags if b.model), '')
     return leg_row(job.vehicle, model, k + 1, one.odometer_km, one.leg) | {
         'period': sum(start <= k for start in starts),
-        'odd': any(k in (number[i] for i in history.odd)
-                   for number, history, _ in histories.values())}
+        'odd': any(k in past.outlier_legs for past in histories.values())}

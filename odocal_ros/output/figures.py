@@ -214,7 +214,8 @@ def accept_line(calibration: Calibration, acceptance: Acceptance, config: Config
     """Return the decision on a vehicle as one line of JSON."""
     return json.dumps({'vehicle': config.vehicle, **acceptance.as_dict(),
                        'verdict': calibration.verdict.value,
-                       'reasons': [r.code.name for r in calibration.reasons]}, allow_nan=False)
+                       'reasons': list(dict.fromkeys(r.code.name for r in calibration.reasons))},
+                      allow_nan=False)
 
 
 def accept_words(acceptance: Acceptance) -> list[str]:

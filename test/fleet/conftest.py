@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from odocal_ros.fleet.bag_jobs import bag_jobs
 from odocal_ros.fleet.bags import find_bags
 from odocal_ros.fleet.engine import engine
-from odocal_ros.fleet.jobs import bag_jobs
 from odocal_ros.offline.cli import main
 from odocal_ros.offline.replay import add_calibration_arguments
 

@@ -11,9 +11,9 @@ import pytest
 
 from odocal_ros.errors import BadBag, BadData, BadUsage
 from odocal_ros.fleet import bags as bags_module
-from odocal_ros.fleet.bags import at_hand, find_bags, FleetBag, seen_as
-from odocal_ros.fleet.rows import key_of, leg_text, legs_from, Row, rows_of, RowStore
-from odocal_ros.fleet.second_stage import file_name
+from odocal_ros.fleet.bags import bag_fingerprint, find_bags, FleetBag, local_copy
+from odocal_ros.fleet.rows import key_of, legs_from_text, read_rows, Row, RowStore, text_of_legs
+from odocal_ros.fleet.tables import folder_name
 from odocal_ros.output.files import as_json
 from odocal_ros.pipeline.calibrate import calibrate, combine
 
@@ -69,17 +69,17 @@ def test_a_bag_by_url_is_copied_and_the_copy_removed(tmp_path):
     url = f'zip://drive::{tmp_path}/bags.zip'
     scratch = tmp_path / 'scratch'
     scratch.mkdir()
-    with at_hand(url, str(scratch)) as path:
+    with local_copy(url, str(scratch)) as path:
         assert path.is_relative_to(scratch)
         assert (path / 'drive_0.mcap').read_bytes() == b'12345'
     assert not list(scratch.iterdir())
-    before = seen_as(url, 'settings')
-    assert before == seen_as(url, 'settings') != seen_as(url, 'others')
+    before = bag_fingerprint(url, 'settings')
+    assert before == bag_fingerprint(url, 'settings') != bag_fingerprint(url, 'others')
     with zipfile.ZipFile(tmp_path / 'bags.zip', 'w') as archive:
         archive.writestr('drive/drive_0.mcap', b'12346')
-    assert seen_as(url, 'settings') != before
+    assert bag_fingerprint(url, 'settings') != before
     with pytest.raises(BadBag, match='gone'):
-        seen_as(f'{tmp_path}/gone', '')
+        bag_fingerprint(f'{tmp_path}/gone', '')
 
 
 def test_a_remote_bag_stays_in_its_folder_and_has_to_fit(tmp_path, monkeypatch):
@@ -89,17 +89,18 @@ def test_a_remote_bag_stays_in_its_folder_and_has_to_fit(tmp_path, monkeypatch):
     scratch = tmp_path / 'scratch'
     scratch.mkdir()
     monkeypatch.setattr(bags_module, 'file_system', lambda url: (memory, '/odd/..'))
-    with at_hand('memory://odd/..', str(scratch)) as path:
+    with local_copy('memory://odd/..', str(scratch)) as path:
         assert path.parent.parent == scratch
     monkeypatch.setattr(bags_module.shutil, 'disk_usage',
                         lambda folder: shutil._ntuple_diskusage(9, 9, 9))
-    with pytest.raises(BadBag, match='free disk space'), at_hand('memory://odd/..', str(scratch)):
+    with pytest.raises(BadBag, match='free disk space'), \
+            local_copy('memory://odd/..', str(scratch)):
         pass
 
 
 def test_folders_of_vehicles_are_their_own():
     names = ['7', '.7', '..', '', '../x', 'x' * 300, 'x' * 299 + 'y', '\u00fc' * 200, 'a b']
-    folders = [file_name(name) for name in names]
+    folders = [folder_name(name) for name in names]
     assert len(set(folders)) == len(names)
     for folder in folders:
         assert 0 < len(folder) < 200
@@ -119,7 +120,7 @@ def test_a_row_that_was_cut_is_computed_again(tmp_path, spoil):
     store.path(key).write_bytes(spoil(store.path(key).read_bytes()))
     assert store.get(key) is None
     with pytest.raises(BadData, match='not a fleet row'):
-        list(rows_of([store.path(key)]))
+        list(read_rows([store.path(key)]))
     for odd in (b'../../x', b'\xff\xfe', b''):
         (tmp_path / 'seen' / 'ab' / ('ab' * 20)).write_bytes(odd)
         assert store.known('ab' * 20) is None
@@ -133,9 +134,9 @@ def test_legs_from_text_combine_to_the_same_digits():
                      odometer_rate=10.0, fix_rate=2.0, seed=seed, start_ns=seed * 10**18)
         config = settings(made, heading_sigma=None, method='auto')
         legs.append(calibrate(made.leg(), config))
-    text = leg_text(legs)
-    again = legs_from(text)
-    assert leg_text(again) == text
+    text = text_of_legs(legs)
+    again = legs_from_text(text)
+    assert text_of_legs(again) == text
     kept = [leg.numbers() for leg in legs]      # what is drawn is left out
     found, known = (as_json(combine(some, config), config, [], '') for some in (again, kept))
     assert found == known

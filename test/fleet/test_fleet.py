@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 
 from odocal_ros.fleet import calibrate_bags
+from odocal_ros.fleet.bag_jobs import computed_rows
 from odocal_ros.fleet.bags import find_bags
-from odocal_ros.fleet.engine import FEWEST, results
-from odocal_ros.fleet.jobs import computed_rows
-from odocal_ros.fleet.rows import DONE, FAILED, rows_of
+from odocal_ros.fleet.engine import FEWEST, task_results
+from odocal_ros.fleet.rows import DONE, FAILED, read_rows
 from odocal_ros.offline.cli import main
 
 pytestmark = pytest.mark.slow
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 
 def stored(output):
     """Return all rows in an output folder, by bag, but for how long each took."""
-    rows = list(rows_of(sorted((output / 'rows').rglob('*.parquet'))))
+    rows = list(read_rows(sorted((output / 'rows').rglob('*.parquet'))))
     by_bag = {row.bag: replace(row, seconds=0.0) for row in rows}
     assert len(by_bag) == len(rows)      # one row a bag
     return by_bag
@@ -224,7 +224,7 @@ def kill_at(client, job):
     """Kill the worker that a job is on, once it has no other: of one try none would be left."""
     def at_work():
         return [address for address, keys in client.processing().items()
-                if len(keys) == 1 and job.place in str(keys[0])]
+                if len(keys) == 1 and job.failed_key in str(keys[0])]
     while not (where := at_work()):
         time.sleep(0.1)
     os.kill(client.run(os.getpid, workers=where)[where[0]], signal.SIGKILL)
@@ -241,8 +241,8 @@ def test_a_bag_that_needs_more_memory_than_it_may_is_a_row_that_says_so(fleet, c
 
 def test_libraries_are_loaded_before_memory_is_limited():
     """OpenBLAS that is loaded with 8 to 64 MB left tries for ever to map its buffer."""
-    code = ('import resource\nimport numpy as np\nfrom odocal_ros.fleet import bag_task\n'
-            'bag_task._load_libraries()\nmost = bag_task._data_bytes() + 2**24\n'
+    code = ('import resource\nimport numpy as np\nfrom odocal_ros.fleet import bag_jobs\n'
+            'bag_jobs._load_libraries()\nmost = bag_jobs._data_bytes() + 2**24\n'
             'resource.setrlimit(resource.RLIMIT_DATA, (most, -1))\n'
             'from odocal_ros import estimator\nfrom scipy.linalg import cho_factor\n'
             'cho_factor(np.eye(128) @ np.eye(128))')
@@ -251,7 +251,8 @@ def test_libraries_are_loaded_before_memory_is_limited():
 
 def test_the_scheduler_is_given_some_tasks_at_a_time(client):
     found, most = {}, 0
-    for i, result, error in results(client, abs, range(-400, 0), 'abs', [*map(str, range(400))]):
+    keys = [str(k) for k in range(400)]
+    for i, result, error in task_results(client, abs, range(-400, 0), 'abs', keys):
         found[i], most = (result, error), max(most, len(client.futures))
     assert found == {i: (400 - i, None) for i in range(400)}
     assert most <= 2 * FEWEST      # and given anew when half are left
@@ -259,8 +260,8 @@ def test_the_scheduler_is_given_some_tasks_at_a_time(client):
 
 def test_a_process_that_has_read_rows_ends_well(output):
     """Three processes: with threads of its own pyarrow aborted seven of eight as they ended."""
-    code = ('import sys\nfrom odocal_ros.fleet.rows import rows_of\n'
-            'assert list(rows_of(sys.argv[1:]))')
+    code = ('import sys\nfrom odocal_ros.fleet.rows import read_rows\n'
+            'assert list(read_rows(sys.argv[1:]))')
     files = [str(path) for path in (output / 'rows').rglob('*.parquet')]
     for _ in range(3):
         assert subprocess.run([sys.executable, '-c', code, *files]).returncode == 0

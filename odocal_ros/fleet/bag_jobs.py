@@ -1,9 +1,14 @@
 # Copyright 2026 odocal_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The row of a bag: the pipeline of replay with limits of time and memory, on any worker."""
+"""
+Jobs of a fleet, one for each bag: their settings, their submission, and the row of a worker.
 
-from collections.abc import Callable, Iterator
+A worker runs the pipeline of replay with limits of time and memory.
+"""
+
+from argparse import Namespace
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 import faulthandler
@@ -14,15 +19,25 @@ import os
 from pathlib import Path
 import resource
 import signal
+import tempfile
 import threading
 import time
 from typing import Any
 
 import numpy as np
 
-from odocal_ros.errors import OdocalError
-from odocal_ros.fleet.bags import at_hand, FleetBag, seen_as
-from odocal_ros.fleet.rows import changed_settings, FAILED, key_of, leg_text, Row, RowStore
+from odocal_ros.errors import BadBag, BadUsage, OdocalError
+from odocal_ros.fleet.bags import bag_fingerprint, file_system, FleetBag, is_local, local_copy
+from odocal_ros.fleet.engine import task_results
+from odocal_ros.fleet.rows import (
+    changed_settings,
+    FAILED,
+    key_of,
+    Row,
+    RowStore,
+    settings_key,
+    text_of_legs,
+)
 from odocal_ros.safe_io.text_formats import error_text
 
 # error texts without memory for the stack of a thread, or for a library
@@ -43,7 +58,7 @@ class BagJob:
     memory: int = 0               # limit, bytes; 0: none
 
     @property
-    def place(self) -> str:
+    def failed_key(self) -> str:
         """Return the key of the row of a failed bag, whose content is unknown."""
         return key_of('failed', self.bag.bag, self.settings)
 
@@ -53,11 +68,11 @@ class BagJob:
 
     def failed(self, reason: str, **more: Any) -> Row:
         longest = 500    # characters of a reason
-        return self.row(key=self.place, status=FAILED, reason=reason[:longest], **more)
+        return self.row(key=self.failed_key, status=FAILED, reason=reason[:longest], **more)
 
 
 @dataclass(frozen=True)
-class Done:
+class BagOutcome:
     """The report on a bag to the command; the rest is in its row."""
 
     key: str
@@ -65,21 +80,21 @@ class Done:
     computed: bool      # in this run
 
 
-def calibrate_bag(job: BagJob) -> Done:
+def calibrate_bag(job: BagJob) -> BagOutcome:
     """Ensure that the data set has the row of a bag; compute it if it is missing."""
     store, began = RowStore(job.folder), time.monotonic()
     seen = ''
     _load_libraries()
-    with _bounded(job, lambda why: store.put(job.failed(why, seen=seen))):
+    with _resource_limits(job, lambda why: store.put(job.failed(why, seen=seen))):
         try:
-            seen = seen_as(job.bag.bag, job.settings)
-            if found := _known(store, job, seen):
-                return Done(found.key, found.status, False)
-            row, computed = _row(job, store, seen, began)
+            seen = bag_fingerprint(job.bag.bag, job.settings)
+            if found := _existing_row(store, job, seen):
+                return BagOutcome(found.key, found.status, False)
+            row, computed = _compute_row(job, store, seen, began)
             store.put(row)
             store.remember(seen, row.key)
-            store.drop(job.place)
-            return Done(row.key, row.status, computed)
+            store.drop(job.failed_key)
+            return BagOutcome(row.key, row.status, computed)
         except OdocalError as error:
             why = error_text(error)
         except Exception as error:     # noqa: BLE001 one bag must not stop others
@@ -89,7 +104,7 @@ def calibrate_bag(job: BagJob) -> Done:
     # outside the memory limit: the row needs memory
     row = job.failed(why, seen=seen, seconds=time.monotonic() - began)
     store.put(row)
-    return Done(row.key, FAILED, True)
+    return BagOutcome(row.key, FAILED, True)
 
 
 @cache
@@ -106,23 +121,23 @@ def _load_libraries() -> None:
     cho_factor(matrix @ matrix)
 
 
-def _known(store: RowStore, job: BagJob, seen: str) -> Row | None:
+def _existing_row(store: RowStore, job: BagJob, seen: str) -> Row | None:
     """Return the existing row of an unchanged bag, None without one."""
     if key := store.known(seen):
         return store.get(key)
-    failed = store.get(job.place)
+    failed = store.get(job.failed_key)
     # a bag that ended its worker may have no hash: only its place is known
     if failed is not None and failed.seen in ('', seen):
         return failed
     return None
 
 
-def _row(job: BagJob, store: RowStore, seen: str, began: float) -> tuple[Row, bool]:
+def _compute_row(job: BagJob, store: RowStore, seen: str, began: float) -> tuple[Row, bool]:
     """Return the row of a bag, and whether it was computed, not copied from a known one."""
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.library.calibrate_bag import calibrate_bag as calibrated
     worker = _worker()
-    with at_hand(job.bag.bag, worker.local_directory if worker else None) as path:
+    with local_copy(job.bag.bag, worker.local_directory if worker else None) as path:
         with open_bag(path) as bag:
             sha256 = bag_sha256(bag)
             size = sum(Path(file).stat().st_size for file in bag.files)
@@ -135,7 +150,8 @@ def _row(job: BagJob, store: RowStore, seen: str, began: float) -> tuple[Row, bo
         key=key, seen=seen, sha256=sha256, topics=json.dumps(found.inputs[0]['topics']),
         settings=json.dumps(changed_settings(found.config), sort_keys=True), bytes=size,
         seconds=time.monotonic() - began, driven_s=sum(leg.duration for leg in legs),
-        start_ns=min((leg.start_ns for leg in legs), default=0), legs=leg_text(list(legs))), True
+        start_ns=min((leg.start_ns for leg in legs), default=0),
+        legs=text_of_legs(list(legs))), True
 
 
 def _worker() -> Any:
@@ -148,7 +164,7 @@ def _worker() -> Any:
 
 
 @contextmanager
-def _bounded(job: BagJob, give_up: Callable[[str], None]) -> Iterator[None]:
+def _resource_limits(job: BagJob, give_up: Callable[[str], None]) -> Iterator[None]:
     """
     Limit the memory, and end the worker after the time limit, once the bag's row is written.
 
@@ -191,3 +207,87 @@ def _data_bytes() -> int:
         if line.startswith('VmData:'):
             return int(line.split()[1]) * 1024
     return 0
+
+
+def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: float,
+             memory: int, config: Any = None) -> list[BagJob]:
+    """
+    Return a job for each bag.
+
+    args : parsed options of replay (``add_calibration_arguments``).   config : settings
+    that take precedence, in any form accepted by the library.
+
+    Raises BadUsage, BadConfig: a setting or a settings file is wrong.
+    """
+    from odocal_ros.library.asked import config_of, legs_of
+    from odocal_ros.offline.replay import asked_config, asked_topics
+    settings_of_file: dict[str, dict[str, Any]] = {}
+    jobs, topics = [], asked_topics(args)
+    before = changed_settings(config_of(config))
+    for bag in bags:
+        file = bag.config or args.config or ''
+        if file not in settings_of_file:
+            settings_of_file[file] = asked_config(Namespace(**vars(args) | {'config': file}))
+        settings = before | settings_of_file[file] | {'vehicle': bag.vehicle}
+        legs = bag.legs or tuple(args.leg)
+        legs_of(legs)
+        key = settings_key(config_of(settings), topics, legs)
+        if is_local(bag.bag):      # valid for workers in any folder
+            bag = replace(bag, bag=os.path.abspath(file_system(bag.bag)[1]))
+        jobs.append(BagJob(bag, topics, settings, legs, key, str(folder.resolve()), seconds,
+                           memory))
+    return jobs
+
+
+def computed_rows(client: Any, jobs: Sequence[BagJob],
+                  again: bool = False) -> Iterator[tuple[int, BagOutcome]]:
+    """Yield (number, outcome) of each job as it ends; ``again``: retry failed ones."""
+    store = RowStore(jobs[0].folder)
+    open_jobs = []
+    for i, job in enumerate(jobs):
+        if (key := _existing_key(store, job)) is None:
+            open_jobs.append(i)
+            if again:
+                store.drop(job.failed_key)
+        else:
+            yield i, BagOutcome(key, 'done', False)
+    submitted = [jobs[i] for i in open_jobs]
+    keys = [f'{job.failed_key}-{os.urandom(4).hex()}' for job in submitted]
+    for k, done, error in task_results(client, calibrate_bag, submitted, 'bag', keys):
+        job = jobs[open_jobs[k]]
+        if error is not None:      # the worker was ended each time, or could not write
+            row = store.get(job.failed_key) or job.failed(_failure_text(error))
+            store.put(row)
+            done = BagOutcome(row.key, FAILED, True)
+        yield open_jobs[k], done
+
+
+def _existing_key(store: RowStore, job: BagJob) -> str | None:
+    """Return the key of the row of an unchanged bag on this machine, None without one."""
+    if not is_local(job.bag.bag):      # the worker contacts servers: they may not answer
+        return None
+    try:
+        return store.known(bag_fingerprint(job.bag.bag, job.settings))
+    except BadBag:
+        return None
+
+
+def _failure_text(error: BaseException) -> str:
+    """Return the cause of a failed task, for people."""
+    from distributed.scheduler import KilledWorker
+    if isinstance(error, KilledWorker):
+        return (f'its worker ended {error.allowed_failures + 1} times during the computation: '
+                'killed, or out of memory')
+    return f'{type(error).__name__}: {error}'
+
+
+def make_output_folder(folder: Path) -> None:
+    """Make the output folder, or raise BadUsage."""
+    try:
+        for part in ('rows', 'seen'):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise BadUsage(f'{folder}: cannot be written ({error.strerror}); choose another '
+                       '--output') from None

@@ -1,0 +1,218 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Results of a fleet from the rows of its bags: vehicles, tables, page, reports, summary.
+
+Vehicles are computed in groups, each a task that writes its part of the table of legs.
+"""
+
+from argparse import Namespace
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import datetime, UTC
+import io
+from pathlib import Path
+import shutil
+from typing import Any
+import uuid
+
+from odocal_ros.errors import OdocalError
+from odocal_ros.fleet import tables
+from odocal_ros.fleet.bag_jobs import BagJob
+from odocal_ros.fleet.bags import FleetBag, local_copy
+from odocal_ros.fleet.engine import task_results
+from odocal_ros.fleet.page import fleet_page, remarks
+from odocal_ros.fleet.vehicles import Vehicle, vehicle_of, VehicleJob
+from odocal_ros.output.figures import counted
+from odocal_ros.reasons import Verdict
+from odocal_ros.safe_io.atomic_files import locked, write_text
+from odocal_ros.safe_io.text_formats import for_table
+
+TABLE, PAGE = 'fleet.csv', 'fleet.html'
+
+
+@dataclass(frozen=True)
+class GroupJob:
+    """Vehicles whose legs go to one part of a table; ``files``: folder for results, or ''."""
+
+    vehicles: tuple[VehicleJob, ...]
+    part: str
+    files: str = ''
+
+
+def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
+                 settings: dict[str, Any]) -> list[VehicleJob]:
+    """Return a job for each vehicle; ``rows``: the file of each bag's row."""
+    bags_of: dict[str, list[int]] = {}
+    for i, bag in enumerate(bags):
+        bags_of.setdefault(bag.vehicle, []).append(i)
+    # the same bag given twice under one vehicle is one row
+    return [VehicleJob(vehicle, tuple(bags[i] for i in which),
+                       tuple(dict.fromkeys(rows[i] for i in which)), settings)
+            for vehicle, which in bags_of.items()]
+
+
+def compute_vehicles(client: Any, jobs: Sequence[VehicleJob], folder: Path,
+                     files: bool) -> list[dict[str, Any]]:
+    """Return the vehicles' rows, the worst first; write tables, and results if ``files``."""
+    parts = folder / f'.parts.{uuid.uuid4().hex}'
+    parts.mkdir(parents=True)
+    try:
+        groups = [GroupJob(group, str(parts / f'{k:06d}.parquet'),
+                           str(folder / 'vehicles') if files else '')
+                  for k, group in enumerate(_grouped(jobs))]
+        found: dict[int, list[dict[str, Any]]] = {}
+        keys = [Path(group.part).stem + parts.name for group in groups]
+        for k, rows, error in task_results(client, compute_group, groups, 'vehicles', keys):
+            if error is not None:
+                raise error
+            found[k] = rows
+        vehicles = tables.compare_with_model([row for k in sorted(found) for row in found[k]])
+        tables.write_table(folder / tables.LEGS, tables.leg_schema(),
+                           tables.part_batches(sorted(parts.glob('*.parquet'))))
+        tables.write_table(folder / tables.VEHICLES, tables.vehicle_schema(),
+                           tables.vehicle_batches(vehicles))
+        return vehicles
+    finally:
+        shutil.rmtree(parts, ignore_errors=True)
+
+
+def _grouped(jobs: Sequence[VehicleJob]) -> Iterator[tuple[VehicleJob, ...]]:
+    group: list[VehicleJob] = []
+    together = 500    # bags of a group of vehicles, at least
+    for job in jobs:
+        group.append(job)
+        if sum(len(one.bags) for one in group) >= together:
+            yield tuple(group)
+            group = []
+    if group:
+        yield tuple(group)
+
+
+def compute_group(group: GroupJob) -> list[dict[str, Any]]:
+    """Compute vehicles one after the other; write their legs as a part, return their rows."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    rows = []
+    with pq.ParquetWriter(group.part, tables.leg_schema(), compression='zstd') as writer:
+        legs: list[dict[str, Any]] = []
+        for job in group.vehicles:
+            vehicle = vehicle_of(job)
+            rows.append(vehicle.row)
+            legs += vehicle.legs
+            if group.files and vehicle.calibration is not None:
+                _write_files(vehicle, Path(group.files))
+        if legs:
+            writer.write_table(pa.Table.from_pylist(legs, schema=tables.leg_schema()))
+    return rows
+
+
+def _write_files(vehicle: Vehicle, folder: Path) -> None:
+    """Write the files of replay for a vehicle, except report and track."""
+    from odocal_ros.output.files import write_results
+    from odocal_ros.settings.config import with_settings
+    assert vehicle.calibration is not None
+    assert vehicle.config is not None
+    formats = tuple(f for f in vehicle.config.output.formats if f not in ('report', 'track'))
+    write_results(vehicle.calibration, with_settings(vehicle.config, {'output.formats': formats}),
+                  folder / tables.folder_name(vehicle.row['vehicle']), list(vehicle.inputs),
+                  datetime.now(UTC).isoformat(timespec='seconds'), force=True)
+
+
+@dataclass(frozen=True)
+class ReportJob:
+    """A replay of the bags of a vehicle since its last change."""
+
+    jobs: tuple[BagJob, ...]
+    output: str
+
+
+def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], output: Path,
+                  args: Namespace) -> list[dict[str, Any]]:
+    """Write tables, reports and page from the rows of all bags; return the vehicles' rows."""
+    groups = vehicle_jobs([job.bag for job in jobs], rows, run_settings(jobs))
+    vehicles = compute_vehicles(client, groups, output, args.files)
+    with locked(output):          # another fleet's command may write here too
+        write_text(output / TABLE, _csv(output / tables.VEHICLES))
+    _draw_reports(client, vehicles, jobs, output, args.reports)
+    with locked(output):
+        write_text(output / PAGE, fleet_page(vehicles, output))
+    return vehicles
+
+
+def run_settings(jobs: Sequence[BagJob]) -> dict[str, Any]:
+    """Return the settings of this run that do not affect legs, such as the limits."""
+    from odocal_ros.fleet.rows import GROUPS_NOT_OF_LEGS
+    from odocal_ros.library.asked import config_of
+    from odocal_ros.settings.config import flat
+    return {name: value for name, value in flat(config_of(jobs[0].config)).items()
+            if name.partition('.')[0] in GROUPS_NOT_OF_LEGS and (name != 'frames.imu' or value)}
+
+
+def _csv(table: Path) -> str:
+    """Return a table as text for a spreadsheet."""
+    import pyarrow as pa
+    from pyarrow import csv, parquet as pq
+    whole = pq.ParquetFile(table).read(use_threads=False)
+    for i, name in enumerate(whole.column_names):
+        if pa.types.is_string(whole.schema.types[i]):
+            text = [None if x is None else for_table(x) for x in whole[name].to_pylist()]
+            whole = whole.set_column(i, name, pa.array(text, pa.string()))
+    sink = io.BytesIO()
+    csv.write_csv(whole, sink)
+    return sink.getvalue().decode()
+
+
+def _draw_reports(client: Any, vehicles: Sequence[dict[str, Any]], jobs: Sequence[BagJob],
+                  output: Path, which: str) -> None:
+    """Draw reports of vehicles, each a task; store the cause of a failure, or '', in the row."""
+    job_of = {job.bag.bag: job for job in jobs}
+    reported = [row for row in vehicles if row['now'] and (
+        which == 'all' or which == 'flagged' and tables.needs_inspection(row))]
+    report_jobs = [ReportJob(tuple(job_of[bag] for bag in row['now']), str(
+        (output / 'reports' / tables.folder_name(row['vehicle'])).resolve()))
+        for row in reported]
+    keys = [f'{k}-{id(report_jobs)}' for k in range(len(report_jobs))]
+    for k, why, error in task_results(client, draw_report, report_jobs, 'report', keys):
+        reported[k]['report'] = why if error is None else f'{type(error).__name__}: {error}'
+
+
+def draw_report(job: ReportJob) -> str:
+    """Replay bags into a folder; return the cause of a failure, or ''."""
+    from odocal_ros.library.calibrate_bag import calibrate_bag
+    first = job.jobs[0]
+    errors: list[str] = []
+    try:
+        with ExitStack() as stack:
+            bags = [stack.enter_context(local_copy(one.bag.bag, None)) for one in job.jobs]
+            found = calibrate_bag(bags, first.topics, first.config, first.legs)
+            found.save(Path(job.output), True, errors.append)
+    except OdocalError as error:
+        return str(error)
+    return '; '.join(errors)
+
+
+def summary_text(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
+    """Return the summary for the terminal, with remarks on at most ``most`` vehicles."""
+    counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
+    failed = sum(row['bags_failed'] for row in vehicles)
+    bags = sum(row['bags'] for row in vehicles)
+    lines = [', '.join(f'{n} {what}' for what, n in sorted(counts.items()))
+             + f'; {counted(bags, "bag")}, {failed} failed']
+    flagged = [row for row in vehicles if tables.needs_inspection(row)]
+    lines += [f'  {row["vehicle"]}: {"; ".join(remarks(row))}' for row in flagged[:most]]
+    if len(flagged) > most:
+        lines.append(f'  and {len(flagged) - most} more')
+    return '\n'.join([*lines, f'written: {output}/ ({TABLE}, vehicles.parquet, legs.parquet)',
+                      f'report:  {output / PAGE}'])
+
+
+def exit_code(vehicles: Sequence[dict[str, Any]], strict: bool) -> int:
+    """Return 1 for failed bags, and for vehicles that are rejected or do not pass; else 0."""
+    bad = {'FAIL', 'UNDECIDED', Verdict.REJECTED.value} | (
+        {Verdict.CAUTION.value} if strict else set())
+    return int(any(row['bags_failed'] or (row['decision'] or row['verdict']) in bad
+                   for row in vehicles))
