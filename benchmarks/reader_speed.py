@@ -35,9 +35,10 @@ clock = time.perf_counter if sys.argv[2] == 'wall' else time.process_time
 BARE = TIMED + """
 from backports.zstd import ZstdDecompressor
 import numpy as np
-from odocal_ros.bagio.channels import LET_GO
+from odocal_ros.bagio.bag_file import PREALLOCATED_BYTES
 from odocal_ros.bagio.mcap_records import CHUNK, CHUNK_HEAD, records_of
-np.empty(LET_GO, np.uint8)    # else most of it goes into memory that is made for each chunk
+# else most of it goes into memory that is made for each chunk
+np.empty(PREALLOCATED_BYTES, np.uint8)
 began = clock()
 with file.open('rb') as f:
     data = f.read()
@@ -61,7 +62,7 @@ from odocal_ros.bagio.read import open_bag
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.messages.decode import make_reader
 from odocal_ros.settings.config import Config
-import odocal_ros.bagio.mcap_gather, yaml
+import odocal_ros.bagio.mcap_columns, yaml
 import rosbags.typesys, concurrent.futures.thread
 recorder = LegRecorder()
 began = clock()

@@ -44,7 +44,8 @@ class Topic:
     pack: Callable[[slice], np.ndarray]
 
 
-def _empty(msgtype: str, parts: Mapping[str, Any]) -> tuple[bytes, dict[str, tuple[Any, ...]]]:
+def _message_template(msgtype: str, parts: Mapping[str, Any]
+                      ) -> tuple[bytes, dict[str, tuple[Any, ...]]]:
     """Return a message of zeros with these texts and lengths, and type, shape, offset by path."""
     raw, places = bytearray((0, 1, 0, 0)), {}      # little-endian
 
@@ -71,7 +72,7 @@ def _empty(msgtype: str, parts: Mapping[str, Any]) -> tuple[bytes, dict[str, tup
 def _topic(name: str, msgtype: str, time_ns: NDArray[np.int64], values: Values,
            parts: Mapping[str, Any]) -> Topic:
     """Return a topic; ``values`` by path, of x, y, z (and w) together by that of their parent."""
-    raw, places = _empty(msgtype, parts)
+    raw, places = _message_template(msgtype, parts)
     kinds, offsets = [], []
     for path in values:
         found = [one for known, one in places.items() if f'{known}.'.startswith(f'{path}.')]
@@ -92,8 +93,8 @@ def _topic(name: str, msgtype: str, time_ns: NDArray[np.int64], values: Values,
     return Topic(name, msgtype, time_ns, pack)
 
 
-def _stamped(name: str, msgtype: str, samples: data.Samples, frame: str, values: Values,
-             parts: Mapping[str, Any] | None = None) -> Topic:
+def _stamped_topic(name: str, msgtype: str, samples: data.Samples, frame: str, values: Values,
+                   parts: Mapping[str, Any] | None = None) -> Topic:
     stamps = {'header.stamp.sec': lambda rows: samples.stamp_ns[rows] // 10**9,
               'header.stamp.nanosec': lambda rows: samples.stamp_ns[rows] % 10**9}
     return _topic(name, msgtype, samples.received_ns, {**stamps, **values},
@@ -119,19 +120,19 @@ def imu(name: str, samples: data.ImuSamples, frame: str = 'imu_link',
     known = {f'{field}_covariance': _diagonal(variance) for field, variance in (
         ('angular_velocity', w_variance), ('linear_acceleration', f_variance))
         if variance is not None}
-    return _stamped(name, 'sensor_msgs/msg/Imu', samples, frame, {
+    return _stamped_topic(name, 'sensor_msgs/msg/Imu', samples, frame, {
         **_orientation(samples), 'angular_velocity': samples.w_i,
         'linear_acceleration': samples.f_i, **known})
 
 
 def heading(name: str, samples: data.HeadingSamples, frame: str = 'imu_link') -> Topic:
     """Return sensor_msgs/Imu of HeadingSamples: an orientation, no rates (covariance -1)."""
-    return _stamped(name, 'sensor_msgs/msg/Imu', samples, frame, {
-        **_orientation(samples), 'angular_velocity_covariance': _none,
-        'linear_acceleration_covariance': _none})
+    return _stamped_topic(name, 'sensor_msgs/msg/Imu', samples, frame, {
+        **_orientation(samples), 'angular_velocity_covariance': _not_sent,
+        'linear_acceleration_covariance': _not_sent})
 
 
-def _none(_rows: slice) -> Floats:
+def _not_sent(_rows: slice) -> Floats:
     """Return the covariance of a value that is not sent (REP-145)."""
     return np.array([-1.0, *[0.0] * 8])
 
@@ -154,23 +155,23 @@ def counter(name: str, samples: data.OdometerSamples) -> Topic:
 
 def twist(name: str, samples: data.OdometerSamples, frame: str = 'base_link') -> Topic:
     """Return geometry_msgs/TwistStamped of OdometerSamples: forward speed, the rest zero."""
-    return _stamped(name, 'geometry_msgs/msg/TwistStamped', samples, frame,
-                    {'twist.linear.x': samples.value})
+    return _stamped_topic(name, 'geometry_msgs/msg/TwistStamped', samples, frame,
+                          {'twist.linear.x': samples.value})
 
 
 def joints(name: str, wheels: dict[str, data.OdometerSamples], frame: str = '',
            rates: bool = False) -> Topic:
     """Return sensor_msgs/JointState of OdometerSamples by joint: positions, or rates, only."""
-    first, *_ = every = list(wheels.values())
-    given = 'velocity' if rates else 'position'
-    return _stamped(
+    first, *_ = columns = list(wheels.values())
+    quantity = 'velocity' if rates else 'position'
+    return _stamped_topic(
         name, 'sensor_msgs/msg/JointState', first, frame,
-        {given: lambda rows: np.column_stack([one.value[rows] for one in every])},
-        {'name': list(wheels), given: len(every)})
+        {quantity: lambda rows: np.column_stack([one.value[rows] for one in columns])},
+        {'name': list(wheels), quantity: len(columns)})
 
 
 def fix(name: str, samples: data.FixSamples, frame: str = 'gnss') -> Topic:
-    return _stamped(name, 'sensor_msgs/msg/NavSatFix', samples, frame, {
+    return _stamped_topic(name, 'sensor_msgs/msg/NavSatFix', samples, frame, {
         'status.status': samples.status, 'status.service': lambda rows: 1,
         'latitude': lambda rows: np.degrees(samples.latitude[rows]),
         'longitude': lambda rows: np.degrees(samples.longitude[rows]), 'altitude': samples.height,
@@ -180,32 +181,33 @@ def fix(name: str, samples: data.FixSamples, frame: str = 'gnss') -> Topic:
 
 def point(name: str, samples: data.FixSamples, position: Floats) -> Topic:
     """Return geometry_msgs/PointStamped of positions, (n, 3) m, at the times of FixSamples."""
-    return _stamped(name, 'geometry_msgs/msg/PointStamped', samples, 'map', {'point': position})
+    return _stamped_topic(name, 'geometry_msgs/msg/PointStamped', samples, 'map',
+                          {'point': position})
 
 
 def pose(name: str, samples: data.FixSamples, position: Floats, frame: str = 'map') -> Topic:
     """Return geometry_msgs/PoseStamped of such positions, without a rotation."""
-    return _stamped(name, 'geometry_msgs/msg/PoseStamped', samples, frame, {
+    return _stamped_topic(name, 'geometry_msgs/msg/PoseStamped', samples, frame, {
         'pose.position': position, 'pose.orientation.w': lambda rows: 1.0})
 
 
 def pose_with_covariance(name: str, samples: data.FixSamples, position: Floats) -> Topic:
     def covariance(rows: slice) -> Floats:
         return np.pad(samples.covariance_n[rows], ((0, 0), (0, 3), (0, 3))).reshape(-1, 36)
-    return _stamped(name, 'geometry_msgs/msg/PoseWithCovarianceStamped', samples, 'map', {
+    return _stamped_topic(name, 'geometry_msgs/msg/PoseWithCovarianceStamped', samples, 'map', {
         'pose.pose.position': position, 'pose.pose.orientation.w': lambda rows: 1.0,
         'pose.covariance': covariance})
 
 
 def velocity(name: str, samples: data.VelocitySamples) -> Topic:
     """Return geometry_msgs/TwistWithCovarianceStamped of VelocitySamples; no angular rates."""
-    return _stamped(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples, 'gnss', {
+    return _stamped_topic(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples, 'gnss', {
         'twist.twist.linear': samples.velocity_n,
         'twist.covariance': _diagonal(samples.variance_n, 6)})
 
 
 def pressure(name: str, samples: data.ScalarSamples) -> Topic:
-    return _stamped(name, 'sensor_msgs/msg/FluidPressure', samples, 'imu', {
+    return _stamped_topic(name, 'sensor_msgs/msg/FluidPressure', samples, 'imu', {
         'fluid_pressure': samples.value, 'variance': samples.variance})
 
 
@@ -216,5 +218,5 @@ def camera(name: str, times_ns: Sequence[int], size: int, rng: np.random.Generat
     def random(rows: slice) -> NDArray[np.uint8]:
         n = len(time_ns[rows])
         return np.frombuffer(rng.bytes(n * size), np.uint8).reshape(n, size)
-    return _stamped(name, 'sensor_msgs/msg/CompressedImage', data.Samples(time_ns, time_ns),
-                    'camera', {'data': random}, {'format': 'jpeg', 'data': size})
+    return _stamped_topic(name, 'sensor_msgs/msg/CompressedImage', data.Samples(time_ns, time_ns),
+                          'camera', {'data': random}, {'format': 'jpeg', 'data': size})

@@ -11,14 +11,21 @@ import struct
 import zlib
 
 from odocal_ros.bagio import mcap_records as mcap
-from odocal_ros.bagio.channels import Batch, Channel, FileBytes, FORMATS, overlapping, Recording
-from odocal_ros.bagio.mcap_gather import batches
+from odocal_ros.bagio.bag_file import (
+    BagFile,
+    Batch,
+    Channel,
+    FileBytes,
+    FORMATS,
+    group_overlapping,
+)
+from odocal_ros.bagio.mcap_columns import batches
 from odocal_ros.safe_io.limits import Allowance, Damaged, LATEST_NS
 
 Entry = tuple[int, int, bytes]     # time, channel, message
 
 
-class McapFile(Recording):
+class McapFile(BagFile):
     """
     A file of messages in chunks.
 
@@ -31,8 +38,8 @@ class McapFile(Recording):
         super().__init__(path)
         self._allowance = allowance
         self._schemas: dict[int, tuple[str, tuple[str, str]]] = {}
-        self._places: list[mcap.Place] = []
-        self._counted = ''         # known damage when messages were counted
+        self._chunks: list[mcap.ChunkIndex] = []
+        self._counted_damage = ''         # known damage when messages were counted
         self._file = FileBytes(path)
         try:
             self._open()
@@ -42,42 +49,44 @@ class McapFile(Recording):
 
     def _open(self) -> None:
         try:
-            if self._index():
+            if self._read_index():
                 return
         except (Damaged, struct.error, UnicodeDecodeError) as error:
             self.damage = str(error) if isinstance(error, Damaged) else mcap.INDEX_DAMAGED
-        self._places = []
+        self._chunks = []
         self._count()
-        self._counted = self.damage
+        self._counted_damage = self.damage
 
     # ---- the index -------------------------------------------------------------------------
 
-    def _index(self) -> bool:
+    def _read_index(self) -> bool:
+        """Read the index; return False if the file has none, or raise Damaged."""
         data = self._file
-        if data[-len(mcap.MAGIC):] != mcap.MAGIC or (
-                data[-mcap.END:-mcap.END + 9] != mcap.RECORD.pack(mcap.FOOTER, 20)):
+        footer = data[-mcap.FOOTER_SIZE:]
+        if footer[-len(mcap.MAGIC):] != mcap.MAGIC or (
+                footer[:9] != mcap.RECORD.pack(mcap.FOOTER, 20)):
             raise Damaged('cut off')
-        start, _, crc = struct.unpack('<QQI', data[-mcap.END + 9:-len(mcap.MAGIC)])
+        start, _, crc = struct.unpack('<QQI', footer[9:-len(mcap.MAGIC)])
         if not start:
             return False
-        if not len(mcap.MAGIC) <= start <= len(data) - mcap.END:
+        if not len(mcap.MAGIC) <= start <= len(data) - mcap.FOOTER_SIZE:
             raise Damaged(mcap.INDEX_DAMAGED)
         if crc and zlib.crc32(data[start:-len(mcap.MAGIC) - 4]) != crc:
             raise Damaged(mcap.INDEX_DAMAGED)
         found = None
-        for op, body, _ in mcap.records_of(data[start:-mcap.END]):
+        for op, body, _ in mcap.records_of(data[start:-mcap.FOOTER_SIZE]):
             if op in (mcap.SCHEMA, mcap.CHANNEL):
-                self._learn(op, body)
+                self._add_definition(op, body)
             elif op == mcap.CHUNK_INDEX:
-                self._places.append(mcap.place_of(body))
+                self._chunks.append(mcap.chunk_index_of(body))
             elif op == mcap.STATISTICS:
                 found = mcap.statistics_of(body)
-        if found is None or found[0] and not (self._places and self._schemas):
+        if found is None or found[0] and not (self._chunks and self._schemas):
             return False
         count, start_ns, end_ns, counts = found
         if not 0 <= start_ns <= end_ns < LATEST_NS and count:
             raise Damaged(mcap.INDEX_DAMAGED)
-        self._places = mcap.apart(self._places, start)
+        self._chunks = mcap.ordered_chunks(self._chunks, start)
         self._set_counts(counts, start_ns, end_ns)
         return True
 
@@ -85,107 +94,111 @@ class McapFile(Recording):
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
         """Yield the messages of some topics (name -> type) by time; by chunk without an index."""
-        wanted = self._wanted(topics)
-        self._allowance.again()
-        entries = self._by_time(wanted) if self._places else (
-            entry for entry in self._walk() if entry[1] in wanted)
+        channels = self._channels_of(topics)
+        self._allowance.restart()
+        entries = self._by_time(channels) if self._chunks else (
+            entry for entry in self._scan_records() if entry[1] in channels)
         for time_ns, key, raw in entries:
-            yield wanted[key], time_ns, raw
+            yield channels[key], time_ns, raw
         self._recount()
 
     def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
         """Return the messages in batches; None if the index is missing or of other chunks."""
-        wanted = self._wanted(topics)
-        places = [place for place in self._places
-                  if not place.channels or place.channels & wanted.keys()]
-        if not self._places or any(self._file[place.at + 9:place.at + 25] != mcap.TIMES.pack(
-                place.start_ns, place.end_ns) for place in places):
+        channels = self._channels_of(topics)
+        chunks = [chunk for chunk in self._chunks
+                  if not chunk.channels or chunk.channels & channels.keys()]
+        if not self._chunks or any(self._file[chunk.at + 9:chunk.at + 25] != mcap.TIMES.pack(
+                chunk.start_ns, chunk.end_ns) for chunk in chunks):
             return None
-        return self._gathered(places, wanted)
+        return self._indexed_batches(chunks, channels)
 
-    def _gathered(self, places: list[mcap.Place],
-                  wanted: Mapping[int, Channel]) -> Iterator[Batch]:
-        self._allowance.again()
-        yield from batches(places, wanted, self._channels, self._read, self._walked, self._note)
+    def _indexed_batches(self, chunks: list[mcap.ChunkIndex],
+                         channels: Mapping[int, Channel]) -> Iterator[Batch]:
+        self._allowance.restart()
+        yield from batches(chunks, channels, self._channels, self._read, self._messages_by_scan,
+                           self._report_damage)
         self._recount()
 
-    def _read(self, places: Sequence[mcap.Place]) -> list[mcap.Chunk | Damaged]:
+    def _read(self, chunks: Sequence[mcap.ChunkIndex]) -> list[mcap.Chunk | Damaged]:
         """Return adjacent chunks of the index, each with its message index."""
-        begin, end = places[0].at, places[-1].at + places[-1].size + places[-1].index_size
+        begin, end = chunks[0].at, chunks[-1].at + chunks[-1].size + chunks[-1].index_size
         data = self._file[begin:end]
         found: list[mcap.Chunk | Damaged] = []
-        for place in places:
-            at = place.at - begin
-            stop = at + place.size
+        for chunk in chunks:
+            at = chunk.at - begin
+            stop = at + chunk.size
             try:
-                if data[at:at + 9] != mcap.RECORD.pack(mcap.CHUNK, place.size - 9):
+                if data[at:at + 9] != mcap.RECORD.pack(mcap.CHUNK, chunk.size - 9):
                     raise Damaged(mcap.CHUNK_DAMAGED)
-                found.append(mcap.unpacked(data, at + 9, stop, self._allowance)._replace(
-                    begins=memoryview(data)[stop:stop + place.index_size]))
+                found.append(mcap.unpack_chunk(data, at + 9, stop, self._allowance)._replace(
+                    message_index=memoryview(data)[stop:stop + chunk.index_size]))
             except Damaged as error:
                 found.append(error)
         return found
 
-    def _note(self, damage: Damaged) -> None:
+    def _report_damage(self, damage: Damaged) -> None:
         self.damage = self.damage or str(damage)
 
     def _recount(self) -> None:
         """Count the messages again if some of those in the index are lost."""
-        if self.damage != self._counted:
+        if self.damage != self._counted_damage:
             self._count()
-            self._counted = self.damage
+            self._counted_damage = self.damage
 
-    def _by_time(self, wanted: Mapping[int, Channel]) -> Iterator[Entry]:
-        for together in overlapping(place for place in self._places
-                                    if not place.channels or place.channels & wanted.keys()):
-            yield from self._merged(together, wanted)
+    def _by_time(self, channels: Mapping[int, Channel]) -> Iterator[Entry]:
+        chunks = (chunk for chunk in self._chunks
+                  if not chunk.channels or chunk.channels & channels.keys())
+        for group in group_overlapping(chunks):
+            yield from self._merged(group, channels)
 
-    def _merged(self, places: list[mcap.Place], wanted: Mapping[int, Channel]) -> Iterator[Entry]:
-        def lazily(place: mcap.Place) -> Iterator[Entry | tuple[int]]:
-            yield (place.start_ns,)        # the chunk is unpacked at its start time
-            yield from self._of(place, wanted)
-        return (entry for entry in heapq.merge(*map(lazily, places), key=itemgetter(0))
+    def _merged(self, chunks: list[mcap.ChunkIndex],
+                channels: Mapping[int, Channel]) -> Iterator[Entry]:
+        def lazily(chunk: mcap.ChunkIndex) -> Iterator[Entry | tuple[int]]:
+            yield (chunk.start_ns,)        # the chunk is unpacked at its start time
+            yield from self._messages_of(chunk, channels)
+        return (entry for entry in heapq.merge(*map(lazily, chunks), key=itemgetter(0))
                 if len(entry) > 1)
 
-    def _of(self, place: mcap.Place, wanted: Mapping[int, Channel]) -> list[Entry]:
+    def _messages_of(self, index: mcap.ChunkIndex, channels: Mapping[int, Channel]) -> list[Entry]:
         """Return the messages of a chunk of the index, sorted; [] if it is damaged."""
         try:
-            (chunk,) = self._read([place])
+            (chunk,) = self._read([index])
             if isinstance(chunk, Damaged):
                 raise chunk
-            found = self._walked(chunk)
+            found = self._messages_by_scan(chunk)
         except Damaged as error:
-            self._note(error)
+            self._report_damage(error)
             return []
-        return [entry for entry in found if entry[1] in wanted]
+        return [entry for entry in found if entry[1] in channels]
 
     def _scan(self) -> Iterator[tuple[int, int]]:
-        self._allowance.again()
-        entries = (entry for place in self._places for entry in self._of(place, self._channels)
-                   ) if self._places else self._walk()
+        self._allowance.restart()
+        entries = (entry for chunk in self._chunks
+                   for entry in self._messages_of(chunk, self._channels)
+                   ) if self._chunks else self._scan_records()
         return ((key, time_ns) for time_ns, key, _ in entries)
 
-    def _walk(self) -> Iterator[Entry]:
+    def _scan_records(self) -> Iterator[Entry]:
         """Yield every message from the first record on, chunk by chunk."""
         for op, body, whole in mcap.records_of(self._file, len(mcap.MAGIC)):
             try:
                 if op == mcap.CHUNK:
-                    chunk = mcap.unpacked(body, 0, len(body), self._allowance, cut=not whole)
-                    yield from self._walked(chunk, cut=not whole)
+                    chunk = mcap.unpack_chunk(body, 0, len(body), self._allowance, cut=not whole)
+                    yield from self._messages_by_scan(chunk, cut=not whole)
                 elif op == mcap.MESSAGE:
                     key, _, time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(body)
                     if key not in self._channels or time_ns >= LATEST_NS:
                         raise Damaged('a damaged record')
                     yield time_ns, key, body[mcap.MESSAGE_HEAD.size:]
                 elif op in (mcap.SCHEMA, mcap.CHANNEL):
-                    self._learn(op, body)
+                    self._add_definition(op, body)
             except (Damaged, struct.error, UnicodeDecodeError) as error:
                 self.damage = self.damage or (
                     str(error) if isinstance(error, Damaged) else 'a damaged record')
 
     # ---- records one by one ----------------------------------------------------------------
 
-    def _walked(self, chunk: mcap.Chunk, cut: bool = False) -> list[Entry]:
+    def _messages_by_scan(self, chunk: mcap.Chunk, cut: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time, from a sequential scan."""
         found = self._entries(bytes(chunk.records), cut)
         found.sort(key=itemgetter(0))
@@ -212,7 +225,7 @@ class McapFile(Recording):
                 found.append((time_ns, key, records[at + 31:stop]))
             elif op in (mcap.SCHEMA, mcap.CHANNEL):
                 try:
-                    self._learn(op, records[at + 9:stop])
+                    self._add_definition(op, records[at + 9:stop])
                 except (struct.error, UnicodeDecodeError):
                     raise Damaged(mcap.CHUNK_DAMAGED) from None
             else:       # not allowed in a chunk
@@ -222,7 +235,7 @@ class McapFile(Recording):
             raise Damaged(mcap.CHUNK_DAMAGED)
         return found
 
-    def _learn(self, op: int, body: bytes) -> None:
+    def _add_definition(self, op: int, body: bytes) -> None:
         (key,) = struct.unpack_from('<H', body)
         if op == mcap.SCHEMA:
             name, at = mcap.text_at(body, 2)

@@ -9,7 +9,7 @@ import struct
 from typing import NamedTuple
 import zlib
 
-from odocal_ros.bagio.channels import FileBytes
+from odocal_ros.bagio.bag_file import FileBytes
 from odocal_ros.messages.raws import Bytes
 from odocal_ros.safe_io.limits import Allowance, Damaged, LimitReached
 
@@ -23,15 +23,15 @@ CHUNK_DAMAGED = 'a damaged chunk'
 MOST_CUT = 2**26        # judgement: bytes used of a chunk that is truncated by the end of the file
 RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
 INDEX_HEAD, TIMES = struct.Struct('<QQQQ'), struct.Struct('<QQ')
-END = 9 + 20 + len(MAGIC)      # format: of the footer
+FOOTER_SIZE = 9 + 20 + len(MAGIC)      # format: of the footer
 
 
-class Place(NamedTuple):
+class ChunkIndex(NamedTuple):
     """
     Index entry of a chunk: times, position of its record, channels.
 
-    index_size : bytes of the message index after the chunk, limited by ``apart`` to the space
-    before the next chunk.   unpacked : bytes, unpacked size as stated.
+    index_size : bytes of the message index after the chunk, limited by ``ordered_chunks`` to the
+    space before the next chunk.   unpacked_size : bytes, as stated.
     """
 
     start_ns: int
@@ -40,7 +40,7 @@ class Place(NamedTuple):
     size: int
     channels: frozenset[int]
     index_size: int = 0
-    unpacked: int = 0
+    unpacked_size: int = 0
 
 
 def records_of(data: bytes | FileBytes, at: int = 0) -> Iterator[tuple[int, bytes, bool]]:
@@ -50,36 +50,36 @@ def records_of(data: bytes | FileBytes, at: int = 0) -> Iterator[tuple[int, byte
         if op == FOOTER:
             return
         stop = at + 9 + size
-        whole = stop <= len(data)
-        if op in USED and whole or op == CHUNK:      # also a truncated last chunk
-            yield op, data[at + 9:min(stop, at + 9 + MOST_CUT) if not whole else stop], whole
+        complete = stop <= len(data)
+        if op in USED and complete or op == CHUNK:      # also a truncated last chunk
+            yield op, data[at + 9:min(stop, at + 9 + MOST_CUT) if not complete else stop], complete
         at = stop
 
 
-def place_of(body: bytes) -> Place:
+def chunk_index_of(body: bytes) -> ChunkIndex:
     """Return the chunk described by a record of the index."""
     start_ns, end_ns, at, size = INDEX_HEAD.unpack_from(body)
     (length,) = struct.unpack_from('<I', body, INDEX_HEAD.size)
     stop = INDEX_HEAD.size + 4 + length
     pairs = body[INDEX_HEAD.size + 4:stop]
-    return Place(start_ns, end_ns, at, size,
-                 frozenset(key for key, _ in struct.iter_unpack('<HQ', pairs)),
-                 int.from_bytes(body[stop:stop + 8], 'little'),
-                 int.from_bytes(body[-8:], 'little'))
+    return ChunkIndex(start_ns, end_ns, at, size,
+                      frozenset(key for key, _ in struct.iter_unpack('<HQ', pairs)),
+                      int.from_bytes(body[stop:stop + 8], 'little'),
+                      int.from_bytes(body[-8:], 'little'))
 
 
-def apart(places: Sequence[Place], end: int) -> list[Place]:
+def ordered_chunks(chunks: Sequence[ChunkIndex], end: int) -> list[ChunkIndex]:
     """
     Return the chunks of an index in order of time.
 
     Raises Damaged if they overlap in the file or exceed ``end``: they could unpack to any size.
     """
-    places, found, at = sorted(places, key=attrgetter('at')), [], len(MAGIC)
-    for place, after in zip(places, [*(p.at for p in places[1:]), end], strict=True):
-        if place.at < at or place.size < 9 or place.at + place.size > end:
+    chunks, found, at = sorted(chunks, key=attrgetter('at')), [], len(MAGIC)
+    for chunk, after in zip(chunks, [*(c.at for c in chunks[1:]), end], strict=True):
+        if chunk.at < at or chunk.size < 9 or chunk.at + chunk.size > end:
             raise Damaged(INDEX_DAMAGED)
-        at = place.at + place.size
-        found.append(place._replace(index_size=min(place.index_size, max(after - at, 0))))
+        at = chunk.at + chunk.size
+        found.append(chunk._replace(index_size=min(chunk.index_size, max(after - at, 0))))
     return sorted(found)
 
 
@@ -107,14 +107,15 @@ class Chunk(NamedTuple):
     stop: int
     start_ns: int
     end_ns: int
-    begins: Bytes = b''
+    message_index: Bytes = b''
 
     @property
     def records(self) -> memoryview:
         return memoryview(self.data)[self.at:self.stop]
 
 
-def unpacked(data: Bytes, at: int, stop: int, allowance: Allowance, cut: bool = False) -> Chunk:
+def unpack_chunk(data: Bytes, at: int, stop: int, allowance: Allowance,
+                 cut: bool = False) -> Chunk:
     """
     Return the chunk of a record, or raise Damaged.
 
@@ -123,9 +124,9 @@ def unpacked(data: Bytes, at: int, stop: int, allowance: Allowance, cut: bool = 
     body = memoryview(data)[at:stop]
     try:
         start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)
-        packing, place = text_at(body, CHUNK_HEAD.size)
-        (length,) = struct.unpack_from('<Q', body, place)
-        packed = body[place + 8:place + 8 + length]
+        packing, offset = text_at(body, CHUNK_HEAD.size)
+        (length,) = struct.unpack_from('<Q', body, offset)
+        packed = body[offset + 8:offset + 8 + length]
         records = allowance.unpack(packing, packed, size)
     except (LimitReached, MemoryError):
         raise
@@ -135,4 +136,4 @@ def unpacked(data: Bytes, at: int, stop: int, allowance: Allowance, cut: bool = 
         raise Damaged(CHUNK_DAMAGED)
     if packing:
         return Chunk(records, 0, len(records), start_ns, end_ns)
-    return Chunk(data, at + place + 8, at + place + 8 + len(records), start_ns, end_ns)
+    return Chunk(data, at + offset + 8, at + offset + 8 + len(records), start_ns, end_ns)

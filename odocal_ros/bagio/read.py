@@ -13,17 +13,17 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from odocal_ros.bagio.channels import Batch, overlapping
-from odocal_ros.bagio.parts import group, Part
-from odocal_ros.bagio.sources import find, names, Source, unpack
-from odocal_ros.bagio.types import Types
+from odocal_ros.bagio.any_bag_file import AnyBagFile, next_batch
+from odocal_ros.bagio.bag_file import Batch, group_overlapping
+from odocal_ros.bagio.rosbags_readers import Types
+from odocal_ros.bagio.sources import file_names, find_source, Source, unpack
 from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
 from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Feed, RowReader
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.safe_io.limits import is_file
 
-MISSING = 0.5   # s, judgement: shorter losses are not reported
+LEAST_LOSS = 0.5   # s, judgement: shorter losses are not reported
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Bag:
     messages for the user: sentences, and reasons if they concern a result.
     """
 
-    def __init__(self, source: Source, parts: list[Part], types: Types) -> None:
+    def __init__(self, source: Source, parts: list[AnyBagFile], types: Types) -> None:
         self.name, self.files = source.name, source.files
         self._source, self._types = source, types
         self._parts = sorted((p for p in parts if p.count), key=lambda p: p.start_ns)
@@ -68,17 +68,17 @@ class Bag:
     @property
     def notes(self) -> tuple[Reason | str, ...]:
         """Return the notes on this bag; complete only after it was read."""
-        return (*self._sentences, *self._cut(), *self._reader_notes)
+        return (*self._sentences, *self._missing_data_notes(), *self._reader_notes)
 
-    def _cut(self) -> list[Reason | str]:
+    def _missing_data_notes(self) -> list[Reason | str]:
         """Return notes on missing data, with its duration if metadata or the next file give it."""
         found: list[Reason | str] = []
-        known = self._source.known
+        metadata = self._source.metadata
         for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
             if not part.damage:
                 continue
-            span = known.of_file.get(part.path.name) or (
-                known.whole if len(self._parts) == 1 else None)
+            span = metadata.of_file.get(part.path.name) or (
+                metadata.whole if len(self._parts) == 1 else None)
             note = f'{part.path.name} is damaged ({part.damage})'
             if span and part.count >= span.count:
                 found.append(f'{note}, but all {span.count} messages were read')
@@ -87,17 +87,17 @@ class Bag:
                 found.append(Reason(Code.BAG_TRUNCATED, f'{note}: none of its messages can be '
                                     'read'))
                 continue
-            span = span or (known.whole if after is None else None)
+            span = span or (metadata.whole if after is None else None)
             end_ns = span.end_ns if span else after.start_ns if after else None
             seconds = (part.end_ns - part.start_ns) * 1e-9
             lost = 0.0 if end_ns is None else (end_ns - part.end_ns) * 1e-9
             missing = ('without metadata.yaml the lost time is unknown' if end_ns is None else
-                       f'{lost:.1f} s at the end are missing' if lost > MISSING else
+                       f'{lost:.1f} s at the end are missing' if lost > LEAST_LOSS else
                        'the end is there, messages before it are missing')
             found.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
                                 f'{seconds:.1f} s were read; {missing}'))
-        lost = (known.whole.end_ns - self.end_ns) * 1e-9 if known.whole else 0.0
-        if not found and lost > MISSING:
+        lost = (metadata.whole.end_ns - self.end_ns) * 1e-9 if metadata.whole else 0.0
+        if not found and lost > LEAST_LOSS:
             found.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: {lost:.1f} s at the end, '
                                 'listed in metadata.yaml, are missing'))
         return found
@@ -126,7 +126,8 @@ class Bag:
             if progress:
                 newest = int(max(times[-1] for times, _ in batch.values()))
                 progress((newest - self.start_ns) / max(self.end_ns - self.start_ns, 1))
-        _check_content(self.name, self._source, self._parts)     # reading finds damaged chunks
+        # reading finds damaged chunks
+        _check_has_messages(self.name, self._source, self._parts)
         for topic, reader in readers.items():
             self._add_notes(topic, reader, used[topic])
 
@@ -172,17 +173,17 @@ class Bag:
     def _batches(self, topics: Collection[str]) -> Iterator[Batch]:
         """Yield messages of some topics in order of bag time, many at a time."""
         wanted = {t: self.topics[t].msgtype for t in topics if self.topics[t].count}
-        for together in overlapping(self._parts):
+        for together in group_overlapping(self._parts):
             yield from _merged(together, wanted)
 
 
-def _merged(parts: list[Part], topics: Mapping[str, str]) -> Iterator[Batch]:
+def _merged(parts: list[AnyBagFile], topics: Mapping[str, str]) -> Iterator[Batch]:
     """Yield the batches of files that overlap in time, merged; those of one file unchanged."""
     if len(parts) == 1:
         yield from parts[0].batches(topics)
         return
     stream = heapq.merge(*(part.stream(topics) for part in parts), key=itemgetter(1))
-    while batch := group(stream):
+    while batch := next_batch(stream):
         yield batch
 
 
@@ -204,16 +205,16 @@ def open_bag(path: Path | str) -> Iterator[Bag]:
 
 
 def _opened(path: Path, stack: ExitStack) -> Bag:
-    source, types = find(path), Types()
-    if source.known.foreign:
-        raise BadBag(f'{path}: its serialization format is {source.known.foreign!r}, only '
-                     'cdr is supported; convert the bag with ros2 bag convert')
+    source, types = find_source(path), Types()
+    if foreign := source.metadata.foreign_formats:
+        raise BadBag(f'{path}: its serialization format is {foreign!r}, only cdr is supported; '
+                     'convert the bag with ros2 bag convert')
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
     parts, lost = [], []
     total = sum(path.stat().st_size for path in source.files if is_file(path))
     for path in source.files:
         try:
-            part = Part(path, *unpack(path, folder, total), total, types.cdr_from_ros1)
+            part = AnyBagFile(path, *unpack(path, folder, total), total, types.cdr_from_ros1)
         except BadBag as error:
             lost.append(error)
             continue
@@ -227,20 +228,20 @@ def _opened(path: Path, stack: ExitStack) -> Bag:
     if formats and not formats & {'cdr', 'ros1'}:
         raise BadBag(f'{path}: its serialization format is {", ".join(formats)!r}, '
                      'only cdr is supported; convert the bag with ros2 bag convert')
-    _check_content(path, source, parts)
+    _check_has_messages(path, source, parts)
     return Bag(replace(source, notes=source.notes + bag_notes), parts, types)
 
 
-def _check_content(path: Path | str, source: Source, parts: list[Part]) -> None:
+def _check_has_messages(path: Path | str, source: Source, parts: list[AnyBagFile]) -> None:
     if any(part.count for part in parts):
         return
     damage = ' or '.join({part.damage for part in parts if part.damage})
     if damage:
-        raise BadBag(f'{path}: the messages of {names(source.files)} cannot be read ({damage}); '
-                     'copy it again from its source')
+        raise BadBag(f'{path}: the messages of {file_names(source.files)} cannot be read '
+                     f'({damage}); copy it again from its source')
     topics = sum(len(part.channels) for part in parts)
     raise BadBag(f'{path}: the bag is empty, 0 messages on {topics} topics in '
-                 f'{names(source.files)}; record again')
+                 f'{file_names(source.files)}; record again')
 
 
 def bag_sha256(bag: Bag) -> str:

@@ -17,16 +17,16 @@ from pathlib import Path
 import re
 from typing import Any
 
-from odocal_ros.bagio.channels import Channel
-from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file, Written
+from odocal_ros.bagio.bag_file import Channel
+from odocal_ros.bagio.mcap_write import Chunk, read_chunks, write_file, Written
 from odocal_ros.safe_io.atomic_files import disk, write_text
 
 JOURNAL = 'journal.yaml'     # marks the folder as a journal, and has its settings
 # status of the node, by which a replay finds the marks; events of legs that it leaves out
 STATUS_NAME, STATUS_TYPE = 'calibrator: calibration', 'diagnostic_msgs/msg/DiagnosticArray'
-DROPPED = ('cancelled', 'undone')
+DROPPED_EVENTS = ('cancelled', 'undone')
 NUMBERED = re.compile(r'part_(\d+)(?:-(\d+))?\.mcap')
-TOGETHER = 60        # judgement: files joined while the bag grows: an hour has then 60 + 60
+FILES_JOINED = 60        # judgement: files joined while the bag grows: an hour has then 60 + 60
 
 
 def part_name(first: int, last: int) -> str:
@@ -78,11 +78,11 @@ class SegmentedBag:
         return _size((*self.segments, *self.extra))
 
     @property
-    def loose_size(self) -> int:
+    def unjoined_size(self) -> int:
         """Return the size of the files that are joined next, bytes."""
-        return _size(self._loose())
+        return _size(self._unjoined())
 
-    def _loose(self) -> list[Segment]:
+    def _unjoined(self) -> list[Segment]:
         # the first has the size of the pre-roll: it is only copied once
         return [s for s in self.segments[1:] if s.first == s.last]
 
@@ -92,8 +92,8 @@ class SegmentedBag:
 
     def join_some(self) -> None:
         """Join the newest segments if there are enough of them."""
-        single = self._loose()
-        if len(single) >= TOGETHER:
+        single = self._unjoined()
+        if len(single) >= FILES_JOINED:
             self._join(single)
 
     def finish(self, room: int | None = None) -> Path:

@@ -11,7 +11,7 @@ import shutil
 import sqlite3
 from typing import Any
 
-from odocal_ros.bagio.channels import possible
+from odocal_ros.bagio.bag_file import is_valid_time
 from odocal_ros.bagio.segments import JOURNAL, without_joined
 from odocal_ros.errors import BadBag
 from odocal_ros.reasons import Code, Reason
@@ -34,17 +34,18 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Known:
+class BagMetadata:
     """
     Content of metadata.yaml on a bag.
 
-    foreign : serialization formats, if none is cdr.   trouble : reason why it cannot be used.
+    foreign_formats : serialization formats, if none is cdr.   trouble : reason why it cannot be
+    used.
     """
 
-    names: tuple[str, ...] = ()
+    file_names: tuple[str, ...] = ()
     whole: Span | None = None
     of_file: Mapping[str, Span] = field(default_factory=dict)      # by name
-    foreign: str = ''
+    foreign_formats: str = ''
     trouble: str = ''
 
 
@@ -55,10 +56,10 @@ class Source:
     name: str
     files: tuple[Path, ...]
     notes: tuple[Reason | str, ...] = ()
-    known: Known = Known()
+    metadata: BagMetadata = BagMetadata()
 
 
-def find(path: Path) -> Source:
+def find_source(path: Path) -> Source:
     """
     Return the source at a path: a folder, its metadata.yaml, or a file of a bag.
 
@@ -72,39 +73,39 @@ def find(path: Path) -> Source:
     if path.is_dir():
         return _folder(path)
     beside = path.parent / 'metadata.yaml'
-    known = _read_metadata(beside) if beside.exists() else Known()
-    if path.name not in known.names:
+    metadata = _read_metadata(beside) if beside.exists() else BagMetadata()
+    if path.name not in metadata.file_names:
         return Source(_stem(path), (path,))
-    whole = known.of_file.get(path.name) or (
-        known.whole if known.names == (path.name,) else None)
-    return Source(_stem(path), (path,), known=replace(known, whole=whole, of_file={}))
+    whole = metadata.of_file.get(path.name) or (
+        metadata.whole if metadata.file_names == (path.name,) else None)
+    return Source(_stem(path), (path,), metadata=replace(metadata, whole=whole, of_file={}))
 
 
 def _folder(path: Path) -> Source:
     beside = path / 'metadata.yaml'
-    known = _read_metadata(beside) if beside.exists() else None
-    wanted = known.names if known else ()
-    notes: list[Reason | str] = [known.trouble] if known and known.trouble else []
-    files = _distinct([path / file for file in wanted if limits.is_file(path / file)])
-    lost = [file for file in wanted if not limits.is_file(path / file)]
+    metadata = _read_metadata(beside) if beside.exists() else None
+    listed = metadata.file_names if metadata else ()
+    notes: list[Reason | str] = [metadata.trouble] if metadata and metadata.trouble else []
+    files = _distinct([path / file for file in listed if limits.is_file(path / file)])
+    lost = [file for file in listed if not limits.is_file(path / file)]
     if lost and files:
         named = ', '.join(lost[:10]) + ' ...' * (len(lost) > 10)
         notes.append(Reason(Code.BAG_TRUNCATED, f'{path.resolve().name}: {len(lost)} of '
-                            f'{len(wanted)} files named in metadata.yaml are missing ({named}); '
+                            f'{len(listed)} files named in metadata.yaml are missing ({named}); '
                             'the others are read', 'Copy the missing files into the folder.'))
     if not files:
         files = _distinct(sorted((f for f in path.iterdir()
                                   if f.name.endswith(ENDINGS) and limits.is_file(f)),
-                                 key=_by_number))
+                                 key=_number_key))
         if (path / JOURNAL).exists():
             files = without_joined(files)
         if not files:
-            raise BadBag(f'{path}: holds no .mcap, .db3 or .bag file{_hint(path)}')
-        what = 'names no existing file' if wanted else 'is missing'
-        if known is None or wanted:
+            raise BadBag(f'{path}: holds no .mcap, .db3 or .bag file{_hint_on_subfolders(path)}')
+        what = 'names no existing file' if listed else 'is missing'
+        if metadata is None or listed:
             notes.append(f'{path}: metadata.yaml {what}; read {len(files)} file'
                          f'{"s" * (len(files) > 1)} in name order')
-    return Source(path.resolve().name, tuple(files), tuple(notes), known or Known())
+    return Source(path.resolve().name, tuple(files), tuple(notes), metadata or BagMetadata())
 
 
 def _distinct(files: list[Path]) -> list[Path]:
@@ -116,14 +117,14 @@ def _distinct(files: list[Path]) -> list[Path]:
     return list(found.values())
 
 
-def _hint(path: Path) -> str:
+def _hint_on_subfolders(path: Path) -> str:
     """Return a hint with the bags one folder below, or an empty text."""
     below = [sub for sub in sorted(path.iterdir()) if sub.is_dir()
              and any(file.name.endswith(ENDINGS) for file in sub.iterdir())]
     return f'; did you mean {" or ".join(map(str, below[:3]))}?' if below else ''
 
 
-def _by_number(path: Path) -> list[tuple[int, str]]:
+def _number_key(path: Path) -> list[tuple[int, str]]:
     """Return a sort key that places bag_2 before bag_10."""
     return [(int(part), '') if part.isdigit() else (0, part)
             for part in re.split(r'(\d+)', path.name)]
@@ -136,43 +137,44 @@ def _stem(path: Path) -> str:
     return name or path.name
 
 
-def _read_metadata(path: Path) -> Known:
+def _read_metadata(path: Path) -> BagMetadata:
     """Return the content of a metadata.yaml; with ``trouble`` if it is invalid."""
     import yaml
     if not limits.is_file(path):
-        return Known(trouble=f'{path}: is not a regular file and is ignored')
+        return BagMetadata(trouble=f'{path}: is not a regular file and is ignored')
     try:
-        return _known(yaml.load(limits.read_text(path), Loader=safe_loader(aliases=True)))
+        return _parse_metadata(yaml.load(limits.read_text(path), Loader=safe_loader(aliases=True)))
     except (OSError, MemoryError):
         raise
     except limits.LimitReached as error:
-        return Known(trouble=f'{error}; it is ignored')
+        return BagMetadata(trouble=f'{error}; it is ignored')
     except Exception as error:      # any error: types, numbers, nesting, encoding
         why = ' '.join(str(error).split())[:100] if isinstance(error, yaml.YAMLError) else (
             'not the structure that rosbag2 writes')
-        return Known(trouble=f'{path}: cannot be parsed ({why}) and is ignored')
+        return BagMetadata(trouble=f'{path}: cannot be parsed ({why}) and is ignored')
 
 
-def _known(content: dict[str, dict[str, Any]]) -> Known:
-    known = content['rosbag2_bagfile_information']
-    spans = ((Path(file['path']).name, _span(file)) for file in known.get('files') or ())
+def _parse_metadata(content: dict[str, dict[str, Any]]) -> BagMetadata:
+    metadata = content['rosbag2_bagfile_information']
+    spans = ((Path(file['path']).name, _span(file)) for file in metadata.get('files') or ())
     formats = {topic['topic_metadata'].get('serialization_format', 'cdr')
-               for topic in known.get('topics_with_message_count') or ()}
+               for topic in metadata.get('topics_with_message_count') or ()}
     if not all(isinstance(form, str) for form in formats):
         raise ValueError('a serialization format that is not text')
-    return Known(      # a file named twice is read once
-        tuple(dict.fromkeys(Path(name).name for name in known.get('relative_file_paths') or ())),
-        _span(known), {name: span for name, span in spans if span},
+    paths = [Path(path).name for path in metadata.get('relative_file_paths') or ()]
+    return BagMetadata(
+        tuple(dict.fromkeys(paths)),      # a file named twice is read once
+        _span(metadata), {name: span for name, span in spans if span},
         '' if 'cdr' in formats else ', '.join(sorted(formats)))
 
 
-def _span(known: dict[str, Any]) -> Span | None:
-    if not known.get('message_count') or 'starting_time' not in known:
+def _span(metadata: dict[str, Any]) -> Span | None:
+    if not metadata.get('message_count') or 'starting_time' not in metadata:
         return None
-    end_ns = (int(known['starting_time']['nanoseconds_since_epoch'])
-              + int(known['duration']['nanoseconds']))
-    count = int(known['message_count'])
-    if not (possible(end_ns) and 0 <= count < limits.LATEST_NS):
+    end_ns = (int(metadata['starting_time']['nanoseconds_since_epoch'])
+              + int(metadata['duration']['nanoseconds']))
+    count = int(metadata['message_count'])
+    if not (is_valid_time(end_ns) and 0 <= count < limits.LATEST_NS):
         raise ValueError('invalid times or counts')
     return Span(end_ns, count)
 
@@ -248,5 +250,5 @@ def _with_wal(path: Path, wal: Path, folder: Path) -> Path:
     return target
 
 
-def names(paths: Sequence[Path]) -> str:
+def file_names(paths: Sequence[Path]) -> str:
     return ', '.join(path.name for path in paths)

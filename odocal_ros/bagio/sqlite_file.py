@@ -11,7 +11,7 @@ import struct
 from typing import Any
 from urllib.parse import quote
 
-from odocal_ros.bagio.channels import Channel, FileBytes, FORMATS, possible, Recording
+from odocal_ros.bagio.bag_file import BagFile, Channel, FileBytes, FORMATS, is_valid_time
 from odocal_ros.errors import BadBag
 from odocal_ros.safe_io.limits import Damaged, factor, MESSAGE
 
@@ -28,7 +28,7 @@ BY_TIME = ('SELECT m.rowid, topic_id, timestamp, data FROM (SELECT rowid AS row 
 TEXTS = ('name', 'type', 'serialization_format')
 
 
-class Leaves:
+class LeafPages:
     """The leaf pages of the table of messages that are in the file."""
 
     def __init__(self, path: Path) -> None:
@@ -146,7 +146,7 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
     return value << 8 | data[at + 8], at + 9
 
 
-class SqliteFile(Recording):
+class SqliteFile(BagFile):
     """
     A database of messages.
 
@@ -158,7 +158,7 @@ class SqliteFile(Recording):
         super().__init__(path)
         self._opened = path.stat()
         self._size = self._opened.st_size
-        self._leaves: Leaves | None = None
+        self._leaf_pages: LeafPages | None = None
         self._sorted = True
         self._db = sqlite3.connect(f'file:{quote(str(path.resolve()))}?mode=ro&immutable=1',
                                    uri=True, check_same_thread=False)
@@ -215,7 +215,7 @@ class SqliteFile(Recording):
         try:
             self._count()
         except Damaged as error:
-            self._to_leaves(error)
+            self._use_leaf_pages(error)
             self._count()
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
@@ -227,31 +227,32 @@ class SqliteFile(Recording):
         return {msgtype: (FORMATS.get(form, ''), text) for msgtype, form, text in rows
                 if all(isinstance(x, str) for x in (msgtype, form, text))}
 
-    def _to_leaves(self, error: Damaged) -> None:
+    def _use_leaf_pages(self, error: Damaged) -> None:
         """Switch to the leaf pages: inner pages, which SQL needs, are damaged or missing."""
         try:
-            self._leaves = Leaves(self.path)
+            self._leaf_pages = LeafPages(self.path)
         except (ValueError, struct.error, IndexError) as second:
             raise Damaged(f'{error}; {second}') from None
-        self.damage = 'cut off' if self._leaves.cut else str(error)
+        self.damage = 'cut off' if self._leaf_pages.cut else str(error)
 
     def _scan(self) -> Iterator[tuple[int, int]]:
-        rows: Iterator[tuple[Any, ...]] = self._leaves.rows(None) if self._leaves else self._query(
-            'SELECT topic_id, timestamp, NULL FROM messages')
+        rows: Iterator[tuple[Any, ...]] = (
+            self._leaf_pages.rows(None) if self._leaf_pages
+            else self._query('SELECT topic_id, timestamp, NULL FROM messages'))
         before = -1
         for key, time_ns, _ in rows:
-            if key in self._channels and possible(time_ns):
+            if key in self._channels and is_valid_time(time_ns):
                 self._sorted &= time_ns >= before
                 before = time_ns
                 yield key, time_ns
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
         """Yield the messages of some topics (name -> type) by time; as written if damaged."""
-        wanted, last = self._wanted(topics), -1
-        if not self._leaves:
+        wanted, last = self._channels_of(topics), -1
+        if not self._leaf_pages:
             try:
                 for row, key, time_ns, raw in self._query(AS_STORED if self._sorted else BY_TIME):
-                    if key in wanted and possible(time_ns):
+                    if key in wanted and is_valid_time(time_ns):
                         # text and numbers are not messages: readers count b'' as unreadable
                         yield wanted[key], time_ns, raw if isinstance(raw, bytes) else b''
                     last = row
@@ -259,11 +260,11 @@ class SqliteFile(Recording):
                 return
             except Damaged as error:
                 self._refuse_if_changed()
-                self._to_leaves(error)
+                self._use_leaf_pages(error)
                 self._count()
-        assert self._leaves
-        for key, time_ns, raw in self._leaves.rows(wanted, last if self._sorted else -1):
-            if possible(time_ns):
+        assert self._leaf_pages
+        for key, time_ns, raw in self._leaf_pages.rows(wanted, last if self._sorted else -1):
+            if is_valid_time(time_ns):
                 yield wanted[key], time_ns, raw
 
     def _refuse_if_changed(self) -> None:
@@ -275,5 +276,5 @@ class SqliteFile(Recording):
 
     def close(self) -> None:
         self._db.close()
-        if self._leaves:
-            self._leaves.close()
+        if self._leaf_pages:
+            self._leaf_pages.close()

@@ -14,7 +14,7 @@ import numpy as np
 
 from odocal_ros.bagio import encode
 from odocal_ros.bagio.encode import Topic
-from odocal_ros.bagio.types import rosbags_for
+from odocal_ros.bagio.rosbags_readers import require_rosbags
 from odocal_ros.errors import BadUsage
 
 STORAGES = ('mcap', 'sqlite3', 'rosbag1')
@@ -104,7 +104,7 @@ def _is_bag(path: Path) -> bool:
 
 def _write(path: Path, topics: Sequence[Topic], storage: str, compression: str,
            progress: Callable[[float], None] | None) -> None:
-    with rosbags_for('writing a bag'):
+    with require_rosbags('writing a bag'):
         from rosbags import rosbag1
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
         from rosbags.typesys import get_typestore, Stores

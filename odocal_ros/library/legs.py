@@ -9,7 +9,7 @@ from typing import Any, TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from odocal_ros.bagio.read import Bag
-from odocal_ros.bagio.segments import DROPPED, STATUS_NAME, STATUS_TYPE
+from odocal_ros.bagio.segments import DROPPED_EVENTS, STATUS_NAME, STATUS_TYPE
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.inputs import INPUTS
 from odocal_ros.data.leg import LegRecorder
@@ -44,7 +44,7 @@ def marked_legs(bag: Bag) -> list[tuple[int, int]]:
     legs = []
     for values in leg_statuses(bag):
         start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
-        if values.get('leg_event') not in DROPPED and start > 0:
+        if values.get('leg_event') not in DROPPED_EVENTS and start > 0:
             legs.append((start, stop))
     return sorted(legs)
 
@@ -79,7 +79,7 @@ def cut_short(recorder: LegRecorder) -> tuple[Reason, ...]:
 
 def dropped_legs(bag: Bag) -> bool:
     """Return True if the operator cancelled or undid a leg that is marked in the bag."""
-    return any(values.get('leg_event') in DROPPED for values in leg_statuses(bag))
+    return any(values.get('leg_event') in DROPPED_EVENTS for values in leg_statuses(bag))
 
 
 def leg_statuses(bag: Bag) -> list[dict[str, str]]:
@@ -104,7 +104,7 @@ def _remember(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str
     # ids begin again with each run of the node: a leg is identified by its start too
     leg_id = values.get('leg_id', ''), start
     before = last.get(leg_id, {}).get('leg_event', '')
-    if leg_id[0] not in ('', '0') and before not in DROPPED:
+    if leg_id[0] not in ('', '0') and before not in DROPPED_EVENTS:
         last[leg_id] = values | {'leg_event': values.get('leg_event') or before}
 
 

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 
 from odocal_ros import __version__
-from odocal_ros.bagio.segments import DROPPED, STATUS_TYPE
+from odocal_ros.bagio.segments import DROPPED_EVENTS, STATUS_TYPE
 from odocal_ros.live.filing import output_root
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_writer import JournalWriter, Received
@@ -128,8 +128,8 @@ class Journal:
     def receive(self, session: Session, array: DiagnosticArray) -> None:
         """Store a published status: it contains the marks of the leg."""
         leg_id, event = session.leg_id, session.event
-        dropped = event in DROPPED and leg_id not in self._dropped
-        if event in DROPPED:
+        dropped = event in DROPPED_EVENTS and leg_id not in self._dropped
+        if event in DROPPED_EVENTS:
             self._dropped.add(leg_id)
         if leg_id != self._leg_id and not dropped:
             return

@@ -13,8 +13,8 @@ import shutil
 import time
 from typing import TextIO
 
-from odocal_ros.bagio.channels import Channel
-from odocal_ros.bagio.chunks import Chunk
+from odocal_ros.bagio.bag_file import Channel
+from odocal_ros.bagio.mcap_write import Chunk
 from odocal_ros.bagio.segments import JOURNAL, SegmentedBag
 from odocal_ros.safe_io.atomic_files import new_folder, PART, write_text
 
@@ -170,7 +170,8 @@ class LegJournal:
         if self._bag is None:
             self._bag = self._open()
         # joining files, this one included, temporarily needs their size twice
-        size = 2 * sum(chunk.size for chunk in self._waiting) + self._bag.loose_size + HEADS_BYTES
+        size = 2 * sum(chunk.size for chunk in self._waiting) + HEADS_BYTES
+        size += self._bag.unjoined_size
         if self._others + self._bag.size + size > self.plan.limit:
             taken = make_room(self.plan.root, self.plan.limit, size)
             self._others = taken - self._bag.size

@@ -10,8 +10,8 @@ import queue
 import threading
 from typing import Any
 
-from odocal_ros.bagio.channels import Channel
-from odocal_ros.bagio.chunks import Chunk, pack
+from odocal_ros.bagio.bag_file import Channel
+from odocal_ros.bagio.mcap_write import Chunk, pack
 from odocal_ros.live.journal_leg import LegJournal, Plan
 from odocal_ros.live.messages import definition_of
 

@@ -62,7 +62,7 @@ class Allowance:
         self.most = int(unpacked * packed / max(total, packed, 1) + ratio * packed)
         self._used = 0
 
-    def again(self) -> None:
+    def restart(self) -> None:
         """Restart the count for another pass."""
         self._used = 0
 

@@ -15,7 +15,7 @@ import pytest
 import ros_bags
 from ros_bags import T0
 
-from odocal_ros.bagio import types
+from odocal_ros.bagio import rosbags_readers
 from odocal_ros.bagio.mcap_records import MAGIC
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.errors import BadBag, BadData
@@ -165,7 +165,7 @@ DEFINITIONS = {
 
 @pytest.mark.parametrize('kind', DEFINITIONS)
 def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
-    monkeypatch.setattr('odocal_ros.bagio.types.SECONDS', 3)
+    monkeypatch.setattr('odocal_ros.bagio.rosbags_readers.SECONDS', 3)
     most, said = peak(database(
         tmp_path, ("UPDATE topics SET type = 'a/msg/B'",),
         ("UPDATE message_definitions SET topic_type = 'a/msg/B', encoding = ?, "
@@ -177,8 +177,9 @@ def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
 
 def test_annotations_cost_nothing():
     strings = '"a (b" ' * 20_000
-    found = types.parsed('a/msg/B', 'idl', f'module a {{ module msg {{ @verbatim(text='
-                               f'{strings}) @x struct B {{ @y(z=(1)) long x; /* ( */ }}; }}; }};')
+    text = (f'module a {{ module msg {{ @verbatim(text={strings}) '
+            '@x struct B { @y(z=(1)) long x; /* ( */ }; }; };')
+    found = rosbags_readers.parse_definition('a/msg/B', 'idl', text)
     assert [name for name, _ in found['a/msg/B'][1]] == ['x']
 
 

@@ -18,9 +18,9 @@ from rosbags import rosbag1
 from rosbags.rosbag1 import reader
 from rosbags.rosbag2 import storage_mcap
 
-from odocal_ros.bagio import rosbag1_file, write
+from odocal_ros.bagio import rosbags_readers, write
+from odocal_ros.bagio.any_bag_file import AnyBagFile
 from odocal_ros.bagio.encode import counter, fix, imu
-from odocal_ros.bagio.parts import Part
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.errors import BadBag
 from odocal_ros.safe_io.limits import Allowance, LimitReached
@@ -37,7 +37,7 @@ def test_the_version_is_one_that_was_looked_at():
 
 
 def test_the_reader_of_rosbag1_is_as_we_take_it(tmp_path):
-    assert set(reader.decompressors) == set(rosbag1_file.PACKINGS)
+    assert set(reader.decompressors) == set(rosbags_readers.PACKINGS)
     assert set(reader.Chunk._fields) == {'datasize', 'datapos', 'decompressor'}
     assert list(inspect.signature(rosbag1.Reader.read_index_data).parameters) == [
         'self', 'pos', 'indexes']
@@ -49,7 +49,7 @@ def test_the_reader_of_rosbag1_is_as_we_take_it(tmp_path):
         def unpack(self, packing, data, size=None):
             taken.append(packing)
             return super().unpack(packing, data, size)
-    file = rosbag1_file.Rosbag1File(path, Counted(path, 1), lambda raw, _: raw)
+    file = rosbags_readers.Rosbag1File(path, Counted(path, 1), lambda raw, _: raw)
     assert len(list(file.messages({'/imu': 'sensor_msgs/msg/Imu'}))) == 3
     assert taken == ['bz2']
     file.close()
@@ -68,12 +68,12 @@ def test_a_rosbag1_whose_index_runs_in_circles(tmp_path, monkeypatch):
     data[at:at + 4] = (1000).to_bytes(4, 'little')
     path.write_bytes(data)
     with pytest.raises(BadBag, match='contains a cycle'):
-        Part(path, path, '.bag', len(data), print)
+        AnyBagFile(path, path, '.bag', len(data), print)
 
 
 def test_a_rosbag1_that_unpacks_to_more_than_it_may(tmp_path, monkeypatch):
     path = ros_bags.write(tmp_path / 'a.bag', ros_bags.drive(1.0), 'rosbag1')
-    part = Part(path, path, '.bag', 2**40, lambda raw, _: raw)
+    part = AnyBagFile(path, path, '.bag', 2**40, lambda raw, _: raw)
     part._allowance.most = 1000
     with pytest.raises(LimitReached):
         list(part.batches({'/imu/data': 'sensor_msgs/msg/Imu'}))

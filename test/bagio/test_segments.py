@@ -14,9 +14,9 @@ import ros_bags
 import ros_messages as make
 from rosbags import rosbag2
 
-from odocal_ros.bagio import chunks, segments
-from odocal_ros.bagio.channels import Channel
-from odocal_ros.bagio.chunks import pack, read_chunks, write_file
+from odocal_ros.bagio import mcap_write, segments
+from odocal_ros.bagio.bag_file import Channel
+from odocal_ros.bagio.mcap_write import pack, read_chunks, write_file
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.segments import JOURNAL, part_name, SegmentedBag, whole_name
 from odocal_ros.errors import BadBag
@@ -66,7 +66,7 @@ def read(path):
 @pytest.mark.parametrize('zstd', [True, False])
 def test_other_readers_read_a_segment(tmp_path, monkeypatch, zstd):
     if not zstd:
-        monkeypatch.setattr(chunks, '_zstd', lambda: None)
+        monkeypatch.setattr(mcap_write, '_zstd', lambda: None)
     packed, messages = second(0)
     written = write_file(tmp_path / 'part.mcap', CHANNELS, packed)
     assert written.size == (tmp_path / 'part.mcap').stat().st_size
@@ -95,12 +95,12 @@ def test_records_are_read_without_an_index_and_chunks_come_back_as_packed(tmp_pa
 def test_the_index_of_a_chunk_points_at_its_messages(monkeypatch, zstd):
     # rosbags reads without it, the readers of ros2 bag and Foxglove do not
     if not zstd:
-        monkeypatch.setattr(chunks, '_zstd', lambda: None)
+        monkeypatch.setattr(mcap_write, '_zstd', lambda: None)
     times, raws = [T0 + 5, T0 + 3, T0 + 9], [b'a' * 10, b'b', b'c' * 300]
     chunk = pack(7, times, raws, sequence=40)
-    start_ns, end_ns, size, crc, form, packed = chunks._chunk_body(chunk.record)
+    start_ns, end_ns, size, crc, form, packed = mcap_write._chunk_body(chunk.record)
     records = chunk.record[-packed:]
-    records = chunks.zstd_module().decompress(records) if zstd else records
+    records = mcap_write.zstd_module().decompress(records) if zstd else records
     assert (start_ns, end_ns, size, crc, form) == (
         T0 + 3, T0 + 9, len(records), zlib.crc32(records), 'zstd' if zstd else '')
     channel, nbytes = struct.unpack_from('<HI', chunk.index, 9)
@@ -131,12 +131,12 @@ def test_a_finished_bag_is_one_file_with_metadata(tmp_path):
 
 
 def test_sixty_segments_are_joined_while_it_grows(tmp_path, monkeypatch):
-    monkeypatch.setattr(segments, 'TOGETHER', 3)
+    monkeypatch.setattr(segments, 'FILES_JOINED', 3)
     bag, messages = grown(tmp_path / 'leg', 9)
     assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [
         part_name(0, 0), part_name(1, 3), part_name(4, 6), part_name(7, 7), part_name(8, 8)]
     assert bag.size == sum(p.stat().st_size for p in bag.folder.glob('*.mcap'))
-    assert bag.loose_size == sum((bag.folder / part_name(k, k)).stat().st_size for k in (7, 8))
+    assert bag.unjoined_size == sum((bag.folder / part_name(k, k)).stat().st_size for k in (7, 8))
     assert read(bag.folder) == messages
 
 
@@ -150,9 +150,9 @@ def test_a_kill_at_any_step_of_joining_loses_and_doubles_nothing(tmp_path, join)
     for step in count(1):
         folder = tmp_path / str(step) / 'leg'
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(segments, 'TOGETHER', 99)
+            patch.setattr(segments, 'FILES_JOINED', 99)
             bag, messages = grown(folder, 5)
-            patch.setattr(segments, 'TOGETHER', 4)
+            patch.setattr(segments, 'FILES_JOINED', 4)
             disk = Refusing(step, for_ever=True, error=Killed()).put_in(patch)
             with suppress(Killed):
                 join(bag)

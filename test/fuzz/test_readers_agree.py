@@ -16,8 +16,8 @@ import ros_bags
 from ros_bags import T0
 import ros_messages as make
 
-from odocal_ros.bagio import chunks, mcap_gather
-from odocal_ros.bagio.channels import Channel
+from odocal_ros.bagio import mcap_columns, mcap_write
+from odocal_ros.bagio.bag_file import Channel
 from odocal_ros.bagio.mcap_file import McapFile
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.errors import OdocalError
@@ -56,8 +56,9 @@ def clean(tmp_path_factory):
 def walked(monkeypatch):
     """Count the chunks that had to be walked over."""
     count = []
-    given = McapFile._walked
-    monkeypatch.setattr(McapFile, '_walked', lambda *args: count.append(1) or given(*args))
+    given = McapFile._messages_by_scan
+    monkeypatch.setattr(
+        McapFile, '_messages_by_scan', lambda *args: count.append(1) or given(*args))
     return count
 
 
@@ -79,9 +80,9 @@ def test_simulated_bags(clean, monkeypatch, name):
 @pytest.mark.parametrize('form', ['zstd', 'lz4', ''])
 @pytest.mark.parametrize('lengths', [1, 7])
 def test_chunks_that_overlap(tmp_path, monkeypatch, walked, form, lengths):
-    monkeypatch.setattr(mcap_gather, 'BLOCK', 4000)
+    monkeypatch.setattr(mcap_columns, 'BLOCK', 4000)
     if form != 'zstd':
-        monkeypatch.setattr(chunks, '_packed', lambda records: (
+        monkeypatch.setattr(mcap_write, '_packed', lambda records: (
             form, frame.compress(records) if form else records))
     rng = np.random.default_rng(1)
     channels = {k: Channel(f'/t{k}', 'std_msgs/msg/String') for k in (3, 9, 500)}
@@ -90,9 +91,9 @@ def test_chunks_that_overlap(tmp_path, monkeypatch, walked, form, lengths):
         key = (3, 9, 500)[k % 3]
         times = (T0 + 100 * k + rng.integers(0, 400, 30)).tolist()     # not in order either
         raws = [b'\0\1\0\0' + rng.bytes(int(n)) for n in rng.integers(9, 9 + lengths, 30)]
-        packed.append(chunks.pack(key, times, raws))
+        packed.append(mcap_write.pack(key, times, raws))
         sent.setdefault(f'/t{key}', []).append((min(times), list(zip(times, raws, strict=True))))
-    chunks.write_file(tmp_path / 'bag.mcap', channels, packed)
+    mcap_write.write_file(tmp_path / 'bag.mcap', channels, packed)
     (_, found, *_), one_by_one = both(tmp_path / 'bag.mcap', monkeypatch)
     assert found == one_by_one[1]
     for topic, parts in sent.items():

@@ -11,8 +11,8 @@ from faults import Refusing
 import pytest
 
 from odocal_ros.bagio import segments
-from odocal_ros.bagio.channels import Channel
-from odocal_ros.bagio.chunks import pack
+from odocal_ros.bagio.bag_file import Channel
+from odocal_ros.bagio.mcap_write import pack
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.live import journal_leg
@@ -70,7 +70,7 @@ def times(folder):
 @pytest.fixture(autouse=True)
 def joined_soon(monkeypatch):
     """Join files already after three."""
-    monkeypatch.setattr(segments, 'TOGETHER', 3)
+    monkeypatch.setattr(segments, 'FILES_JOINED', 3)
 
 
 def test_one_refused_step_loses_nothing_but_what_it_says(tmp_path, monkeypatch):

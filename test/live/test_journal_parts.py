@@ -12,7 +12,7 @@ import pytest
 import ros_bags
 import ros_messages as make
 
-from odocal_ros.bagio.chunks import pack
+from odocal_ros.bagio.mcap_write import pack
 from odocal_ros.bagio.segments import JOURNAL
 from odocal_ros.errors import BadConfig
 from odocal_ros.library.read_bag import journal_notes

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.bagio.channels import Batch, Channel
-from odocal_ros.bagio.mcap_records import Chunk, MESSAGE, MESSAGE_INDEX, Place, RECORD
+from odocal_ros.bagio.bag_file import Batch, Channel
+from odocal_ros.bagio.mcap_records import Chunk, ChunkIndex, MESSAGE, MESSAGE_INDEX, RECORD
 from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.messages.raws import Raws, Rows
 from odocal_ros.safe_io.limits import Damaged, LATEST_NS
@@ -41,64 +41,70 @@ class Columns(NamedTuple):
 
 
 Block = list[Chunk | Damaged]
-Read = Callable[[Sequence[Place]], Block]                     # of adjacent chunks
-Walk = Callable[[Chunk], Sequence[tuple[int, int, bytes]]]    # time, channel, message; or Damaged
-Note = Callable[[Damaged], None]
+ReadChunks = Callable[[Sequence[ChunkIndex]], Block]     # of adjacent chunks
+# returns time, channel and message of each, or raises Damaged
+ScanChunk = Callable[[Chunk], Sequence[tuple[int, int, bytes]]]
+ReportDamage = Callable[[Damaged], None]
 
 
-def batches(places: Sequence[Place], wanted: Mapping[int, Channel], known: Collection[int],
-            read: Read, walk: Walk, note: Note) -> Iterator[Batch]:
+def batches(index: Sequence[ChunkIndex], channels: Mapping[int, Channel],
+            known_channels: Collection[int], read_chunks: ReadChunks, scan: ScanChunk,
+            report_damage: ReportDamage) -> Iterator[Batch]:
     """
     Yield the messages of some channels by time, many at a time.
 
-    places : chunks in order of their stated times.   known : all channels of the file.
-    walk   : returns the messages of a chunk one by one.   note : called with each damage.
+    index : chunks in order of their stated times.   known_channels : all channels of the file.
+    scan : returns the messages of a chunk one by one.   report_damage : called with each damage.
     """
-    mine, all_known = _table(wanted), _table(known)
-    late: Columns | None = None          # messages that may be later than those of the next chunk
+    is_requested, is_known = _table(channels), _table(known_channels)
+    later: Columns | None = None         # messages that may be later than those of the next chunk
     at, size = 0, 1                      # the first block is one chunk, which is often sufficient
-    while at < len(places):
-        block, at = _block(places, at, size, read)
-        found = _columns(block, all_known, walk, note)
-        if len(wanted) < len(known):
-            found = found.take(mine[found.channel])
-        found = _by_time(_joined(late, found) if late else found)
-        end = int(np.searchsorted(found.time_ns, places[at].start_ns)) if at < len(
-            places) else len(found.time_ns)
-        late = found.take(slice(end, None)) if end < len(found.time_ns) else None
+    while at < len(index):
+        block, at = _read_block(index, at, size, read_chunks)
+        found = _columns(block, is_known, scan, report_damage)
+        if len(channels) < len(known_channels):
+            found = found.take(is_requested[found.channel])
+        found = _by_time(_join(later, found) if later else found)
+        end = int(np.searchsorted(found.time_ns, index[at].start_ns)) if at < len(
+            index) else len(found.time_ns)
+        later = found.take(slice(end, None)) if end < len(found.time_ns) else None
         if end:
-            yield _batch(found.take(slice(end)), wanted)
-        size = BLOCK + int(late.raws.size.sum() if late else 0)
+            yield _batch(found.take(slice(end)), channels)
+        size = BLOCK + int(later.raws.size.sum() if later else 0)
 
 
-def _block(places: Sequence[Place], at: int, size: int, read: Read) -> tuple[Block, int]:
+def _read_block(index: Sequence[ChunkIndex], at: int, size: int,
+                read_chunks: ReadChunks) -> tuple[Block, int]:
     """Read chunks from number ``at``, of ``size`` bytes or more; return them and the next one."""
     block: Block = []
-    end_ns, first, beside = 0, at, 0
-    while at < len(places) and (size > 0 or places[at].start_ns < end_ns and size > -BLOCK):
-        place = places[at]
-        if place.at != beside:
-            block += read(places[first:at]) if at > first else []
+    end_ns, first, adjacent = 0, at, 0
+    while at < len(index) and (size > 0 or index[at].start_ns < end_ns and size > -BLOCK):
+        entry = index[at]
+        if entry.at != adjacent:
+            block += read_chunks(index[first:at]) if at > first else []
             first = at
-        beside = place.at + place.size + place.index_size
-        size -= max(place.size, place.unpacked)
-        end_ns, at = max(end_ns, place.end_ns), at + 1
-    return block + read(places[first:at]), at
+        adjacent = entry.at + entry.size + entry.index_size
+        size -= max(entry.size, entry.unpacked_size)
+        end_ns, at = max(end_ns, entry.end_ns), at + 1
+    return block + read_chunks(index[first:at]), at
 
 
-def _columns(block: Block, known: Bools, walk: Walk, note: Note) -> Columns:
+def _columns(block: Block, known_channels: Bools, scan: ScanChunk,
+             report_damage: ReportDamage) -> Columns:
     """Return the messages of chunks; of one with an unexpected layout by a sequential scan."""
-    found = _gathered([chunk for chunk in block if isinstance(chunk, Chunk)], known)
+    chunks = [chunk for chunk in block if isinstance(chunk, Chunk)]
+    found = _columns_by_index(chunks, known_channels)
     parts = []
     for chunk in block:
         try:
             if isinstance(chunk, Damaged):
                 raise chunk
             if found is None:
-                parts.append(_gathered([chunk], known) or _walked(walk(chunk)))
+                parts.append(_columns_by_index([chunk], known_channels)
+                             or _columns_of_messages(scan(chunk)))
         except Damaged as error:
-            note(error)
-    return found or _joined(*parts)
+            report_damage(error)
+    return found or _join(*parts)
 
 
 def _table(keys: Collection[int]) -> Bools:
@@ -108,10 +114,10 @@ def _table(keys: Collection[int]) -> Bools:
     return table
 
 
-def _gathered(chunks: Sequence[Chunk], known: Bools) -> Columns | None:
+def _columns_by_index(chunks: Sequence[Chunk], known_channels: Bools) -> Columns | None:
     """Return the messages of chunks; None if any of them has an unexpected layout."""
-    chunks = _in_one(chunks)
-    starts = [_starts(chunk) for chunk in chunks]
+    chunks = _concatenated(chunks)
+    starts = [_record_offsets(chunk) for chunk in chunks]
     counts = np.array([len(s) for s in starts])
     if not chunks or not counts.all():
         return None
@@ -129,7 +135,7 @@ def _gathered(chunks: Sequence[Chunk], known: Bools) -> Columns | None:
     chain = ((head['size'] == size).all() and size.min() >= BODY and (head['op'] == MESSAGE).all()
              and start[first].tolist() == [chunk.at for chunk in chunks])
     time_ns, channel = head['time_ns'].copy(), head['channel'].copy()
-    if not chain or not known[channel].all():
+    if not chain or not known_channels[channel].all():
         return None
     least, most = np.minimum.reduceat(time_ns, first), np.maximum.reduceat(time_ns, first)
     for chunk, a, b in zip(chunks, least.tolist(), most.tolist(), strict=True):
@@ -138,7 +144,7 @@ def _gathered(chunks: Sequence[Chunk], known: Bools) -> Columns | None:
     return Columns(time_ns, channel, Raws(data, start + HEAD.itemsize, size - BODY))
 
 
-def _in_one(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
+def _concatenated(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
     if len({id(chunk.data) for chunk in chunks}) <= 1:
         return chunks
     data, at, found = b''.join([chunk.records for chunk in chunks]), 0, []
@@ -149,9 +155,9 @@ def _in_one(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
     return found
 
 
-def _starts(chunk: Chunk) -> Ints:
+def _record_offsets(chunk: Chunk) -> Ints:
     """Return the offsets of the records of a chunk from its message index, in any order."""
-    found, at, index = [np.empty(0, np.int64)], 0, chunk.begins
+    found, at, index = [np.empty(0, np.int64)], 0, chunk.message_index
     while at + 15 <= len(index):
         op, size = RECORD.unpack_from(index, at)
         (length,) = struct.unpack_from('<I', index, at + 11)
@@ -163,15 +169,15 @@ def _starts(chunk: Chunk) -> Ints:
     return np.concatenate(found) + chunk.at
 
 
-def _walked(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
+def _columns_of_messages(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
     return Columns(np.array([entry[0] for entry in entries], np.int64),
                    np.array([entry[1] for entry in entries], np.uint16),
                    Raws.of([entry[2] for entry in entries]))
 
 
-def _joined(*parts: Columns) -> Columns:
+def _join(*parts: Columns) -> Columns:
     if not parts:
-        return _walked([])
+        return _columns_of_messages([])
     packed = [part.raws.packed() for part in parts]
     base = np.cumsum([0, *(len(raws.data) for raws in packed)])
     return Columns(
@@ -188,11 +194,12 @@ def _by_time(found: Columns) -> Columns:
     return found.take(np.argsort(found.time_ns, kind='stable'))
 
 
-def _batch(found: Columns, wanted: Mapping[int, Channel]) -> Batch:
+def _batch(found: Columns, channels: Mapping[int, Channel]) -> Batch:
     batch: Batch = {}
-    for topic in dict.fromkeys(channel.topic for channel in wanted.values()):
-        mine = [found.channel == key for key, channel in wanted.items() if channel.topic == topic]
-        rows = np.flatnonzero(np.logical_or.reduce(mine))
+    for topic in dict.fromkeys(channel.topic for channel in channels.values()):
+        of_topic = [found.channel == key for key, channel in channels.items()
+                    if channel.topic == topic]
+        rows = np.flatnonzero(np.logical_or.reduce(of_topic))
         if len(rows):
             batch[topic] = found.time_ns[rows], found.raws.take(rows)
     return batch

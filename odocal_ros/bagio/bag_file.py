@@ -16,7 +16,7 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.messages.raws import Raws
 from odocal_ros.safe_io.limits import LATEST_NS
 
-LET_GO = 2**23      # judgement: bytes
+PREALLOCATED_BYTES = 2**23      # judgement: bytes
 FORMATS = {'ros2msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl'}
 
 
@@ -26,7 +26,7 @@ class FileBytes:
     def __init__(self, path: Path) -> None:
         # glibc returns a released block of memory to the system, and allocates all its pages again
         # for the next one, unless a larger block was released earlier
-        np.empty(LET_GO, np.uint8)
+        np.empty(PREALLOCATED_BYTES, np.uint8)
         self._path = path
         self._file = path.open('rb')
         self._size = os.fstat(self._file.fileno()).st_size
@@ -65,7 +65,7 @@ class Channel:
 Batch = dict[str, tuple[Ints, Raws]]
 
 
-class Recording:
+class BagFile:
     """
     A file of a bag: its channels by number, their counts, first and last time.
 
@@ -109,15 +109,15 @@ class Recording:
     def channels(self) -> list[Channel]:
         return list(self._channels.values())
 
-    def _wanted(self, topics: Mapping[str, str]) -> dict[int, Channel]:
+    def _channels_of(self, topics: Mapping[str, str]) -> dict[int, Channel]:
         return {k: c for k, c in self._channels.items() if topics.get(c.topic) == c.msgtype}
 
 
-def possible(time_ns: int) -> bool:
+def is_valid_time(time_ns: int) -> bool:
     return isinstance(time_ns, int) and 0 <= time_ns < LATEST_NS
 
 
-def overlapping(items: Iterable[Any]) -> Iterator[list[Any]]:
+def group_overlapping(items: Iterable[Any]) -> Iterator[list[Any]]:
     """Yield groups of items that overlap in time; the items are in order of ``start_ns``."""
     together: list[Any] = []
     end_ns = 0

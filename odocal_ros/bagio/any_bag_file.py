@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.bagio.channels import Batch, Channel, Recording
+from odocal_ros.bagio.bag_file import BagFile, Batch, Channel
 from odocal_ros.bagio.mcap_file import McapFile
-from odocal_ros.bagio.rosbag1_file import Rosbag1File
+from odocal_ros.bagio.rosbags_readers import Rosbag1File
 from odocal_ros.bagio.sqlite_file import SqliteFile
 from odocal_ros.errors import BadBag
 from odocal_ros.messages.raws import Raws
@@ -25,7 +25,7 @@ BLOCK = 20_000         # judgement: messages in a batch
 ZSTD = b'\x28\xb5\x2f\xfd'
 
 
-class Part:
+class AnyBagFile:
     """A file of a bag; ``file`` has its metadata."""
 
     def __init__(self, path: Path, file: Path, kind: str, total: int,
@@ -33,7 +33,7 @@ class Part:
         self.path = path
         self._allowance = Allowance(path, total)
         try:
-            self._file: Recording = (
+            self._file: BagFile = (
                 McapFile(file, self._allowance) if kind == '.mcap' else
                 SqliteFile(file) if kind == '.db3' else
                 Rosbag1File(file, self._allowance, convert))
@@ -48,12 +48,12 @@ class Part:
         """Yield the messages of some topics (name -> type), many at a time, as CDR."""
         batches = self._file.batches(topics)
         first = next(batches, {}) if batches else {}
-        if batches and not any(_packed(raws[0]) for _, raws in first.values()):
+        if batches and not any(_is_compressed(raws[0]) for _, raws in first.values()):
             yield from chain([first] * bool(first), batches)
             return
         del batches
         stream = self._messages(topics)
-        while batch := group(stream):
+        while batch := next_batch(stream):
             yield batch
 
     def stream(self, topics: Mapping[str, str]) -> Iterator[tuple[Channel, int, bytes]]:
@@ -71,7 +71,7 @@ class Part:
         if first is None:
             return iter(())
         stream = chain([first], stream)
-        return self._unpacked(stream) if _packed(first[2]) else stream
+        return self._unpacked(stream) if _is_compressed(first[2]) else stream
 
     def _unpacked(self, stream: Iterator[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:
         """Yield messages unpacked; b'' if that fails, which readers count as unreadable."""
@@ -89,12 +89,12 @@ class Part:
             self._file.close()
 
 
-def _packed(raw: bytes) -> bool:
+def _is_compressed(raw: bytes) -> bool:
     """Return True if each message is compressed separately: CDR starts with a zero byte."""
     return raw[:4] == ZSTD
 
 
-def group(stream: Iterator[tuple[Any, ...]]) -> Batch:
+def next_batch(stream: Iterator[tuple[Any, ...]]) -> Batch:
     """Return the next messages (connection or Channel, time, raw) by topic; {} at the end."""
     # lists of bytes and numbers only, which the garbage collector does not traverse (a list of
     # tuples takes as long as the reading itself)

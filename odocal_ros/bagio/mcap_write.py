@@ -20,7 +20,7 @@ import zlib
 import numpy as np
 
 from odocal_ros.bagio import mcap_records as mcap
-from odocal_ros.bagio.channels import Channel
+from odocal_ros.bagio.bag_file import Channel
 from odocal_ros.safe_io.atomic_files import whole_file, WholeFile
 from odocal_ros.safe_io.limits import zstd_module
 

@@ -1,0 +1,287 @@
+# Copyright 2026 odocal_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Readers by the package rosbags: non-standard message types, and rosbag1 files.
+
+Both are limited, since rosbags trusts a file: a definition is parsed in bounded time, and sizes
+stated by index and chunks of a rosbag1 file are checked.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+import io
+from pathlib import Path
+import re
+import signal
+import threading
+from typing import Any
+
+from odocal_ros.bagio.bag_file import BagFile, Channel
+from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
+from odocal_ros.safe_io.limits import (
+    Allowance,
+    check,
+    DEFINITION,
+    ELEMENTS,
+    factor,
+    LATEST_NS,
+    LimitReached,
+    SECONDS,
+)
+
+# format: between definitions, of ros2msg in mcap.dev/spec/registry
+IDL_SEPARATOR = '=' * 80 + '\n'
+TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/@()]+|.',
+                   re.DOTALL)
+PACKINGS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
+
+
+@contextmanager
+def require_rosbags(what: str) -> Iterator[None]:
+    """Raise BadUsage if an import of rosbags, which is optional, fails; ``what`` needs it."""
+    try:
+        yield
+    except ModuleNotFoundError:
+        raise BadUsage(f'{what} needs the Python package rosbags, which is not installed: '
+                       'pip install rosbags') from None
+
+
+def parse_definition(msgtype: str, form: str, text: str) -> dict[str, Any]:
+    """Return the fields of a type and of the types in it; form is 'msg' or 'idl'."""
+    with require_rosbags('a non-standard message type'):
+        from rosbags.typesys import get_types_from_idl, get_types_from_msg
+    if form == 'msg':
+        return get_types_from_msg(text, msgtype)
+    parts = [part.split('\n', 1)[1] for part in text.split(IDL_SEPARATOR)[1:]] if text.startswith(
+        f'{IDL_SEPARATOR}IDL: ') else [text]
+    found: dict[str, Any] = {}
+    for part in parts:
+        found.update(get_types_from_idl(strip_idl(part)))
+    return found
+
+
+def strip_idl(text: str) -> str:
+    """
+    Return IDL without comments and annotations, which do not affect a layout and parse slowly.
+
+    Raises ValueError for computed constants: messages have none, and 1 << 2**40 is large.
+    """
+    kept, depth, annotated = [], 0, False
+    for token in TOKEN.findall(text):
+        if depth:
+            depth += (token == '(') - (token == ')')
+        elif token.startswith('@'):
+            annotated = True
+        elif annotated and token == '(':
+            depth, annotated = 1, False
+        elif token.startswith(('//', '/*')):
+            kept.append(' ')
+        else:
+            annotated = annotated and token.isspace()
+            kept.append(token)
+    plain = ''.join(kept)
+    if '<<' in plain or '*' in plain:
+        raise ValueError('computed constants')
+    return plain
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raise TimeoutError if the block runs longer; only has an effect in the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def late(*_: Any) -> None:
+        raise TimeoutError(f'it takes longer than {seconds:g} s')
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+class Types:
+    """Deserialises messages; a type is loaded with its first message."""
+
+    def __init__(self) -> None:
+        self._store: Any = None
+        self._definitions: dict[str, tuple[str, str]] = {}
+
+    def define(self, msgtype: str, definition: tuple[str, str]) -> None:
+        if definition[0]:
+            self._definitions.setdefault(msgtype, definition)
+
+    def deserializer(self, msgtype: str) -> Callable[[bytes], Any]:
+        """Return a function that converts CDR bytes of a type to an object."""
+        def deserialize(raw: bytes) -> Any:
+            store = self._typestore_for(msgtype)
+            try:
+                return store.deserialize_cdr(raw, msgtype)
+            except Exception:
+                # bytes after the message, as left by rclpy's serialize_message, are allowed
+                if raw[:2] != b'\x00\x01':
+                    raise
+                kind = store.get_msgdef(msgtype)
+                return kind.deserialize_cdr_le(raw[4:], 0, kind.cls, store)[0]
+        return deserialize
+
+    def cdr_from_ros1(self, raw: bytes, connection: Any) -> bytes:
+        cdr: bytes = self._typestore_for(connection.msgtype).ros1_to_cdr(raw, connection.msgtype)
+        return cdr
+
+    def _typestore_for(self, msgtype: str) -> Any:
+        if self._store is None:
+            with require_rosbags(msgtype):
+                from rosbags.typesys import get_typestore, Stores
+            self._store = get_typestore(Stores.ROS2_JAZZY)
+        if msgtype not in self._store.fielddefs:
+            self._register(msgtype)
+        return self._store
+
+    def _register(self, msgtype: str) -> None:
+        form, text = self._definitions.get(msgtype, ('', ''))
+        if not form:
+            raise BadData(f'{msgtype} is not a standard message type and the bag holds no '
+                          'definition of it: record with a current rosbag2 (mcap), or use '
+                          'another topic')
+        check(len(text), DEFINITION, f'{msgtype}: its definition in the bag', 'characters')
+        try:
+            with time_limit(SECONDS * factor()):
+                known = self._store.fielddefs
+                parsed = parse_definition(msgtype, form, text)
+                found = {name: fields for name, fields in parsed.items() if name not in known}
+                check(_count_elements(msgtype, known | found), ELEMENTS, f'{msgtype}: a message',
+                      'values')
+                self._store.register(found)
+        except (MemoryError, LimitReached):
+            raise
+        except Exception as error:   # a parser's errors
+            why = ' '.join(str(error).split())[:100] or type(error).__name__
+            raise BadData(f'{msgtype}: its definition in the bag cannot be parsed ({why}); use '
+                          'another topic') from None
+
+
+def _count_elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> int:
+    """Return the minimum number of values in the fixed arrays of a message."""
+    deepest = 50    # largest nesting of messages
+    if depth > deepest:
+        raise ValueError('it contains itself')
+
+    def of(field: tuple[Any, Any]) -> int:
+        kind, what = field
+        if kind.name == 'NAME':
+            return _count_elements(what, fielddefs, depth + 1)
+        return of(what[0]) * int(what[1]) if kind.name == 'ARRAY' else 1
+    total = 0
+    for _, field in fielddefs[msgtype][1]:
+        total += of(field)
+        if total > ELEMENTS * factor():
+            break
+    return total
+
+
+class Rosbag1File(BagFile):
+    """
+    A file of ROS 1.
+
+    rosbags allocates the sizes that the file states for index and chunks. Here the bytes read for
+    the index are counted, and its decompressors are replaced by limited ones.
+    """
+
+    def __init__(self, path: Path, allowance: Allowance, convert: Callable[..., Any]) -> None:
+        super().__init__(path)
+        self._convert, self._allowance = convert, allowance
+        try:
+            self._reader = self._opened(path)
+        except (PermissionError, MemoryError, BadBag):
+            raise
+        except Exception as error:   # rosbags and its dependencies raise many exceptions
+            raise self._unreadable(error) from None
+        found = self._reader.connections
+        self._channels = {c.id: Channel(c.topic, c.msgtype, c.msgcount, 'ros1', (
+            c.msgdef.format.name.lower(), c.msgdef.data)) for c in found}
+        self.count = sum(c.msgcount for c in found)
+        self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
+        if self.count and not 0 <= self.start_ns <= self.end_ns < LATEST_NS:
+            raise self._unreadable(ValueError('invalid start or end time'))
+
+    def _opened(self, path: Path) -> Any:
+        reader = _reader(path)
+        reader.open()
+        from rosbags.rosbag1.reader import decompressors
+        names = {known: name for name, known in decompressors.items()}
+        for at, chunk in reader.chunks.items():
+            reader.chunks[at] = chunk._replace(decompressor=partial(
+                self._allowance.unpack, PACKINGS[names[chunk.decompressor]]))
+        return reader
+
+    def _unreadable(self, error: Exception) -> BadBag:
+        # an error of rosbags may contain the one that it is raised from, as a tuple
+        why = ' '.join(str(error.__cause__ or error).split()).rstrip('.')[:200]
+        why = why if ' ' in why else 'damaged records'      # a key, or nothing
+        return BadBag(f"{self.path}: cannot be read ({why}); try 'rosbag reindex' on it")
+
+    def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
+        """Yield the messages of some topics (name -> type) by time, as CDR."""
+        connections = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
+        if not connections:      # for rosbags an empty list means all
+            return
+        self._allowance.restart()
+        stream = self._reader.messages(connections=connections)
+        while True:
+            try:
+                channel, time_ns, raw = next(stream)
+            except StopIteration:
+                return
+            except (MemoryError, LimitReached):
+                raise
+            except Exception as error:
+                raise self._unreadable(error) from None
+            try:
+                raw = bytes(self._convert(raw, channel))
+            except (OdocalError, MemoryError):
+                raise
+            except Exception:   # a damaged message: readers count it
+                raw = b''
+            yield channel, time_ns, raw
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+def _reader(path: Path) -> Any:
+    """Return a reader of rosbags whose index is limited to the size of the file."""
+    with require_rosbags('a rosbag1 file'):
+        from rosbags.rosbag1 import Reader
+    most = path.stat().st_size
+
+    class Bounded(io.BufferedReader):
+        """File whose reads are limited to the size of the file."""
+
+        def read(self, size: int | None = -1) -> bytes:
+            return super().read(min(size, most) if size and size > 0 else size)
+
+    class File(type(Path())):     # type: ignore[misc]
+        """A path that opens a Bounded file."""
+
+        def open(self, *_: str) -> io.BufferedReader:
+            return Bounded(io.FileIO(self))
+
+    class Counted(Reader):
+        """Reader that limits the bytes read for the index."""
+
+        left = most
+
+        def read_index_data(self, pos: int, indexes: Any) -> None:
+            assert self.bio
+            begin = self.bio.tell()
+            super().read_index_data(pos, indexes)
+            self.left -= self.bio.tell() - begin
+            if self.left < 0:
+                raise ValueError('its index contains a cycle')
+    return Counted(File(path))
